@@ -1,0 +1,143 @@
+"""Reading YAML into pydantic models: one-line errors with the place and the nearest key, and effective copies."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
+
+from omnibench.errors import ConfigError, nearest
+
+M = TypeVar("M", bound=BaseModel)
+
+
+class Model(BaseModel):
+    """Base of every document that omnibench reads: unknown keys are refused, values do not change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.1 without its traps: a key given twice is refused, ``1e-6`` is a number."""
+
+
+def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
+    keys = [loader.construct_object(key, deep=True) for key, _ in node.value]
+    for index, key in enumerate(keys):
+        if key in keys[:index]:
+            line = node.value[index][0].start_mark.line + 1
+            raise ConfigError(f"line {line}: key {key!r} is given twice")
+    return loader.construct_mapping(node, deep=True)
+
+
+_Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:float"]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(
+        r"^[-+]?(?:[0-9][0-9_]*\.[0-9_]*(?:[eE][-+]?[0-9]+)?|\.[0-9]+(?:[eE][-+]?[0-9]+)?|[0-9]+[eE][-+]?[0-9]+"
+        r"|\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+    ),
+    list("-+0123456789."),
+)
+
+
+def read_yaml(path: Path) -> Any:
+    """The content of a YAML file; ConfigError in one line when it cannot be read."""
+    try:
+        return yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)  # noqa: S506 (derived from SafeLoader)
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: not valid YAML: {error}") from None
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def read_model(model: type[M], path: Path) -> M:
+    """A YAML file as ``model``; ConfigError names file, key and the nearest known key."""
+    return validate(model, read_yaml(path), str(path))
+
+
+def validate(model: type[M], data: Any, where: str) -> M:
+    """``data`` as ``model``; ConfigError with ``where`` in front of the first thing that is wrong."""
+    if data is None:
+        data = {}
+    if not isinstance(data, Mapping | BaseModel):
+        raise ConfigError(f"{where}: expected keys and values, found {type(data).__name__}")
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError(f"{where}: {_describe(model, error)}") from None
+
+
+def _describe(model: type[BaseModel], error: ValidationError) -> str:
+    details = error.errors(include_url=False)
+    # An unknown key explains a missing one, so it is told first.
+    details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
+    rest = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+    return _describe_one(model, details[0]) + rest
+
+
+def _describe_one(model: type[BaseModel], detail: ErrorDetails) -> str:
+    location = detail["loc"]
+    place = ".".join(str(part) for part in location)
+    if detail["type"] == "extra_forbidden":
+        known = _keys_at(model, location[:-1])
+        return f"unknown key {place!r}; {nearest(str(location[-1]), known)}known: {', '.join(known) or 'none'}"
+    if detail["type"] == "missing":
+        return f"key {place!r} is missing"
+    message = detail["msg"].removeprefix("Value error, ")
+    given = repr(detail["input"])
+    shown = "" if detail["type"] == "value_error" or len(given) > 60 else f" (given: {given})"
+    return f"{place}: {message}{shown}" if place else f"{message}{shown}"
+
+
+def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
+    """The keys that the JSON schema of ``model`` allows at ``location``."""
+    schema = model.model_json_schema(by_alias=True)
+    definitions = schema.get("$defs", {})
+    nodes = [schema]
+    for part in location:
+        reached = [child for node in _expand(nodes, definitions) for child in _children(node, part)]
+        if reached:  # names of union members in the location are not keys: stay where we are
+            nodes = reached
+    return sorted({key for node in _expand(nodes, definitions) for key in node.get("properties", {})})
+
+
+def _expand(nodes: list[dict[str, Any]], definitions: dict[str, Any]) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = []
+    for node in nodes:
+        if "$ref" in node:
+            node = definitions[node["$ref"].rsplit("/", 1)[-1]]
+        found.append(node)
+        found.extend(_expand(node.get("anyOf", []) + node.get("oneOf", []) + node.get("allOf", []), definitions))
+    return found
+
+
+def _children(node: dict[str, Any], part: int | str) -> list[dict[str, Any]]:
+    if isinstance(part, int):
+        return [node["items"]] if isinstance(node.get("items"), dict) else []
+    if part in node.get("properties", {}):
+        return [node["properties"][part]]
+    extra = node.get("additionalProperties")
+    return [extra] if isinstance(extra, dict) else []
+
+
+def to_yaml(document: BaseModel | Mapping[str, Any]) -> str:
+    """A document as YAML that ``read_model`` reads back to the same values, floats to the last bit."""
+    data = document.model_dump(mode="json", by_alias=True) if isinstance(document, BaseModel) else dict(document)
+    # A JSON round trip drops types that YAML would tag (tuples, NumPy numbers).
+    plain = json.loads(json.dumps(data))
+    return yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)

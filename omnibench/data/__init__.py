@@ -1,0 +1,1 @@
+"""Where recordings come from: data sets on disk, importers and simulation."""

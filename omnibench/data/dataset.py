@@ -1,0 +1,156 @@
+"""Trajectory and Dataset: a robot's recordings in memory, SI units throughout."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from omnibench.data.checks import implausible
+from omnibench.data.headings import unwrap
+from omnibench.errors import DataError
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.odometry import WheelLog
+
+Split = Literal["train", "validation"]
+SPLITS: tuple[Split, ...] = ("train", "validation")
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One recorded run.
+
+    times (F,): end of each wheel sample, s, > 0. rates (F, N): mean wheel rates over each sample, rad/s.
+    pose_times (K,): s, the first is 0. poses (K, 3): reference poses x, y (m) and heading (rad).
+    Everything that follows may be unknown (None).
+    """
+
+    id: str
+    split: Split
+    times: Array
+    rates: Array
+    pose_times: Array
+    poses: Array
+    command: str | None = None
+    repetition: int | None = None
+    session: str | None = None
+    started_at: float | None = None  # s since the session's start
+    v: float | None = None  # commanded speed, m/s
+    alpha: float | None = None  # commanded direction, rad
+    omega: float | None = None  # commanded rate of turn, rad/s
+    duration: float | None = None  # s
+    distance: float | None = None  # commanded length, m
+    angles: Array | None = None  # phi, absolute wheel angles at ``times`` (F, N), rad
+    targets: Array | None = None  # what the motor controllers were told (F, N), rad/s
+    pose_covariances: Array | None = None  # (K, 3, 3)
+
+    @property
+    def start(self) -> Array:
+        """The reference pose at t = 0."""
+        start: Array = self.poses[0]
+        return start
+
+    @property
+    def final_pose(self) -> Array:
+        final: Array = self.poses[-1]
+        return final
+
+    def log(self, stamps: Sequence[float] | Array) -> WheelLog:
+        """The wheel rates from the start pose, with poses wanted at ``stamps`` (s)."""
+        return WheelLog(self.times, self.rates, self.start, np.asarray(stamps, dtype=float))
+
+    @property
+    def final_log(self) -> WheelLog:
+        """The log up to the last reference pose."""
+        return self.log(self.pose_times[-1:])
+
+    @property
+    def reference_log(self) -> WheelLog:
+        """The log with a stamp at every reference pose after the start."""
+        return self.log(self.pose_times[1:])
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Recordings of one robot. Make it with :func:`make_dataset`, which unwraps headings and looks for wrong units."""
+
+    name: str
+    robot: Robot
+    sample_period: float
+    trajectories: tuple[Trajectory, ...]
+    description: str = ""
+    source: str = ""
+    licence: str = ""
+    simulated: bool = False
+    warnings: tuple[str, ...] = field(default=())
+
+    def split(self, name: Split) -> tuple[Trajectory, ...]:
+        """The trajectories of one split; may be empty."""
+        return tuple(trajectory for trajectory in self.trajectories if trajectory.split == name)
+
+    @cached_property
+    def hash(self) -> str:
+        """SHA-256 of everything a fit could depend on; independent of names and file formats."""
+        digest = hashlib.sha256(self.robot.model_dump_json().encode())
+        digest.update(repr(self.sample_period).encode())
+        for trajectory in self.trajectories:
+            for item in fields(trajectory):
+                value = getattr(trajectory, item.name)
+                digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+        return digest.hexdigest()
+
+
+def make_dataset(
+    name: str,
+    robot: Robot,
+    sample_period: float,
+    trajectories: Iterable[Trajectory],
+    *,
+    description: str = "",
+    source: str = "",
+    licence: str = "",
+    simulated: bool = False,
+) -> Dataset:
+    """A data set with unwrapped headings and with warnings about values that cannot be right.
+
+    DataError when there is no trajectory or two have the same id.
+    """
+    raw = tuple(trajectories)
+    if not raw:
+        raise DataError(f"data set {name}: it has no trajectory")
+    seen: set[str] = set()
+    for trajectory in raw:
+        if trajectory.id in seen:
+            raise DataError(f"data set {name}: trajectory {trajectory.id} is there twice; give each its own id")
+        seen.add(trajectory.id)
+    logs = [trajectory.log(trajectory.pose_times) for trajectory in raw]
+    headings, doubts = unwrap(robot, logs, [trajectory.poses[:, 2] for trajectory in raw])
+    warnings = implausible(robot, logs, [trajectory.poses for trajectory in raw], headings)
+    if doubts and not warnings:
+        shown = ", ".join(raw[index].id for index in doubts[:5])
+        warnings = [f"headings of {len(doubts)} trajectories may be unwrapped wrongly (reference too sparse): {shown}"]
+    warnings += _late_references(raw)
+    unwrapped = (
+        replace(trajectory, poses=np.column_stack([trajectory.poses[:, :2], heading]))
+        for trajectory, heading in zip(raw, headings, strict=True)
+    )
+    return Dataset(
+        name, robot, sample_period, tuple(unwrapped), description, source, licence, simulated, tuple(warnings)
+    )
+
+
+def _late_references(trajectories: Sequence[Trajectory]) -> list[str]:
+    late = []
+    for trajectory in trajectories:
+        last = trajectory.times[-1]
+        period = last / len(trajectory.times)
+        if trajectory.pose_times[-1] > last + 1.5 * period:
+            late.append(trajectory.id)
+    if not late:
+        return []
+    shown = ", ".join(late[:5])
+    return [f"{len(late)} trajectories have reference poses after their last wheel sample, e.g. {shown}"]

@@ -1,0 +1,1 @@
+"""The importers, one a file. Importing a module registers it."""

@@ -1,0 +1,311 @@
+"""Data sets on disk, ``omnibench-dataset/1``: a folder with dataset.yaml and Parquet or CSV tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+import polars as pl
+from pydantic import Field, model_validator
+
+from omnibench.config import Model, read_yaml, to_yaml, validate
+from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, make_dataset
+from omnibench.errors import ConfigError, DataError, nearest
+from omnibench.files import replacing, write_text
+from omnibench.robot.kinematics import Array, Robot
+
+FORMAT = "omnibench-dataset/1"
+_RUN_NUMBERS = ("started_at", "v", "alpha", "omega", "duration", "distance")
+_COVARIANCE = ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
+
+
+class Header(Model):
+    """The content of dataset.yaml."""
+
+    format: Literal["omnibench-dataset/1"] = FORMAT
+    name: str = Field(min_length=1)
+    description: str = ""
+    source: str = ""
+    licence: str = ""
+    simulated: bool = Field(False, description="true for data that no robot drove")
+    robot: Robot
+    sample_period: float = Field(gt=0, allow_inf_nan=False, description="s")
+    wheels: tuple[str, ...] = Field(description="column names: omega_<wheel>")
+
+    @model_validator(mode="after")
+    def _wheels_are_the_robots(self) -> Header:
+        if self.wheels != self.robot.wheel_names:
+            raise ValueError(
+                f"wheels are {', '.join(self.wheels)}, but robot.wheels are {', '.join(self.robot.wheel_names)}; "
+                "name the same wheels in the same order"
+            )
+        return self
+
+
+def load_dataset(path: Path | str) -> Dataset:
+    """Read and check a data set folder.
+
+    DataError names the file, the row (1 is the first after the header) and what is wrong.
+    """
+    folder = Path(path)
+    header = _read_header(folder)
+    runs = _read_table(folder, "trajectories", ("trajectory", "split"))
+    rates = [f"omega_{wheel}" for wheel in header.wheels]
+    wheels = _read_table(folder, "wheels", ("trajectory", "t", *rates))
+    poses = _read_table(folder, "poses", ("trajectory", "t", "x", "y", "theta"))
+    _check_runs(runs)
+    wheel_rows = _rows_by_trajectory(runs, wheels)
+    pose_rows = _rows_by_trajectory(runs, poses)
+    _check_wheel_times(wheels, wheel_rows)
+    _check_pose_times(poses, pose_rows)
+    samples = _WheelColumns(wheels, header.wheels)
+    reference = _PoseColumns(poses)
+    trajectories = [
+        _trajectory(row, samples, wheel_rows[index], reference, pose_rows[index])
+        for index, row in enumerate(runs.frame.iter_rows(named=True))
+    ]
+    return make_dataset(
+        header.name,
+        header.robot,
+        header.sample_period,
+        trajectories,
+        description=header.description,
+        source=header.source,
+        licence=header.licence,
+        simulated=header.simulated,
+    )
+
+
+def save_dataset(dataset: Dataset, path: Path | str, table_format: Literal["parquet", "csv"] = "parquet") -> None:
+    """Write a data set folder. DataError when the disk refuses, or when the folder holds something else."""
+    folder = Path(path)
+    if folder.is_file():
+        raise DataError(f"{folder}: is a file; name a folder for the data set")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "dataset.yaml").is_file():
+        raise DataError(f"{folder}: holds other files; name an empty or new folder for the data set")
+    tables = {
+        "trajectories": pl.DataFrame([_run_row(trajectory) for trajectory in dataset.trajectories]),
+        "wheels": pl.concat([_wheel_frame(trajectory, dataset.robot) for trajectory in dataset.trajectories]),
+        "poses": pl.concat([_pose_frame(trajectory) for trajectory in dataset.trajectories]),
+    }
+    for name, frame in tables.items():
+        kept = frame.select(column for column in frame.iter_columns() if column.null_count() < len(column))
+        for stale in {"parquet", "csv"} - {table_format}:
+            (folder / f"{name}.{stale}").unlink(missing_ok=True)
+        with replacing(folder / f"{name}.{table_format}") as partial:
+            kept.write_parquet(partial) if table_format == "parquet" else kept.write_csv(partial)
+    write_text(folder / "dataset.yaml", to_yaml(header_of(dataset)))
+
+
+def header_of(dataset: Dataset) -> Header:
+    """What dataset.yaml says of a data set."""
+    return Header(
+        name=dataset.name,
+        description=dataset.description,
+        source=dataset.source,
+        licence=dataset.licence,
+        simulated=dataset.simulated,
+        robot=dataset.robot,
+        sample_period=dataset.sample_period,
+        wheels=dataset.robot.wheel_names,
+    )
+
+
+class _Table:
+    """A table and the file it came from, for messages."""
+
+    def __init__(self, file: Path, frame: pl.DataFrame) -> None:
+        self.file = file
+        self.frame = frame
+
+    def fail(self, row: int, what: str) -> DataError:
+        return DataError(f"{self.file}, row {row + 1}: {what}")
+
+    def numbers(self, column: str) -> Array:
+        """A column as finite floats (rows,)."""
+        series = self.frame[column]
+        if not series.dtype.is_numeric():
+            raise DataError(f"{self.file}: column {column!r} holds {series.dtype}, expected numbers")
+        values = series.cast(pl.Float64).fill_null(np.nan).to_numpy()
+        bad = np.flatnonzero(~np.isfinite(values))
+        if len(bad):
+            found = series[int(bad[0])]
+            raise self.fail(int(bad[0]), f"{column} is {'missing' if found is None else found}; remove or repair the row")
+        result: Array = values
+        return result
+
+    def stack(self, columns: Sequence[str]) -> Array | None:
+        """Optional columns as (rows, n), or None when one is not there."""
+        if not all(column in self.frame.columns for column in columns):
+            return None
+        return np.column_stack([self.numbers(column) for column in columns])
+
+
+class _WheelColumns:
+    def __init__(self, table: _Table, wheels: Sequence[str]) -> None:
+        self.times = table.numbers("t")
+        rates = table.stack([f"omega_{wheel}" for wheel in wheels])
+        assert rates is not None  # their presence was checked on reading
+        self.rates = rates
+        self.angles = table.stack([f"phi_{wheel}" for wheel in wheels])
+        self.targets = table.stack([f"target_{wheel}" for wheel in wheels])
+
+
+class _PoseColumns:
+    def __init__(self, table: _Table) -> None:
+        self.times = table.numbers("t")
+        self.poses = np.column_stack([table.numbers(column) for column in ("x", "y", "theta")])
+        upper = table.stack([f"cov_{name}" for name in _COVARIANCE])
+        self.covariances = None if upper is None else upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+
+
+def _read_header(folder: Path) -> Header:
+    if not folder.is_dir():
+        raise DataError(f"{folder}: no such folder; a data set is a folder with dataset.yaml in it")
+    file = folder / "dataset.yaml"
+    try:
+        content = read_yaml(file)
+        found = content.get("format") if isinstance(content, dict) else None
+        if found != FORMAT:
+            raise DataError(f"{file}: format is {found!r}, expected {FORMAT!r}")
+        return validate(Header, content, str(file))
+    except ConfigError as error:
+        raise DataError(str(error)) from None
+
+
+def _read_table(folder: Path, name: str, required: Sequence[str]) -> _Table:
+    file = next((f for f in (folder / f"{name}.parquet", folder / f"{name}.csv") if f.is_file()), None)
+    if file is None:
+        raise DataError(f"{folder}: {name}.parquet (or {name}.csv) is missing")
+    try:
+        frame = pl.read_parquet(file) if file.suffix == ".parquet" else pl.read_csv(file, infer_schema_length=None)
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise DataError(f"{file}: cannot be read: {error}") from None
+    for column in required:
+        if column not in frame.columns:
+            known = ", ".join(frame.columns)
+            raise DataError(f"{file}: column {column!r} is missing; {nearest(column, frame.columns)}found: {known}")
+    if frame.is_empty():
+        raise DataError(f"{file}: it has no rows")
+    table = _Table(file, frame)
+    missing = frame["trajectory"].is_null().arg_true()
+    if len(missing):
+        raise table.fail(int(missing[0]), "trajectory is missing")
+    table.frame = frame.with_columns(pl.col("trajectory").cast(pl.String))
+    return table
+
+
+def _check_runs(runs: _Table) -> None:
+    repeated = runs.frame["trajectory"].is_first_distinct().not_().arg_true()
+    if len(repeated):
+        row = int(repeated[0])
+        raise runs.fail(row, f"trajectory {runs.frame['trajectory'][row]} is there twice; give each its own id")
+    for row, split in enumerate(runs.frame["split"]):
+        if split not in SPLITS:
+            raise runs.fail(row, f"split is {split!r}; {nearest(str(split), SPLITS)}it must be train or validation")
+
+
+def _rows_by_trajectory(runs: _Table, table: _Table) -> list[np.ndarray[Any, np.dtype[np.intp]]]:
+    """For each run the rows of ``table`` that belong to it, in the file's order."""
+    ids = runs.frame["trajectory"].to_list()
+    number = {identity: index for index, identity in enumerate(ids)}
+    codes = np.array([number.get(identity, -1) for identity in table.frame["trajectory"]])
+    strangers = np.flatnonzero(codes < 0)
+    if len(strangers):
+        row = int(strangers[0])
+        identity = table.frame["trajectory"][row]
+        raise table.fail(row, f"trajectory {identity} is not in {runs.file.name}")
+    order = np.argsort(codes, kind="stable")
+    counts = np.bincount(codes, minlength=len(ids))
+    for index, count in enumerate(counts):
+        if count == 0:
+            what = "wheel samples" if table.file.stem == "wheels" else "reference poses"
+            raise DataError(f"{table.file}: trajectory {ids[index]} ({runs.file.name}, row {index + 1}) has no {what}")
+    return np.split(order, np.cumsum(counts)[:-1])
+
+
+def _check_wheel_times(wheels: _Table, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]) -> None:
+    times = wheels.numbers("t")
+    early = np.flatnonzero(times <= 0)
+    if len(early):
+        row = int(early[0])
+        raise wheels.fail(row, f"t is {times[row]:g}; wheel samples start after t = 0 (a row holds the rate up to its t)")
+    _check_increasing(wheels, times, groups)
+
+
+def _check_pose_times(poses: _Table, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]) -> None:
+    times = poses.numbers("t")
+    early = np.flatnonzero(times < 0)
+    if len(early):
+        raise poses.fail(int(early[0]), f"t is {times[early[0]]:g}; it must not be negative")
+    _check_increasing(poses, times, groups)
+    for rows in groups:
+        first = int(rows[0])
+        identity = poses.frame["trajectory"][first]
+        if times[first] != 0:
+            raise poses.fail(first, f"trajectory {identity} has no reference pose at t = 0, its start pose")
+        if len(rows) < 2:
+            raise poses.fail(first, f"trajectory {identity} has no reference pose after its start")
+
+
+def _check_increasing(
+    table: _Table, times: Array, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]
+) -> None:
+    for rows in groups:
+        steps = np.diff(times[rows])
+        bad = np.flatnonzero(steps <= 0)
+        if len(bad):
+            row, before = int(rows[bad[0] + 1]), int(rows[bad[0]])
+            what = "goes backwards" if steps[bad[0]] < 0 else "is repeated"
+            raise table.fail(row, f"t {what}: {times[row]:g} after {times[before]:g}")
+
+
+def _trajectory(
+    run: dict[str, Any],
+    wheels: _WheelColumns,
+    wheel_rows: np.ndarray[Any, np.dtype[np.intp]],
+    reference: _PoseColumns,
+    pose_rows: np.ndarray[Any, np.dtype[np.intp]],
+) -> Trajectory:
+    numbers = {name: float(run[name]) for name in _RUN_NUMBERS if run.get(name) is not None}
+    return Trajectory(
+        id=run["trajectory"],
+        split=cast(Split, run["split"]),
+        times=wheels.times[wheel_rows],
+        rates=wheels.rates[wheel_rows],
+        pose_times=reference.times[pose_rows],
+        poses=reference.poses[pose_rows],
+        command=None if run.get("command") is None else str(run["command"]),
+        repetition=None if run.get("repetition") is None else int(run["repetition"]),
+        session=None if run.get("session") is None else str(run["session"]),
+        angles=None if wheels.angles is None else wheels.angles[wheel_rows],
+        targets=None if wheels.targets is None else wheels.targets[wheel_rows],
+        pose_covariances=None if reference.covariances is None else reference.covariances[pose_rows],
+        **numbers,
+    )
+
+
+def _run_row(trajectory: Trajectory) -> dict[str, Any]:
+    names = ("command", "repetition", "split", "session", *_RUN_NUMBERS)
+    return {"trajectory": trajectory.id} | {name: getattr(trajectory, name) for name in names}
+
+
+def _wheel_frame(trajectory: Trajectory, robot: Robot) -> pl.DataFrame:
+    columns: dict[str, Any] = {"trajectory": [trajectory.id] * len(trajectory.times), "t": trajectory.times}
+    for prefix, values in (("omega", trajectory.rates), ("phi", trajectory.angles), ("target", trajectory.targets)):
+        for index, wheel in enumerate(robot.wheel_names):
+            columns[f"{prefix}_{wheel}"] = [None] * len(trajectory.times) if values is None else values[:, index]
+    return pl.DataFrame(columns, schema_overrides={name: pl.Float64 for name in columns if name != "trajectory"})
+
+
+def _pose_frame(trajectory: Trajectory) -> pl.DataFrame:
+    count = len(trajectory.pose_times)
+    columns: dict[str, Any] = {"trajectory": [trajectory.id] * count, "t": trajectory.pose_times}
+    columns |= {name: trajectory.poses[:, index] for index, name in enumerate(("x", "y", "theta"))}
+    covariances = trajectory.pose_covariances
+    for index, name in enumerate(_COVARIANCE):
+        row, column = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))[index]
+        columns[f"cov_{name}"] = [None] * count if covariances is None else covariances[:, row, column]
+    return pl.DataFrame(columns, schema_overrides={name: pl.Float64 for name in columns if name != "trajectory"})

@@ -1,0 +1,40 @@
+"""The family of errors that a user can cause: the command line prints each as one line and exits with 2."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class OmnibenchError(Exception):
+    """Something the user can put right. The message is one line: the thing, the place, the way out."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.split()))
+
+
+class ConfigError(OmnibenchError):
+    """A config, an option or an argument is wrong."""
+
+
+class DataError(OmnibenchError):
+    """A recording, a data set or a calibration file is wrong."""
+
+
+class PluginError(OmnibenchError):
+    """A plug-in cannot be loaded or does not keep the contract."""
+
+
+class UnknownNameError(ConfigError):
+    """A name that nothing is registered under."""
+
+    def __init__(self, kind: str, name: str, known: Iterable[str], where: str = "") -> None:
+        names = sorted(known)
+        place = f"{where}: " if where else ""
+        super().__init__(f"{place}unknown {kind} {name!r}; {nearest(name, names)}known: {', '.join(names) or 'none'}")
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """``did you mean 'x'? `` for the known name closest to ``name``, or an empty text."""
+    matches = get_close_matches(str(name), list(known), n=1, cutoff=0.5)
+    return f"did you mean {matches[0]!r}? " if matches else ""

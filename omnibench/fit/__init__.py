@@ -1,0 +1,1 @@
+"""How a model is fitted to recordings: costs, the calibration problem, calibrators."""

@@ -1,0 +1,133 @@
+"""What a calibrator is, and how one is run so that every end of a run is a row."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, ClassVar
+
+import numpy as np
+
+from omnibench.errors import OmnibenchError
+from omnibench.fit.parameterisation import ParameterisationName
+from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
+from omnibench.registry import Options
+from omnibench.robot.kinematics import Array
+
+
+class Outcome(StrEnum):
+    """How a run ended."""
+
+    CONVERGED = "converged"  # by the calibrator's own rule
+    BUDGET = "budget"  # the evaluations were spent
+    TIME = "time"  # the seconds were spent
+    FAILED = "failed"  # it raised, died, or cannot solve this problem
+    INVALID = "invalid"  # its answer is no calibration: NaN, wrong shape, outside the box
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A calibrator's answer: the vector (n,) and why it stopped there."""
+
+    vector: Array
+    reason: str
+    converged: bool = True
+
+
+class Calibrator(ABC):
+    """Finds a vector of low cost. Made with validated options; ``calibrate`` may be called more than once.
+
+    parameterisation: what it searches unless the config says otherwise.
+    bounded: False for answers that do not depend on the box (a published matrix).
+    """
+
+    Options: ClassVar[type[Options]] = Options
+    name: ClassVar[str]
+    parameterisation: ClassVar[ParameterisationName] = "matrix"
+    bounded: ClassVar[bool] = True
+
+    def __init__(self, options: Any) -> None:
+        self.options = options
+
+    @abstractmethod
+    def calibrate(self, problem: CalibrationProblem) -> Solution:
+        """Minimise ``problem.cost`` within the box; BudgetSpent, raised by it, is to be let through.
+
+        Raise OmnibenchError when the problem cannot be solved this way.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class RunResult:
+    """How one calibrator did on one problem. ``vector``, ``matrix`` and ``cost`` are None unless there is an answer."""
+
+    outcome: Outcome
+    reason: str
+    vector: Array | None
+    matrix: Array | None
+    cost: float | None
+    evaluations: int
+    seconds: float
+    history: tuple[Improvement, ...]
+    at_bounds: tuple[str, ...] = ()
+
+
+def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunResult:
+    """Run a calibrator to its end, whatever that is."""
+    vector: Array | None = None
+    try:
+        solution = calibrator.calibrate(problem)
+        outcome = Outcome.CONVERGED if solution.converged else Outcome.BUDGET
+        vector, reason = solution.vector, solution.reason
+    except BudgetSpent as spent:
+        outcome, reason = Outcome(spent.kind), str(spent)
+        vector = problem.best_vector if np.isfinite(problem.best_cost) else None
+        if vector is None:
+            outcome, reason = Outcome.INVALID, f"{reason}, and no candidate in the box had a finite cost"
+    except OmnibenchError as error:
+        outcome, reason = Outcome.FAILED, str(error)
+    except Exception as error:  # whatever a plug-in raises is this run's outcome
+        outcome, reason = Outcome.FAILED, " ".join(f"{type(error).__name__}: {error}".split())
+    seconds = problem.seconds
+    cost: float | None = None
+    if vector is not None:
+        vector, cost, flaw = _examine(calibrator, problem, vector)
+        if flaw:
+            outcome, reason = Outcome.INVALID, flaw
+    return RunResult(
+        outcome=outcome,
+        reason=reason,
+        vector=vector,
+        matrix=None if vector is None else problem.matrix(vector),
+        cost=cost,
+        evaluations=problem.evaluations,
+        seconds=seconds,
+        history=tuple(problem.history),
+        at_bounds=problem.at_bounds(vector) if vector is not None and calibrator.bounded else (),
+    )
+
+
+def _examine(
+    calibrator: Calibrator, problem: CalibrationProblem, answer: Any
+) -> tuple[Array | None, float | None, str]:
+    """The answer as a vector, its cost, and what is wrong with it."""
+    try:
+        vector = np.array(answer, dtype=float)
+    except (TypeError, ValueError):
+        return None, None, "the answer is not a vector of numbers"
+    if vector.shape != problem.start.shape:
+        return None, None, f"the answer has shape {vector.shape}, expected ({problem.size},)"
+    if not np.isfinite(vector).all():
+        return None, None, "the answer holds NaN or infinity"
+    if calibrator.bounded and not problem.inside(vector[None])[0]:
+        outside = [
+            name
+            for name, value, low, high in zip(problem.names, vector, problem.lower, problem.upper, strict=True)
+            if not low <= value <= high
+        ]
+        return None, None, f"the answer is outside the box ({', '.join(outside)})"
+    cost = float(problem.values(vector[None])[0])
+    if not np.isfinite(cost):
+        return None, None, "the answer's cost is not finite"
+    return vector, cost, ""

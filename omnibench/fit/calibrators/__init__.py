@@ -1,0 +1,1 @@
+"""The calibrators, one a file. Importing a module registers it."""

@@ -1,0 +1,30 @@
+"""The simplest search: what any other must beat, and the shortest example of a calibrator."""
+
+import numpy as np
+from pydantic import Field
+
+from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.problem import CalibrationProblem
+from omnibench.registry import Options, calibrators
+
+
+class RandomSearchOptions(Options):
+    """How many candidates are tried."""
+
+    candidates: int = Field(10_000, gt=0)
+    batch: int = Field(100, gt=0, description="candidates evaluated at once")
+
+
+@calibrators.register("random_search")
+class RandomSearch(Calibrator):
+    """Uniform random candidates in the box; the best is kept."""
+
+    Options = RandomSearchOptions
+    options: RandomSearchOptions
+
+    def calibrate(self, problem: CalibrationProblem) -> Solution:
+        """Draw candidates until their number is reached or the budget is spent."""
+        for first in range(0, self.options.candidates, self.options.batch):
+            count = min(self.options.batch, self.options.candidates - first)
+            problem.cost(problem.from_unit(problem.rng.uniform(size=(count, np.count_nonzero(problem.free)))))
+        return Solution(problem.best_vector, f"{self.options.candidates} candidates tried")

@@ -1,0 +1,92 @@
+"""What a calibration minimises: Eq. (6) of the paper and its relatives, all sums of norms of pose errors."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.data.dataset import Trajectory
+from omnibench.registry import Options, costs
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import Integration, OdometryBatch
+
+
+class Cost(ABC):
+    """One number for the pose errors of a set of trajectories.
+
+    ``stamps`` says where along a trajectory poses are compared: at the last reference pose or at all after the start.
+    """
+
+    Options: ClassVar[type[Options]] = Options
+    name: ClassVar[str]
+    stamps: ClassVar[Literal["final", "reference"]] = "final"
+
+    def __init__(self, options: Options) -> None:
+        self.options = options
+
+    @abstractmethod
+    def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
+        """Costs (P,) from pose errors (P, S, 3) in m, m, rad; ``trajectory`` (S,) tells whose stamp each is."""
+
+    def batch(self, trajectories: Sequence[Trajectory], integration: Integration) -> OdometryBatch:
+        """The odometry of the trajectories at this cost's stamps."""
+        return OdometryBatch([t.final_log if self.stamps == "final" else t.reference_log for t in trajectories], integration)
+
+    def reference(self, trajectories: Sequence[Trajectory]) -> Array:
+        """The reference poses (S, 3) at this cost's stamps."""
+        return np.concatenate([t.poses[-1:] if self.stamps == "final" else t.poses[1:] for t in trajectories])
+
+
+class SumOfNorms(Cost):
+    """The mean over trajectories of the mean norm of weighted pose errors at the stamps.
+
+    ``weights`` (3,) multiply the errors of x (m), y (m) and heading (rad) before the norm is taken.
+    """
+
+    weights: ClassVar[tuple[float, float, float]] = (1.0, 1.0, 1.0)
+
+    def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
+        """Costs (P,): the norms, weighted by the stamps' shares."""
+        values: Array = self.norms(errors) @ self.shares(trajectory)
+        return values
+
+    def norms(self, errors: Array) -> Array:
+        """Norms (..., S) of pose errors (..., S, 3)."""
+        squares: Array = np.square(errors) @ np.square(self.weights)
+        return np.sqrt(squares)
+
+    def shares(self, trajectory: NDArray[np.intp]) -> Array:
+        """Share (S,) of each stamp in the cost; they sum to one."""
+        counts = np.bincount(trajectory)
+        share: Array = 1.0 / (counts[trajectory] * len(counts))
+        return share
+
+
+@costs.register("final_pose")
+class FinalPose(SumOfNorms):
+    """Eq. (6): mean over trajectories of the norm of the final pose error, m and rad alike."""
+
+
+@costs.register("final_position")
+class FinalPosition(SumOfNorms):
+    """Mean distance between final odometry and final reference position, m."""
+
+    weights = (1.0, 1.0, 0.0)
+
+
+@costs.register("final_heading")
+class FinalHeading(SumOfNorms):
+    """Mean absolute final heading error, rad."""
+
+    weights = (0.0, 0.0, 1.0)
+
+
+@costs.register("trajectory")
+class AlongTrajectory(SumOfNorms):
+    """Mean pose error along the whole reference, m and rad alike, each trajectory counting the same."""
+
+    stamps = "reference"

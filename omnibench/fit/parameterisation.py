@@ -1,0 +1,158 @@
+"""What is searched, apart from how: a vector of numbers, what matrix it means and the box it lies in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+import numpy as np
+from pydantic import Field, FiniteFloat
+
+from omnibench.config import Model
+from omnibench.errors import ConfigError
+from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrices
+
+ParameterisationName = Literal["matrix", "geometry"]
+
+
+class ExplicitBox(Model):
+    """Bounds of each matrix element, 3 rows of N."""
+
+    lower: tuple[tuple[FiniteFloat, ...], ...]
+    upper: tuple[tuple[FiniteFloat, ...], ...]
+
+
+Box = Literal["paper", "row"] | ExplicitBox
+Deviation = FiniteFloat | tuple[FiniteFloat, FiniteFloat]
+
+
+class GeometryLimits(Model):
+    """How far the physical parameters may lie from their design values: +-number, or [low, high]."""
+
+    radius: Deviation = Field(0.10, description="share of the wheel radius")
+    distance: Deviation = Field(0.20, description="share of the distance from wheel to centre")
+    angle_deg: Deviation = Field(3.0, description="degrees of the wheel's direction")
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """A box: ``lower`` and ``upper`` (n,), and the name it goes by in tables."""
+
+    name: str
+    lower: Array
+    upper: Array
+
+
+class Parameterisation(Protocol):
+    """A vector of n numbers and the matrix that it means."""
+
+    @property
+    def name(self) -> ParameterisationName: ...
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What each number is called."""
+    @property
+    def start(self) -> Array:
+        """The vector (n,) of the design values."""
+    @property
+    def bounds(self) -> Bounds: ...
+    def matrices(self, vectors: Array) -> Array:
+        """Inverse kinematic matrices (P, 3, N) of vectors (P, n)."""
+
+
+@dataclass(frozen=True, eq=False)
+class MatrixElements:
+    """The elements of the matrix row by row, Eq. (4) and (5): the paper's non-parametric way.
+
+    ``span`` (N, N) projects onto the wheel rates that the data drive; across it the start values are kept.
+    """
+
+    robot: Robot
+    box: Box
+    span: Array
+    name: ParameterisationName = field(default="matrix", init=False)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(f"m{row}{column}" for row in (1, 2, 3) for column in range(1, len(self.robot.wheels) + 1))
+
+    @property
+    def start(self) -> Array:
+        return self.robot.inverse_kinematic_matrix.ravel()
+
+    @property
+    def bounds(self) -> Bounds:
+        return _checked(_matrix_bounds(self.robot.inverse_kinematic_matrix, self.box), self.start, self.names)
+
+    def matrices(self, vectors: Array) -> Array:
+        """Matrices (P, 3, N); on data that drive every direction simply the elements."""
+        matrices = np.asarray(vectors, dtype=float).reshape(len(vectors), 3, -1)
+        if np.array_equal(self.span, np.eye(len(self.span))):
+            return matrices
+        start = self.robot.inverse_kinematic_matrix
+        moved: Array = start + (matrices - start) @ self.span
+        return moved
+
+
+@dataclass(frozen=True, eq=False)
+class WheelGeometry:
+    """Radius, distance and angle of each wheel, Eq. (3), within physical limits: the parametric way."""
+
+    robot: Robot
+    limits: GeometryLimits
+    name: ParameterisationName = field(default="geometry", init=False)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        kinds = ("radius", "distance", "angle")
+        return tuple(f"{kind}_{wheel}" for kind in kinds for wheel in self.robot.wheel_names)
+
+    @property
+    def start(self) -> Array:
+        wheels = self.robot.wheels
+        return np.array([[w.radius for w in wheels], [w.distance for w in wheels], [w.angle for w in wheels]]).ravel()
+
+    @property
+    def bounds(self) -> Bounds:
+        count = len(self.robot.wheels)
+        low, high = np.array(
+            [_range(self.limits.radius), _range(self.limits.distance), np.radians(_range(self.limits.angle_deg))]
+        ).T
+        scale = self.start.copy()
+        scale[2 * count :] = 1.0
+        lower = self.start + np.repeat(low, count) * scale
+        upper = self.start + np.repeat(high, count) * scale
+        return _checked(Bounds("limits", lower, upper), self.start, self.names)
+
+    def matrices(self, vectors: Array) -> Array:
+        """Matrices (P, 3, N) by Eq. (3), or by the pseudo-inverse for other wheels."""
+        radius, distance, angle = np.moveaxis(np.asarray(vectors, dtype=float).reshape(len(vectors), 3, -1), 1, 0)
+        rollers = np.array([wheel.roller_angle for wheel in self.robot.wheels])
+        return inverse_kinematic_matrices(radius, distance, angle, rollers)
+
+
+def _range(deviation: float | tuple[float, float]) -> tuple[float, float]:
+    return deviation if isinstance(deviation, tuple) else (-abs(deviation), abs(deviation))
+
+
+def _matrix_bounds(start: Array, box: Box) -> Bounds:
+    if isinstance(box, ExplicitBox):
+        for side in (box.lower, box.upper):
+            if [len(row) for row in side] != [start.shape[1]] * 3:
+                raise ConfigError(f"box: lower and upper must have 3 rows of {start.shape[1]} values")
+        return Bounds("custom", np.array(box.lower).ravel(), np.array(box.upper).ravel())
+    if box == "paper":
+        width = 0.10 * np.abs(start)
+    else:
+        width = np.repeat(0.25 * np.abs(start).max(axis=1, keepdims=True), start.shape[1], axis=1)
+    return Bounds(box, (start - width).ravel(), (start + width).ravel())
+
+
+def _checked(bounds: Bounds, start: Array, names: Sequence[str]) -> Bounds:
+    for name, low, high, value in zip(names, bounds.lower, bounds.upper, start, strict=True):
+        if low > high:
+            raise ConfigError(f"box: lower bound {low:g} of {name} is above its upper bound {high:g}")
+        if not low <= value <= high:
+            raise ConfigError(f"box: start value {value:g} of {name} is outside [{low:g}, {high:g}]; widen the box")
+    return bounds

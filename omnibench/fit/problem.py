@@ -1,0 +1,207 @@
+"""CalibrationProblem: what every calibrator is given, and all it is given."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from omnibench.config import Model
+from omnibench.data.dataset import Trajectory
+from omnibench.errors import DataError
+from omnibench.fit.cost import Cost
+from omnibench.fit.parameterisation import (
+    Box,
+    GeometryLimits,
+    MatrixElements,
+    Parameterisation,
+    ParameterisationName,
+    WheelGeometry,
+)
+from omnibench.fit.span import driven_span
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.odometry import Integration
+
+_PROGRESS_PERIOD = 0.1  # s
+
+
+class Budget(Model):
+    """What one run may spend."""
+
+    evaluations: int = Field(60_000, gt=0, description="candidates that may be evaluated")
+    seconds: float = Field(600.0, gt=0, description="wall time, s")
+
+
+class BudgetSpent(Exception):  # noqa: N818 (not an error: the run is over)
+    """Raised by ``problem.cost`` when nothing is left; calibrators let it pass."""
+
+    def __init__(self, kind: str, reason: str) -> None:
+        super().__init__(reason)
+        self.kind = kind
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """The best cost so far, and when it was found."""
+
+    evaluations: int
+    seconds: float
+    cost: float
+
+
+class CalibrationProblem:
+    """Training trajectories, a start, a box, a budget and a cost to be minimised.
+
+    trajectories: the training data; the validation data are nowhere in reach.
+    start, lower, upper (n,): the vector that is searched and its box. names: what its numbers are.
+    cost(candidates): what is minimised. rng: the only source of randomness a calibrator may use.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        trajectories: Sequence[Trajectory],
+        cost: Cost,
+        parameterisation: Parameterisation,
+        *,
+        integration: Integration,
+        budget: Budget,
+        seed: int,
+        watch: Callable[[int, float], None] | None = None,
+    ) -> None:
+        if not trajectories:
+            raise DataError("the training split is empty; nothing can be calibrated (see the column split)")
+        self.robot = robot
+        self.trajectories = tuple(trajectories)
+        self.objective = cost
+        self.parameterisation = parameterisation
+        self.integration: Integration = integration
+        self.budget = budget
+        self.seed = seed
+        self.rng = np.random.default_rng(seed)
+        bounds = parameterisation.bounds
+        self.box = bounds.name
+        self.start, self.lower, self.upper = (_frozen(v) for v in (parameterisation.start, bounds.lower, bounds.upper))
+        self.names = parameterisation.names
+        self.free = _frozen(self.upper > self.lower)
+        self.odometry = cost.batch(self.trajectories, integration)
+        self.reference = _frozen(cost.reference(self.trajectories))
+        self.evaluations = 0
+        self.best_vector = self.start
+        self.best_cost = np.inf
+        self.history: list[Improvement] = []
+        self._watch = watch
+        self._began = time.perf_counter()
+        self._shown = 0.0
+
+    @property
+    def size(self) -> int:
+        """The number n of values that are searched."""
+        return len(self.start)
+
+    @property
+    def remaining(self) -> int:
+        """Evaluations that the budget still allows."""
+        return self.budget.evaluations - self.evaluations
+
+    @property
+    def seconds(self) -> float:
+        """Wall time since the problem was made."""
+        return time.perf_counter() - self._began
+
+    def cost(self, candidates: Array) -> Array:
+        """Costs (P,) of candidates (P, n), counted against the budget.
+
+        A candidate that cannot be evaluated costs NaN. Raises BudgetSpent when the budget is spent; a population
+        that is larger than what remains is evaluated as far as it goes.
+        """
+        candidates = np.array(candidates, dtype=float, ndmin=2)
+        if candidates.shape[1:] != self.start.shape:
+            raise ValueError(f"candidates have shape {candidates.shape}, expected (P, {self.size})")
+        self._check_budget()
+        asked = len(candidates)
+        candidates = candidates[: self.remaining]
+        values = self.values(candidates)
+        self._record(candidates, values)
+        if len(candidates) < asked:
+            self._check_budget()
+        return values
+
+    def values(self, candidates: Array) -> Array:
+        """Costs (P,) of candidates (P, n) without counting: for the verdict on a run, not for a search."""
+        with np.errstate(all="ignore"):
+            errors = self.odometry.poses(self.parameterisation.matrices(candidates)) - self.reference
+            return self.objective.combine(errors, self.odometry.trajectory)
+
+    def to_unit(self, vectors: Array) -> Array:
+        """Vectors (P, n) as points (P, free) of the unit cube over the free elements."""
+        free = self.free
+        unit: Array = (np.atleast_2d(vectors)[:, free] - self.lower[free]) / (self.upper - self.lower)[free]
+        return unit
+
+    def from_unit(self, points: Array) -> Array:
+        """Vectors (P, n) of points (P, free) of the unit cube; never outside the box."""
+        points = np.atleast_2d(points)
+        vectors = np.tile(self.start, (len(points), 1))
+        span = (self.upper - self.lower)[self.free]
+        vectors[:, self.free] = self.lower[self.free] + points * span
+        return np.clip(vectors, self.lower, self.upper)
+
+    def inside(self, vectors: Array) -> Array:
+        """Which vectors (P, n) lie in the box, up to rounding: (P,) of bool."""
+        slack = 1e-12 * np.maximum(np.abs(self.lower), np.abs(self.upper))
+        inside: Array = ((vectors >= self.lower - slack) & (vectors <= self.upper + slack)).all(axis=-1)
+        return inside
+
+    def at_bounds(self, vector: Array) -> tuple[str, ...]:
+        """Names of the free elements that lie on a bound of the box."""
+        margin = 1e-6 * (self.upper - self.lower)
+        on_bound = self.free & ((vector <= self.lower + margin) | (vector >= self.upper - margin))
+        return tuple(name for name, touching in zip(self.names, on_bound, strict=True) if touching)
+
+    def matrix(self, vector: Array) -> Array:
+        """The inverse kinematic matrix (3, N) of one vector (n,)."""
+        matrix: Array = self.parameterisation.matrices(vector[None])[0]
+        return matrix
+
+    def _check_budget(self) -> None:
+        if self.remaining <= 0:
+            raise BudgetSpent("budget", f"budget of {self.budget.evaluations} evaluations spent")
+        if self.seconds > self.budget.seconds:
+            raise BudgetSpent("time", f"time budget of {self.budget.seconds:g} s spent")
+
+    def _record(self, candidates: Array, values: Array) -> None:
+        eligible = np.where(np.isfinite(values) & self.inside(candidates), values, np.inf)
+        running = np.minimum.accumulate(eligible)
+        for index in np.flatnonzero(np.diff(np.concatenate([[self.best_cost], running])) < 0):
+            self.best_cost = float(running[index])
+            self.best_vector = _frozen(candidates[index])
+            self.history.append(Improvement(self.evaluations + int(index) + 1, self.seconds, self.best_cost))
+        self.evaluations += len(candidates)
+        if self._watch and self.seconds - self._shown > _PROGRESS_PERIOD:
+            self._shown = self.seconds
+            self._watch(self.evaluations, self.best_cost)
+
+
+def make_parameterisation(
+    name: ParameterisationName,
+    robot: Robot,
+    trajectories: Sequence[Trajectory],
+    *,
+    box: Box = "row",
+    limits: GeometryLimits | None = None,
+) -> Parameterisation:
+    """The parameterisation called ``name``. ConfigError when its box excludes the start."""
+    if name == "geometry":
+        return WheelGeometry(robot, limits or GeometryLimits())
+    span = driven_span(trajectories).projector if len(robot.wheels) > 3 else np.eye(3)
+    return MatrixElements(robot, box, span)
+
+
+def _frozen(array: Array) -> Array:
+    array = np.array(array)
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,197 @@
+"""One registry for everything that can be named in a config: calibrators, effects, costs and importers.
+
+A registered class carries a pydantic ``Options`` model and takes a validated instance of it as its only argument.
+Built-in classes register when their module is imported; plug-ins do the same from a file or from an installed package.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.util
+import inspect
+import pkgutil
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from pydantic import BaseModel, ConfigDict
+
+from omnibench.config import validate
+from omnibench.errors import PluginError, UnknownNameError
+
+T = TypeVar("T")
+C = TypeVar("C", bound=type)
+
+
+class Options(BaseModel):
+    """Base of every ``Options`` model: unknown keys are refused, values do not change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+@dataclass(frozen=True)
+class Entry(Generic[T]):
+    """A registered class and where it comes from."""
+
+    name: str
+    cls: type[T]
+    origin: str
+
+    @property
+    def summary(self) -> str:
+        """First line of the class's docstring."""
+        return (inspect.getdoc(self.cls) or "").split("\n", 1)[0]
+
+    @property
+    def options(self) -> type[BaseModel]:
+        """The pydantic model of the class's options."""
+        model = getattr(self.cls, "Options", Options)
+        assert issubclass(model, BaseModel)
+        return model
+
+
+@dataclass(frozen=True)
+class PluginFailure:
+    """A plug-in that could not be loaded, and why, in one line."""
+
+    origin: str
+    error: str
+
+
+class Registry(Generic[T]):
+    """Names of one kind and the classes behind them.
+
+    ``builtin`` is the package whose modules register the built-in ones; it is imported on the first look-up.
+    """
+
+    def __init__(self, kind: str, builtin: str) -> None:
+        self.kind = kind
+        self.group = f"omnibench.{kind}s"
+        self._builtin = builtin
+        self._entries: dict[str, Entry[T]] = {}
+        self._complete = False
+
+    def register(self, name: str) -> Callable[[C], C]:
+        """Class decorator: make the class known as ``name``.
+
+        Raises PluginError when the name is taken by another class.
+        """
+
+        def decorate(cls: C) -> C:
+            taken = self._entries.get(name)
+            if taken is not None and taken.cls is not cls:
+                raise PluginError(f"{self.kind} {name!r} is registered already, by {taken.origin}; choose another name")
+            cls.name = name  # type: ignore[attr-defined]
+            self._entries[name] = Entry(name, cls, _origin(cls))
+            return cls
+
+        return decorate
+
+    def entries(self) -> list[Entry[T]]:
+        """Everything registered, by name."""
+        self._load_builtin()
+        return [self._entries[name] for name in sorted(self._entries)]
+
+    def entry(self, name: str, where: str = "") -> Entry[T]:
+        """The entry called ``name``; UnknownNameError names the nearest one and lists all."""
+        self._load_builtin()
+        if name not in self._entries:
+            raise UnknownNameError(self.kind, name, self._entries, where)
+        return self._entries[name]
+
+    def create(self, name: str, options: Mapping[str, Any] | None = None, where: str = "") -> T:
+        """An instance of the class called ``name`` with validated ``options``."""
+        entry = self.entry(name, where)
+        place = f"{where}: {self.kind} {name!r}" if where else f"{self.kind} {name!r}"
+        return entry.cls(validate(entry.options, options or {}, place))  # type: ignore[call-arg]
+
+    def _load_builtin(self) -> None:
+        if self._complete:
+            return
+        self._complete = True
+        package = importlib.import_module(self._builtin)
+        for module in pkgutil.iter_modules(getattr(package, "__path__", ()), f"{self._builtin}."):
+            importlib.import_module(module.name)
+
+
+calibrators: Registry[Any] = Registry("calibrator", "omnibench.fit.calibrators")
+costs: Registry[Any] = Registry("cost", "omnibench.fit.cost")
+effects: Registry[Any] = Registry("effect", "omnibench.robot.effects")
+importers: Registry[Any] = Registry("importer", "omnibench.data.importers")
+REGISTRIES: tuple[Registry[Any], ...] = (calibrators, costs, effects, importers)
+
+_loaded: dict[Path, PluginFailure | None] = {}
+
+
+def load_plugins(folders: Iterable[Path | str] = (), installed: bool = True) -> list[PluginFailure]:
+    """Load every plug-in of the folders (``*.py``, without tests) and of the installed packages' entry points.
+
+    A plug-in that fails is returned with its error and the others are loaded. PluginError: a folder is missing.
+    """
+    failures = [failure for folder in folders for failure in _load_folder(Path(folder))]
+    return failures + (_load_entry_points() if installed else [])
+
+
+def load_plugin_file(path: Path) -> PluginFailure | None:
+    """Import one plug-in file, once a process; the failure, if it fails."""
+    path = path.resolve()
+    if path not in _loaded:
+        _loaded[path] = _attempt(str(path), lambda: _import_file(path))
+    return _loaded[path]
+
+
+def registered_from(path: Path) -> list[tuple[Registry[Any], Entry[Any]]]:
+    """What the file at ``path`` registered, with the registry of each."""
+    origin = str(path.resolve())
+    return [(registry, entry) for registry in REGISTRIES for entry in registry.entries() if entry.origin == origin]
+
+
+def _load_folder(folder: Path) -> list[PluginFailure]:
+    if not folder.is_dir():
+        raise PluginError(f"plug-in folder {folder} does not exist; make it or name another with --plugins")
+    files = [path for path in sorted(folder.glob("*.py")) if not path.name.startswith(("test_", "_", "conftest"))]
+    return [failure for path in files if (failure := load_plugin_file(path)) is not None]
+
+
+def _load_entry_points() -> list[PluginFailure]:
+    found = [point for registry in REGISTRIES for point in entry_points(group=registry.group)]
+    attempts = (_attempt(f"{point.group}: {point.value}", point.load) for point in found)
+    return [failure for failure in attempts if failure is not None]
+
+
+def _attempt(origin: str, load: Callable[[], object]) -> PluginFailure | None:
+    before = [dict(registry._entries) for registry in REGISTRIES]
+    try:
+        load()
+    except (Exception, SystemExit) as error:  # a plug-in may raise anything while it is imported
+        for registry, entries in zip(REGISTRIES, before, strict=True):
+            registry._entries = entries
+        return PluginFailure(origin, " ".join(f"{type(error).__name__}: {error}".split()))
+    return None
+
+
+def _import_file(path: Path) -> None:
+    for registry in REGISTRIES:  # so that a plug-in cannot take a built-in name unnoticed
+        registry._load_builtin()
+    digest = hashlib.sha256(str(path).encode()).hexdigest()[:8]
+    name = f"omnibench_plugin_{path.stem}_{digest}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise PluginError(f"{path} is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+
+
+def _origin(cls: type) -> str:
+    if cls.__module__.startswith("omnibench."):
+        return "built in"
+    module = sys.modules.get(cls.__module__)
+    file = getattr(module, "__file__", None)
+    if file and cls.__module__.startswith("omnibench_plugin_"):
+        return str(Path(file).resolve())
+    return cls.__module__

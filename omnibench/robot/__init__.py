@@ -1,0 +1,1 @@
+"""What the robot is: kinematics, odometry, effects and the calibration file."""

@@ -1,0 +1,122 @@
+"""The calibration file, ``omnibench-calibration/1``: what a calibrator writes and everything else reads."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, FiniteFloat, model_validator
+
+from omnibench.config import Model, read_yaml, to_yaml, validate
+from omnibench.errors import ConfigError, DataError
+from omnibench.files import write_text
+from omnibench.registry import effects
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import Integration
+
+FORMAT = "omnibench-calibration/1"
+Row = tuple[FiniteFloat, ...]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class EffectTerm(Model):
+    """A named effect and its parameters."""
+
+    name: str
+    parameters: dict[str, FiniteFloat] = {}
+
+
+class Noise(Model):
+    """Standard deviations of the reference's noise: white, random walk along the way, bias of a run."""
+
+    pose_position: NonNegative = Field(0.0, description="white noise of each pose, m")
+    pose_heading: NonNegative = Field(0.0, description="white noise of each pose, rad")
+    walk_position: NonNegative = Field(0.0, description="random walk, m per sqrt s")
+    walk_heading: NonNegative = Field(0.0, description="random walk, rad per sqrt s")
+    bias_position: NonNegative = Field(0.0, description="constant over a run, m")
+    bias_heading: NonNegative = Field(0.0, description="constant over a run, rad")
+
+
+class Provenance(Model):
+    """Where a calibration comes from."""
+
+    dataset: str
+    dataset_hash: str
+    simulated: bool = False
+    calibrator: str
+    options: dict[str, Any] = {}
+    seed: int
+    cost: str
+    box: str
+    versions: dict[str, str] = {}
+    training_cost: float | None = None
+    validation_cost: float | None = None
+    outcome: str
+    reason: str = ""
+
+
+class Calibration(Model):
+    """The content of a calibration file."""
+
+    format: Literal["omnibench-calibration/1"] = FORMAT
+    name: str
+    created: datetime = Field(default_factory=lambda: datetime.now(UTC).replace(microsecond=0))
+    robot: Robot
+    sample_period: float = Field(gt=0, allow_inf_nan=False, description="s")
+    matrix: tuple[Row, Row, Row] = Field(description="3 x N: m (rows 1, 2) and rad (row 3) per rad of wheel")
+    integration: Integration
+    effects: tuple[EffectTerm, ...] = ()
+    noise: Noise | None = None
+    covariance: tuple[Row, ...] | None = Field(None, description="of the matrix, row by row, then of the effects")
+    session: str | None = Field(None, description="what drift terms are measured from")
+    provenance: Provenance | None = None
+
+    @model_validator(mode="after")
+    def _shapes_agree(self) -> Calibration:
+        wheels = len(self.robot.wheels)
+        for index, row in enumerate(self.matrix, 1):
+            if len(row) != wheels:
+                raise ValueError(f"row {index} of the matrix has {len(row)} values, the robot has {wheels} wheels")
+        if self.covariance is not None:
+            size = 3 * wheels + sum(len(term.parameters) for term in self.effects)
+            if [len(row) for row in self.covariance] != [size] * size:
+                raise ValueError(f"covariance is not {size} x {size}")
+        return self
+
+    @property
+    def model(self) -> OdometryModel:
+        """The odometry model that the file describes."""
+        return OdometryModel(self.robot, self.matrix_array, self.integration)
+
+    @property
+    def matrix_array(self) -> Array:
+        return np.array(self.matrix)
+
+
+def matrix_rows(matrix: Array) -> tuple[Row, Row, Row]:
+    """A matrix (3, N) as the rows that documents hold."""
+    first, second, third = (tuple(float(value) for value in row) for row in matrix)
+    return first, second, third
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Read and check a calibration file. DataError names the file and what is wrong."""
+    try:
+        content = read_yaml(path)
+        found = content.get("format") if isinstance(content, dict) else None
+        if found != FORMAT:
+            raise DataError(f"{path}: format is {found!r}, expected {FORMAT!r}; is this a calibration file?")
+        calibration = validate(Calibration, content, str(path))
+    except ConfigError as error:
+        raise DataError(str(error)) from None
+    for term in calibration.effects:
+        effects.entry(term.name, str(path))
+    return calibration
+
+
+def write_calibration(calibration: Calibration, path: Path) -> None:
+    """Write a calibration file; it is complete or it is not there. DataError when it cannot be written."""
+    write_text(path, to_yaml(calibration))

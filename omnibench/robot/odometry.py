@@ -1,0 +1,219 @@
+"""Odometry from wheel rates, Eq. (1) and (2): many trajectories and candidates at once, or one sample at a time.
+
+With a(k) the wheel angles driven in sample k (rad), C(k) their sum up to sample k and m3 row 3 of the matrix, the
+heading is theta(k) = theta(0) + m3.C(k), and sample k moves the robot by
+
+    dx + i dy = (m1 + i m2).a(k) * s * exp(i psi),
+
+Euler step (Eq. 1): psi = theta(k-1) and s = 1. Arc, the exact path at constant twist: psi = theta(k-1) + h and
+s = sin(h)/h with h = m3.a(k)/2. For a given row 3 positions are linear in rows 1 and 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.robot.kinematics import Array
+
+Integration = Literal["euler", "arc"]
+Complex = NDArray[np.complex128]
+
+# Candidates go in blocks of about this many samples, whose temporaries stay in the processor's cache.
+_BLOCK = 120_000
+
+
+@dataclass(frozen=True)
+class WheelLog:
+    """What odometry needs of one trajectory.
+
+    times (F,): end of each sample, s, increasing, > 0. rates (F, N): mean wheel rates over each sample, rad/s.
+    start (3,): pose at t = 0 (m, m, rad). stamps (S,): when poses are wanted, s, increasing, >= 0.
+    """
+
+    times: Array
+    rates: Array
+    start: Array
+    stamps: Array
+
+
+class OdometryBatch:
+    """Poses of several trajectories at their stamps, for any number of candidate matrices.
+
+    A stamp within a sample is reached by constant twist from the sample's start; one after the last sample has the
+    pose at the end of the last sample.
+
+    trajectory (S,): index of the log of each stamp. driven (S, N): wheel angles driven up to each stamp, rad.
+    """
+
+    def __init__(self, logs: Sequence[WheelLog], integration: Integration) -> None:
+        self.integration: Integration = integration
+        self.trajectory = np.repeat(np.arange(len(logs)), [len(log.stamps) for log in logs])
+        located = [_locate(log) for log in logs]
+        self._sample = np.concatenate([sample for sample, _ in located])
+        share = np.concatenate([share for _, share in located])
+        counts = [int(sample[-1]) + 1 for sample, _ in located]
+        shape = (len(logs), max(counts), logs[0].rates.shape[1])
+        self._angles = np.zeros(shape)  # a(k); zeros after a trajectory's last sample move nothing
+        for row, (log, count) in enumerate(zip(logs, counts, strict=True)):
+            durations = np.diff(log.times[:count], prepend=0.0)
+            self._angles[row, :count] = log.rates[:count] * durations[:, None]
+        self._before = np.zeros(shape)  # C(k-1)
+        np.cumsum(self._angles[:, :-1], axis=1, out=self._before[:, 1:])
+        # The part of a sample that lies before its stamp.
+        self._piece = share[:, None] * self._angles[self.trajectory, self._sample]
+        self._piece_before = self._before[self.trajectory, self._sample]
+        self.driven = self._piece_before + self._piece
+        self._start = np.array([log.start for log in logs])[self.trajectory]
+        self._turn = np.exp(1j * self._start[:, 2])
+        self._one_stamp_each = all(len(log.stamps) == 1 for log in logs)
+        if self._one_stamp_each:  # then the last sample can be cut to its stamp, and all is one sum
+            self._angles[self.trajectory, self._sample] = self._piece
+        self._angles_by_wheel = np.ascontiguousarray(np.swapaxes(self._angles, 1, 2))
+        self._phase = self._phase_basis(self._angles, self._before)
+
+    def poses(self, matrices: Array) -> Array:
+        """Poses (P, S, 3) in m, m, rad of candidate matrices (P, 3, N). Headings are not wrapped."""
+        result = np.empty((len(matrices), len(self.trajectory), 3))
+        result[..., 2] = self._start[:, 2] + matrices[:, 2] @ self.driven.T
+        block = max(1, _BLOCK // (self._angles.shape[0] * self._angles.shape[1]))
+        displacement = self._final_displacement if self._one_stamp_each else self._displacement
+        for first in range(0, len(matrices), block):
+            part = slice(first, first + block)
+            path = displacement(matrices[part]) * self._turn
+            result[part, :, 0] = self._start[:, 0] + path.real
+            result[part, :, 1] = self._start[:, 1] + path.imag
+        return result
+
+    def jacobian(self, matrix: Array) -> Array:
+        """Derivatives (S, 3, 3, N) of the poses (x, y, theta) with respect to the elements of one matrix (3, N)."""
+        row_12, row_3 = self._at_stamps(
+            self._slopes(self._angles, self._before, matrix), self._slopes(self._piece, self._piece_before, matrix)
+        )
+        row_12, row_3 = row_12 * self._turn[:, None], row_3 * self._turn[:, None]
+        zero = np.zeros_like(self.driven)
+        return np.stack(
+            [
+                np.stack([row_12.real, -row_12.imag, row_3.real], axis=1),
+                np.stack([row_12.imag, row_12.real, row_3.imag], axis=1),
+                np.stack([zero, zero, self.driven], axis=1),
+            ],
+            axis=1,
+        )
+
+    def position_design(self, headings: Sequence[Array]) -> Complex:
+        """Regressors (S, N) of (x - x0) + i(y - y0) on m1 + i m2 when the headings are known beforehand.
+
+        ``headings``: absolute heading at the start of each sample of each log, rad; a list of (F,).
+        """
+        turn = np.ones(self._angles.shape[:2], dtype=complex)
+        for row, values in enumerate(headings):
+            count = min(len(values), turn.shape[1])
+            turn[row, :count] = np.exp(1j * values[:count])
+        piece_turn = turn[self.trajectory, self._sample]
+        (design,) = self._at_stamps((self._angles * turn[..., None],), (self._piece * piece_turn[:, None],))
+        return design
+
+    def _phase_basis(self, angles: Array, before: Array) -> Array:
+        return before + angles / 2 if self.integration == "arc" else before
+
+    def _final_displacement(self, matrices: Array) -> Complex:
+        """x + iy (P, S) relative to the start, each trajectory having one stamp, at the end of its samples."""
+        psi = np.tensordot(self._phase, matrices[:, 2], (2, 1))  # (T, F, P)
+        cosine, sine = np.cos(psi), np.sin(psi)
+        if self.integration == "arc":
+            stretch = _sinc(np.tensordot(self._angles, matrices[:, 2] / 2, (2, 1)))
+            cosine *= stretch
+            sine *= stretch
+        moved = self._angles_by_wheel @ cosine + 1j * (self._angles_by_wheel @ sine)  # (T, N, P)
+        path: Complex = np.einsum("tnp,pn->pt", moved, matrices[:, 0] + 1j * matrices[:, 1])
+        return path
+
+    def _displacement(self, matrices: Array) -> Complex:
+        """x + iy (P, S) relative to the start, at any stamps."""
+        return np.array(
+            [
+                self._at_stamps(
+                    (self._steps(self._angles, self._before, matrix)[..., None],),
+                    (self._steps(self._piece, self._piece_before, matrix)[..., None],),
+                )[0][:, 0]
+                for matrix in matrices
+            ]
+        )
+
+    def _at_stamps(self, whole: tuple[Complex, ...], pieces: tuple[Complex, ...]) -> tuple[Complex, ...]:
+        """Sums of whole samples (T, F, n) before each stamp plus the stamp's own piece (S, n)."""
+        sums = []
+        for samples, piece in zip(whole, pieces, strict=True):
+            total = np.cumsum(samples, axis=1)
+            before = np.where(
+                (self._sample > 0)[:, None], total[self.trajectory, np.maximum(self._sample - 1, 0)], 0.0
+            )
+            sums.append(before + piece)
+        return tuple(sums)
+
+    def _steps(self, angles: Array, before: Array, matrix: Array) -> Complex:
+        rotation, stretch, _ = self._rotation(angles, before, matrix)
+        step: Complex = (angles @ (matrix[0] + 1j * matrix[1])) * stretch * rotation
+        return step
+
+    def _slopes(self, angles: Array, before: Array, matrix: Array) -> tuple[Complex, Complex]:
+        """Derivatives of the steps with respect to m1 + i m2 and to m3, each (..., N)."""
+        rotation, stretch, bend = self._rotation(angles, before, matrix)
+        row_12 = angles * (stretch * rotation)[..., None]
+        velocity = (angles @ (matrix[0] + 1j * matrix[1])) * rotation
+        phase = self._phase_basis(angles, before)
+        row_3 = velocity[..., None] * (1j * stretch[..., None] * phase + bend[..., None] * angles / 2)
+        return row_12, row_3
+
+    def _rotation(self, angles: Array, before: Array, matrix: Array) -> tuple[Complex, Array, Array]:
+        """exp(i psi), s and ds/dh of every sample, relative to the start heading."""
+        rotation: Complex = np.exp(1j * (self._phase_basis(angles, before) @ matrix[2]))
+        if self.integration == "euler":
+            return rotation, np.ones(rotation.shape), np.zeros(rotation.shape)
+        half_turn = angles @ matrix[2] / 2
+        return rotation, _sinc(half_turn), _sinc_slope(half_turn)
+
+
+class OdometryStream:
+    """The same odometry, one sample at a time: ``step`` moves ``pose`` (3,) in m, m, rad."""
+
+    def __init__(self, matrix: Array, integration: Integration, start: Array | None = None) -> None:
+        self.matrix = matrix
+        self.integration: Integration = integration
+        self.pose = np.zeros(3) if start is None else np.array(start, dtype=float)
+
+    def step(self, rates: Array, duration: float) -> Array:
+        """Advance by one sample of mean wheel rates (N,) rad/s over ``duration`` s; the new pose."""
+        moved_x, moved_y, turned = self.matrix @ np.asarray(rates) * duration
+        direction, stretch = self.pose[2], 1.0
+        if self.integration == "arc":
+            direction, stretch = direction + turned / 2, float(_sinc(turned / 2))
+        path = (moved_x + 1j * moved_y) * stretch * np.exp(1j * direction)
+        self.pose = self.pose + np.array([path.real, path.imag, turned])
+        return self.pose
+
+
+def _locate(log: WheelLog) -> tuple[NDArray[np.intp], Array]:
+    """For each stamp the sample that contains it and the share of that sample which lies before it."""
+    sample = np.minimum(np.searchsorted(log.times, log.stamps), len(log.times) - 1)
+    begin = np.where(sample > 0, log.times[sample - 1], 0.0)
+    share = np.clip((log.stamps - begin) / (log.times[sample] - begin), 0.0, 1.0)
+    return sample, share
+
+
+def _sinc(angle: Array) -> Array:
+    result: Array = np.sinc(np.asarray(angle) / np.pi)
+    return result
+
+
+def _sinc_slope(angle: Array) -> Array:
+    """d/dh of sin(h)/h, by its series near 0 where the quotient would cancel."""
+    small = np.abs(angle) < 1e-2
+    safe = np.where(small, 1.0, angle)
+    exact = (safe * np.cos(safe) - np.sin(safe)) / safe**2
+    return np.where(small, angle * (-1 / 3 + angle**2 * (1 / 30 - angle**2 / 840)), exact)
