@@ -51,13 +51,12 @@ class Trajectory:
     @property
     def start(self) -> Array:
         """The reference pose at t = 0."""
-        start: Array = self.poses[0]
-        return start
+        return self.poses[0]
 
     @property
     def final_pose(self) -> Array:
-        final: Array = self.poses[-1]
-        return final
+        """The last reference pose."""
+        return self.poses[-1]
 
     def log(self, stamps: Sequence[float] | Array) -> WheelLog:
         """The wheel rates from the start pose, with poses wanted at ``stamps`` (s)."""

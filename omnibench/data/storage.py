@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Final, Literal, cast
 
 import numpy as np
 import polars as pl
@@ -16,7 +16,7 @@ from omnibench.errors import ConfigError, DataError, nearest
 from omnibench.files import replacing, write_text
 from omnibench.robot.kinematics import Array, Robot
 
-FORMAT = "omnibench-dataset/1"
+FORMAT: Final = "omnibench-dataset/1"
 _RUN_NUMBERS = ("started_at", "v", "alpha", "omega", "duration", "distance")
 _COVARIANCE = ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
 
@@ -133,8 +133,7 @@ class _Table:
         if len(bad):
             found = series[int(bad[0])]
             raise self.fail(int(bad[0]), f"{column} is {'missing' if found is None else found}; remove or repair the row")
-        result: Array = values
-        return result
+        return values
 
     def stack(self, columns: Sequence[str]) -> Array | None:
         """Optional columns as (rows, n), or None when one is not there."""

@@ -40,12 +40,14 @@ class Calibrator(ABC):
 
     parameterisation: what it searches unless the config says otherwise.
     bounded: False for answers that do not depend on the box (a published matrix).
+    stochastic: False where the seed makes no difference, so that one run is enough.
     """
 
     Options: ClassVar[type[Options]] = Options
     name: ClassVar[str]
     parameterisation: ClassVar[ParameterisationName] = "matrix"
     bounded: ClassVar[bool] = True
+    stochastic: ClassVar[bool] = True
 
     def __init__(self, options: Any) -> None:
         self.options = options

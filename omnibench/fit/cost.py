@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,12 +25,17 @@ class Cost(ABC):
     name: ClassVar[str]
     stamps: ClassVar[Literal["final", "reference"]] = "final"
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: Any) -> None:
         self.options = options
 
     @abstractmethod
     def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
         """Costs (P,) from pose errors (P, S, 3) in m, m, rad; ``trajectory`` (S,) tells whose stamp each is."""
+
+    def of_each(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
+        """The cost (Z,) of every trajectory by itself, from errors (S, 3) of one candidate."""
+        own = (errors[None, trajectory == index] for index in range(int(trajectory[-1]) + 1))
+        return np.array([self.combine(part, np.zeros(part.shape[1], dtype=np.intp))[0] for part in own])
 
     def batch(self, trajectories: Sequence[Trajectory], integration: Integration) -> OdometryBatch:
         """The odometry of the trajectories at this cost's stamps."""
@@ -56,14 +61,12 @@ class SumOfNorms(Cost):
 
     def norms(self, errors: Array) -> Array:
         """Norms (..., S) of pose errors (..., S, 3)."""
-        squares: Array = np.square(errors) @ np.square(self.weights)
-        return np.sqrt(squares)
+        return np.sqrt(np.square(errors) @ np.square(self.weights))
 
     def shares(self, trajectory: NDArray[np.intp]) -> Array:
         """Share (S,) of each stamp in the cost; they sum to one."""
         counts = np.bincount(trajectory)
-        share: Array = 1.0 / (counts[trajectory] * len(counts))
-        return share
+        return 1.0 / (counts[trajectory] * len(counts))
 
 
 @costs.register("final_pose")

@@ -65,12 +65,13 @@ class Parameterisation(Protocol):
 class MatrixElements:
     """The elements of the matrix row by row, Eq. (4) and (5): the paper's non-parametric way.
 
-    ``span`` (N, N) projects onto the wheel rates that the data drive; across it the start values are kept.
+    ``null`` (q, N): orthonormal directions of wheel rates that the data do not drive; along them the start values
+    are kept.
     """
 
     robot: Robot
     box: Box
-    span: Array
+    null: Array
     name: ParameterisationName = field(default="matrix", init=False)
 
     @property
@@ -83,16 +84,15 @@ class MatrixElements:
 
     @property
     def bounds(self) -> Bounds:
-        return _checked(_matrix_bounds(self.robot.inverse_kinematic_matrix, self.box), self.start, self.names)
+        return _checked(make_bounds(self.robot, self.box), self.start, self.names)
 
     def matrices(self, vectors: Array) -> Array:
         """Matrices (P, 3, N); on data that drive every direction simply the elements."""
         matrices = np.asarray(vectors, dtype=float).reshape(len(vectors), 3, -1)
-        if np.array_equal(self.span, np.eye(len(self.span))):
+        if len(self.null) == 0:
             return matrices
-        start = self.robot.inverse_kinematic_matrix
-        moved: Array = start + (matrices - start) @ self.span
-        return moved
+        across = (matrices - self.robot.inverse_kinematic_matrix) @ self.null.T
+        return matrices - across @ self.null
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ class WheelGeometry:
     """Radius, distance and angle of each wheel, Eq. (3), within physical limits: the parametric way."""
 
     robot: Robot
-    limits: GeometryLimits
+    limits: GeometryLimits | None = None
     name: ParameterisationName = field(default="geometry", init=False)
 
     @property
@@ -116,8 +116,9 @@ class WheelGeometry:
     @property
     def bounds(self) -> Bounds:
         count = len(self.robot.wheels)
+        limits = self.limits or GeometryLimits()
         low, high = np.array(
-            [_range(self.limits.radius), _range(self.limits.distance), np.radians(_range(self.limits.angle_deg))]
+            [_range(limits.radius), _range(limits.distance), np.radians(_range(limits.angle_deg))]
         ).T
         scale = self.start.copy()
         scale[2 * count :] = 1.0
@@ -132,11 +133,9 @@ class WheelGeometry:
         return inverse_kinematic_matrices(radius, distance, angle, rollers)
 
 
-def _range(deviation: float | tuple[float, float]) -> tuple[float, float]:
-    return deviation if isinstance(deviation, tuple) else (-abs(deviation), abs(deviation))
-
-
-def _matrix_bounds(start: Array, box: Box) -> Bounds:
+def make_bounds(robot: Robot, box: Box) -> Bounds:
+    """The bounds (3N,) of the matrix elements. ConfigError when an explicit box has the wrong shape."""
+    start = robot.inverse_kinematic_matrix
     if isinstance(box, ExplicitBox):
         for side in (box.lower, box.upper):
             if [len(row) for row in side] != [start.shape[1]] * 3:
@@ -147,6 +146,10 @@ def _matrix_bounds(start: Array, box: Box) -> Bounds:
     else:
         width = np.repeat(0.25 * np.abs(start).max(axis=1, keepdims=True), start.shape[1], axis=1)
     return Bounds(box, (start - width).ravel(), (start + width).ravel())
+
+
+def _range(deviation: float | tuple[float, float]) -> tuple[float, float]:
+    return deviation if isinstance(deviation, tuple) else (-abs(deviation), abs(deviation))
 
 
 def _checked(bounds: Bounds, start: Array, names: Sequence[str]) -> Bounds:

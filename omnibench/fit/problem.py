@@ -5,8 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from omnibench.config import Model
@@ -86,7 +88,7 @@ class CalibrationProblem:
         self.box = bounds.name
         self.start, self.lower, self.upper = (_frozen(v) for v in (parameterisation.start, bounds.lower, bounds.upper))
         self.names = parameterisation.names
-        self.free = _frozen(self.upper > self.lower)
+        self.free: NDArray[np.bool_] = _frozen(self.upper > self.lower)
         self.odometry = cost.batch(self.trajectories, integration)
         self.reference = _frozen(cost.reference(self.trajectories))
         self.evaluations = 0
@@ -139,8 +141,7 @@ class CalibrationProblem:
     def to_unit(self, vectors: Array) -> Array:
         """Vectors (P, n) as points (P, free) of the unit cube over the free elements."""
         free = self.free
-        unit: Array = (np.atleast_2d(vectors)[:, free] - self.lower[free]) / (self.upper - self.lower)[free]
-        return unit
+        return (np.atleast_2d(vectors)[:, free] - self.lower[free]) / (self.upper - self.lower)[free]
 
     def from_unit(self, points: Array) -> Array:
         """Vectors (P, n) of points (P, free) of the unit cube; never outside the box."""
@@ -150,11 +151,11 @@ class CalibrationProblem:
         vectors[:, self.free] = self.lower[self.free] + points * span
         return np.clip(vectors, self.lower, self.upper)
 
-    def inside(self, vectors: Array) -> Array:
+    def inside(self, vectors: Array) -> NDArray[np.bool_]:
         """Which vectors (P, n) lie in the box, up to rounding: (P,) of bool."""
         slack = 1e-12 * np.maximum(np.abs(self.lower), np.abs(self.upper))
-        inside: Array = ((vectors >= self.lower - slack) & (vectors <= self.upper + slack)).all(axis=-1)
-        return inside
+        within = (vectors >= self.lower - slack) & (vectors <= self.upper + slack)
+        return np.asarray(within.all(axis=-1))
 
     def at_bounds(self, vector: Array) -> tuple[str, ...]:
         """Names of the free elements that lie on a bound of the box."""
@@ -164,8 +165,7 @@ class CalibrationProblem:
 
     def matrix(self, vector: Array) -> Array:
         """The inverse kinematic matrix (3, N) of one vector (n,)."""
-        matrix: Array = self.parameterisation.matrices(vector[None])[0]
-        return matrix
+        return self.parameterisation.matrices(vector[None])[0]
 
     def _check_budget(self) -> None:
         if self.remaining <= 0:
@@ -196,12 +196,12 @@ def make_parameterisation(
 ) -> Parameterisation:
     """The parameterisation called ``name``. ConfigError when its box excludes the start."""
     if name == "geometry":
-        return WheelGeometry(robot, limits or GeometryLimits())
-    span = driven_span(trajectories).projector if len(robot.wheels) > 3 else np.eye(3)
-    return MatrixElements(robot, box, span)
+        return WheelGeometry(robot, limits)
+    null = driven_span(trajectories).null if len(robot.wheels) > 3 else np.zeros((0, 3))
+    return MatrixElements(robot, box, null)
 
 
-def _frozen(array: Array) -> Array:
+def _frozen(array: NDArray[Any]) -> NDArray[Any]:
     array = np.array(array)
     array.flags.writeable = False
     return array

@@ -25,12 +25,6 @@ class DrivenSpan:
     null: Array
     shares: Array
 
-    @property
-    def projector(self) -> Array:
-        """The projection (N, N) onto the driven directions; the identity when all are driven."""
-        projector: Array = np.eye(self.driven.shape[1]) - self.null.T @ self.null
-        return projector
-
 
 def driven_span(trajectories: Sequence[Trajectory]) -> DrivenSpan:
     """The span of the wheel angles driven between reference poses.

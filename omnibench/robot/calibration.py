@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
@@ -17,7 +17,7 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 
-FORMAT = "omnibench-calibration/1"
+FORMAT: Final = "omnibench-calibration/1"
 Row = tuple[FiniteFloat, ...]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 

@@ -8,6 +8,7 @@ about the robot's centre, r the radius. A positive rate drives the robot counter
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +16,7 @@ from pydantic import Field, field_validator, model_validator
 
 from omnibench.config import Model
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 
 
 class Wheel(Model):

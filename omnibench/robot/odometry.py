@@ -115,7 +115,7 @@ class OdometryBatch:
             count = min(len(values), turn.shape[1])
             turn[row, :count] = np.exp(1j * values[:count])
         piece_turn = turn[self.trajectory, self._sample]
-        (design,) = self._at_stamps((self._angles * turn[..., None],), (self._piece * piece_turn[:, None],))
+        (design,) = self._at_stamps([turn[..., None] * self._angles], [piece_turn[:, None] * self._piece])
         return design
 
     def _phase_basis(self, angles: Array, before: Array) -> Array:
@@ -130,22 +130,21 @@ class OdometryBatch:
             cosine *= stretch
             sine *= stretch
         moved = self._angles_by_wheel @ cosine + 1j * (self._angles_by_wheel @ sine)  # (T, N, P)
-        path: Complex = np.einsum("tnp,pn->pt", moved, matrices[:, 0] + 1j * matrices[:, 1])
-        return path
+        return np.einsum("tnp,pn->pt", moved, matrices[:, 0] + 1j * matrices[:, 1])
 
     def _displacement(self, matrices: Array) -> Complex:
         """x + iy (P, S) relative to the start, at any stamps."""
         return np.array(
             [
                 self._at_stamps(
-                    (self._steps(self._angles, self._before, matrix)[..., None],),
-                    (self._steps(self._piece, self._piece_before, matrix)[..., None],),
+                    [self._steps(self._angles, self._before, matrix)[..., None]],
+                    [self._steps(self._piece, self._piece_before, matrix)[..., None]],
                 )[0][:, 0]
                 for matrix in matrices
             ]
         )
 
-    def _at_stamps(self, whole: tuple[Complex, ...], pieces: tuple[Complex, ...]) -> tuple[Complex, ...]:
+    def _at_stamps(self, whole: Sequence[Complex], pieces: Sequence[Complex]) -> tuple[Complex, ...]:
         """Sums of whole samples (T, F, n) before each stamp plus the stamp's own piece (S, n)."""
         sums = []
         for samples, piece in zip(whole, pieces, strict=True):
@@ -158,8 +157,7 @@ class OdometryBatch:
 
     def _steps(self, angles: Array, before: Array, matrix: Array) -> Complex:
         rotation, stretch, _ = self._rotation(angles, before, matrix)
-        step: Complex = (angles @ (matrix[0] + 1j * matrix[1])) * stretch * rotation
-        return step
+        return (angles @ (matrix[0] + 1j * matrix[1])) * stretch * rotation
 
     def _slopes(self, angles: Array, before: Array, matrix: Array) -> tuple[Complex, Complex]:
         """Derivatives of the steps with respect to m1 + i m2 and to m3, each (..., N)."""
@@ -172,7 +170,7 @@ class OdometryBatch:
 
     def _rotation(self, angles: Array, before: Array, matrix: Array) -> tuple[Complex, Array, Array]:
         """exp(i psi), s and ds/dh of every sample, relative to the start heading."""
-        rotation: Complex = np.exp(1j * (self._phase_basis(angles, before) @ matrix[2]))
+        rotation = np.exp(1j * (self._phase_basis(angles, before) @ matrix[2]))
         if self.integration == "euler":
             return rotation, np.ones(rotation.shape), np.zeros(rotation.shape)
         half_turn = angles @ matrix[2] / 2
@@ -207,8 +205,7 @@ def _locate(log: WheelLog) -> tuple[NDArray[np.intp], Array]:
 
 
 def _sinc(angle: Array) -> Array:
-    result: Array = np.sinc(np.asarray(angle) / np.pi)
-    return result
+    return np.sinc(np.asarray(angle) / np.pi)
 
 
 def _sinc_slope(angle: Array) -> Array:

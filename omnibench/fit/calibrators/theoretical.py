@@ -9,6 +9,9 @@ from omnibench.registry import calibrators
 class Theoretical(Calibrator):
     """The design values, unchanged: what every calibration is measured against."""
 
+    bounded = False
+    stochastic = False
+
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """The start vector."""
         problem.cost(problem.start[None])

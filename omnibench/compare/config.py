@@ -1,0 +1,115 @@
+"""What a comparison's YAML says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import ConfigDict, Field, field_validator, model_validator
+
+from omnibench.config import Model
+from omnibench.data.simulate.config import FlowerConfig
+from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
+from omnibench.fit.problem import Budget
+from omnibench.robot.odometry import Integration
+
+
+class ImportSource(Model):
+    """Recordings that an importer reads."""
+
+    format: str = Field(description="an importer, see omnibench list")
+    source: Path = Field(description="file or folder; relative to the config file")
+    options: dict[str, Any] = {}
+
+
+class DatasetSource(Model):
+    """Where a data set comes from: exactly one of the three."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_by_name=True, validate_by_alias=True)
+
+    path: Path | None = Field(None, description="a data set folder; relative to the config file")
+    simulate: FlowerConfig | None = None
+    import_: ImportSource | None = Field(default=None, alias="import")
+
+    @model_validator(mode="after")
+    def _one_is_given(self) -> DatasetSource:
+        given = [n for n, v in (("path", self.path), ("simulate", self.simulate), ("import", self.import_)) if v]
+        if len(given) != 1:
+            raise ValueError(f"give one of path, simulate, import (given: {', '.join(given) or 'none'})")
+        return self
+
+
+class CostChoice(Model):
+    """The cost that every calibrator minimises."""
+
+    name: str = Field("final_pose", description="a cost, see omnibench list")
+    options: dict[str, Any] = {}
+
+
+class CalibratorEntry(Model):
+    """One line of the comparison."""
+
+    name: str = Field(description="a calibrator, see omnibench list")
+    label: str | None = Field(None, description="what tables call it; default: the name and, if it differs, the box")
+    options: dict[str, Any] = {}
+    parameterisation: ParameterisationName | None = Field(None, description="default: the calibrator's own")
+    box: Box | None = Field(None, description="default: the config's box")
+    limits: GeometryLimits | None = Field(None, description="of the geometry parameterisation")
+
+
+class Bootstrap(Model):
+    """Resampling of trajectories behind the intervals."""
+
+    resamples: int = Field(2000, ge=100)
+    seed: int = Field(0, ge=0)
+
+
+class PublishedResult(Model):
+    """A result from the literature, shown beside ours and said to be on other data."""
+
+    label: str
+    source: str
+    theoretical_train_cost: float
+    train_cost: float
+    theoretical_validation_cost: float | None = None
+    validation_cost: float | None = None
+
+
+class CompareConfig(Model):
+    """Data sets x calibrators x seeds, with one cost and one budget for all."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
+    description: str = ""
+    notes: tuple[str, ...] = Field((), description="what a reader of the report must know")
+    datasets: dict[str, DatasetSource] = Field(min_length=1)
+    cost: CostChoice = CostChoice()
+    integration: Integration = "arc"
+    box: Box = "row"
+    budget: Budget = Budget()
+    seeds: tuple[int, ...] = Field((1,), min_length=1, description="one run of every search for each")
+    calibrators: tuple[CalibratorEntry, ...] = Field(min_length=1)
+    plugins: tuple[Path, ...] = Field((), description="folders of plug-ins; relative to the config file")
+    workers: int | None = Field(None, gt=0, description="processes; default: the processors")
+    bootstrap: Bootstrap = Bootstrap()
+    published_results: tuple[PublishedResult, ...] = ()
+
+    @field_validator("calibrators", mode="before")
+    @classmethod
+    def _names_stand_for_entries(cls, entries: Any) -> Any:
+        if isinstance(entries, list | tuple):
+            return [{"name": entry} if isinstance(entry, str) else entry for entry in entries]
+        return entries
+
+    @field_validator("cost", mode="before")
+    @classmethod
+    def _name_stands_for_cost(cls, cost: Any) -> Any:
+        return {"name": cost} if isinstance(cost, str) else cost
+
+    @field_validator("seeds")
+    @classmethod
+    def _seeds_differ(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
+        if len(set(seeds)) < len(seeds):
+            raise ValueError("a seed is given twice")
+        if min(seeds) < 0:
+            raise ValueError("seeds must not be negative")
+        return seeds

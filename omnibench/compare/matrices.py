@@ -1,0 +1,158 @@
+"""The report's matrices: elements, their differences by Eq. (10)-(11), physical parameters."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from omnibench.compare.results import FittedParameter
+from omnibench.compare.tables import entry_cell
+from omnibench.compare.view import DatasetView
+from omnibench.fit.span import driven_span
+from omnibench.report.blocks import Block, Cell, Code, Column, Paragraph, Row, Table
+from omnibench.report.numbers import NOTHING, fixed, significant
+from omnibench.robot.kinematics import Array
+
+# An element this much smaller than the largest of its row is a zero, up to rounding: Eq. (7) gives m12 as 1e-17.
+_ZERO_SHARE = 1e-9
+
+
+def matrix_blocks(view: DatasetView) -> tuple[Block, ...]:
+    """Everything that the report says of the matrices."""
+    if not view.calibrated:
+        return (Paragraph("No run gave a matrix.", "note"),)
+    blocks: list[Block] = [_element_table(view), _difference_table(view, None)]
+    if view.reference_entry is not None and len(view.calibrated) > 1:
+        blocks.append(_difference_table(view, view.reference_entry[0].label))
+    parameters = parameter_table(view)
+    if parameters is not None:
+        blocks.append(parameters)
+    blocks.append(Code(matrices_as_text(view), "Matrices with all digits: rows x, y (m/rad), heading (rad/rad)"))
+    return tuple(blocks)
+
+
+def differences(matrix: Array, reference: Array) -> Array:
+    """D of Eq. (10), (11): reference * (1 + D) = matrix, element by element (3, N); NaN where the reference is 0."""
+    zero = np.abs(reference) <= _ZERO_SHARE * np.abs(reference).max(axis=1, keepdims=True)
+    quotient: Array = matrix / np.where(zero, np.nan, reference) - 1
+    return quotient
+
+
+def matrices_as_text(view: DatasetView) -> str:
+    """Every matrix with the digits that bring back the same numbers, as Python and YAML read them."""
+    named = [("theoretical", view.design_matrix)]
+    named += [(entry.label, run.matrix) for entry, run in view.calibrated if run.matrix is not None]
+    parts = []
+    for label, matrix in named:
+        rows = ",\n  ".join(f"[{', '.join(repr(float(value)) for value in row)}]" for row in matrix)
+        parts.append(f"{label}:\n [{rows}]".replace("\n [[", "\n  [["))
+    return "\n".join(parts)
+
+
+def parameter_table(view: DatasetView) -> Table | None:
+    """Physical parameters and their deviation from the design values, as in section 4.2; None without any."""
+    fitted = [(entry, run.record) for entry, run in view.calibrated if run.record.parameters]
+    if not fitted:
+        return None
+    names = list(dict.fromkeys(p.name for _, record in fitted for p in record.parameters or ()))
+    rows = []
+    for name in names:
+        cells = [Cell(name)]
+        found = [next((p for p in record.parameters or () if p.name == name), None) for _, record in fitted]
+        known = next(parameter for parameter in found if parameter is not None)
+        value, unit = _shown(known.design, known.unit)
+        cells.append(Cell(f"{value} {unit}"))
+        for parameter, (_, record) in zip(found, fitted, strict=True):
+            cells.append(_parameter_cell(parameter, name in record.at_bounds))
+        rows.append(Row(tuple(cells)))
+    columns = (Column("Parameter", numeric=False), Column("design"), *(Column(entry.label) for entry, _ in fitted))
+    return Table(
+        "Physical parameters and their deviation from the design values",
+        columns,
+        tuple(rows),
+        "As section 4.2 of the paper. Several geometries share one matrix, so a parameter by itself is not a "
+        "measurement of the robot. † on a bound of its limits.",
+    )
+
+
+def _element_table(view: DatasetView) -> Table:
+    rows = [Row((entry_cell(view, None), *(Cell(fixed(v, 6)) for v in view.design_matrix.ravel())))]
+    for entry, run in view.calibrated:
+        if run.matrix is None:
+            continue
+        bound = run.record.at_bounds if entry.parameterisation == "matrix" else ()
+        cells = [
+            Cell(fixed(value, 6) + ("†" if name in bound else ""))
+            for name, value in zip(_element_names(view), run.matrix.ravel(), strict=True)
+        ]
+        rows.append(Row((entry_cell(view, entry), *cells), "best" if entry.is_best else "plain"))
+    return Table(
+        "Inverse kinematic matrices M⁻¹",
+        (Column("M⁻¹", numeric=False), *_element_columns(view, with_units=True)),
+        tuple(rows),
+        f"Columns of each row in the order of the wheels: {', '.join(view.dataset.robot.wheel_names)}. "
+        "† on a bound of its box.",
+    )
+
+
+def _difference_table(view: DatasetView, against: str | None) -> Table:
+    """Differences from the design values, or from the entry called ``against``."""
+    matrices = {entry.label: run.matrix for entry, run in view.calibrated if run.matrix is not None}
+    reference = view.design_matrix if against is None else matrices[against]
+    project = _span_projector(view)
+    rows = []
+    for entry, run in view.calibrated:
+        if run.matrix is None or entry.label == against:
+            continue
+        matrix = run.matrix if project is None else reference + (run.matrix - reference) @ project
+        share = differences(matrix, reference).ravel()
+        moved = (matrix - reference).ravel()
+        cells = tuple(_difference_cell(s, d) for s, d in zip(share, moved, strict=True))
+        rows.append(Row((entry_cell(view, entry), *cells)))
+    name = "the design values" if against is None else against
+    note = "Eq. (10) and (11) of the paper, element by element. Where the reference is 0 the change itself is given."
+    if project is not None:
+        note += " Compared on the span of wheel rates that the data drive; across it the matrix is not determined."
+    return Table(
+        f"Differences from {name}",
+        (Column("M⁻¹", numeric=False), *_element_columns(view, with_units=False)),
+        tuple(rows),
+        note,
+    )
+
+
+def _difference_cell(share: float, moved: float) -> Cell:
+    if math.isnan(share):
+        return Cell("0" if abs(moved) < 1e-15 else significant(moved, 2, signed=True), "reference is 0")
+    return Cell(f"{fixed(100 * share, 3, signed=True)} %")
+
+
+def _span_projector(view: DatasetView) -> Array | None:
+    wheels = len(view.dataset.robot.wheels)
+    training = view.dataset.split("train")
+    return driven_span(training).projector if wheels > 3 and training else None
+
+
+def _element_names(view: DatasetView) -> list[str]:
+    return [f"m{row}{column}" for row in (1, 2, 3) for column in range(1, len(view.dataset.robot.wheels) + 1)]
+
+
+def _element_columns(view: DatasetView, with_units: bool) -> tuple[Column, ...]:
+    units = {"1": "m/rad", "2": "m/rad", "3": "rad/rad"} if with_units else dict.fromkeys("123", "")
+    return tuple(Column(name, units[name[1]]) for name in _element_names(view))
+
+
+def _shown(value: float, unit: str) -> tuple[str, str]:
+    """A parameter's value and unit as a person reads them: angles in degrees."""
+    return (fixed(math.degrees(value), 3), "°") if unit == "rad" else (fixed(value, 5), unit)
+
+
+def _parameter_cell(parameter: FittedParameter | None, on_bound: bool) -> Cell:
+    if parameter is None:
+        return Cell(NOTHING)
+    value, unit = _shown(parameter.value, parameter.unit)
+    deviation = f"{fixed(parameter.deviation_percent, 2, signed=True)} %"
+    if parameter.design == 0 or not math.isfinite(parameter.deviation_percent):
+        deviation = "design is 0"
+    return Cell(f"{value} {unit}{' †' if on_bound else ''}", deviation)

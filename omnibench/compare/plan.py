@@ -1,0 +1,182 @@
+"""From a config to data sets and a list of runs."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from omnibench.compare.config import CalibratorEntry, CompareConfig, DatasetSource
+from omnibench.config import read_model
+from omnibench.data.dataset import Dataset
+from omnibench.data.importer import import_dataset
+from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.storage import load_dataset
+from omnibench.errors import ConfigError, DataError, UnknownNameError
+from omnibench.fit.parameterisation import ParameterisationName
+from omnibench.fit.problem import make_parameterisation
+from omnibench.registry import calibrators, costs
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run: an entry of the config on one data set with one seed."""
+
+    config: CompareConfig
+    dataset_name: str
+    dataset: Dataset
+    entry: CalibratorEntry
+    label: str
+    parameterisation: ParameterisationName
+    box: str
+    seed: int
+
+    @cached_property
+    def key(self) -> str:
+        """Names the run's result: changes with anything that the result depends on, the calibrator's code too."""
+        cls = calibrators.entry(self.entry.name).cls
+        source = inspect.getsourcefile(cls)
+        facts = {
+            "data": self.dataset.hash,
+            "cost": self.config.cost.model_dump(mode="json"),
+            "integration": self.config.integration,
+            "calibrator": self.entry.model_dump(mode="json", exclude={"label"}),
+            "box": self.config.box if isinstance(self.config.box, str) else self.config.box.model_dump(mode="json"),
+            "budget": self.config.budget.model_dump(mode="json"),
+            "seed": self.seed,
+            "code": hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else "",
+        }
+        return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:20]
+
+
+def read_compare_config(path: Path, data: Mapping[str, Path] | None = None) -> CompareConfig:
+    """The config at ``path`` with its paths made absolute; ``data`` replaces the sources of data sets by name.
+
+    The name "" stands for the only data set. ConfigError in one line.
+    """
+    config = read_model(CompareConfig, path)
+    sources = dict(config.datasets)
+    for name, location in (data or {}).items():
+        if not name and len(sources) > 1:
+            raise ConfigError(f"--data: {path} has several data sets; say which: --data NAME={location}")
+        name = name or next(iter(sources))
+        if name not in sources:
+            raise UnknownNameError("data set", name, sources, str(path))
+        sources[name] = _relocated(sources[name], location.resolve())
+    folder = path.resolve().parent
+    return config.model_copy(
+        update={
+            "datasets": {name: _anchored(source, folder) for name, source in sources.items()},
+            "plugins": tuple((folder / plugin).resolve() for plugin in config.plugins),
+        }
+    )
+
+
+def load_datasets(config: CompareConfig) -> dict[str, Dataset]:
+    """Read, import or simulate every data set. DataError when one has no training data."""
+    loaded = {}
+    for name, source in config.datasets.items():
+        dataset = load_source(name, source, config.description)
+        if not dataset.split("train"):
+            raise DataError(f"data set {name}: the training split is empty; set split to train for some trajectories")
+        loaded[name] = dataset
+    return loaded
+
+
+def load_source(name: str, source: DatasetSource, description: str = "") -> Dataset:
+    """One data set from its source."""
+    if source.simulate is not None:
+        return simulate_dataset(source.simulate, name, description).dataset
+    if source.import_ is not None:
+        return import_dataset(source.import_.format, source.import_.source, source.import_.options)
+    assert source.path is not None  # one of the three is given
+    return load_dataset(source.path)
+
+
+def effective_config(config: CompareConfig) -> CompareConfig:
+    """The config with every default of every option written out. Refuses unknown names and options."""
+    cost = config.cost
+    cost_options = costs.create(cost.name, cost.options, f"config {config.name}").options
+    entries = []
+    for index, entry in enumerate(config.calibrators):
+        place = f"config {config.name}: calibrators.{index}"
+        options = calibrators.create(entry.name, entry.options, place).options
+        entries.append(entry.model_copy(update={"options": _plain(options)}))
+    return config.model_copy(
+        update={
+            "calibrators": tuple(entries),
+            "cost": cost.model_copy(update={"options": _plain(cost_options)}),
+        }
+    )
+
+
+def make_plan(config: CompareConfig, datasets: Mapping[str, Dataset]) -> list[PlannedRun]:
+    """Data sets x calibrators x seeds; a calibrator without randomness runs once. ConfigError for a bad box."""
+    plan = []
+    for name, dataset in datasets.items():
+        labels: set[str] = set()
+        for entry in config.calibrators:
+            cls = calibrators.entry(entry.name).cls
+            parameterisation = entry.parameterisation or cls.parameterisation
+            box = _box_name(config, entry, dataset, parameterisation)
+            label = _label(config, entry, parameterisation, box, labels)
+            seeds = config.seeds if cls.stochastic else config.seeds[:1]
+            plan += [PlannedRun(config, name, dataset, entry, label, parameterisation, box, seed) for seed in seeds]
+    return plan
+
+
+def _box_name(
+    config: CompareConfig, entry: CalibratorEntry, dataset: Dataset, parameterisation: ParameterisationName
+) -> str:
+    try:
+        searched = make_parameterisation(
+            parameterisation,
+            dataset.robot,
+            dataset.split("train"),
+            box=entry.box or config.box,
+            limits=entry.limits,
+        )
+        return searched.bounds.name
+    except ConfigError as error:
+        raise ConfigError(f"config {config.name}: calibrator {entry.name!r}: {error}") from None
+
+
+def _label(
+    config: CompareConfig, entry: CalibratorEntry, parameterisation: str, box: str, taken: set[str]
+) -> str:
+    cls = calibrators.entry(entry.name).cls
+    label = entry.label or entry.name
+    if not entry.label:
+        if parameterisation != cls.parameterisation:
+            label += f" ({parameterisation})"
+        elif entry.box is not None and entry.box != config.box:
+            label += f" ({box} box)"
+    if label in taken:
+        raise ConfigError(f"config {config.name}: two entries are called {label!r}; give one a label of its own")
+    taken.add(label)
+    return label
+
+
+def _plain(options: Any) -> dict[str, Any]:
+    plain: dict[str, Any] = options.model_dump(mode="json")
+    return plain
+
+
+def _relocated(source: DatasetSource, location: Path) -> DatasetSource:
+    if source.import_ is not None and not (location / "dataset.yaml").is_file():
+        return source.model_copy(update={"import_": source.import_.model_copy(update={"source": location})})
+    return DatasetSource(path=location)
+
+
+def _anchored(source: DatasetSource, folder: Path) -> DatasetSource:
+    if source.path is not None:
+        return source.model_copy(update={"path": (folder / source.path).resolve()})
+    if source.import_ is not None:
+        anchored = (folder / source.import_.source).resolve()
+        return source.model_copy(update={"import_": source.import_.model_copy(update={"source": anchored})})
+    return source

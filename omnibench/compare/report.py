@@ -1,0 +1,196 @@
+"""The report of a comparison: one HTML file that opens offline."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from omnibench.compare.error_figures import error_blocks
+from omnibench.compare.headline import cost, headline, improvement, interval_in_percent
+from omnibench.compare.matrices import matrix_blocks
+from omnibench.compare.path_figures import path_grid
+from omnibench.compare.results import ComparisonResult
+from omnibench.compare.search_figures import search_blocks
+from omnibench.compare.tables import cost_in_words, cost_table, entry_table, final_error_table, run_table
+from omnibench.compare.view import SPLIT_NAMES, DatasetView, views
+from omnibench.config import to_yaml
+from omnibench.data.dataset import SPLITS
+from omnibench.report.blocks import (
+    Badge,
+    Block,
+    Callout,
+    Cell,
+    Code,
+    Column,
+    Details,
+    Document,
+    Fact,
+    Facts,
+    Paragraph,
+    Row,
+    Section,
+    Table,
+)
+from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, plural, significant
+from omnibench.report.render import write_document
+
+_SIMULATED = Badge("SIMULATED DATA", "warning")
+_FOLDED_ABOVE = 20  # runs
+
+
+def write_report(result: ComparisonResult, path: Path) -> None:
+    """Write the report of a comparison to ``path``, whole or not at all. DataError when the disk refuses."""
+    write_document(comparison_document(result), path)
+
+
+def comparison_document(result: ComparisonResult) -> Document:
+    """The report as blocks, data set by data set."""
+    found = views(result)
+    if len(found) == 1:
+        body = _parts(result, found[0], "")
+    else:
+        body = (
+            Section("overview", "Overview", (_overview(found),)),
+            *(
+                Section(f"data-{index}", view.name, (), _parts(result, view, f"data-{index}-"), _badges(view))
+                for index, view in enumerate(found, 1)
+            ),
+        )
+    simulated = [view for view in found if view.dataset.simulated]
+    badges = (_SIMULATED,) if len(simulated) == len(found) else (Badge("SIMULATED AND REAL DATA", "warning"),)
+    return Document(
+        title=f"Odometry calibrations compared: {result.config.name}",
+        subtitle=result.config.description,
+        sections=(*_about(result), *body, _reproduction(result)),
+        badges=badges if simulated else (),
+        footer=f"omnibench {result.environment.versions.get('omnibench', '')}, written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+    )
+
+
+def _about(result: ComparisonResult) -> tuple[Section, ...]:
+    blocks: list[Block] = []
+    if result.config.notes:
+        blocks.append(Callout("Before you read on", result.config.notes))
+    if result.warnings:
+        blocks.append(Callout("Warnings", result.warnings, "warning"))
+    return (Section("notes", "Notes", tuple(blocks)),) if blocks else ()
+
+
+def _parts(result: ComparisonResult, view: DatasetView, prefix: str) -> tuple[Section, ...]:
+    splits = [split for split in SPLITS if split in view.design_errors]
+    runs: Block = run_table(view)
+    if len(view.runs) > _FOLDED_ABOVE:
+        runs = Details(f"Every run ({len(view.runs)})", (runs,))
+    paths: tuple[Block, ...] = (path_grid(view),)
+    return (
+        Section(f"{prefix}result", "Result", headline(view)),
+        Section(f"{prefix}costs", "Costs", tuple(cost_table(view, split) for split in splits)),
+        Section(
+            f"{prefix}errors",
+            "Final errors",
+            (*(final_error_table(view, split) for split in reversed(splits)), *error_blocks(view)),
+        ),
+        Section(f"{prefix}paths", "Paths", paths),
+        Section(f"{prefix}searches", "Searches", search_blocks(view)),
+        Section(f"{prefix}outcomes", "Outcomes", (entry_table(view), runs)),
+        Section(f"{prefix}matrices", "Matrices", matrix_blocks(view)),
+        Section(f"{prefix}data", "Data", _data_blocks(result, view)),
+    )
+
+
+def _badges(view: DatasetView) -> tuple[Badge, ...]:
+    return (_SIMULATED,) if view.dataset.simulated else ()
+
+
+def _overview(found: list[DatasetView]) -> Table:
+    rows = []
+    for view in found:
+        best = view.best
+        reached = None if best is None else cost(best, view.scored)
+        fell = None if best is None else improvement(best, view.scored)
+        rows.append(
+            Row(
+                (
+                    Cell(view.name, "simulated" if view.dataset.simulated else ""),
+                    Cell(NOTHING if best is None else best.label),
+                    Cell(SPLIT_NAMES[view.scored]),
+                    Cell(fixed(view.theoretical_cost(view.scored), 4)),
+                    Cell(NOTHING if reached is None else fixed(reached.value, 4)),
+                    Cell(NOTHING) if fell is None else Cell(percent(fell.value), interval_in_percent(fell)),
+                )
+            )
+        )
+    return Table(
+        "Best entry of each data set",
+        (
+            Column("Data set", numeric=False),
+            Column("Best entry", numeric=False),
+            Column("Scored on", numeric=False),
+            Column("CF theoretical"),
+            Column("CF best"),
+            Column("Improvement"),
+        ),
+        tuple(rows),
+        f"CF is the cost {cost_in_words(found[0])} Small print: 95 % bootstrap intervals.",
+    )
+
+
+def _data_blocks(result: ComparisonResult, view: DatasetView) -> tuple[Block, ...]:
+    dataset = view.dataset
+    trajectories = dataset.trajectories
+    durations = np.array([trajectory.pose_times[-1] for trajectory in trajectories])
+    commands = {trajectory.command for trajectory in trajectories} - {None}
+    sessions = {trajectory.session for trajectory in trajectories} - {None}
+    split_sizes = [f"{count(len(dataset.split(split)))} for {SPLIT_NAMES[split]}" for split in SPLITS]
+    wheels = [
+        f"{wheel.name}: radius {wheel.radius:g} m, distance {wheel.distance:g} m, "
+        f"angle {fixed(np.degrees(wheel.angle), 1)}°"
+        + (f", rollers {fixed(np.degrees(wheel.roller_angle), 1)}°" if wheel.roller_angle else "")
+        for wheel in dataset.robot.wheels
+    ]
+    facts = [
+        Fact("Data set", dataset.name, "simulated" if dataset.simulated else ""),
+        Fact("Description", dataset.description),
+        Fact("Source", dataset.source),
+        Fact("Licence", dataset.licence),
+        Fact("Trajectories", f"{count(len(trajectories))}: {listing(split_sizes)}"),
+        Fact("Commands", count(len(commands)) if commands else "not known"),
+        Fact("Sessions", listing(sorted(map(str, sessions))) if sessions else "not known"),
+        Fact(
+            "Duration",
+            f"{significant(float(durations.min()), 3)} to {significant(float(durations.max()), 3)} s a run",
+            f"wheel samples every {significant(1e3 * dataset.sample_period, 3)} ms",
+        ),
+        Fact("Robot", dataset.robot.name, "; ".join(wheels)),
+        Fact("Odometry", "exact arcs" if result.config.integration == "arc" else "Euler steps, Eq. (1)"),
+        Fact("Content (SHA-256)", dataset.hash[:16]),
+    ]
+    warnings = Callout("Warnings on reading the data", dataset.warnings, "warning")
+    return (Facts(tuple(fact for fact in facts if fact.value)), warnings)
+
+
+def _reproduction(result: ComparisonResult) -> Section:
+    environment, config = result.environment, result.config
+    facts = Facts(
+        (
+            Fact("Budget of each run", f"{count(config.budget.evaluations)} evaluations or {config.budget.seconds:g} s"),
+            Fact("Seeds", listing([str(seed) for seed in config.seeds], 20)),
+            Fact("Intervals", f"{count(config.bootstrap.resamples)} bootstrap resamples, seed {config.bootstrap.seed}"),
+            Fact("Python", environment.python),
+            Fact("Platform", environment.platform),
+            Fact("Processor", environment.processor or "not known", plural(environment.processors, "logical processor")),
+            Fact("Versions", ", ".join(f"{name} {version}" for name, version in environment.versions.items())),
+        )
+    )
+    return Section(
+        "reproduction",
+        "How to reproduce",
+        (
+            Paragraph("The effective config lies beside this report. From this folder:"),
+            Code("omnibench compare config.yaml --output again"),
+            facts,
+            Details("Effective config", (Code(to_yaml(config)),)),
+        ),
+    )

@@ -1,0 +1,76 @@
+"""The results of runs on disk, one file a run, so that a run that is there is not run again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from pydantic import ValidationError
+
+from omnibench.config import Model
+from omnibench.files import write_text
+from omnibench.fit.calibrator import Outcome, RunResult
+from omnibench.fit.problem import Improvement
+from omnibench.robot.calibration import matrix_rows
+from omnibench.robot.kinematics import Array
+
+
+class StoredRun(Model):
+    """The file of one run."""
+
+    outcome: Outcome
+    reason: str
+    vector: tuple[float, ...] | None
+    matrix: tuple[tuple[float, ...], ...] | None
+    cost: float | None
+    evaluations: int
+    seconds: float
+    history: tuple[tuple[int, float, float], ...]
+    at_bounds: tuple[str, ...]
+
+
+class RunStore:
+    """Results by key in ``folder``. DataError when one cannot be written."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def get(self, key: str) -> RunResult | None:
+        """The result of a run that has ended before; a damaged file counts as none."""
+        try:
+            stored = StoredRun.model_validate_json(self._file(key).read_text(encoding="utf-8"))
+        except (OSError, ValidationError):
+            return None
+        return RunResult(
+            outcome=stored.outcome,
+            reason=stored.reason,
+            vector=_array(stored.vector),
+            matrix=_array(stored.matrix),
+            cost=stored.cost,
+            evaluations=stored.evaluations,
+            seconds=stored.seconds,
+            history=tuple(Improvement(*row) for row in stored.history),
+            at_bounds=stored.at_bounds,
+        )
+
+    def put(self, key: str, result: RunResult) -> None:
+        """Keep a result."""
+        stored = StoredRun(
+            outcome=result.outcome,
+            reason=result.reason,
+            vector=None if result.vector is None else tuple(result.vector.tolist()),
+            matrix=None if result.matrix is None else matrix_rows(result.matrix),
+            cost=result.cost,
+            evaluations=result.evaluations,
+            seconds=result.seconds,
+            history=tuple((step.evaluations, step.seconds, step.cost) for step in result.history),
+            at_bounds=result.at_bounds,
+        )
+        write_text(self._file(key), stored.model_dump_json(indent=1))
+
+    def _file(self, key: str) -> Path:
+        return self.folder / f"{key}.json"
+
+
+def _array(values: tuple[float, ...] | tuple[tuple[float, ...], ...] | None) -> Array | None:
+    return None if values is None else np.array(values, dtype=float)

@@ -1,0 +1,254 @@
+"""The report's tables of costs, errors and outcomes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omnibench.compare.headline import cost, improvement, interval_in_percent, position_unit
+from omnibench.compare.results import EntryStatistics, Interval, RunRecord
+from omnibench.compare.view import (
+    SPLIT_NAMES,
+    THEORETICAL_LOOK,
+    THEORETICAL_NAME,
+    DatasetView,
+    positions_and_headings,
+)
+from omnibench.data.dataset import Split
+from omnibench.registry import costs
+from omnibench.report.blocks import Cell, Column, Row, Table
+from omnibench.report.numbers import (
+    NOTHING,
+    count,
+    decimals_for,
+    fixed,
+    listing,
+    percent,
+    plural,
+    seconds,
+    significant,
+    span,
+)
+from omnibench.robot.kinematics import Array
+
+
+def cost_table(view: DatasetView, split: Split) -> Table:
+    """Table 2 (training) or 3 (validation) of the paper, with intervals."""
+    theoretical = view.theoretical_cost(split)
+    own = next((entry for entry in view.statistics if entry.calibrator == THEORETICAL_NAME), None)
+    before = fixed(theoretical, 4)
+    ours = None if own is None else cost(own, split)
+    first = Row((entry_cell(view, None), Cell(before, _span(ours)), Cell(NOTHING), Cell(NOTHING)))
+    rows = [first]
+    for entry in view.statistics:
+        if entry.calibrator != THEORETICAL_NAME:
+            rows.append(_cost_row(view, entry, split, before))
+    rows += _published_rows(view, split)
+    number = len(view.dataset.split(split))
+    return Table(
+        caption=f"Cost of the {plural(number, f'{SPLIT_NAMES[split]} trajectory')}"
+        if number == 1
+        else f"Cost of the {count(number)} {SPLIT_NAMES[split]} trajectories",
+        columns=(
+            Column("M⁻¹", numeric=False),
+            Column("CF theoretical"),
+            Column(f"CF {SPLIT_NAMES[split]}"),
+            Column("Improvement"),
+        ),
+        rows=tuple(rows),
+        note=f"As Table {2 if split == 'train' else 3} of the paper. CF is the cost {cost_in_words(view)} "
+        "Small print: 95 % bootstrap intervals over trajectories, of the run with the median training cost.",
+    )
+
+
+def cost_in_words(view: DatasetView) -> str:
+    """The cost's name and what it is."""
+    return f"{view.config.cost.name}: {costs.entry(view.config.cost.name).summary.rstrip('.')}."
+
+
+def final_error_table(view: DatasetView, split: Split) -> Table:
+    """Mean and worst final errors in position and heading, design values first."""
+    errors: list[tuple[EntryStatistics | None, Array]] = [(None, view.design_errors[split])]
+    for entry, run in view.calibrated:
+        found = view.errors(run, split)
+        if found is not None:
+            errors.append((entry, found))
+    factor, unit, decimals = position_unit(*(float(positions_and_headings(e)[0].mean()) for _, e in errors))
+    rows = []
+    for entry_or_none, found in errors:
+        positions, headings = positions_and_headings(found)
+        cells = (
+            entry_cell(view, entry_or_none),
+            Cell(fixed(factor * positions.mean(), decimals)),
+            Cell(fixed(factor * positions.max(), decimals)),
+            Cell(fixed(np.degrees(headings.mean()), 2)),
+            Cell(fixed(np.degrees(headings.max()), 2)),
+        )
+        rows.append(Row(cells, "best" if entry_or_none and entry_or_none.is_best else "plain"))
+    return Table(
+        caption=f"Error of the final pose, {SPLIT_NAMES[split]}",
+        columns=(
+            Column("M⁻¹", numeric=False),
+            Column("position, mean", unit),
+            Column("position, worst", unit),
+            Column("heading, mean", "°"),
+            Column("heading, worst", "°"),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def entry_table(view: DatasetView) -> Table:
+    """How each entry did over its seeds and against the best."""
+    rows = []
+    for entry in view.statistics:
+        role = "best" if entry.is_best else "plain" if entry.answers else "failed"
+        digits = decimals_for(entry.train_median, 5)
+        rows.append(
+            Row(
+                (
+                    entry_cell(view, entry),
+                    Cell(f"{entry.answers} of {entry.runs}"),
+                    Cell(fixed(entry.train_median, digits), _spread(entry)),
+                    Cell(gap(entry.gap_median)),
+                    Cell(count(entry.evaluations_median)),
+                    Cell(seconds(entry.seconds_median)),
+                    _difference(entry),
+                    _verdict(entry),
+                ),
+                role,
+            )
+        )
+    return Table(
+        caption="Entries over their seeds",
+        columns=(
+            Column("Entry", numeric=False),
+            Column("Runs with an answer"),
+            Column("CF training, median"),
+            Column("Gap above the exact optimum"),
+            Column("Evaluations, median"),
+            Column("Time, median"),
+            Column(f"Difference from the best in CF {SPLIT_NAMES[view.scored]}"),
+            Column("Verdict", numeric=False),
+        ),
+        rows=tuple(rows),
+        note="Spread: interquartile range over seeds. Gap: training cost relative to the exact optimum in the same box "
+        f"(closed_form), minus one; {NOTHING} where that is not known. Difference: paired over trajectories, with its "
+        "95 % bootstrap interval. Practically equal: the difference lies within the noise.",
+    )
+
+
+def run_table(view: DatasetView) -> Table:
+    """Every run, those without an answer too."""
+    return Table(
+        caption="Every run",
+        columns=(
+            Column("Entry", numeric=False),
+            Column("Seed"),
+            Column("Outcome", numeric=False),
+            Column("Reason", numeric=False),
+            Column("CF training"),
+            Column("CF validation"),
+            Column("Gap"),
+            Column("Evaluations"),
+            Column("Time"),
+            Column("On a bound", numeric=False),
+        ),
+        rows=tuple(_run_row(view, run.record) for run in view.runs),
+    )
+
+
+def entry_cell(view: DatasetView, entry: EntryStatistics | None) -> Cell:
+    """An entry's name with its colour; None stands for the design values."""
+    if entry is None:
+        return Cell("Theoretical", "design values", THEORETICAL_LOOK.colour)
+    note = "design values" if entry.calibrator == THEORETICAL_NAME else f"{entry.parameterisation}, box {entry.box}"
+    return Cell(entry.label, note, view.looks[entry.label].colour)
+
+
+def gap(value: float | None) -> str:
+    """A relative gap; below what arithmetic can tell it is zero."""
+    if value is not None and abs(value) < 5e-13:
+        return "0"
+    return significant(value, 2)
+
+
+def _cost_row(view: DatasetView, entry: EntryStatistics, split: Split, before: str) -> Row:
+    reached, fell = cost(entry, split), improvement(entry, split)
+    if reached is None:
+        failed = [run.record for run in view.runs if run.record.label == entry.label]
+        outcome = failed[0].outcome.value if failed else "no run"
+        return Row((entry_cell(view, entry), Cell(before), Cell("no answer", outcome), Cell(NOTHING)), "failed")
+    cells = (
+        entry_cell(view, entry),
+        Cell(before),
+        Cell(fixed(reached.value, 4), _span(reached)),
+        Cell(percent(fell.value, 2), interval_in_percent(fell)) if fell else Cell(NOTHING),
+    )
+    return Row(cells, "best" if entry.is_best else "plain")
+
+
+def _published_rows(view: DatasetView, split: Split) -> list[Row]:
+    rows = []
+    for result in view.config.published_results:
+        before = result.theoretical_train_cost if split == "train" else result.theoretical_validation_cost
+        after = result.train_cost if split == "train" else result.validation_cost
+        if before is None or after is None:
+            continue
+        cells = (
+            Cell(result.label, result.source),
+            Cell(fixed(before, 4)),
+            Cell(fixed(after, 4)),
+            Cell(percent(1 - after / before, 2)),
+        )
+        rows.append(Row(cells, "muted"))
+    if rows:
+        rows.insert(0, Row((Cell("Published, on other data: not comparable row by row"),), "group"))
+    return rows
+
+
+def _span(interval: Interval | None) -> str:
+    return "" if interval is None else span(interval.low, interval.high, 4)
+
+
+def _spread(entry: EntryStatistics) -> str:
+    if entry.train_spread is None or entry.answers < 2:
+        return "one seed" if entry.answers == 1 else ""
+    return f"spread {significant(entry.train_spread, 2)}"
+
+
+def _difference(entry: EntryStatistics) -> Cell:
+    if entry.difference is None or entry.is_best:
+        return Cell(NOTHING)
+    largest = max(abs(entry.difference.low), abs(entry.difference.high))
+    digits = max(4, decimals_for(largest, 2))
+    return Cell(
+        fixed(entry.difference.value, digits, signed=True),
+        span(entry.difference.low, entry.difference.high, digits, signed=True),
+    )
+
+
+def _verdict(entry: EntryStatistics) -> Cell:
+    if entry.typical is None:
+        return Cell("no answer")
+    if entry.is_best:
+        return Cell("best")
+    if entry.practically_equal is None:
+        return Cell(NOTHING)
+    return Cell("practically equal" if entry.practically_equal else "worse")
+
+
+def _run_row(view: DatasetView, record: RunRecord) -> Row:
+    answered = record.matrix is not None
+    cells = (
+        Cell(record.label, colour=view.looks[record.label].colour),
+        Cell(str(record.seed)),
+        Cell(record.outcome.value),
+        Cell(record.reason),
+        Cell(fixed(record.train_cost, 6)),
+        Cell(fixed(record.validation_cost, 6)),
+        Cell(gap(record.gap)),
+        Cell(count(record.evaluations)),
+        Cell(seconds(record.seconds)),
+        Cell(listing(list(record.at_bounds), 9) if answered and record.at_bounds else NOTHING),
+    )
+    return Row(cells, "plain" if answered else "failed")

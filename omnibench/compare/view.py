@@ -1,0 +1,157 @@
+"""What the report shows of one data set, gathered once: entries with their colours, errors of the design values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from omnibench.compare.config import CompareConfig
+from omnibench.compare.results import ComparisonResult, EntryStatistics, ScoredRun
+from omnibench.data.dataset import Dataset, Split
+from omnibench.report.blocks import Dash, LegendItem
+from omnibench.report.style import REFERENCE, SYMBOLS, THEORETICAL, colours
+from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
+
+THEORETICAL_NAME = "theoretical"
+SPLIT_NAMES: Mapping[Split, str] = {"train": "training", "validation": "validation"}
+
+# The paper draws its non-parametric (genetic) result in magenta and the parametric one in brown.
+_CUSTOMARY = {
+    "closed_form": "#0072b2",
+    "crs": "#e69f00",
+    "genetic": "#aa3377",
+    "isres": "#4fb0e8",
+    "parametric": "#7b4b2a",
+    "random_search": "#8a8f98",
+}
+
+
+@dataclass(frozen=True)
+class Look:
+    """How an entry is drawn in every plot of the report."""
+
+    key: str
+    label: str
+    colour: str
+    dash: Dash
+    symbol: str
+
+    @property
+    def legend(self) -> LegendItem:
+        return LegendItem(self.key, self.label, self.colour, self.dash)
+
+
+REFERENCE_LOOK = Look("reference", "reference", REFERENCE, "solid", "circle")
+THEORETICAL_LOOK = Look("theoretical", "theoretical (design values)", THEORETICAL, "dash", "circle")
+
+
+@dataclass(frozen=True, eq=False)
+class DatasetView:
+    """One data set of the comparison.
+
+    looks: by label, the same in the whole report. design_errors: final pose errors (Z, 3) in m, m, rad of the design
+    matrix on each split that has trajectories.
+    """
+
+    name: str
+    config: CompareConfig
+    dataset: Dataset
+    runs: tuple[ScoredRun, ...]
+    statistics: tuple[EntryStatistics, ...]
+    looks: Mapping[str, Look]
+    design_errors: Mapping[Split, Array]
+
+    @property
+    def scored(self) -> Split:
+        """The split that the verdict is about: validation where there is one."""
+        return "validation" if "validation" in self.design_errors else "train"
+
+    @property
+    def best(self) -> EntryStatistics | None:
+        """The best entry, unless nothing gave an answer."""
+        return next((entry for entry in self.statistics if entry.is_best and entry.typical is not None), None)
+
+    @property
+    def calibrated(self) -> list[tuple[EntryStatistics, ScoredRun]]:
+        """Entries with an answer, and their typical run; without the design values."""
+        return [
+            (entry, entry.typical)
+            for entry in self.statistics
+            if entry.typical is not None and entry.calibrator != THEORETICAL_NAME
+        ]
+
+    @property
+    def reference_entry(self) -> tuple[EntryStatistics, ScoredRun] | None:
+        """The entry that matrices are compared with: the exact optimum, else the best calibration."""
+        exact = [pair for pair in self.calibrated if pair[0].calibrator == "closed_form"]
+        best = [pair for pair in self.calibrated if pair[0].is_best]
+        return next(iter(exact + best + self.calibrated), None)
+
+    def theoretical_cost(self, split: Split) -> float | None:
+        """The cost of the design values, which every run's record holds."""
+        for run in self.runs:
+            record = run.record
+            return record.theoretical_train_cost if split == "train" else record.theoretical_validation_cost
+        return None
+
+    def errors(self, run: ScoredRun, split: Split) -> Array | None:
+        """Final pose errors (Z, 3) of a run's answer, m, m, rad."""
+        return run.train_errors if split == "train" else run.validation_errors
+
+    def model(self, matrix: Array) -> OdometryModel:
+        """The odometry that the comparison used, with another matrix."""
+        return OdometryModel(self.dataset.robot, matrix, self.config.integration)
+
+    @property
+    def design_matrix(self) -> Array:
+        """The design matrix (3, N)."""
+        return self.dataset.robot.inverse_kinematic_matrix
+
+
+def views(result: ComparisonResult) -> list[DatasetView]:
+    """The data sets of a comparison, in the config's order."""
+    looks = _looks(result)
+    return [_view(result, name, looks) for name in result.datasets]
+
+
+def positions_and_headings(errors: Array) -> tuple[Array, Array]:
+    """Distances (Z,) in m and absolute heading errors (Z,) in rad of final pose errors (Z, 3)."""
+    return np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2])
+
+
+def _view(result: ComparisonResult, name: str, looks: Mapping[str, Look]) -> DatasetView:
+    dataset = result.datasets[name]
+    splits: tuple[Split, ...] = ("train", "validation")
+    present = [split for split in splits if dataset.split(split)]
+    return DatasetView(
+        name=name,
+        config=result.config,
+        dataset=dataset,
+        runs=tuple(run for run in result.runs if run.record.dataset == name),
+        statistics=tuple(entry for entry in result.statistics if entry.dataset == name),
+        looks=looks,
+        design_errors={split: _design_errors(result, dataset, split) for split in present},
+    )
+
+
+def _design_errors(result: ComparisonResult, dataset: Dataset, split: Split) -> Array:
+    trajectories = dataset.split(split)
+    model = OdometryModel.of_design(dataset.robot, result.config.integration)
+    odometry = np.concatenate(model.poses([trajectory.final_log for trajectory in trajectories]))
+    errors: Array = odometry - np.array([trajectory.final_pose for trajectory in trajectories])
+    return errors
+
+
+def _looks(result: ComparisonResult) -> dict[str, Look]:
+    calibrators = {run.record.label: run.record.calibrator for run in result.runs}
+    calibrators = {entry.label: entry.calibrator for entry in result.statistics} | calibrators
+    searches = {label: name for label, name in calibrators.items() if name != THEORETICAL_NAME}
+    styles = colours({label: _CUSTOMARY.get(name) for label, name in searches.items()})
+    looks = {
+        label: Look(f"entry-{index}", label, colour, dash, SYMBOLS[index % len(SYMBOLS)])
+        for index, (label, (colour, dash)) in enumerate(styles.items())
+    }
+    return {label: looks.get(label, THEORETICAL_LOOK) for label in calibrators}

@@ -1,0 +1,142 @@
+"""Reading columns of numbers from delimited text, so that every flaw is told with its file and row."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.errors import DataError, nearest
+from omnibench.robot.kinematics import Array
+
+
+@dataclass(frozen=True, eq=False)
+class NumberTable:
+    """Named columns of finite numbers: ``values`` (rows, n), and the line of the file that each row came from."""
+
+    file: Path
+    names: tuple[str, ...]
+    values: Array
+    lines: NDArray[np.intp]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.names
+
+    def column(self, name: str) -> Array:
+        """One column (rows,)."""
+        column: Array = self.values[:, self.names.index(name)]
+        return column
+
+    def columns(self, names: Sequence[str]) -> Array:
+        """Several columns (rows, n), in the order asked for."""
+        columns: Array = self.values[:, [self.names.index(name) for name in names]]
+        return columns
+
+    def increasing(self, name: str) -> Array:
+        """One column (rows,), which must increase; DataError names the first row that does not."""
+        values = self.column(name)
+        bad = np.flatnonzero(np.diff(values) <= 0)
+        if len(bad):
+            row = int(bad[0]) + 1
+            what = "is repeated" if values[row] == values[row - 1] else "goes backwards"
+            raise self.fail(row, f"{name} {what}: {values[row]:.10g} after {values[row - 1]:.10g}")
+        return values
+
+    def fail(self, row: int, what: str) -> DataError:
+        """The error of one row (0 is the first)."""
+        return row_error(self.file, row, int(self.lines[row]), what)
+
+
+def read_numbers(
+    file: Path,
+    required: Sequence[str],
+    *,
+    optional: Sequence[str] = (),
+    separator: str = ",",
+    header_lines: int = 1,
+) -> NumberTable:
+    """The columns ``required``, and those of ``optional`` that are there, of a delimited text file.
+
+    The last of the header lines names the columns; without header lines the file has exactly the required columns.
+    Blank lines are skipped. DataError: the file cannot be read, a column is missing or named twice, the file has no
+    rows, a row has more or fewer fields than columns, a field is not a finite number.
+    """
+    lines = _read_lines(file, separator)
+    names = [name.strip() for name in _header(file, lines, header_lines)] if header_lines else list(required)
+    wanted = [*required, *(name for name in optional if name in names)]
+    for name in wanted:
+        _check_column(file, name, names)
+    rows = lines[header_lines:]
+    if not rows:
+        raise DataError(f"{file}: it has no rows")
+    for row, (line, fields) in enumerate(rows):
+        if len(fields) != len(names):
+            raise row_error(file, row, line, f"it has {len(fields)} fields, expected {len(names)}; repair the row")
+    chosen = [names.index(name) for name in wanted]
+    try:
+        values = np.array([[fields[index] for index in chosen] for _, fields in rows], dtype=float)
+    except ValueError:
+        values = np.full((len(rows), len(chosen)), np.nan)
+    if not np.isfinite(values).all():
+        raise _first_flaw(file, rows, wanted, chosen)
+    return NumberTable(file, tuple(wanted), values, np.array([line for line, _ in rows]))
+
+
+def row_error(file: Path, row: int, line: int, what: str) -> DataError:
+    """The error of one row (0 is the first) of a text file, with its line where that is another number."""
+    place = f"row {row + 1}" if line == row + 1 else f"row {row + 1} (line {line})"
+    return DataError(f"{file}, {place}: {what}")
+
+
+def read_text(file: Path) -> str:
+    """The text of a file; DataError when it cannot be read."""
+    try:
+        return file.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise DataError(f"{file}: no such file") from None
+    except UnicodeDecodeError:
+        raise DataError(f"{file}: is not a text file (UTF-8)") from None
+    except OSError as error:
+        raise DataError(f"{file}: cannot be read: {error.strerror or error}") from None
+
+
+def _read_lines(file: Path, separator: str) -> list[tuple[int, list[str]]]:
+    reader = csv.reader(read_text(file).splitlines(), delimiter=separator)
+    try:
+        return [(reader.line_num, fields) for fields in reader if any(field.strip() for field in fields)]
+    except csv.Error as error:
+        raise DataError(f"{file}, line {reader.line_num}: {error}") from None
+
+
+def _header(file: Path, lines: Sequence[tuple[int, list[str]]], header_lines: int) -> list[str]:
+    if len(lines) < header_lines:
+        raise DataError(f"{file}: it has no header with the names of its columns")
+    return lines[header_lines - 1][1]
+
+
+def _check_column(file: Path, name: str, names: Sequence[str]) -> None:
+    count = names.count(name)
+    if count == 0:
+        known = ", ".join(filter(None, names))
+        raise DataError(f"{file}: column {name!r} is missing; {nearest(name, names)}found: {known}")
+    if count > 1:
+        raise DataError(f"{file}: column {name!r} is there {count} times; name each column once")
+
+
+def _first_flaw(
+    file: Path, rows: Sequence[tuple[int, list[str]]], wanted: Sequence[str], chosen: Sequence[int]
+) -> DataError:
+    for row, (line, fields) in enumerate(rows):
+        for name, index in zip(wanted, chosen, strict=True):
+            field = fields[index].strip()
+            try:
+                flaw = None if np.isfinite(float(field)) else f"{name} is {field}; remove or repair the row"
+            except ValueError:
+                flaw = f"{name} is {field!r}, expected a number" if field else f"{name} is missing"
+            if flaw:
+                return row_error(file, row, line, flaw)
+    raise AssertionError(f"{file}: no flaw found")

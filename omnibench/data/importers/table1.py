@@ -1,0 +1,186 @@
+"""Importer of what Table 1 of Palacin et al. 2023 lists, as files: rpm, degrees, metres or millimetres."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from omnibench.data.alignment import align, median_period
+from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, make_dataset
+from omnibench.data.delimited import NumberTable, read_numbers
+from omnibench.data.importer import Importer
+from omnibench.data.robot_option import RobotOption
+from omnibench.data.splits import Names, every_second, repetitions, split_by_name
+from omnibench.errors import DataError
+from omnibench.registry import Options, importers
+from omnibench.robot.kinematics import Array, Robot, Wheel
+
+RPM = 2 * math.pi / 60  # rad/s
+_METRES = {"m": 1.0, "mm": 1e-3}
+_COMMAND = ("v", "alpha", "omega", "d")
+_POSE = ("t", "x", "y", "theta")
+
+APR_02 = Robot(
+    name="APR-02",
+    wheels=tuple(
+        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle), roller_angle=0.0)
+        for name, angle in (("a", 60), ("b", 180), ("c", 300))
+    ),
+)
+"""The design values behind Eq. (7)."""
+
+
+class Table1Options(Options):
+    """Unit of positions, the robot, and which trajectories train and validate."""
+
+    position_unit: Literal["m", "mm"] = Field("m", description="of x and y in slam.csv; Table 1 has m")
+    robot: RobotOption = Field(APR_02, description="mapping as in dataset.yaml, or path of a YAML file; default APR-02")
+    train: Names = Field((), description="patterns of trajectory names that train")
+    validation: Names = Field((), description="patterns of trajectory names that validate")
+    sample_period: float | None = Field(
+        None, gt=0, allow_inf_nan=False, description="s; default: the median of the wheel samples"
+    )
+    name: str = Field("table1", min_length=1, description="name of the data set")
+    description: str = ""
+    source: str = ""
+    licence: str = ""
+
+
+@importers.register("table1")
+class Table1(Importer):
+    """What Table 1 of Palacin et al. 2023 lists, one folder a trajectory: rpm, degrees, m or mm.
+
+    The source is any folder above trajectory folders, or one of them; each is found by its ``command.csv``:
+
+        command.csv  one row: v (m/s), alpha (deg), omega (rad/s), d (m)[, omega_Ma, omega_Mb, omega_Mc (rpm)]
+        wheels.csv   t (s), omega_a, omega_b, omega_c (rpm): a row holds the rates up to its t; rows start after 0
+        slam.csv     t (s), x, y (m; ``position_unit: mm`` for mm), theta (deg): the ground truth, one row a scan
+
+    Columns are separated by commas and named in a header; more columns do no harm. For another ``robot`` than the
+    APR-02 the columns are omega_<wheel> and omega_M<wheel>. Table 1's other two items are not read: the odometry that
+    the robot computed (omnibench computes its own) and the LIDAR scans (lidar.csv, mm), which data sets do not hold
+    yet. A first scan later than the first wheel sample becomes t = 0.
+
+    A trajectory is called by its folder, seen from the source; its session is the folder above. Repetitions share
+    session and (v, alpha, omega, d). Splits: by ``train`` and ``validation`` (patterns such as ``training/*``); without them
+    by folders called train and validation, and without these every second repetition validates.
+    """
+
+    Options = Table1Options
+    options: Table1Options
+
+    def read(self, source: Path) -> Dataset:
+        """All trajectories under ``source``; DataError names the file and the row of what is wrong."""
+        folders = [file.parent for file in sorted(source.rglob("command.csv"))]
+        if not folders:
+            raise DataError(
+                f"{source}: no command.csv below it; Table 1 wants one folder a trajectory with command.csv"
+            )
+        runs = [self._trajectory(folder, _name(folder, source)) for folder in folders]
+        if any(run.targets is None for run in runs):
+            runs = [replace(run, targets=None) for run in runs]
+        numbers = repetitions([(run.session, run.command) for run in runs])
+        runs = [replace(run, repetition=number) for run, number in zip(runs, numbers, strict=True)]
+        period = self.options.sample_period or median_period([run.times for run in runs])
+        return make_dataset(
+            self.options.name,
+            self.options.robot,
+            period,
+            self._split(runs),
+            description=self.options.description,
+            source=self.options.source,
+            licence=self.options.licence,
+        )
+
+    def _trajectory(self, folder: Path, name: str) -> Trajectory:
+        wheels = self.options.robot.wheel_names
+        samples = read_numbers(folder / "wheels.csv", ("t", *(f"omega_{wheel}" for wheel in wheels)))
+        slam = read_numbers(folder / "slam.csv", _POSE)
+        command = _read_command(folder / "command.csv", wheels)
+        times, pose_times = _times(samples), _times(slam)
+        metres = _METRES[self.options.position_unit]
+        poses = slam.columns(_POSE[1:]) * (metres, metres, math.pi / 180)
+        aligned = align(0.0, times, pose_times, poses)
+        if aligned is None:
+            raise DataError(
+                f"{slam.file}: no two poses while the wheels were recorded (wheels end at t = {times[-1]:g})"
+            )
+        times = times[aligned.kept] - aligned.zero
+        return Trajectory(
+            id=name,
+            split="train",
+            times=times,
+            rates=samples.values[aligned.kept, 1:] * RPM,
+            pose_times=aligned.pose_times,
+            poses=aligned.poses,
+            command=command.name,
+            session=name.rsplit("/", 1)[0] if "/" in name else None,
+            v=command.v,
+            alpha=command.alpha,
+            omega=command.omega,
+            distance=command.distance,
+            duration=float(times[-1]),
+            targets=None if command.targets is None else np.tile(command.targets, (len(times), 1)),
+        )
+
+    def _split(self, runs: Sequence[Trajectory]) -> list[Trajectory]:
+        names = [run.id for run in runs]
+        splits: Sequence[Split | None]
+        if self.options.train or self.options.validation:
+            splits = split_by_name(names, self.options.train, self.options.validation, "trajectory")
+        else:
+            by_folder = [_split_in(name) for name in names]
+            splits = by_folder if any(by_folder) else every_second([run.command for run in runs])
+            if any(by_folder) and not all(by_folder):
+                stray = names[by_folder.index(None)]
+                raise DataError(
+                    f"trajectory {stray!r} is in no folder train or validation; move it or give train=PATTERN"
+                )
+        return [replace(run, split=split) for run, split in zip(runs, splits, strict=True) if split is not None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Command:
+    """A row of command.csv: m/s, rad, rad/s, m; targets (N,) in rad/s."""
+
+    v: float
+    alpha: float
+    omega: float
+    distance: float
+    targets: Array | None
+
+    @property
+    def name(self) -> str:
+        return f"v{self.v:g}_a{math.degrees(self.alpha):g}_w{self.omega:g}_d{self.distance:g}"
+
+
+def _read_command(file: Path, wheels: Sequence[str]) -> _Command:
+    targets = [f"omega_M{wheel}" for wheel in wheels]
+    table = read_numbers(file, _COMMAND, optional=targets)
+    if len(table.values) != 1:
+        raise DataError(f"{file}: it has {len(table.values)} rows, expected one: the command of this trajectory")
+    v, alpha, omega, distance = (float(value) for value in table.columns(_COMMAND)[0])
+    told = table.columns(targets)[0] * RPM if all(name in table for name in targets) else None
+    return _Command(v, math.radians(alpha), omega, distance, told)
+
+
+def _times(table: NumberTable) -> Array:
+    times = table.increasing("t")
+    if times[0] < 0:
+        raise table.fail(0, f"t is {times[0]:g}; times count from the start of the command and must not be negative")
+    return times
+
+
+def _name(folder: Path, source: Path) -> str:
+    name = folder.relative_to(source).as_posix()
+    return folder.resolve().name if name == "." else name
+
+
+def _split_in(name: str) -> Split | None:
+    return next((split for split in SPLITS if split in name.split("/")), None)

@@ -1,0 +1,100 @@
+"""What a config says of a simulated experiment."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, FiniteFloat, field_validator, model_validator
+
+from omnibench.config import Model
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Robot
+from omnibench.robot.odometry import Integration
+from omnibench.robot.published import PUBLISHED
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class Tolerances(Model):
+    """Standard deviations of the true wheels about their design values."""
+
+    radius: float = Field(0.0, ge=0, lt=0.3, description="share of the radius")
+    distance: float = Field(0.0, ge=0, lt=0.3, description="share of the distance")
+    angle_deg: float = Field(0.0, ge=0, lt=30, description="degrees")
+    seed: int = Field(0, ge=0)
+
+
+class Truth(Model):
+    """The matrix that the simulated robot really has: exactly one of the three."""
+
+    published: str | None = Field(None, description=f"one of {', '.join(PUBLISHED)}")
+    matrix: tuple[tuple[FiniteFloat, ...], ...] | None = Field(None, description="3 rows of N")
+    tolerances: Tolerances | None = Field(None, description="drawn about the design")
+
+    @model_validator(mode="after")
+    def _one_is_given(self) -> Truth:
+        given = [name for name in ("published", "matrix", "tolerances") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"give one of published, matrix, tolerances (given: {', '.join(given) or 'none'})")
+        return self
+
+
+class Session(Model):
+    """One session of recordings: every command, repeated."""
+
+    seed: int = Field(ge=0)
+    distance: Positive = Field(description="length of each run, m")
+    noise_scale: float = Field(1.0, ge=0, allow_inf_nan=False, description="factor on all the reference's noise")
+
+
+class Commands(Model):
+    """Motion commands: every direction with every rate of turn, at each speed."""
+
+    speeds: tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...] = Field((0.2,), min_length=1, description="m/s")
+    directions_deg: tuple[FiniteFloat, ...] = Field(min_length=1)
+    turn_rates: tuple[FiniteFloat, ...] = Field(min_length=1, description="rad/s")
+    turn_duration: Positive = Field(6.0, description="duration of turns on the spot, s")
+
+
+class EncoderNoise(Noise):
+    """The whole noise model: encoders, and the reference poses as in a calibration file."""
+
+    encoder: float = Field(0.0, ge=0, allow_inf_nan=False, description="white noise of each wheel rate, rad/s")
+
+
+class FlowerConfig(Model):
+    """A flower-shaped experiment, simulated: constant commands, wheel rates with noise, noisy reference poses."""
+
+    generator: Literal["flower"] = "flower"
+    robot: Robot
+    sample_period: Positive = Field(0.01, description="s")
+    pose_period: Positive = Field(0.25, description="time between reference poses, s")
+    commands: Commands
+    repetitions: int = Field(5, gt=0)
+    truth: Truth
+    integration: Integration = Field("arc", description="how the true robot moves")
+    noise: EncoderNoise = EncoderNoise()
+    train: Session
+    validation: Session | None = None
+    order: Literal["shuffled", "sorted"] = "shuffled"
+
+    @field_validator("robot")
+    @classmethod
+    def _named(cls, robot: Robot) -> Robot:
+        if not robot.name:
+            raise ValueError("give the robot a name")
+        return robot
+
+    @model_validator(mode="after")
+    def _something_moves(self) -> FlowerConfig:
+        if not any(self.commands.speeds) and not any(self.commands.turn_rates):
+            raise ValueError("commands: no command moves the robot")
+        if self.truth.matrix is not None and [len(row) for row in self.truth.matrix] != [len(self.robot.wheels)] * 3:
+            raise ValueError(f"truth.matrix must have 3 rows of {len(self.robot.wheels)} values")
+        if self.truth.published is not None and len(self.robot.wheels) != 3:
+            raise ValueError("truth.published matrices are for three wheels")
+        shortest = min(s.distance for s in (self.train, self.validation) if s) / max(*self.commands.speeds, 1e-9)
+        if math.isfinite(shortest) and shortest < self.sample_period:
+            raise ValueError("runs are shorter than one sample; raise distance or lower sample_period")
+        return self

@@ -1,0 +1,71 @@
+"""Which imported runs train and which validate."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Hashable, Sequence
+from fnmatch import fnmatchcase
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator
+
+from omnibench.data.dataset import Split
+from omnibench.errors import ConfigError, nearest
+
+
+def _as_names(value: Any) -> Any:
+    values = value if isinstance(value, list | tuple) else (value,)
+    # YAML reads a name made of digits as a number.
+    return tuple(str(item) if isinstance(item, int) and not isinstance(item, bool) else item for item in values)
+
+
+Names = Annotated[tuple[str, ...], BeforeValidator(_as_names)]
+"""An option that takes one name or pattern, or a list of them."""
+
+
+def split_by_name(
+    names: Sequence[str], train: Sequence[str], validation: Sequence[str], kind: str
+) -> list[Split | None]:
+    """The split of each name, by shell patterns (``*``, ``?``, ``[ab]``).
+
+    When only one side has patterns, everything else goes to the other; with both, names that match neither get None.
+    ConfigError: a pattern matches nothing, or a name matches both sides. ``kind`` is what the names are, for messages.
+    """
+    sides = {"train": train, "validation": validation}
+    for side, patterns in sides.items():
+        for pattern in patterns:
+            if not any(fnmatchcase(name, pattern) for name in names):
+                known = sorted(set(names))
+                shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
+                raise ConfigError(f"{side}: no {kind} matches {pattern!r}; {nearest(pattern, known)}found: {shown}")
+    rest: Split | None = "validation" if not validation else "train" if not train else None
+    return [_split_of(name, train, validation, rest, kind) for name in names]
+
+
+def _split_of(
+    name: str, train: Sequence[str], validation: Sequence[str], rest: Split | None, kind: str
+) -> Split | None:
+    trains, validates = (any(fnmatchcase(name, pattern) for pattern in side) for side in (train, validation))
+    if trains and validates:
+        raise ConfigError(f"{kind} {name!r} is in both train and validation; name it once")
+    return "train" if trains else "validation" if validates else rest
+
+
+def every_second(groups: Sequence[Hashable]) -> list[Split]:
+    """Within each group every second member validates, in the order given; the first one trains."""
+    seen: Counter[Hashable] = Counter()
+    splits: list[Split] = []
+    for group in groups:
+        splits.append("train" if seen[group] % 2 == 0 else "validation")
+        seen[group] += 1
+    return splits
+
+
+def repetitions(commands: Sequence[Hashable]) -> list[int]:
+    """How many-eth run of its command each run is, from 1, in the order given."""
+    seen: Counter[Hashable] = Counter()
+    numbers = []
+    for command in commands:
+        seen[command] += 1
+        numbers.append(seen[command])
+    return numbers

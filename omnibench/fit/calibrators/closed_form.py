@@ -1,0 +1,124 @@
+"""The exact minimiser: linear least squares with known headings, then second-order cone programs.
+
+For a given row 3 of the matrix positions are linear in rows 1 and 2, and headings are linear in row 3. With the
+headings of the reference poses the fit is therefore two linear least squares. A cost that is a sum of norms is, with
+the poses linearised about the present matrix, a second-order cone program; its step bends the path so little that
+the sequence converges in a few programs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from omnibench.errors import ConfigError
+from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.cost import SumOfNorms
+from omnibench.fit.parameterisation import MatrixElements
+from omnibench.fit.problem import CalibrationProblem
+from omnibench.registry import Options, calibrators
+from omnibench.robot.kinematics import Array
+
+_MOST_HALVINGS = 30
+
+
+class ClosedFormOptions(Options):
+    """When to stop."""
+
+    tolerance: float = Field(1e-9, gt=0, description="largest change of an element in the last step, m or rad per rad")
+    programs: int = Field(50, gt=0, description="most second-order cone programs")
+
+
+@calibrators.register("closed_form")
+class ClosedForm(Calibrator):
+    """Exact minimiser in the box by least squares and second-order cone programs (cvxpy)."""
+
+    Options = ClosedFormOptions
+    options: ClosedFormOptions
+    stochastic = False
+
+    def __init__(self, options: ClosedFormOptions) -> None:
+        super().__init__(options)
+        import omnibench.fit.sum_of_norms  # noqa: F401 (cvxpy takes a second to import: before the clock runs)
+
+    def calibrate(self, problem: CalibrationProblem) -> Solution:
+        """The minimiser. ConfigError for another parameterisation or a cost that is no sum of norms."""
+        if not isinstance(problem.parameterisation, MatrixElements):
+            raise ConfigError("closed_form works on the matrix parameterisation; search the geometry with another")
+        if not isinstance(problem.objective, SumOfNorms):
+            raise ConfigError(f"closed_form needs a cost that is a sum of norms, which {problem.objective.name} is not")
+        vector = self._better(problem, problem.start, linear_start(problem))
+        cost = float(problem.cost(vector[None])[0])
+        for count in range(1, self.options.programs + 1):
+            step = cone_step(problem, problem.objective, vector)
+            vector_before = vector
+            vector, cost = _descend(problem, vector, cost, step)
+            moved = float(np.abs(vector - vector_before).max())
+            if moved < self.options.tolerance:
+                return Solution(vector, f"step below {self.options.tolerance:g} after {count} cone programs")
+        reason = f"step still {moved:.1e} after {self.options.programs} cone programs"
+        return Solution(vector, reason, converged=False)
+
+    @staticmethod
+    def _better(problem: CalibrationProblem, *vectors: Array) -> Array:
+        costs = problem.cost(np.array(vectors))
+        return vectors[int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))]
+
+
+def linear_start(problem: CalibrationProblem) -> Array:
+    """Least squares of headings on row 3, then of positions on rows 1 and 2 with the reference's headings: (n,)."""
+    from omnibench.fit.sum_of_norms import least_squares
+
+    lower, upper = (bound.reshape(3, -1) for bound in (problem.lower, problem.upper))
+    starts = np.array([trajectory.start for trajectory in problem.trajectories])[problem.odometry.trajectory]
+    moved = problem.reference - starts
+    row_3 = least_squares(problem.odometry.driven, moved[:, 2], lower[2], upper[2])
+    headings = [
+        np.interp(np.concatenate([[0.0], t.times[:-1]]), t.pose_times, t.poses[:, 2]) for t in problem.trajectories
+    ]
+    design = problem.odometry.position_design(headings)
+    rows_12 = least_squares(
+        np.block([[design.real, -design.imag], [design.imag, design.real]]),
+        np.concatenate([moved[:, 0], moved[:, 1]]),
+        np.concatenate([lower[0], lower[1]]),
+        np.concatenate([upper[0], upper[1]]),
+    )
+    return np.concatenate([rows_12, row_3])
+
+
+def cone_step(
+    problem: CalibrationProblem, objective: SumOfNorms, vector: Array, weights: Array | None = None
+) -> Array:
+    """The step (n,) that minimises the cost with the poses linearised about ``vector``.
+
+    weights: how often each trajectory counts (Z,); default once.
+    """
+    from omnibench.fit.sum_of_norms import minimise_sum_of_norms
+
+    matrix = problem.matrix(vector)
+    used = np.flatnonzero(objective.weights)
+    scale = np.array(objective.weights)[used]
+    residuals = (problem.odometry.poses(matrix[None])[0] - problem.reference)[:, used] * scale
+    jacobian = problem.odometry.jacobian(matrix).reshape(len(residuals), 3, -1)[:, used] * scale[:, None]
+    shares = objective.shares(problem.odometry.trajectory)
+    if weights is not None:
+        shares = shares * weights[problem.odometry.trajectory]
+    assert isinstance(problem.parameterisation, MatrixElements)  # calibrate refuses others
+    across: Array = np.kron(np.eye(3), problem.parameterisation.null)
+    counted = shares > 0
+    return minimise_sum_of_norms(
+        residuals[counted], jacobian[counted], shares[counted], problem.lower - vector, problem.upper - vector, across
+    )
+
+
+def _descend(problem: CalibrationProblem, vector: Array, cost: float, step: Array) -> tuple[Array, float]:
+    """Take the step, or as much of it as lowers the cost."""
+    trial = np.clip(vector + step, problem.lower, problem.upper)
+    for _ in range(_MOST_HALVINGS):
+        trial_cost = float(problem.cost(trial[None])[0])
+        if trial_cost <= cost:
+            return trial, trial_cost
+        if np.abs(trial - vector).max() < 1e-12:
+            break
+        trial = (trial + vector) / 2
+    return vector, cost

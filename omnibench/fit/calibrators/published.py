@@ -1,0 +1,45 @@
+"""A matrix from the literature, scored beside the calibrations."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field, FiniteFloat, model_validator
+
+from omnibench.errors import ConfigError
+from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.problem import CalibrationProblem
+from omnibench.registry import Options, calibrators
+from omnibench.robot.published import PUBLISHED, published_matrix
+
+
+class PublishedOptions(Options):
+    """Which matrix: by name, or its rows."""
+
+    matrix: str | tuple[tuple[FiniteFloat, ...], ...] = Field(
+        "palacin2023_eq9", description=f"{' or '.join(PUBLISHED)}, or 3 rows of N values"
+    )
+
+    @model_validator(mode="after")
+    def _name_is_known(self) -> PublishedOptions:
+        if isinstance(self.matrix, str) and self.matrix not in PUBLISHED:
+            raise ValueError(f"matrix {self.matrix!r} is not one of {', '.join(PUBLISHED)}")
+        return self
+
+
+@calibrators.register("published")
+class Published(Calibrator):
+    """A published matrix, as it stands: the paper's Eq. (8) or (9), or one given in the config."""
+
+    Options = PublishedOptions
+    options: PublishedOptions
+    bounded = False
+    stochastic = False
+
+    def calibrate(self, problem: CalibrationProblem) -> Solution:
+        """The published matrix as a vector; ConfigError when it is for another number of wheels."""
+        given = self.options.matrix
+        matrix = published_matrix(given) if isinstance(given, str) else np.array(given)
+        if problem.parameterisation.name != "matrix" or matrix.size != problem.size:
+            raise ConfigError(f"a published {matrix.shape} matrix does not fit a problem of {problem.size} values")
+        problem.cost(matrix.reshape(1, -1))
+        return Solution(matrix.ravel(), "as published")

@@ -1,0 +1,65 @@
+"""A document as one HTML file that needs nothing else: no network, no fonts, no second file."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import plotly.graph_objects as go
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from omnibench.files import write_text
+from omnibench.report.blocks import Document
+
+_PLOT_OPTIONS = {
+    "responsive": True,
+    "displaylogo": False,
+    "modeBarButtonsToRemove": ["select2d", "lasso2d", "autoScale2d"],
+    "toImageButtonOptions": {"format": "svg"},
+}
+
+
+def write_document(document: Document, path: Path) -> None:
+    """Write a report, whole or not at all. DataError when the disk refuses."""
+    write_text(path, render(document))
+
+
+def render(document: Document) -> str:
+    """The report's HTML."""
+    template = _environment().get_template("report.html.j2")
+    return template.render(document=document, plot_options=_json(_PLOT_OPTIONS))
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("omnibench.report"),
+        autoescape=select_autoescape(default=True, default_for_string=True),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["plot_json"] = _plot_json
+    environment.globals["plotly_js"] = Markup(get_plotlyjs())  # noqa: S704 (plotly's own text, no input of ours)
+    environment.globals["source"] = lambda name: Markup(_source(environment, name))  # noqa: S704 (our own files)
+    return environment
+
+
+def _source(environment: Environment, name: str) -> str:
+    assert environment.loader is not None
+    return environment.loader.get_source(environment, name)[0]
+
+
+def _plot_json(figure: go.Figure) -> Markup:
+    return _json(json.loads(figure.to_json()))
+
+
+def _json(content: Any) -> Markup:
+    """JSON that cannot end the script element that holds it."""
+    dense = json.dumps(content, separators=(",", ":"), allow_nan=False)
+    escapes = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
+    return Markup(dense.translate(str.maketrans(escapes)))  # noqa: S704 (escaped above)

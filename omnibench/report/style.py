@@ -1,0 +1,134 @@
+"""How plots look: quiet axes, colours that colour-blind readers can tell apart, units on every axis."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping
+from typing import Any
+
+import plotly.graph_objects as go
+
+from omnibench.report.blocks import Dash
+
+FONT = 'system-ui, -apple-system, "Segoe UI", "Helvetica Neue", "Liberation Sans", Arial, sans-serif'
+INK = "#1f2933"
+QUIET = "#66727f"
+GRID = "#e6e9ed"
+AXIS = "#9aa5b1"
+
+# As in the paper's figures: the reference is red, the theoretical matrix green.
+REFERENCE = "#c8102e"
+THEORETICAL = "#00875f"
+
+# After Okabe and Ito and after Tol, without the red and the green above.
+PALETTE = (
+    "#0072b2",
+    "#e69f00",
+    "#aa3377",
+    "#4fb0e8",
+    "#7b4b2a",
+    "#332288",
+    "#8f8f1f",
+    "#8a8f98",
+    "#cc79a7",
+    "#111111",
+)
+DASHES: tuple[Dash, ...] = ("solid", "dot", "dashdot")
+SYMBOLS = (
+    "circle-open",
+    "square-open",
+    "diamond-open",
+    "triangle-up-open",
+    "triangle-down-open",
+    "pentagon-open",
+    "star-open",
+    "hexagon-open",
+    "cross-open",
+    "x-open",
+)
+
+
+def colours(wanted: Mapping[str, str | None]) -> dict[str, tuple[str, Dash]]:
+    """A colour and a dash for each key: the wanted colour while it is free, then the palette's next."""
+    styles: dict[str, tuple[str, Dash]] = {}
+    taken: set[tuple[str, Dash]] = set()
+    reserved = {colour for colour in wanted.values() if colour}
+    # Colours that nobody has asked for come first, so that every key can have what it wants.
+    order = sorted(PALETTE, key=lambda colour: colour in reserved)
+    pool = [(colour, dash) for dash in DASHES for colour in order]
+    for key, colour in wanted.items():
+        if colour and (colour, DASHES[0]) not in taken:
+            styles[key] = (colour, DASHES[0])
+            taken.add(styles[key])
+    for key in wanted:
+        if key not in styles:
+            free = [style for style in pool if style not in taken]
+            styles[key] = free[0] if free else pool[len(styles) % len(pool)]
+            taken.add(styles[key])
+    return {key: styles[key] for key in wanted}
+
+
+def text(words: str) -> str:
+    """Words for a plot, which reads some HTML: as they stand."""
+    return html.escape(words, quote=False)
+
+
+def plot(*traces: go.Scatter, **layout: Any) -> go.Figure:
+    """A figure of these traces in the house style, without a legend of its own."""
+    figure = go.Figure(data=list(traces))
+    figure.update_layout(
+        template=_TEMPLATE,
+        showlegend=False,
+        hovermode="closest",
+        margin={"l": 62, "r": 18, "t": 12, "b": 50},
+        **layout,
+    )
+    return figure
+
+
+def logarithmic(figure: go.Figure, *axes: str) -> None:
+    """Make axes (``x``, ``y``) logarithmic, with ticks at powers of ten and unlabelled ones between."""
+    for axis in axes:
+        figure.update_layout(
+            {
+                f"{axis}axis": {
+                    "type": "log",
+                    "dtick": 1,
+                    "exponentformat": "power",
+                    "minor": {"ticks": "outside", "ticklen": 3, "dtick": "D1", "tickcolor": AXIS, "showgrid": False},
+                }
+            }
+        )
+
+
+def equal_aspect(figure: go.Figure) -> None:
+    """A metre is as long upwards as sideways."""
+    figure.update_yaxes(scaleanchor="x", scaleratio=1)
+
+
+_AXIS_STYLE = {
+    "showline": True,
+    "linecolor": AXIS,
+    "gridcolor": GRID,
+    "zeroline": False,
+    "ticks": "outside",
+    "ticklen": 4,
+    "tickcolor": AXIS,
+    "tickfont": {"size": 12, "color": QUIET},
+    "title": {"font": {"size": 13, "color": INK}, "standoff": 8},
+    "automargin": True,
+}
+_POLAR_AXIS_STYLE = {"gridcolor": GRID, "linecolor": AXIS, "tickfont": {"size": 11, "color": QUIET}}
+_TEMPLATE = go.layout.Template(
+    layout={
+        "font": {"family": FONT, "size": 13, "color": INK},
+        "paper_bgcolor": "white",
+        "plot_bgcolor": "white",
+        "colorway": list(PALETTE),
+        "xaxis": _AXIS_STYLE,
+        "yaxis": _AXIS_STYLE,
+        "polar": {"bgcolor": "white", "angularaxis": _POLAR_AXIS_STYLE, "radialaxis": _POLAR_AXIS_STYLE},
+        "hoverlabel": {"bgcolor": "white", "bordercolor": AXIS, "font": {"family": FONT, "size": 12, "color": INK}},
+        "modebar": {"bgcolor": "rgba(255,255,255,0.85)", "color": AXIS, "activecolor": INK},
+    }
+)

@@ -1,0 +1,63 @@
+"use strict";
+
+// One plot after the other, so that the page can be read and scrolled while they are drawn.
+async function drawPlots() {
+  for (const canvas of document.querySelectorAll(".canvas")) {
+    const { data, layout } = JSON.parse(document.getElementById(canvas.dataset.source).textContent);
+    await Plotly.newPlot(canvas, data, layout, PLOT_OPTIONS);
+    await new Promise((resolve) => setTimeout(resolve));
+  }
+  document.body.dataset.plots = "drawn";
+}
+
+// A legend switches its traces in every plot beside it.
+function toggle(button) {
+  const shown = button.getAttribute("aria-pressed") !== "true";
+  button.setAttribute("aria-pressed", String(shown));
+  for (const canvas of button.closest(".figures").querySelectorAll(".canvas")) {
+    const traces = (canvas.data || []).map((trace, index) => (trace.legendgroup === button.dataset.key ? index : -1));
+    const affected = traces.filter((index) => index >= 0);
+    if (affected.length) Plotly.restyle(canvas, { visible: shown }, affected);
+  }
+}
+
+function copy(button) {
+  const code = button.parentElement.querySelector("code");
+  const selection = window.getSelection();
+  selection.selectAllChildren(code);
+  const done = document.execCommand("copy"); // works from file:// too, where the clipboard API may not
+  button.textContent = done ? "Copied" : "Selected";
+  setTimeout(() => (button.textContent = "Copy"), 1500);
+}
+
+function markCurrentSection() {
+  const links = new Map();
+  for (const link of document.querySelectorAll(".contents a")) links.set(link.hash.slice(1), link);
+  const sections = [...document.querySelectorAll("main section")].filter((section) => links.has(section.id));
+  const update = () => {
+    const passed = sections.filter((section) => section.getBoundingClientRect().top < 120);
+    for (const link of links.values()) link.removeAttribute("aria-current");
+    if (passed.length) links.get(passed[passed.length - 1].id).setAttribute("aria-current", "true");
+  };
+  document.addEventListener("scroll", update, { passive: true });
+  update();
+}
+
+// Paper is narrower than most screens: plots are redrawn for it, and back afterwards.
+const PAPER_WIDTH = { "columns-1": 680, "columns-2": 335, "columns-3": 220 };
+window.addEventListener("beforeprint", () => {
+  for (const element of document.querySelectorAll("details")) element.open = true;
+  for (const canvas of document.querySelectorAll(".canvas")) {
+    const grid = canvas.closest(".grid");
+    const width = Object.entries(PAPER_WIDTH).find(([name]) => grid.classList.contains(name))[1];
+    Plotly.relayout(canvas, { width, autosize: false });
+  }
+});
+window.addEventListener("afterprint", () => {
+  for (const canvas of document.querySelectorAll(".canvas")) Plotly.relayout(canvas, { width: null, autosize: true });
+});
+
+for (const button of document.querySelectorAll(".legend button")) button.addEventListener("click", () => toggle(button));
+for (const button of document.querySelectorAll(".copy")) button.addEventListener("click", () => copy(button));
+markCurrentSection();
+drawPlots();

@@ -1,0 +1,242 @@
+"""Conformance cases for calibrators."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+from contextlib import chdir, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+from unittest import SkipTest
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.errors import OmnibenchError
+from omnibench.fit.calibrator import Calibrator, Outcome, RunResult, Solution, run_calibrator
+from omnibench.fit.parameterisation import ParameterisationName
+from omnibench.fit.problem import BudgetSpent, CalibrationProblem
+from omnibench.registry import calibrators
+from omnibench.robot.kinematics import Array
+from omnibench.testing.conformance import Conformance, global_random_fingerprint, global_random_state, require
+from omnibench.testing.synthetic import ObservedProblem, Runaway, synthetic_problem
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """One run of a calibrator: its result, the problem as the run left it, and what ``calibrate`` did.
+
+    solution, error: what it returned or raised. uncounted: candidates that it evaluated past the budget's count.
+    """
+
+    result: RunResult
+    problem: ObservedProblem
+    solution: Any
+    error: Exception | None
+    uncounted: int
+
+
+class CalibratorConformance(Conformance):
+    """What every calibrator must keep to, whatever it does.
+
+    solved: the largest share of the start's cost at which a claim of convergence is believed on a problem that can be
+    solved to zero. By default it need only not be worse than the start; set it to 1e-3, say, for an optimiser.
+    evaluations: the budget of that problem.
+    """
+
+    registry = calibrators
+    solved: ClassVar[float] = 1.0
+    evaluations: ClassVar[int] = 20_000
+
+    def problem(self, parameterisation: ParameterisationName | None = None, **changes: Any) -> ObservedProblem:
+        """A synthetic problem in the calibrator's own parameterisation; see ``synthetic_problem``."""
+        return synthetic_problem(parameterisation or self.make().parameterisation, **changes)
+
+    def attempt(self, problem: ObservedProblem, calibrator: Calibrator | None = None) -> Attempt:
+        """Run the calibrator to its end; Nonconformance when it raises what it may not, or does not end."""
+        calibrator = calibrator or self.make()
+        watched = _watching(calibrator)
+        try:
+            result = run_calibrator(watched, problem)
+        except Runaway:
+            require(False, f"it went on for {problem.refusals} calls after BudgetSpent; let that exception through")
+        if watched.error is not None and not isinstance(watched.error, BudgetSpent | OmnibenchError):
+            require(False, f"calibrate raised {type(watched.error).__name__}: {watched.error}")
+        answer = watched.solution
+        if watched.error is None:
+            require(isinstance(answer, Solution), f"calibrate returned {type(answer).__name__}, expected a Solution")
+            require(bool(answer.reason.strip()), "the solution's reason is empty; say why it stopped")
+        return Attempt(result, problem, answer, watched.error, watched.uncounted)
+
+    def test_same_seed_twice_gives_the_same_answer(self) -> None:
+        """Bit for bit, whatever the global generators are at; the second time by an instance that has run before."""
+        for seed in (0, 1):
+            calibrator = self.make()
+            with global_random_state(1):
+                first = self.attempt(self.problem(seed=seed), calibrator)
+            with global_random_state(2):
+                second = self.attempt(self.problem(seed=seed), calibrator)
+            same = _bytes(first.result.vector) == _bytes(second.result.vector)
+            require(same, f"two runs with seed {seed} gave different answers; draw all random numbers from problem.rng")
+            require(
+                first.result.evaluations == second.result.evaluations,
+                f"two runs with seed {seed} took {first.result.evaluations} and {second.result.evaluations} "
+                "evaluations; draw all random numbers from problem.rng and keep nothing between runs",
+            )
+
+    def test_global_random_state_is_left_alone(self) -> None:
+        """What a plug-in does to the generators of ``random`` and NumPy would change the runs after it."""
+        with global_random_state(1):
+            before = global_random_fingerprint()
+            self.attempt(self.problem())
+            require(before == global_random_fingerprint(), "it used or seeded a global generator; use problem.rng")
+
+    def test_bounds_are_kept(self) -> None:
+        """Every candidate and the answer lie in the box, also where the box holds an element fixed."""
+        if not self.make().bounded:
+            raise SkipTest("its answer does not depend on the box")
+        for fixed in (False, True):
+            attempt = self.attempt(self.problem(fixed=fixed))
+            strays = attempt.problem.strays
+            if strays:
+                require(False, f"{len(strays)} candidates outside the box, e.g. {_shown(attempt.problem, strays[0])}")
+            require(attempt.result.outcome is not Outcome.INVALID, attempt.result.reason)
+
+    def test_budget_is_kept(self) -> None:
+        """The run ends when the evaluations are spent, and it does not claim then to have converged."""
+        for evaluations in (1, 7, 150):
+            attempt = self.attempt(self.problem(evaluations=evaluations))
+            spent = attempt.result.evaluations + attempt.uncounted
+            require(
+                spent <= evaluations,
+                f"{spent} candidates evaluated of {evaluations}: {attempt.uncounted} by problem.values, which is not "
+                "for searching; use problem.cost",
+            )
+            _require_honest_end(attempt)
+
+    def test_spent_time_ends_the_run(self) -> None:
+        """The same for the seconds."""
+        _require_honest_end(self.attempt(self.problem(seconds=1e-9)))
+
+    def test_inputs_are_left_unchanged(self) -> None:
+        """Trajectories, start, box and reference are the same after a run, for those that share them."""
+        problem = self.problem()
+        before, cost = _contents(problem), problem.values(problem.start[None])
+        self.attempt(problem)
+        after = _contents(problem)
+        changed = [name for name in before if before[name] != after[name]]
+        require(not changed, f"it changed {', '.join(changed)}; work on copies")
+        require(_bytes(cost) == _bytes(problem.values(problem.start[None])), "it changed what the problem computes")
+
+    def test_nan_cost_is_survived(self) -> None:
+        """The cost is NaN in most of the box, but neither at the start nor at the optimum."""
+        attempt = self.attempt(self.problem(undefined=_outer_shell))
+        if self.make().bounded:
+            require(attempt.result.outcome is not Outcome.INVALID, f"beside NaN costs: {attempt.result.reason}")
+
+    def test_nothing_but_nan_is_survived(self) -> None:
+        """The run ends without an answer and without a crash."""
+        attempt = self.attempt(self.problem(undefined=lambda points: np.ones(len(points), dtype=bool)))
+        require(attempt.result.outcome is not Outcome.CONVERGED, "it claims to have converged where no cost is finite")
+
+    def test_synthetic_problem_is_solved_or_honestly_reported(self) -> None:
+        """A claim of convergence comes with an answer that is no worse than the start, and a good one if it must be."""
+        if not self.make().bounded:
+            raise SkipTest("its answer does not depend on the problem")
+        problem = self.problem(evaluations=self.evaluations)
+        start = float(problem.values(problem.start[None])[0])
+        result = self.attempt(problem).result
+        require(result.outcome not in (Outcome.FAILED, Outcome.INVALID), f"it ended {result.outcome}: {result.reason}")
+        if result.outcome is Outcome.CONVERGED:
+            share = (np.inf if result.cost is None else result.cost) / start
+            require(share <= 1 + 1e-12, f"it claims to have converged, at {share:.4g} times the cost of the start")
+            require(
+                share <= self.solved,
+                f"it claims to have converged at {share:.2g} of the start's cost, where {self.solved:.2g} was "
+                "expected; return Solution(..., converged=False) when in doubt",
+            )
+
+    def test_other_parameterisation_is_searched_or_refused(self) -> None:
+        """A config may ask for either; OmnibenchError says that one is impossible."""
+        for parameterisation in ("matrix", "geometry"):
+            self.attempt(self.problem(parameterisation))
+
+    def test_four_wheels_are_met(self) -> None:
+        """Nothing may count on nine elements."""
+        attempt = self.attempt(self.problem(wheels=4))
+        if self.make().bounded:
+            require(attempt.result.outcome is not Outcome.INVALID, f"with four wheels: {attempt.result.reason}")
+
+    def test_it_works_in_silence(self) -> None:
+        """Standard output belongs to ``--json``, and a run leaves no files."""
+        printed, folder = io.StringIO(), tempfile.TemporaryDirectory()
+        with folder as place, chdir(place), redirect_stdout(printed), redirect_stderr(printed):
+            self.attempt(self.problem(evaluations=300))
+            left = sorted(path.name for path in Path(place).iterdir())
+        require(not printed.getvalue(), f"it printed {printed.getvalue()[:60]!r}; put what matters into the reason")
+        require(not left, f"it left files in the working folder: {', '.join(left)}")
+
+
+class _Watching(Calibrator):
+    """Passes a run through to a calibrator and keeps what came of it."""
+
+    def __init__(self, inner: Calibrator) -> None:
+        super().__init__(inner.options)
+        self.inner = inner
+        self.solution: Any = None
+        self.error: Exception | None = None
+        self.uncounted = 0
+
+    def calibrate(self, problem: CalibrationProblem) -> Solution:
+        assert isinstance(problem, ObservedProblem)
+        before = problem.uncounted
+        try:
+            self.solution = self.inner.calibrate(problem)
+        except Exception as error:
+            self.error = error
+            raise
+        finally:
+            self.uncounted = problem.uncounted - before
+        solution: Solution = self.solution
+        return solution
+
+
+class _WatchingUnbounded(_Watching):
+    bounded = False
+
+
+def _watching(calibrator: Calibrator) -> _Watching:
+    return _Watching(calibrator) if calibrator.bounded else _WatchingUnbounded(calibrator)
+
+
+def _outer_shell(points: Array) -> NDArray[np.bool_]:
+    """Where any free element is in the upper tenth of its range: 61 % of a box of nine."""
+    return np.asarray((points > 0.9).any(axis=1), dtype=bool)
+
+
+def _require_honest_end(attempt: Attempt) -> None:
+    # A wrapped library may ask a few times more until its stop takes effect; the claim is what counts.
+    require(
+        attempt.result.outcome is not Outcome.CONVERGED or not attempt.problem.refusals,
+        "it swallowed BudgetSpent and claims to have converged; let that exception through",
+    )
+
+
+def _contents(problem: CalibrationProblem) -> dict[str, bytes]:
+    contents = {name: _bytes(getattr(problem, name)) for name in ("start", "lower", "upper", "free", "reference")}
+    for trajectory in problem.trajectories:
+        for name in ("times", "rates", "pose_times", "poses"):
+            contents[f"{name} of trajectory {trajectory.id}"] = _bytes(getattr(trajectory, name))
+    return contents
+
+
+def _bytes(array: Any) -> bytes:
+    return b"" if array is None else np.asarray(array).tobytes()
+
+
+def _shown(problem: CalibrationProblem, vector: Array) -> str:
+    outside = (vector < problem.lower) | (vector > problem.upper) | ~np.isfinite(vector)
+    first = int(np.flatnonzero(outside)[0])
+    low, high = problem.lower[first], problem.upper[first]
+    return f"{problem.names[first]} = {vector[first]:.6g}, not in [{low:.6g}, {high:.6g}]"

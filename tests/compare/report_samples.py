@@ -1,0 +1,105 @@
+"""Small comparisons, really run, for the tests of the report."""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from omnibench.compare.config import CompareConfig
+from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
+from omnibench.compare.results import ComparisonResult, Environment
+from omnibench.compare.scoring import score
+from omnibench.compare.statistics import entry_statistics
+from omnibench.data.dataset import Dataset
+from omnibench.fit.calibrator import RunResult, run_calibrator
+from omnibench.fit.problem import CalibrationProblem, make_parameterisation
+from omnibench.registry import calibrators, costs
+
+APR02 = {
+    "name": "APR-02",
+    "wheels": [
+        {"name": name, "radius": 0.148, "distance": 0.195, "angle": math.radians(degrees)}
+        for name, degrees in zip("abc", (60, 180, 300), strict=True)
+    ],
+}
+
+
+def flower(**changes: Any) -> dict[str, Any]:
+    """A small flower experiment: what a config's ``simulate`` says."""
+    return {
+        "robot": APR02,
+        "sample_period": 0.05,
+        "commands": {"directions_deg": [30, 120, 210, 300], "turn_rates": [-0.35, 0.35]},
+        "repetitions": 2,
+        "truth": {"published": "palacin2023_eq8"},
+        "noise": {"encoder": 0.02, "pose_position": 0.005, "pose_heading": 0.005, "bias_position": 0.008},
+        "train": {"seed": 1, "distance": 1.2},
+        "validation": {"seed": 2, "distance": 1.2},
+        **changes,
+    }
+
+
+def config(**changes: Any) -> CompareConfig:
+    """A small comparison."""
+    return CompareConfig.model_validate(
+        {
+            "name": "small",
+            "description": "A small comparison.",
+            "datasets": {"flower": {"simulate": flower()}},
+            "budget": {"evaluations": 2000},
+            "calibrators": ["theoretical", "closed_form", {"name": "random_search", "options": {"candidates": 1000}}],
+            "seeds": [1, 2],
+            **changes,
+        }
+    )
+
+
+def run(chosen: CompareConfig, datasets: Mapping[str, Dataset] | None = None) -> ComparisonResult:
+    """The comparison of a config, in this process; ``datasets`` in place of the config's own."""
+    loaded = dict(datasets or load_datasets(chosen))
+    plan = make_plan(chosen, loaded)
+    scored = score(plan, [solve(planned) for planned in plan], loaded)
+    return ComparisonResult(
+        config=chosen,
+        output=Path("results"),
+        datasets=loaded,
+        runs=scored,
+        statistics=entry_statistics(scored, chosen.bootstrap),
+        environment=Environment(
+            versions={"omnibench": version("omnibench"), "numpy": np.__version__},
+            python=platform.python_version(),
+            platform=platform.platform(),
+            processor=platform.processor(),
+            processors=os.cpu_count() or 1,
+        ),
+        warnings=(),
+    )
+
+
+def solve(planned: PlannedRun) -> RunResult:
+    """One planned run, in this process."""
+    chosen, dataset = planned.config, planned.dataset
+    training = dataset.split("train")
+    problem = CalibrationProblem(
+        dataset.robot,
+        training,
+        costs.create(chosen.cost.name, chosen.cost.options),
+        make_parameterisation(
+            planned.parameterisation,
+            dataset.robot,
+            training,
+            box=planned.entry.box or chosen.box,
+            limits=planned.entry.limits,
+        ),
+        integration=chosen.integration,
+        budget=chosen.budget,
+        seed=planned.seed,
+    )
+    return run_calibrator(calibrators.create(planned.entry.name, planned.entry.options), problem)
