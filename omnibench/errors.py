@@ -25,6 +25,10 @@ class PluginError(OmnibenchError):
     """A plug-in cannot be loaded or does not keep the contract."""
 
 
+class Interrupted(OmnibenchError):  # noqa: N818 (the user's wish, not a mistake)
+    """Ctrl-C; the message says what is kept and how to go on."""
+
+
 class UnknownNameError(ConfigError):
     """A name that nothing is registered under."""
 

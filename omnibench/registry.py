@@ -33,6 +33,12 @@ class Options(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class AnyOptions(BaseModel):
+    """Options of a class that could not be loaded: kept as they are."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+
 @dataclass(frozen=True)
 class Entry(Generic[T]):
     """A registered class and where it comes from."""

@@ -47,6 +47,7 @@ class Maddahi(Calibrator):
 
     Options = MaddahiOptions
     options: MaddahiOptions
+    stochastic = False
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Find the wheel factors of least cost by a simplex, restarted until it gains nothing, and split them."""

@@ -125,6 +125,12 @@ class PlainRandom(Honest):
         return np.array([[random.gauss() for _ in range(shape[1])] for _ in range(shape[0])])
 
 
+class CallsItselfDeterministic(Honest):
+    """Draws, and denies it."""
+
+    stochastic = False
+
+
 class Remembers(Honest):
     """Starts its second run where the first one ended."""
 
@@ -270,6 +276,7 @@ CASES_OF_CALIBRATORS = [
     (LegacyGenerator, "same seed twice gives the same answer", "different answers"),
     (LegacyGenerator, "global random state is left alone", "global generator"),
     (PlainRandom, "global random state is left alone", "global generator"),
+    (CallsItselfDeterministic, "seed makes no difference where it says so", "depends on the seed"),
     (Remembers, "same seed twice gives the same answer", "two runs with seed 0"),
     (WorseThanStart, "synthetic problem is solved or honestly reported", "times the cost of the start"),
     (SearchesUncounted, "budget is kept", "200 by problem.values"),

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.compare.headline import position_unit
+from omnibench.compare.results import EntryStatistics, ScoredRun
 from omnibench.compare.view import SPLIT_NAMES, THEORETICAL_LOOK, DatasetView, Look, positions_and_headings
+from omnibench.compare.wording import position_unit
 from omnibench.data.dataset import Split, Trajectory
 from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem, Paragraph
 from omnibench.report.numbers import fixed
@@ -33,7 +34,7 @@ def error_blocks(view: DatasetView) -> tuple[Block, ...]:
     trajectories = view.dataset.split(view.scored)
     if _is_flower(trajectories):
         return _flower_blocks(view, trajectories, after, best.label)
-    return (_boxes(view, best.label),)
+    return (_boxes(view, best, best.typical),)
 
 
 @dataclass(frozen=True)
@@ -94,8 +95,8 @@ def _flower_blocks(
                 )
             )
     caption = (
-        f"Mean over the repetitions of each command, {SPLIT_NAMES[view.scored]} data. The angle is the commanded direction "
-        "α in the robot's frame, forward up and left to the left; the radius is the error."
+        f"Mean over the repetitions of each command, {SPLIT_NAMES[view.scored]} data. The angle is the commanded "
+        "direction α in the robot's frame, forward up and left to the left; the radius is the error."
     )
     grid = FigureGrid(tuple(figures), tuple(legend), 3, caption)
     return (grid, *_turns_on_the_spot(view, trajectories, after))
@@ -118,6 +119,7 @@ def _petals(
 def _polar(
     curves: Sequence[tuple[Array, Array]], legend: Sequence[LegendItem], quantity: _Quantity, limit: float
 ) -> go.Figure:
+    hover = f"%{{r:.{quantity.decimals}f}} {quantity.unit}"
     traces = [
         go.Scatterpolar(
             theta=angles.tolist(),
@@ -126,7 +128,7 @@ def _polar(
             line={"color": item.colour, "width": 2},
             marker={"size": 5},
             legendgroup=item.key,
-            hovertemplate=f"{text(item.label)}, α %{{theta:.0f}}°<br>%{{r:.{quantity.decimals}f}} {quantity.unit}<extra></extra>",
+            hovertemplate=f"{text(item.label)}, α %{{theta:.0f}}°<br>{hover}<extra></extra>",
         )
         for (angles, values), item in zip(curves, legend, strict=True)
     ]
@@ -134,7 +136,7 @@ def _polar(
         *traces,
         polar={
             "angularaxis": {"rotation": 90, "direction": "counterclockwise", "dtick": 30, "ticksuffix": "°"},
-            "radialaxis": {"range": [0, limit], "nticks": 5, "angle": 75, "tickangle": 0, "showline": False},
+            "radialaxis": {"range": [0, limit], "nticks": 5, "angle": 75, "tickangle": 75, "showline": False},
         },
     )
     figure.update_layout(margin={"l": 38, "r": 38, "t": 26, "b": 26})
@@ -153,25 +155,23 @@ def _turns_on_the_spot(view: DatasetView, trajectories: Sequence[Trajectory], af
     return (Paragraph(f"Turns on the spot have no direction and are not drawn: {', '.join(parts)}.", "note"),)
 
 
-def _boxes(view: DatasetView, label: str) -> FigureGrid:
+def _boxes(view: DatasetView, best: EntryStatistics, typical: ScoredRun) -> FigureGrid:
     """Boxes over the trajectories of each command or session, both splits."""
-    best = view.best
-    assert best is not None and best.typical is not None  # error_blocks saw it
     groups: list[str] = []
     before, after = [], []
     for split in view.design_errors:
-        errors = view.errors(best.typical, split)
+        errors = view.errors(typical, split)
         if errors is not None:
             groups += _groups(view, split)
             before.append(view.design_errors[split])
             after.append(errors)
     quantities = _quantities(np.concatenate(before), np.concatenate(after))
-    look = view.looks[label]
+    look = view.looks[best.label]
     figures = tuple(
         Figure(
             f"Final {quantity.name} ({quantity.unit})",
             _box_figure(groups, quantity, look),
-            f"Final {quantity.name} in {quantity.unit} of each group of trajectories, theoretical and {label}",
+            f"Final {quantity.name} in {quantity.unit} of each group of trajectories, theoretical and {best.label}",
             400,
         )
         for quantity in quantities

@@ -11,14 +11,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
-from pathlib import Path
 from typing import Any, Protocol
 
-from omnibench.compare.plan import PlannedRun
+from omnibench.compare.config import CalibratorEntry, CompareConfig
+from omnibench.compare.plan import PlannedRun, load_calibrators
 from omnibench.compare.store import RunStore
+from omnibench.data.dataset import Trajectory
 from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
+from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import CalibrationProblem, make_parameterisation
-from omnibench.registry import calibrators, costs, load_plugins
+from omnibench.registry import calibrators, costs
+from omnibench.robot.kinematics import Robot
 
 # A run that does not look at its budget is ended this long after its seconds are spent.
 _GRACE = 10.0
@@ -28,6 +31,7 @@ _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RA
 class Progress(Protocol):
     """Told how a comparison gets on."""
 
+    def planned(self, runs: int) -> None: ...
     def began(self, run: PlannedRun) -> None: ...
     def moved(self, run: PlannedRun, evaluations: int, best: float) -> None: ...
     def ended(self, run: PlannedRun, result: RunResult, reused: bool) -> None: ...
@@ -47,7 +51,8 @@ def execute(plan: Sequence[PlannedRun], store: RunStore, progress: Progress, wor
     KeyboardInterrupt passes through after the running processes are ended; what had ended is in the store.
     """
     results: dict[int, RunResult] = {}
-    waiting = []
+    waiting: list[int] = []
+    progress.planned(len(plan))
     for index, run in enumerate(plan):
         stored = store.get(run.key)
         if stored is None:
@@ -96,7 +101,7 @@ def _processes() -> Iterator[Any]:
 
 def _start(context: Any, run: PlannedRun) -> _Active:
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(sender, run.config.plugins, _Job.of(run)), daemon=True)
+    process = context.Process(target=_work, args=(sender, run.config, _Job.of(run)), daemon=True)
     process.start()
     sender.close()
     return _Active(run, process, receiver, time.monotonic())
@@ -106,14 +111,10 @@ def _start(context: Any, run: PlannedRun) -> _Active:
 class _Job:
     """What the worker needs of a run: the training data and nothing of the validation data."""
 
-    robot: Any
-    trajectories: Any
-    cost: Any
-    entry: Any
-    parameterisation: Any
-    box: Any
-    integration: Any
-    budget: Any
+    robot: Robot
+    trajectories: tuple[Trajectory, ...]
+    entry: CalibratorEntry
+    parameterisation: ParameterisationName
     seed: int
 
     @classmethod
@@ -121,32 +122,29 @@ class _Job:
         return cls(
             robot=run.dataset.robot,
             trajectories=run.dataset.split("train"),
-            cost=run.config.cost,
             entry=run.entry,
             parameterisation=run.parameterisation,
-            box=run.entry.box or run.config.box,
-            integration=run.config.integration,
-            budget=run.config.budget,
             seed=run.seed,
         )
 
 
-def _work(connection: Connection, plugins: Sequence[Path], job: _Job) -> None:
+def _work(connection: Connection, config: CompareConfig, job: _Job) -> None:
     """The worker process: solve one problem and send the result."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
-    load_plugins(plugins)
+    load_calibrators(config)
     calibrator = calibrators.create(job.entry.name, job.entry.options)
-    cost = costs.create(job.cost.name, job.cost.options)
+    cost = costs.create(config.cost.name, config.cost.options)
+    box = job.entry.box or config.box
     searched = make_parameterisation(
-        job.parameterisation, job.robot, job.trajectories, box=job.box, limits=job.entry.limits
+        job.parameterisation, job.robot, job.trajectories, box=box, limits=job.entry.limits
     )
     problem = CalibrationProblem(
         job.robot,
         job.trajectories,
         cost,
         searched,
-        integration=job.integration,
-        budget=job.budget,
+        integration=config.integration,
+        budget=config.budget,
         seed=job.seed,
         watch=lambda evaluations, best: connection.send((evaluations, best)),
     )

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from omnibench.compare.results import EntryStatistics, Interval
+from omnibench.compare.results import EntryStatistics
 from omnibench.compare.view import SPLIT_NAMES, THEORETICAL_NAME, DatasetView, positions_and_headings
-from omnibench.data.dataset import Split
+from omnibench.compare.wording import cost, difference_in_words, improvement, interval_in_percent, position_unit
 from omnibench.report.blocks import Block, Callout, Fact, Facts, Paragraph
 from omnibench.report.numbers import decimals_for, fixed, listing, percent, plural, span
 
@@ -19,29 +19,9 @@ def headline(view: DatasetView) -> tuple[Block, ...]:
     return (Paragraph(_verdict(view, best), "lead"), Facts(_tiles(view, best), "tiles"), _remarks(view, best))
 
 
-def improvement(entry: EntryStatistics, split: Split) -> Interval | None:
-    """The share by which an entry's cost lies below that of the design values."""
-    return entry.train_improvement if split == "train" else entry.validation_improvement
-
-
-def cost(entry: EntryStatistics, split: Split) -> Interval | None:
-    """An entry's cost on a split."""
-    return entry.train if split == "train" else entry.validation
-
-
-def interval_in_percent(interval: Interval) -> str:
-    """``80.9 to 82.5 %``."""
-    return f"{span(100 * interval.low, 100 * interval.high, 1)} %"
-
-
-def position_unit(*errors: float) -> tuple[float, str, int]:
-    """Factor, unit and decimals in which these lengths (m) are best read: mm below a metre."""
-    return (1e3, "mm", 1) if max(errors, default=0.0) < 1.0 else (1.0, "m", 3)
-
-
 def _no_winner(view: DatasetView, best: EntryStatistics | None) -> str:
     if best is None:
-        return f"No calibrator gave an answer: {plural(len(view.runs), 'run')}, none of them usable; see the reasons below."
+        return f"No calibrator gave an answer: {plural(len(view.runs), 'run')}, none usable; the reasons are below."
     answers = [entry.label for entry, _ in view.calibrated]
     if not answers:
         return "Only the design values gave an answer; there is no calibration to compare them with."
@@ -117,7 +97,7 @@ def _remarks(view: DatasetView, best: EntryStatistics | None) -> Callout:
         items.append("There is no validation split: costs and errors are those of the data that were fitted.")
     if best is not None:
         worse = [
-            f"{entry.label} (by {fixed(entry.difference.value, 4)}, {span(entry.difference.low, entry.difference.high, 4)})"
+            f"{entry.label} ({', '.join(difference_in_words(entry.difference))})"
             for entry, _ in view.calibrated
             if entry.difference is not None and entry.practically_equal is False and not entry.is_best
         ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
@@ -40,13 +41,13 @@ def differences(matrix: Array, reference: Array) -> Array:
 
 
 def matrices_as_text(view: DatasetView) -> str:
-    """Every matrix with the digits that bring back the same numbers, as Python and YAML read them."""
+    """Every matrix with the digits that bring back the same numbers, as YAML and JSON read them."""
     named = [("theoretical", view.design_matrix)]
     named += [(entry.label, run.matrix) for entry, run in view.calibrated if run.matrix is not None]
     parts = []
     for label, matrix in named:
         rows = ",\n  ".join(f"[{', '.join(repr(float(value)) for value in row)}]" for row in matrix)
-        parts.append(f"{label}:\n [{rows}]".replace("\n [[", "\n  [["))
+        parts.append(f"{json.dumps(label)}: [\n  {rows}]")
     return "\n".join(parts)
 
 
@@ -58,7 +59,8 @@ def parameter_table(view: DatasetView) -> Table | None:
     names = list(dict.fromkeys(p.name for _, record in fitted for p in record.parameters or ()))
     rows = []
     for name in names:
-        cells = [Cell(name)]
+        kind, _, wheel = name.partition("_")
+        cells = [Cell(f"{kind}, wheel {wheel}" if wheel else name)]
         found = [next((p for p in record.parameters or () if p.name == name), None) for _, record in fitted]
         known = next(parameter for parameter in found if parameter is not None)
         value, unit = _shown(known.design, known.unit)
@@ -77,13 +79,13 @@ def parameter_table(view: DatasetView) -> Table | None:
 
 
 def _element_table(view: DatasetView) -> Table:
-    rows = [Row((entry_cell(view, None), *(Cell(fixed(v, 6)) for v in view.design_matrix.ravel())))]
+    rows = [Row((entry_cell(view, None), *(Cell(fixed(float(v), 6)) for v in view.design_matrix.ravel())))]
     for entry, run in view.calibrated:
         if run.matrix is None:
             continue
         bound = run.record.at_bounds if entry.parameterisation == "matrix" else ()
         cells = [
-            Cell(fixed(value, 6) + ("†" if name in bound else ""))
+            Cell(fixed(float(value), 6) + ("†" if name in bound else ""))
             for name, value in zip(_element_names(view), run.matrix.ravel(), strict=True)
         ]
         rows.append(Row((entry_cell(view, entry), *cells), "best" if entry.is_best else "plain"))
@@ -108,7 +110,7 @@ def _difference_table(view: DatasetView, against: str | None) -> Table:
         matrix = run.matrix if project is None else reference + (run.matrix - reference) @ project
         share = differences(matrix, reference).ravel()
         moved = (matrix - reference).ravel()
-        cells = tuple(_difference_cell(s, d) for s, d in zip(share, moved, strict=True))
+        cells = tuple(_difference_cell(float(s), float(d)) for s, d in zip(share, moved, strict=True))
         rows.append(Row((entry_cell(view, entry), *cells)))
     name = "the design values" if against is None else against
     note = "Eq. (10) and (11) of the paper, element by element. Where the reference is 0 the change itself is given."
@@ -131,7 +133,11 @@ def _difference_cell(share: float, moved: float) -> Cell:
 def _span_projector(view: DatasetView) -> Array | None:
     wheels = len(view.dataset.robot.wheels)
     training = view.dataset.split("train")
-    return driven_span(training).projector if wheels > 3 and training else None
+    if wheels == 3 or not training:
+        return None
+    driven = driven_span(training).driven
+    projector: Array = driven.T @ driven
+    return projector
 
 
 def _element_names(view: DatasetView) -> list[str]:
@@ -152,7 +158,6 @@ def _parameter_cell(parameter: FittedParameter | None, on_bound: bool) -> Cell:
     if parameter is None:
         return Cell(NOTHING)
     value, unit = _shown(parameter.value, parameter.unit)
-    deviation = f"{fixed(parameter.deviation_percent, 2, signed=True)} %"
-    if parameter.design == 0 or not math.isfinite(parameter.deviation_percent):
-        deviation = "design is 0"
+    percent = parameter.deviation_percent
+    deviation = "design is 0" if percent is None else f"{fixed(percent, 2, signed=True)} %"
     return Cell(f"{value} {unit}{' †' if on_bound else ''}", deviation)

@@ -92,7 +92,8 @@ def _with_command(trajectories: Sequence[Trajectory], degrees: float) -> Traject
 
 def _models(view: DatasetView) -> list[tuple[Look, Array]]:
     drawn = [(THEORETICAL_LOOK, view.design_matrix)]
-    drawn += [(view.looks[entry.label], run.matrix) for entry, run in view.calibrated if run.matrix is not None]
+    calibrated = sorted(view.calibrated, key=lambda pair: pair[0].is_best)  # the best on top
+    drawn += [(view.looks[entry.label], run.matrix) for entry, run in calibrated if run.matrix is not None]
     return drawn
 
 
@@ -125,7 +126,7 @@ def _end(view: DatasetView, trajectory: Trajectory) -> go.Figure:
     tails = [(look, view.model(matrix).poses([trajectory.log(stamps)])[0]) for look, matrix in _models(view)]
     half = _window([_distance_mm(poses[-1], final) for look, poses in tails if look is not THEORETICAL_LOOK])
     late = trajectory.poses[trajectory.pose_times >= min(stamps[0], trajectory.pose_times[-2])]
-    traces = _tail_traces(REFERENCE_LOOK, late, final, half, width=3.5)
+    traces = _tail_traces(REFERENCE_LOOK, late, final, half, width=2.6)
     for look, poses in tails:
         traces += _tail_traces(look, poses, final, half, width=1.6)
     figure = plot(*traces, xaxis_title_text="x − x of reference (mm)", yaxis_title_text="y − y of reference (mm)")
@@ -155,11 +156,11 @@ def _tail_traces(look: Look, poses: Array, final: Array, half: float, width: flo
 def _ends_in_words(view: DatasetView, trajectory: Trajectory) -> str:
     """How far the theoretical end and the best one are from the reference's."""
     (design,) = view.model(view.design_matrix).poses([trajectory.final_log])
-    parts = [f"theoretical {_distance_mm(design[-1], trajectory.final_pose):.0f} mm"]
+    parts = [f"theoretical {_distance_mm(design[-1], trajectory.final_pose):.0f} mm off"]
     best = view.best
     if best is not None and best.typical is not None and best.typical.matrix is not None:
         (pose,) = view.model(best.typical.matrix).poses([trajectory.final_log])
-        parts.append(f"{best.label} {_distance_mm(pose[-1], trajectory.final_pose):.0f} mm away")
+        parts.append(f"best {_distance_mm(pose[-1], trajectory.final_pose):.0f} mm")
     return ", ".join(parts)
 
 

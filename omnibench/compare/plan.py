@@ -15,12 +15,14 @@ from omnibench.compare.config import CalibratorEntry, CompareConfig, DatasetSour
 from omnibench.config import read_model
 from omnibench.data.dataset import Dataset
 from omnibench.data.importer import import_dataset
+from omnibench.data.simulate.config import FlowerConfig
 from omnibench.data.simulate.flower import simulate_dataset
 from omnibench.data.storage import load_dataset
-from omnibench.errors import ConfigError, DataError, UnknownNameError
+from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.fit.calibrator import unloadable
 from omnibench.fit.parameterisation import ParameterisationName
-from omnibench.fit.problem import make_parameterisation
-from omnibench.registry import calibrators, costs
+from omnibench.fit.problem import make_parameterisation, training_split
+from omnibench.registry import PluginFailure, calibrators, costs, load_plugins
 
 
 @dataclass(frozen=True)
@@ -77,14 +79,23 @@ def read_compare_config(path: Path, data: Mapping[str, Path] | None = None) -> C
     )
 
 
+def load_calibrators(config: CompareConfig) -> list[PluginFailure]:
+    """Load the config's plug-ins. One that cannot be imported fails in its row, and the others run."""
+    failures = load_plugins(config.plugins)
+    known = {entry.name for entry in calibrators.entries()}
+    for failure in failures:
+        name = Path(failure.origin).stem
+        if name not in known and any(entry.name == name for entry in config.calibrators):
+            calibrators.register(name)(unloadable(failure))
+    return failures
+
+
 def load_datasets(config: CompareConfig) -> dict[str, Dataset]:
     """Read, import or simulate every data set. DataError when one has no training data."""
     loaded = {}
     for name, source in config.datasets.items():
-        dataset = load_source(name, source, config.description)
-        if not dataset.split("train"):
-            raise DataError(f"data set {name}: the training split is empty; set split to train for some trajectories")
-        loaded[name] = dataset
+        loaded[name] = load_source(name, source, config.description)
+        training_split(loaded[name])
     return loaded
 
 
@@ -96,6 +107,18 @@ def load_source(name: str, source: DatasetSource, description: str = "") -> Data
         return import_dataset(source.import_.format, source.import_.source, source.import_.options)
     assert source.path is not None  # one of the three is given
     return load_dataset(source.path)
+
+
+def simulated_source(config: CompareConfig, name: str | None) -> tuple[str, FlowerConfig]:
+    """Name and settings of the simulated data set called ``name``, or of the only one. ConfigError in one line."""
+    simulated = {key: source.simulate for key, source in config.datasets.items() if source.simulate is not None}
+    if name is not None and name not in simulated:
+        raise UnknownNameError("simulated data set", name, simulated, f"config {config.name}")
+    if name is None and len(simulated) != 1:
+        count = "several simulated data sets; choose one with --dataset" if simulated else "no simulated data set"
+        raise ConfigError(f"config {config.name} has {count}")
+    name = name or next(iter(simulated))
+    return name, simulated[name]
 
 
 def effective_config(config: CompareConfig) -> CompareConfig:
@@ -130,9 +153,15 @@ def make_plan(config: CompareConfig, datasets: Mapping[str, Dataset]) -> list[Pl
     return plan
 
 
+# The box of a calibrator whose answer does not depend on it.
+UNBOUNDED = "none"
+
+
 def _box_name(
     config: CompareConfig, entry: CalibratorEntry, dataset: Dataset, parameterisation: ParameterisationName
 ) -> str:
+    if not calibrators.entry(entry.name).cls.bounded:
+        return UNBOUNDED
     try:
         searched = make_parameterisation(
             parameterisation,
@@ -146,9 +175,7 @@ def _box_name(
         raise ConfigError(f"config {config.name}: calibrator {entry.name!r}: {error}") from None
 
 
-def _label(
-    config: CompareConfig, entry: CalibratorEntry, parameterisation: str, box: str, taken: set[str]
-) -> str:
+def _label(config: CompareConfig, entry: CalibratorEntry, parameterisation: str, box: str, taken: set[str]) -> str:
     cls = calibrators.entry(entry.name).cls
     label = entry.label or entry.name
     if not entry.label:

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from omnibench.compare.error_figures import error_blocks
-from omnibench.compare.headline import cost, headline, improvement, interval_in_percent
+from omnibench.compare.headline import headline
 from omnibench.compare.matrices import matrix_blocks
 from omnibench.compare.path_figures import path_grid
 from omnibench.compare.results import ComparisonResult
 from omnibench.compare.search_figures import search_blocks
 from omnibench.compare.tables import cost_in_words, cost_table, entry_table, final_error_table, run_table
 from omnibench.compare.view import SPLIT_NAMES, DatasetView, views
+from omnibench.compare.wording import cost, improvement, interval_in_percent
 from omnibench.config import to_yaml
 from omnibench.data.dataset import SPLITS
 from omnibench.report.blocks import (
@@ -65,7 +66,8 @@ def comparison_document(result: ComparisonResult) -> Document:
         subtitle=result.config.description,
         sections=(*_about(result), *body, _reproduction(result)),
         badges=badges if simulated else (),
-        footer=f"omnibench {result.environment.versions.get('omnibench', '')}, written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+        footer=f"omnibench {result.environment.versions.get('omnibench', '')}, "
+        f"written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     )
 
 
@@ -83,16 +85,20 @@ def _parts(result: ComparisonResult, view: DatasetView, prefix: str) -> tuple[Se
     runs: Block = run_table(view)
     if len(view.runs) > _FOLDED_ABOVE:
         runs = Details(f"Every run ({len(view.runs)})", (runs,))
-    paths: tuple[Block, ...] = (path_grid(view),)
+    others = (
+        Details(f"The same on the {SPLIT_NAMES[split]} data", (final_error_table(view, split),))
+        for split in splits
+        if split != view.scored
+    )
     return (
         Section(f"{prefix}result", "Result", headline(view)),
         Section(f"{prefix}costs", "Costs", tuple(cost_table(view, split) for split in splits)),
         Section(
             f"{prefix}errors",
             "Final errors",
-            (*(final_error_table(view, split) for split in reversed(splits)), *error_blocks(view)),
+            (final_error_table(view, view.scored), *error_blocks(view), *others),
         ),
-        Section(f"{prefix}paths", "Paths", paths),
+        Section(f"{prefix}paths", "Paths", (path_grid(view),)),
         Section(f"{prefix}searches", "Searches", search_blocks(view)),
         Section(f"{prefix}outcomes", "Outcomes", (entry_table(view), runs)),
         Section(f"{prefix}matrices", "Matrices", matrix_blocks(view)),
@@ -167,20 +173,28 @@ def _data_blocks(result: ComparisonResult, view: DatasetView) -> tuple[Block, ..
         Fact("Odometry", "exact arcs" if result.config.integration == "arc" else "Euler steps, Eq. (1)"),
         Fact("Content (SHA-256)", dataset.hash[:16]),
     ]
-    warnings = Callout("Warnings on reading the data", dataset.warnings, "warning")
-    return (Facts(tuple(fact for fact in facts if fact.value)), warnings)
+    told = " ".join(result.warnings)
+    warnings = tuple(warning for warning in dataset.warnings if warning not in told)
+    return (
+        Facts(tuple(fact for fact in facts if fact.value)),
+        Callout("Warnings on reading the data", warnings, "warning"),
+    )
 
 
 def _reproduction(result: ComparisonResult) -> Section:
     environment, config = result.environment, result.config
     facts = Facts(
         (
-            Fact("Budget of each run", f"{count(config.budget.evaluations)} evaluations or {config.budget.seconds:g} s"),
+            Fact(
+                "Budget of each run", f"{count(config.budget.evaluations)} evaluations or {config.budget.seconds:g} s"
+            ),
             Fact("Seeds", listing([str(seed) for seed in config.seeds], 20)),
             Fact("Intervals", f"{count(config.bootstrap.resamples)} bootstrap resamples, seed {config.bootstrap.seed}"),
             Fact("Python", environment.python),
             Fact("Platform", environment.platform),
-            Fact("Processor", environment.processor or "not known", plural(environment.processors, "logical processor")),
+            Fact(
+                "Processor", environment.processor or "not known", plural(environment.processors, "logical processor")
+            ),
             Fact("Versions", ", ".join(f"{name} {version}" for name, version in environment.versions.items())),
         )
     )

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from omnibench.compare.config import CompareConfig
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
+from omnibench.environment import Environment
 from omnibench.fit.calibrator import Outcome
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import Improvement
@@ -24,7 +26,7 @@ class FittedParameter(Model):
     value: float
     unit: str
     design: float
-    deviation_percent: float
+    deviation_percent: float | None  # None where the design value is 0
 
 
 class RunRecord(Model):
@@ -36,6 +38,7 @@ class RunRecord(Model):
     parameterisation: ParameterisationName
     box: str
     seed: int
+    options: dict[str, Any]
     outcome: Outcome
     reason: str
     train_cost: float | None
@@ -119,17 +122,6 @@ class EntryStatistics:
     gap_median: float | None
     evaluations_median: float | None
     seconds_median: float | None
-
-
-@dataclass(frozen=True)
-class Environment:
-    """What the comparison ran on."""
-
-    versions: dict[str, str]
-    python: str
-    platform: str
-    processor: str
-    processors: int
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from omnibench.compare.plan import PlannedRun
+from omnibench.compare.plan import UNBOUNDED, PlannedRun
 from omnibench.compare.results import FittedParameter, RunRecord, ScoredRun
 from omnibench.data.dataset import Dataset, Split, Trajectory
 from omnibench.fit.calibrator import Outcome, RunResult
@@ -70,9 +70,7 @@ def heading_error(errors: Array) -> float:
     return float(np.abs(errors[:, 2]).mean())
 
 
-def _score_one(
-    run: PlannedRun, result: RunResult, scorers: Mapping[tuple[str, Split], SplitScorer]
-) -> ScoredRun:
+def _score_one(run: PlannedRun, result: RunResult, scorers: Mapping[tuple[str, Split], SplitScorer]) -> ScoredRun:
     train = scorers[run.dataset_name, "train"]
     validation = scorers.get((run.dataset_name, "validation"))
     design = run.dataset.robot.inverse_kinematic_matrix
@@ -90,6 +88,7 @@ def _score_one(
         parameterisation=run.parameterisation,
         box=run.box,
         seed=run.seed,
+        options=run.entry.options,
         outcome=result.outcome,
         reason=result.reason,
         train_cost=train_cost,
@@ -136,7 +135,7 @@ def _parameters(run: PlannedRun, result: RunResult) -> tuple[FittedParameter, ..
             value=float(value),
             unit="rad" if name.startswith("angle") else "m",
             design=float(design),
-            deviation_percent=float(100 * (value - design) / design) if design else float("nan"),
+            deviation_percent=float(100 * (value - design) / design) if design else None,
         )
         for name, value, design in zip(geometry.names, result.vector, geometry.start, strict=True)
     )
@@ -145,7 +144,7 @@ def _parameters(run: PlannedRun, result: RunResult) -> tuple[FittedParameter, ..
 def _with_gap(run: ScoredRun, runs: Sequence[ScoredRun], robot: Robot) -> ScoredRun:
     """The gap above closed_form's optimum in the same box.
 
-    A geometry is compared with the optimum over a box of matrices that contains its own matrix.
+    A geometry, or an answer without a box, is compared with the optimum over a box that contains its matrix.
     """
     record = run.record
     if record.train_cost is None or run.matrix is None:
@@ -156,9 +155,8 @@ def _with_gap(run: ScoredRun, runs: Sequence[ScoredRun], robot: Robot) -> Scored
             continue
         if exact.dataset != record.dataset:
             continue
-        same_box = record.parameterisation == "matrix" and exact.box == record.box
-        contained = record.parameterisation == "geometry" and _contains(robot, exact.box, run.matrix)
-        if same_box or contained:
+        elsewhere = record.parameterisation == "geometry" or record.box == UNBOUNDED
+        if exact.box == record.box or (elsewhere and _contains(robot, exact.box, run.matrix)):
             gap = record.train_cost / exact.train_cost - 1
             return replace(run, record=record.model_copy(update={"gap": gap, "gap_box": exact.box}))
     return run

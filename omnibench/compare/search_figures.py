@@ -6,12 +6,13 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import plotly.graph_objects as go
 
 from omnibench.compare.results import ScoredRun
-from omnibench.compare.view import THEORETICAL_LOOK, DatasetView, Look
+from omnibench.compare.view import THEORETICAL_LOOK, DatasetView, Look, is_bounded
 from omnibench.fit.problem import Improvement
 from omnibench.report.blocks import Block, Figure, FigureGrid, Paragraph
 from omnibench.report.numbers import significant
@@ -19,6 +20,9 @@ from omnibench.report.style import logarithmic, plot, text
 from omnibench.robot.kinematics import Array
 
 TARGETS: Array = np.logspace(0, -8, 81)  # relative gaps above the best known cost
+Axis = Literal["evaluations", "time"]
+AXES: tuple[Axis, ...] = ("evaluations", "time")
+_TITLES: Mapping[Axis, str] = {"evaluations": "evaluations", "time": "time (s)"}
 _FLOOR = 1e-10  # gaps below it are drawn on it
 _POINTS = 12_000  # of one plot, shared by its runs
 
@@ -53,65 +57,69 @@ def search_blocks(view: DatasetView) -> tuple[Block, ...]:
     legend = tuple(look.legend for look in looks)
     limit = max(24, _POINTS // len(drawn))
     runs = Counter(run.record.label for run in view.runs)
-    figures = []
-    for axis, unit in (("evaluations", "evaluations"), ("seconds", "time (s)")):
-        figures.append(
-            Figure(
-                f"Best training cost against {axis}",
-                _cost_plot(drawn, axis, unit, limit, view.theoretical_cost("train")),
-                f"Best training cost found so far by each run against {axis}, both axes logarithmic",
-                360,
-            )
+    theoretical = view.theoretical_cost("train")
+    costs = [
+        Figure(
+            f"Best training cost against {axis}",
+            _cost_plot(drawn, axis, limit, theoretical),
+            f"Best training cost found so far by each run against {axis}, both axes logarithmic",
+            360,
         )
-    for axis, unit in (("evaluations", "evaluations"), ("seconds", "time (s)")):
-        figures.append(
-            Figure(
-                f"Gap above the best known cost against {axis}",
-                _gap_plot(drawn, axis, unit, limit),
-                f"Relative gap above the best known cost in the same box against {axis}, both axes logarithmic",
-                360,
-            )
+        for axis in AXES
+    ]
+    gaps = [
+        Figure(
+            f"Gap above the best known cost against {axis}",
+            _gap_plot(drawn, axis, limit),
+            f"Relative gap above the best known cost in the same box against {axis}, both axes logarithmic",
+            360,
         )
-    for axis, unit in (("evaluations", "evaluations"), ("seconds", "time (s)")):
-        figures.append(
-            Figure(
-                f"Targets reached against {axis}",
-                _target_plot(drawn, axis, unit, runs),
-                f"Share of targets that each entry reached, over its seeds, against {axis}",
-                360,
-            )
+        for axis in AXES
+    ]
+    targets = [
+        Figure(
+            f"Targets reached against {axis}",
+            _target_plot(drawn, axis, runs),
+            f"Share of targets that each entry reached, over its seeds, against {axis}",
+            360,
         )
+        for axis in AXES
+    ]
     legend = (*legend, THEORETICAL_LOOK.legend)
-    return (FigureGrid(tuple(figures), legend, 2, _caption(drawn)),)
+    return (FigureGrid((*costs, *gaps, *targets), legend, 2, _caption(drawn)),)
 
 
 def courses(view: DatasetView) -> list[Course]:
     """The runs that searched, in the order of the results; a matrix that is given or kept is no search."""
+    searched = [run for run in view.runs if run.record.evaluations > 1 and is_bounded(run.record.calibrator)]
     best_known: dict[str, float] = {}
-    for run in view.runs:
-        record = run.record
-        if record.train_cost is not None:
-            best_known[record.box] = min(record.train_cost, best_known.get(record.box, math.inf))
+    for run in searched:
+        reached = [run.record.train_cost] if run.record.train_cost is not None else []
+        box = box_of(run)
+        best_known[box] = min([best_known.get(box, math.inf), *reached])
     found = []
-    for run in view.runs:
-        record = run.record
-        history = _with_answer(run)
-        if record.calibrator in ("theoretical", "published") or not history or record.box not in best_known:
-            continue
-        found.append(
-            Course(
-                run,
-                view.looks[record.label],
-                np.array([step.evaluations for step in history], dtype=float),
-                np.array([step.seconds for step in history]),
-                np.array([step.cost for step in history]),
-                best_known[record.box],
+    for run in searched:
+        history, known = _with_answer(run), best_known[box_of(run)]
+        if history and 0 < known < math.inf:
+            found.append(
+                Course(
+                    run,
+                    view.looks[run.record.label],
+                    np.array([step.evaluations for step in history], dtype=float),
+                    np.array([step.seconds for step in history]),
+                    np.array([step.cost for step in history]),
+                    known,
+                )
             )
-        )
     return found
 
 
-def targets_reached(group: Sequence[Course], runs: int, axis: str) -> tuple[Array, Array]:
+def box_of(run: ScoredRun) -> str:
+    """The box whose best known cost a run is measured by: for a geometry the box of matrices that contains it."""
+    return run.record.gap_box or run.record.box
+
+
+def targets_reached(group: Sequence[Course], runs: int, axis: Axis) -> tuple[Array, Array]:
     """When targets were reached (sorted) and the share of all (targets x runs) reached by then.
 
     ``runs`` counts those without a course too: they reached nothing.
@@ -133,9 +141,9 @@ def thinned(along: Array, gaps: Array, limit: int) -> list[int]:
     return sorted({0, *changes.tolist(), len(along) - 1})
 
 
-def _first_times(course: Course, axis: str) -> Array:
+def _first_times(course: Course, axis: Axis) -> Array:
     """When each target was first reached; infinite where it was not."""
-    along: Array = getattr(course, axis)
+    along: Array = _along(course, axis)
     gaps = course.costs / course.best_known - 1.0
     # Rounding alone keeps the best known cost itself from a gap of zero.
     first = np.searchsorted(-gaps, -TARGETS - 1e-12)
@@ -160,19 +168,19 @@ def _groups(drawn: Sequence[Course]) -> Mapping[Look, list[Course]]:
     return groups
 
 
-def _steps(look: Look, group: Sequence[Course], axis: str, limit: int, gaps: bool) -> list[go.Scatter]:
+def _steps(look: Look, group: Sequence[Course], axis: Axis, limit: int, gaps: bool) -> list[go.Scatter]:
     """One trace for all seeds of an entry, with a break between them, and a mark at each end."""
     x: list[float | None] = []
     y: list[float | None] = []
     seeds: list[int | None] = []
     for course in group:
-        picks = thinned(getattr(course, axis), course.gaps, limit)
+        picks = thinned(_along(course, axis), course.gaps, limit)
         values = course.gaps if gaps else course.costs
-        x += [*(float(f"{value:.5g}") for value in getattr(course, axis)[picks]), None]
+        x += [*(float(f"{value:.5g}") for value in _along(course, axis)[picks]), None]
         y += [*(float(f"{value:.6g}") for value in values[picks]), None]
         seeds += [*([course.run.record.seed] * len(picks)), None]
     ends = [index - 1 for index, value in enumerate(x) if value is None]
-    words = f"{text(look.label)}, seed %{{customdata}}<br>%{{x:.4g}}{' s' if axis == 'seconds' else ' evaluations'}"
+    words = f"{text(look.label)}, seed %{{customdata}}<br>%{{x:.4g}}{' s' if axis == 'time' else ' evaluations'}"
     shared = {
         "legendgroup": look.key,
         "hovertemplate": f"{words}, {'gap' if gaps else 'cost'} %{{y:.5g}}<extra></extra>",
@@ -188,13 +196,15 @@ def _steps(look: Look, group: Sequence[Course], axis: str, limit: int, gaps: boo
     ]  # fmt: skip
 
 
-def _cost_plot(drawn: Sequence[Course], axis: str, unit: str, limit: int, theoretical: float | None) -> go.Figure:
+def _cost_plot(drawn: Sequence[Course], axis: Axis, limit: int, theoretical: float | None) -> go.Figure:
     traces = [trace for look, group in _groups(drawn).items() for trace in _steps(look, group, axis, limit, False)]
+    low = min(course.costs.min() for course in drawn)
+    high = max(course.costs.max() for course in drawn)
     if theoretical is not None:
-        extent = [float(np.concatenate([getattr(c, axis) for c in drawn]).min()), _last(drawn, axis)]
+        high = max(high, theoretical)
         traces.append(
             go.Scatter(
-                x=extent,
+                x=list(_extent(drawn, axis)),
                 y=[theoretical, theoretical],
                 mode="lines",
                 line={"color": THEORETICAL_LOOK.colour, "width": 1.8, "dash": THEORETICAL_LOOK.dash},
@@ -202,49 +212,56 @@ def _cost_plot(drawn: Sequence[Course], axis: str, unit: str, limit: int, theore
                 hovertemplate=f"theoretical, cost {theoretical:.5g}<extra></extra>",
             )
         )
-    figure = plot(*traces, xaxis_title_text=unit, yaxis_title_text="best training cost so far")
-    logarithmic(figure, "x", "y")
-    figure.update_yaxes(dtick="D2", exponentformat="none", minor={"ticks": ""})
+    figure = plot(*traces, xaxis_title_text=_TITLES[axis], yaxis_title_text="best training cost so far")
+    logarithmic(figure, "x", *_extent(drawn, axis))
+    logarithmic(figure, "y", float(low), float(high))
     return figure
 
 
-def _gap_plot(drawn: Sequence[Course], axis: str, unit: str, limit: int) -> go.Figure:
+def _gap_plot(drawn: Sequence[Course], axis: Axis, limit: int) -> go.Figure:
     traces = [trace for look, group in _groups(drawn).items() for trace in _steps(look, group, axis, limit, True)]
-    figure = plot(*traces, xaxis_title_text=unit, yaxis_title_text="relative gap above best known cost")
-    logarithmic(figure, "x", "y")
+    figure = plot(*traces, xaxis_title_text=_TITLES[axis], yaxis_title_text="relative gap above best known cost")
+    logarithmic(figure, "x", *_extent(drawn, axis))
+    logarithmic(figure, "y", _FLOOR, float(max(course.gaps.max() for course in drawn)))
     return figure
 
 
-def _target_plot(drawn: Sequence[Course], axis: str, unit: str, runs: Mapping[str, int]) -> go.Figure:
+def _target_plot(drawn: Sequence[Course], axis: Axis, runs: Mapping[str, int]) -> go.Figure:
     traces = []
+    low, high = _extent(drawn, axis)
     for look, group in _groups(drawn).items():
-        x, y = targets_reached(group, runs[look.label], axis)
-        if not len(x):
-            continue
-        x, y = np.append(x, max(x[-1], max(float(getattr(c, axis)[-1]) for c in group))), np.append(y, y[-1])
+        reached, share = targets_reached(group, runs[look.label], axis)
+        x = np.concatenate([[low], reached, [high]])
+        y = np.concatenate([[0.0], share, [share[-1] if len(share) else 0.0]])
         keep = np.append(np.flatnonzero(np.diff(x) > 0), len(x) - 1)
         traces.append(
             go.Scatter(
                 x=[float(f"{value:.5g}") for value in x[keep]],
-                y=np.round(100 * y[keep], 3).tolist(),
+                y=np.round(100 * y[keep], 2).tolist(),
                 mode="lines",
                 line={"color": look.colour, "width": 2.2, "dash": look.dash, "shape": "hv"},
                 legendgroup=look.key,
                 hovertemplate=f"{text(look.label)}<br>%{{y:.1f}} % by %{{x:.4g}}<extra></extra>",
             )
         )
-    figure = plot(*traces, xaxis_title_text=unit, yaxis_title_text="targets reached (%)")
-    logarithmic(figure, "x")
-    figure.update_yaxes(range=[0, 103])
+    figure = plot(*traces, xaxis_title_text=_TITLES[axis], yaxis_title_text="targets reached (%)")
+    logarithmic(figure, "x", low, high)
+    figure.update_yaxes(range=[-1, 104])
     return figure
 
 
-def _last(drawn: Sequence[Course], axis: str) -> float:
-    return max(float(getattr(course, axis)[-1]) for course in drawn)
+def _extent(drawn: Sequence[Course], axis: Axis) -> tuple[float, float]:
+    """From the first improvement of any run to the end of the longest."""
+    ends = [(float(_along(course, axis)[0]), float(_along(course, axis)[-1])) for course in drawn]
+    return max(min(first for first, _ in ends), 1e-4), max(last for _, last in ends)
+
+
+def _along(course: Course, axis: Axis) -> Array:
+    return course.evaluations if axis == "evaluations" else course.seconds
 
 
 def _caption(drawn: Sequence[Course]) -> str:
-    known = {course.run.record.box: course.best_known for course in drawn}
+    known = {box_of(course.run): course.best_known for course in drawn}
     costs = ", ".join(f"box {box}: {significant(value, 8)}" for box, value in known.items())
     return (
         f"One line a seed, marked where the run ended. Best known training cost: {costs}. Gaps below {_FLOOR:.0e} are "

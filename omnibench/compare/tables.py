@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from omnibench.compare.headline import cost, improvement, interval_in_percent, position_unit
 from omnibench.compare.results import EntryStatistics, Interval, RunRecord
 from omnibench.compare.view import (
     SPLIT_NAMES,
     THEORETICAL_LOOK,
     THEORETICAL_NAME,
     DatasetView,
+    is_bounded,
     positions_and_headings,
 )
+from omnibench.compare.wording import cost, difference_in_words, improvement, interval_in_percent, position_unit
 from omnibench.data.dataset import Split
 from omnibench.registry import costs
 from omnibench.report.blocks import Cell, Column, Row, Table
@@ -39,15 +40,12 @@ def cost_table(view: DatasetView, split: Split) -> Table:
     ours = None if own is None else cost(own, split)
     first = Row((entry_cell(view, None), Cell(before, _span(ours)), Cell(NOTHING), Cell(NOTHING)))
     rows = [first]
-    for entry in view.statistics:
-        if entry.calibrator != THEORETICAL_NAME:
-            rows.append(_cost_row(view, entry, split, before))
+    searched = [entry for entry in view.statistics if entry.calibrator != THEORETICAL_NAME]
+    rows += [_cost_row(view, entry, split, before) for entry in searched]
     rows += _published_rows(view, split)
     number = len(view.dataset.split(split))
     return Table(
-        caption=f"Cost of the {plural(number, f'{SPLIT_NAMES[split]} trajectory')}"
-        if number == 1
-        else f"Cost of the {count(number)} {SPLIT_NAMES[split]} trajectories",
+        caption=f"Cost of {plural(number, 'trajectory')}, {SPLIT_NAMES[split]}",
         columns=(
             Column("M⁻¹", numeric=False),
             Column("CF theoretical"),
@@ -101,7 +99,6 @@ def entry_table(view: DatasetView) -> Table:
     """How each entry did over its seeds and against the best."""
     rows = []
     for entry in view.statistics:
-        role = "best" if entry.is_best else "plain" if entry.answers else "failed"
         digits = decimals_for(entry.train_median, 5)
         rows.append(
             Row(
@@ -115,16 +112,16 @@ def entry_table(view: DatasetView) -> Table:
                     _difference(entry),
                     _verdict(entry),
                 ),
-                role,
+                "best" if entry.is_best else "plain" if entry.answers else "failed",
             )
         )
     return Table(
         caption="Entries over their seeds",
         columns=(
             Column("Entry", numeric=False),
-            Column("Runs with an answer"),
+            Column("Answers of runs"),
             Column("CF training, median"),
-            Column("Gap above the exact optimum"),
+            Column("Gap above exact optimum", "relative"),
             Column("Evaluations, median"),
             Column("Time, median"),
             Column(f"Difference from the best in CF {SPLIT_NAMES[view.scored]}"),
@@ -133,7 +130,8 @@ def entry_table(view: DatasetView) -> Table:
         rows=tuple(rows),
         note="Spread: interquartile range over seeds. Gap: training cost relative to the exact optimum in the same box "
         f"(closed_form), minus one; {NOTHING} where that is not known. Difference: paired over trajectories, with its "
-        "95 % bootstrap interval. Practically equal: the difference lies within the noise.",
+        "95 % bootstrap interval. Practically equal: that interval contains zero, or the difference is below a tenth "
+        "of the standard error of the best entry's cost.",
     )
 
 
@@ -161,7 +159,8 @@ def entry_cell(view: DatasetView, entry: EntryStatistics | None) -> Cell:
     """An entry's name with its colour; None stands for the design values."""
     if entry is None:
         return Cell("Theoretical", "design values", THEORETICAL_LOOK.colour)
-    note = "design values" if entry.calibrator == THEORETICAL_NAME else f"{entry.parameterisation}, box {entry.box}"
+    box = f", box {entry.box}" if is_bounded(entry.calibrator) else ", as given"
+    note = "design values" if entry.calibrator == THEORETICAL_NAME else f"{entry.parameterisation}{box}"
     return Cell(entry.label, note, view.looks[entry.label].colour)
 
 
@@ -219,12 +218,7 @@ def _spread(entry: EntryStatistics) -> str:
 def _difference(entry: EntryStatistics) -> Cell:
     if entry.difference is None or entry.is_best:
         return Cell(NOTHING)
-    largest = max(abs(entry.difference.low), abs(entry.difference.high))
-    digits = max(4, decimals_for(largest, 2))
-    return Cell(
-        fixed(entry.difference.value, digits, signed=True),
-        span(entry.difference.low, entry.difference.high, digits, signed=True),
-    )
+    return Cell(*difference_in_words(entry.difference))
 
 
 def _verdict(entry: EntryStatistics) -> Cell:

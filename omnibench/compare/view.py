@@ -10,6 +10,7 @@ import numpy as np
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.results import ComparisonResult, EntryStatistics, ScoredRun
 from omnibench.data.dataset import Dataset, Split
+from omnibench.registry import calibrators
 from omnibench.report.blocks import Dash, LegendItem
 from omnibench.report.style import REFERENCE, SYMBOLS, THEORETICAL, colours
 from omnibench.robot.kinematics import Array
@@ -111,6 +112,12 @@ class DatasetView:
         return self.dataset.robot.inverse_kinematic_matrix
 
 
+def is_bounded(calibrator: str) -> bool:
+    """Whether a calibrator keeps to the box; not so a matrix that is given or kept as it is."""
+    classes = {entry.name: entry.cls for entry in calibrators.entries()}
+    return bool(getattr(classes.get(calibrator), "bounded", True))
+
+
 def views(result: ComparisonResult) -> list[DatasetView]:
     """The data sets of a comparison, in the config's order."""
     looks = _looks(result)
@@ -146,12 +153,12 @@ def _design_errors(result: ComparisonResult, dataset: Dataset, split: Split) -> 
 
 
 def _looks(result: ComparisonResult) -> dict[str, Look]:
-    calibrators = {run.record.label: run.record.calibrator for run in result.runs}
-    calibrators = {entry.label: entry.calibrator for entry in result.statistics} | calibrators
-    searches = {label: name for label, name in calibrators.items() if name != THEORETICAL_NAME}
+    names = {entry.label: entry.calibrator for entry in result.statistics}
+    names |= {run.record.label: run.record.calibrator for run in result.runs}
+    searches = {label: name for label, name in names.items() if name != THEORETICAL_NAME}
     styles = colours({label: _CUSTOMARY.get(name) for label, name in searches.items()})
     looks = {
         label: Look(f"entry-{index}", label, colour, dash, SYMBOLS[index % len(SYMBOLS)])
         for index, (label, (colour, dash)) in enumerate(styles.items())
     }
-    return {label: looks.get(label, THEORETICAL_LOOK) for label in calibrators}
+    return {label: looks.get(label, THEORETICAL_LOOK) for label in names}

@@ -18,9 +18,7 @@ _MOST_TRAJECTORIES = 24
 _STAMPS = 4
 
 
-def implausible(
-    robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array], headings: Sequence[Array]
-) -> list[str]:
+def implausible(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array], headings: Sequence[Array]) -> list[str]:
     """Warnings about units and wheels, from a comparison of the reference with the design model's odometry.
 
     ``poses`` are as recorded, ``headings`` the unwrapped ones (rad).

@@ -99,7 +99,10 @@ class Dataset:
         for trajectory in self.trajectories:
             for item in fields(trajectory):
                 value = getattr(trajectory, item.name)
-                digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+                if isinstance(value, np.ndarray):
+                    digest.update(np.ascontiguousarray(value, dtype=float).tobytes())
+                else:  # 6, 6.0 and a NumPy 6.0 are the same number
+                    digest.update(repr(float(value) if isinstance(value, (int, float)) else value).encode())
         return digest.hexdigest()
 
 

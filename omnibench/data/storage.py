@@ -86,12 +86,16 @@ def save_dataset(dataset: Dataset, path: Path | str, table_format: Literal["parq
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "dataset.yaml").is_file():
         raise DataError(f"{folder}: holds other files; name an empty or new folder for the data set")
     tables = {
-        "trajectories": pl.DataFrame([_run_row(trajectory) for trajectory in dataset.trajectories]),
+        "trajectories": pl.DataFrame(
+            [_run_row(trajectory) for trajectory in dataset.trajectories], infer_schema_length=None
+        ),
         "wheels": pl.concat([_wheel_frame(trajectory, dataset.robot) for trajectory in dataset.trajectories]),
         "poses": pl.concat([_pose_frame(trajectory) for trajectory in dataset.trajectories]),
     }
     for name, frame in tables.items():
-        kept = frame.select(column for column in frame.iter_columns() if column.null_count() < len(column))
+        # What only some trajectories have is left out of the sample tables, which may have no gaps.
+        allowed = len(frame) - 1 if name == "trajectories" else 0
+        kept = frame.select(column for column in frame.iter_columns() if column.null_count() <= allowed)
         for stale in {"parquet", "csv"} - {table_format}:
             (folder / f"{name}.{stale}").unlink(missing_ok=True)
         with replacing(folder / f"{name}.{table_format}") as partial:
@@ -132,7 +136,9 @@ class _Table:
         bad = np.flatnonzero(~np.isfinite(values))
         if len(bad):
             found = series[int(bad[0])]
-            raise self.fail(int(bad[0]), f"{column} is {'missing' if found is None else found}; remove or repair the row")
+            raise self.fail(
+                int(bad[0]), f"{column} is {'missing' if found is None else found}; remove or repair the row"
+            )
         return values
 
     def stack(self, columns: Sequence[str]) -> Array | None:
@@ -197,6 +203,14 @@ def _read_table(folder: Path, name: str, required: Sequence[str]) -> _Table:
 
 
 def _check_runs(runs: _Table) -> None:
+    for column in (*_RUN_NUMBERS, "repetition"):
+        if column in runs.frame.columns:
+            series = runs.frame[column]
+            if not series.dtype.is_numeric() and series.null_count() < len(series):
+                raise DataError(f"{runs.file}: column {column!r} holds {series.dtype}, expected numbers")
+            bad = (series.cast(pl.Float64).is_finite().not_() & series.is_not_null()).arg_true()
+            if len(bad):
+                raise runs.fail(int(bad[0]), f"{column} is {series[int(bad[0])]}; leave it empty if it is not known")
     repeated = runs.frame["trajectory"].is_first_distinct().not_().arg_true()
     if len(repeated):
         row = int(repeated[0])
@@ -230,7 +244,9 @@ def _check_wheel_times(wheels: _Table, groups: Sequence[np.ndarray[Any, np.dtype
     early = np.flatnonzero(times <= 0)
     if len(early):
         row = int(early[0])
-        raise wheels.fail(row, f"t is {times[row]:g}; wheel samples start after t = 0 (a row holds the rate up to its t)")
+        raise wheels.fail(
+            row, f"t is {times[row]:g}; wheel samples start after t = 0 (a row holds the rate up to its t)"
+        )
     _check_increasing(wheels, times, groups)
 
 
@@ -249,9 +265,7 @@ def _check_pose_times(poses: _Table, groups: Sequence[np.ndarray[Any, np.dtype[n
             raise poses.fail(first, f"trajectory {identity} has no reference pose after its start")
 
 
-def _check_increasing(
-    table: _Table, times: Array, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]
-) -> None:
+def _check_increasing(table: _Table, times: Array, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]) -> None:
     for rows in groups:
         steps = np.diff(times[rows])
         bad = np.flatnonzero(steps <= 0)
@@ -268,7 +282,6 @@ def _trajectory(
     reference: _PoseColumns,
     pose_rows: np.ndarray[Any, np.dtype[np.intp]],
 ) -> Trajectory:
-    numbers = {name: float(run[name]) for name in _RUN_NUMBERS if run.get(name) is not None}
     return Trajectory(
         id=run["trajectory"],
         split=cast(Split, run["split"]),
@@ -277,12 +290,12 @@ def _trajectory(
         pose_times=reference.times[pose_rows],
         poses=reference.poses[pose_rows],
         command=None if run.get("command") is None else str(run["command"]),
-        repetition=None if run.get("repetition") is None else int(run["repetition"]),
+        repetition=None if run.get("repetition") is None else round(run["repetition"]),
         session=None if run.get("session") is None else str(run["session"]),
         angles=None if wheels.angles is None else wheels.angles[wheel_rows],
         targets=None if wheels.targets is None else wheels.targets[wheel_rows],
         pose_covariances=None if reference.covariances is None else reference.covariances[pose_rows],
-        **numbers,
+        **{name: float(run[name]) for name in _RUN_NUMBERS if run.get(name) is not None},
     )
 
 

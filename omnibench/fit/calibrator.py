@@ -9,10 +9,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from omnibench.errors import OmnibenchError
+from pydantic import BaseModel
+
+from omnibench.errors import OmnibenchError, PluginError
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
-from omnibench.registry import Options
+from omnibench.registry import AnyOptions, Options, PluginFailure
 from omnibench.robot.kinematics import Array
 
 
@@ -28,7 +30,10 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True)
 class Solution:
-    """A calibrator's answer: the vector (n,) and why it stopped there."""
+    """A calibrator's answer: the vector (n,) and why it stopped there.
+
+    converged: False when a limit of the calibrator's own (generations, programs) came before its stopping rule.
+    """
 
     vector: Array
     reason: str
@@ -43,7 +48,7 @@ class Calibrator(ABC):
     stochastic: False where the seed makes no difference, so that one run is enough.
     """
 
-    Options: ClassVar[type[Options]] = Options
+    Options: ClassVar[type[BaseModel]] = Options
     name: ClassVar[str]
     parameterisation: ClassVar[ParameterisationName] = "matrix"
     bounded: ClassVar[bool] = True
@@ -89,7 +94,7 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
             outcome, reason = Outcome.INVALID, f"{reason}, and no candidate in the box had a finite cost"
     except OmnibenchError as error:
         outcome, reason = Outcome.FAILED, str(error)
-    except Exception as error:  # whatever a plug-in raises is this run's outcome
+    except (Exception, SystemExit) as error:  # whatever a plug-in raises is this run's outcome
         outcome, reason = Outcome.FAILED, " ".join(f"{type(error).__name__}: {error}".split())
     seconds = problem.seconds
     cost: float | None = None
@@ -108,6 +113,21 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
         history=tuple(problem.history),
         at_bounds=problem.at_bounds(vector) if vector is not None and calibrator.bounded else (),
     )
+
+
+def unloadable(failure: PluginFailure) -> type[Calibrator]:
+    """A calibrator that stands for a plug-in which cannot be imported: each of its runs fails with the reason."""
+
+    class Unloadable(Calibrator):
+        """A plug-in that cannot be imported."""
+
+        Options = AnyOptions
+        stochastic = False
+
+        def calibrate(self, problem: CalibrationProblem) -> Solution:  # noqa: ARG002
+            raise PluginError(f"{failure.origin} cannot be imported: {failure.error}")
+
+    return Unloadable
 
 
 def _examine(

@@ -39,7 +39,9 @@ class Cost(ABC):
 
     def batch(self, trajectories: Sequence[Trajectory], integration: Integration) -> OdometryBatch:
         """The odometry of the trajectories at this cost's stamps."""
-        return OdometryBatch([t.final_log if self.stamps == "final" else t.reference_log for t in trajectories], integration)
+        return OdometryBatch(
+            [t.final_log if self.stamps == "final" else t.reference_log for t in trajectories], integration
+        )
 
     def reference(self, trajectories: Sequence[Trajectory]) -> Array:
         """The reference poses (S, 3) at this cost's stamps."""

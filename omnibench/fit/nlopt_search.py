@@ -52,9 +52,8 @@ def search(problem: CalibrationProblem, algorithm: int, options: NloptOptions) -
     if options.population is not None:
         optimiser.set_population(options.population)
     nlopt.srand(int(problem.rng.integers(2**31)))
-    start = np.clip(problem.to_unit(problem.start)[0], 0.0, 1.0)
     try:
-        optimiser.optimize(start)
+        optimiser.optimize(problem.to_unit(problem.start)[0])
     except nlopt.ForcedStop:
         if not spent:
             raise

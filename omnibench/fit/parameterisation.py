@@ -52,9 +52,11 @@ class Parameterisation(Protocol):
     @property
     def names(self) -> tuple[str, ...]:
         """What each number is called."""
+
     @property
     def start(self) -> Array:
         """The vector (n,) of the design values."""
+
     @property
     def bounds(self) -> Bounds: ...
     def matrices(self, vectors: Array) -> Array:
@@ -117,9 +119,7 @@ class WheelGeometry:
     def bounds(self) -> Bounds:
         count = len(self.robot.wheels)
         limits = self.limits or GeometryLimits()
-        low, high = np.array(
-            [_range(limits.radius), _range(limits.distance), np.radians(_range(limits.angle_deg))]
-        ).T
+        low, high = np.array([_range(limits.radius), _range(limits.distance), np.radians(_range(limits.angle_deg))]).T
         scale = self.start.copy()
         scale[2 * count :] = 1.0
         lower = self.start + np.repeat(low, count) * scale

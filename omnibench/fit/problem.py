@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from omnibench.config import Model
-from omnibench.data.dataset import Trajectory
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.cost import Cost
 from omnibench.fit.parameterisation import (
@@ -60,6 +60,7 @@ class CalibrationProblem:
     trajectories: the training data; the validation data are nowhere in reach.
     start, lower, upper (n,): the vector that is searched and its box. names: what its numbers are.
     cost(candidates): what is minimised. rng: the only source of randomness a calibrator may use.
+    best_vector, best_cost: the best candidate in the box so far; the start and infinity before the first.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class CalibrationProblem:
         watch: Callable[[int, float], None] | None = None,
     ) -> None:
         if not trajectories:
-            raise DataError("the training split is empty; nothing can be calibrated (see the column split)")
+            raise DataError("no training trajectories; nothing can be calibrated")
         self.robot = robot
         self.trajectories = tuple(trajectories)
         self.objective = cost
@@ -139,9 +140,10 @@ class CalibrationProblem:
             return self.objective.combine(errors, self.odometry.trajectory)
 
     def to_unit(self, vectors: Array) -> Array:
-        """Vectors (P, n) as points (P, free) of the unit cube over the free elements."""
+        """Vectors (P, n) as points (P, free) of the unit cube over the free elements; never outside it."""
         free = self.free
-        return (np.atleast_2d(vectors)[:, free] - self.lower[free]) / (self.upper - self.lower)[free]
+        points = (np.atleast_2d(vectors)[:, free] - self.lower[free]) / (self.upper - self.lower)[free]
+        return np.clip(points, 0.0, 1.0)
 
     def from_unit(self, points: Array) -> Array:
         """Vectors (P, n) of points (P, free) of the unit cube; never outside the box."""
@@ -175,15 +177,25 @@ class CalibrationProblem:
 
     def _record(self, candidates: Array, values: Array) -> None:
         eligible = np.where(np.isfinite(values) & self.inside(candidates), values, np.inf)
-        running = np.minimum.accumulate(eligible)
-        for index in np.flatnonzero(np.diff(np.concatenate([[self.best_cost], running])) < 0):
-            self.best_cost = float(running[index])
+        running = np.minimum.accumulate(np.concatenate([[self.best_cost], eligible]))
+        for index in np.flatnonzero(running[1:] < running[:-1]):
+            self.best_cost = float(eligible[index])
             self.best_vector = _frozen(candidates[index])
             self.history.append(Improvement(self.evaluations + int(index) + 1, self.seconds, self.best_cost))
         self.evaluations += len(candidates)
         if self._watch and self.seconds - self._shown > _PROGRESS_PERIOD:
             self._shown = self.seconds
             self._watch(self.evaluations, self.best_cost)
+
+
+def training_split(dataset: Dataset) -> tuple[Trajectory, ...]:
+    """The training trajectories; DataError when there are none."""
+    trajectories = dataset.split("train")
+    if not trajectories:
+        raise DataError(
+            f"data set {dataset.name}: the training split is empty; set split to train for some trajectories"
+        )
+    return trajectories
 
 
 def make_parameterisation(

@@ -50,10 +50,20 @@ def count(value: float | None) -> str:
 
 
 def seconds(value: float | None) -> str:
-    """A duration: 3 significant digits below 100 s, whole seconds above."""
+    """A duration, to about three digits."""
     if value is None or not math.isfinite(value):
         return NOTHING
+    if value < 1e-3:
+        return "< 1 ms"
+    if value < 1:
+        return f"{significant(1e3 * value, 2)} ms"
     return f"{significant(value, 3) if value < 100 else fixed(value, 0)} s"
+
+
+def power_of_ten(exponent: int) -> str:
+    """``10⁻³``; small whole powers as they are."""
+    plain = {-2: "0.01", -1: "0.1", 0: "1", 1: "10", 2: "100", 3: "1,000"}
+    return plain.get(exponent, f"10{str(exponent).translate(_SUPERSCRIPT)}")
 
 
 def span(low: float, high: float, decimals: int, signed: bool = False) -> str:

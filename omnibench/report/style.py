@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import plotly.graph_objects as go
 
 from omnibench.report.blocks import Dash
+from omnibench.report.numbers import power_of_ten, significant
 
 FONT = 'system-ui, -apple-system, "Segoe UI", "Helvetica Neue", "Liberation Sans", Arial, sans-serif'
 INK = "#1f2933"
@@ -86,19 +88,29 @@ def plot(*traces: go.Scatter, **layout: Any) -> go.Figure:
     return figure
 
 
-def logarithmic(figure: go.Figure, *axes: str) -> None:
-    """Make axes (``x``, ``y``) logarithmic, with ticks at powers of ten and unlabelled ones between."""
-    for axis in axes:
-        figure.update_layout(
-            {
-                f"{axis}axis": {
-                    "type": "log",
-                    "dtick": 1,
-                    "exponentformat": "power",
-                    "minor": {"ticks": "outside", "ticklen": 3, "dtick": "D1", "tickcolor": AXIS, "showgrid": False},
-                }
+def logarithmic(figure: go.Figure, axis: Literal["x", "y"], low: float, high: float) -> None:
+    """Make an axis logarithmic over ``low`` to ``high``, with labels that fit: at 1, 2, 5 or at powers of ten."""
+    low, high = min(low, high / 1.05), max(high, low * 1.05)
+    decades = math.log10(high / low)
+    exponents = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    if decades < 2:
+        ticks = [step * 10.0**exponent for exponent in exponents for step in (1, 2, 5)]
+        labels = [significant(tick, 1) for tick in ticks]
+    else:
+        stride = math.ceil(decades / 7)
+        ticks = [10.0**exponent for exponent in exponents if exponent % stride == 0]
+        labels = [power_of_ten(exponent) for exponent in exponents if exponent % stride == 0]
+    margin = 0.04 * decades
+    figure.update_layout(
+        {
+            f"{axis}axis": {
+                "type": "log",
+                "range": [math.log10(low) - margin, math.log10(high) + margin],
+                "tickvals": ticks,
+                "ticktext": labels,
             }
-        )
+        }
+    )
 
 
 def equal_aspect(figure: go.Figure) -> None:

@@ -110,12 +110,12 @@ class OdometryBatch:
 
         ``headings``: absolute heading at the start of each sample of each log, rad; a list of (F,).
         """
-        turn = np.ones(self._angles.shape[:2], dtype=complex)
+        turn: Complex = np.ones(self._angles.shape[:2], dtype=complex)
         for row, values in enumerate(headings):
             count = min(len(values), turn.shape[1])
             turn[row, :count] = np.exp(1j * values[:count])
-        piece_turn = turn[self.trajectory, self._sample]
-        (design,) = self._at_stamps([turn[..., None] * self._angles], [piece_turn[:, None] * self._piece])
+        piece_turn: Complex = turn[self.trajectory, self._sample]
+        (design,) = self._at_stamps([self._angles * turn[..., None]], [self._piece * piece_turn[:, None]])
         return design
 
     def _phase_basis(self, angles: Array, before: Array) -> Array:
@@ -149,9 +149,7 @@ class OdometryBatch:
         sums = []
         for samples, piece in zip(whole, pieces, strict=True):
             total = np.cumsum(samples, axis=1)
-            before = np.where(
-                (self._sample > 0)[:, None], total[self.trajectory, np.maximum(self._sample - 1, 0)], 0.0
-            )
+            before = np.where((self._sample > 0)[:, None], total[self.trajectory, np.maximum(self._sample - 1, 0)], 0.0)
             sums.append(before + piece)
         return tuple(sums)
 

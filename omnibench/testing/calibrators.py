@@ -85,6 +85,13 @@ class CalibratorConformance(Conformance):
                 "evaluations; draw all random numbers from problem.rng and keep nothing between runs",
             )
 
+    def test_seed_makes_no_difference_where_it_says_so(self) -> None:
+        """A comparison runs a calibrator with ``stochastic = False`` once, whatever seeds the config lists."""
+        if self.make().stochastic:
+            raise SkipTest("it is stochastic")
+        answers = {_bytes(self.attempt(self.problem(seed=seed)).result.vector) for seed in (0, 1)}
+        require(len(answers) == 1, "it says stochastic = False, but its answer depends on the seed")
+
     def test_global_random_state_is_left_alone(self) -> None:
         """What a plug-in does to the generators of ``random`` and NumPy would change the runs after it."""
         with global_random_state(1):

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import math
-import os
-import platform
 from collections.abc import Mapping
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
-from omnibench.compare.results import ComparisonResult, Environment
+from omnibench.compare.results import ComparisonResult
 from omnibench.compare.scoring import score
 from omnibench.compare.statistics import entry_statistics
 from omnibench.data.dataset import Dataset
+from omnibench.environment import environment
 from omnibench.fit.calibrator import RunResult, run_calibrator
 from omnibench.fit.problem import CalibrationProblem, make_parameterisation
 from omnibench.registry import calibrators, costs
@@ -72,13 +68,7 @@ def run(chosen: CompareConfig, datasets: Mapping[str, Dataset] | None = None) ->
         datasets=loaded,
         runs=scored,
         statistics=entry_statistics(scored, chosen.bootstrap),
-        environment=Environment(
-            versions={"omnibench": version("omnibench"), "numpy": np.__version__},
-            python=platform.python_version(),
-            platform=platform.platform(),
-            processor=platform.processor(),
-            processors=os.cpu_count() or 1,
-        ),
+        environment=environment(),
         warnings=(),
     )
 

@@ -1,4 +1,4 @@
-"""The optiodom importer: on the recordings themselves where they are at hand, else on small files of the same layout."""
+"""The optiodom importer: on the recordings where they are at hand, and on small files of the same layout."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
 
-OMNI3 = Path(__file__).parents[2].parent / "shared" / "data" / "optiodom" / "omni3"
+OMNI3 = Path(__file__).resolve().parents[3] / "shared" / "data" / "optiodom" / "omni3"
 needs_recordings = pytest.mark.skipif(not OMNI3.is_dir(), reason=f"the OptiOdom recordings are not at {OMNI3}")
 TICK = 2 * math.pi / (12 * 1024)
 
@@ -156,9 +156,7 @@ def write_session(root: Path, group: str = "circular", name: str = "s1", runs: i
         rows = [f"{0.04 * k:.2f},{step * k:.9f},0,0,{-100 * (k > 0)},{100 * (k > 0)},0" for k in range(6)]
         (folder / f"{name}_run-{number:02d}.csv").write_text("\n".join(rows) + "\n")
         lines.append(f"Run:,{number}")
-        lines += [
-            f"{10 * number + 0.04 * k:.2f},{100 * (k > 0)},{-100 * (k > 0)},0,0,0,0,0.2,0,0,0" for k in range(6)
-        ]
+        lines += [f"{10 * number + 0.04 * k:.2f},{100 * (k > 0)},{-100 * (k > 0)},0,0,0,0,0.2,0,0,0" for k in range(6)]
         lines.append("RUNFINISHED")
     if log:
         (folder / f"{name}.csv").write_text("\n".join(lines) + "\n")

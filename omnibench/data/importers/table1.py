@@ -68,8 +68,8 @@ class Table1(Importer):
     yet. A first scan later than the first wheel sample becomes t = 0.
 
     A trajectory is called by its folder, seen from the source; its session is the folder above. Repetitions share
-    session and (v, alpha, omega, d). Splits: by ``train`` and ``validation`` (patterns such as ``training/*``); without them
-    by folders called train and validation, and without these every second repetition validates.
+    session and (v, alpha, omega, d). Splits: by ``train`` and ``validation`` (patterns such as ``training/*``); without
+    them by folders called train and validation, and without these every second repetition validates.
     """
 
     Options = Table1Options

@@ -51,7 +51,9 @@ class Session(Model):
 class Commands(Model):
     """Motion commands: every direction with every rate of turn, at each speed."""
 
-    speeds: tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...] = Field((0.2,), min_length=1, description="m/s")
+    speeds: tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...] = Field(
+        (0.2,), min_length=1, description="m/s"
+    )
     directions_deg: tuple[FiniteFloat, ...] = Field(min_length=1)
     turn_rates: tuple[FiniteFloat, ...] = Field(min_length=1, description="rad/s")
     turn_duration: Positive = Field(6.0, description="duration of turns on the spot, s")

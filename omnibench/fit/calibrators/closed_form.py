@@ -83,12 +83,12 @@ def linear_start(problem: CalibrationProblem) -> Array:
         np.concatenate([lower[0], lower[1]]),
         np.concatenate([upper[0], upper[1]]),
     )
-    return np.concatenate([rows_12, row_3])
+    # Along directions that the data do not drive, least squares would go anywhere.
+    kept = problem.matrix(np.concatenate([rows_12, row_3])).ravel()
+    return np.clip(kept, problem.lower, problem.upper)
 
 
-def cone_step(
-    problem: CalibrationProblem, objective: SumOfNorms, vector: Array, weights: Array | None = None
-) -> Array:
+def cone_step(problem: CalibrationProblem, objective: SumOfNorms, vector: Array, weights: Array | None = None) -> Array:
     """The step (n,) that minimises the cost with the poses linearised about ``vector``.
 
     weights: how often each trajectory counts (Z,); default once.

@@ -21,7 +21,9 @@ class GeneticOptions(Options):
     population: int | None = Field(None, ge=4, description="default: 200 for more than five variables, else 50")
     elite: float = Field(0.05, gt=0, lt=1, description="share that survives unchanged")
     crossover: float = Field(0.8, ge=0, le=1, description="share of the other children made by scattered crossover")
-    mutation: Literal["adaptive_feasible", "gaussian"] = "adaptive_feasible"
+    mutation: Literal["adaptive_feasible", "gaussian"] = Field(
+        "adaptive_feasible", description="how a child is varied; gaussian steps are clipped to the box"
+    )
     generations: int | None = Field(None, gt=0, description="default: 100 for each variable")
     stall_generations: int = Field(50, gt=0, description="window of the stopping rule")
     tolerance: float = Field(1e-6, ge=0, description="average relative change of the best over the window")
@@ -40,7 +42,7 @@ class Genetic(Calibrator):
         count = self.options.population or (200 if variables > 5 else 50)
         generations = self.options.generations or 100 * variables
         mutate = _AdaptiveFeasible() if self.options.mutation == "adaptive_feasible" else _Gaussian(generations)
-        people = problem.rng.uniform(size=(count, variables))
+        people: Array = problem.rng.uniform(size=(count, variables))
         people[0] = problem.to_unit(problem.start)[0]  # the paper starts from the theoretical matrix
         scores = _scores(problem, people)
         best = [float(scores.min())]

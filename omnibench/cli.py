@@ -1,0 +1,388 @@
+"""The command line: parse, call, print. A user's mistake is one line on standard error and exit code 2."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterable
+from contextlib import AbstractContextManager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+import yaml
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from omnibench import terminal
+from omnibench.errors import ConfigError, Interrupted, OmnibenchError
+from omnibench.registry import PluginFailure, calibrators, costs, importers, load_plugins
+
+app = typer.Typer(
+    name="omnibench",
+    help="Calibrate the odometry of robots on omnidirectional wheels, compare calibrators, run the result.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    add_completion=False,
+)
+plugin_app = typer.Typer(help="Write a plug-in, or check one.", no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(plugin_app, name="plugin")
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+Plugins = Annotated[
+    list[Path] | None,
+    typer.Option("--plugins", help="Folder of plug-ins; may be repeated. Default: ./plugins, if it is there."),
+]
+Settings = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="An option, value in YAML; may be repeated.")
+]
+
+
+@app.command()
+def compare(
+    config: Annotated[Path, typer.Argument(help="A comparison in YAML.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", help="Folder for results; runs that are there are kept.")
+    ] = None,
+    data: Annotated[
+        list[str] | None, typer.Option("--data", metavar="[NAME=]PATH", help="Where the data (set NAME) is.")
+    ] = None,
+    plugins: Plugins = None,
+) -> None:
+    """Run every calibrator of a config on the same data and budget; score them and write a report."""
+    from omnibench.compare.plan import read_compare_config
+    from omnibench.compare.run import run_comparison
+    from omnibench.compare.terminal import Bars, Lines, print_result
+
+    chosen = read_compare_config(config, _named_paths(data))
+    folders = [*chosen.plugins, *(folder.resolve() for folder in plugins or [])]
+    chosen = chosen.model_copy(update={"plugins": tuple(dict.fromkeys(folders))})
+    console = terminal.make_console(error=True)
+    watch: Bars | Lines = Bars(console) if console.is_terminal else Lines(console)
+    with watch:
+        result = run_comparison(chosen, output, watch)
+    _warn(result.warnings)
+    out = terminal.make_console()
+    print_result(out, result)
+    out.print(f"report: {result.output / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def calibrate(
+    dataset: Annotated[Path, typer.Argument(help="A data set folder.")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="The calibration file to write.")] = None,
+    calibrator: Annotated[str, typer.Option(help="See omnibench list.")] = "closed_form",
+    cost: Annotated[str, typer.Option(help="See omnibench list.")] = "final_pose",
+    box: Annotated[Literal["paper", "row"], typer.Option(help="paper: +-10 % of each element; row: wider.")] = "row",
+    integration: Annotated[Literal["euler", "arc"], typer.Option(help="Euler: the paper's step.")] = "arc",
+    seed: Annotated[int, typer.Option(min=0)] = 1,
+    evaluations: Annotated[int, typer.Option(min=1, help="Budget.")] = 60_000,
+    seconds: Annotated[float, typer.Option(min=0.001, help="Budget.")] = 600.0,
+    settings: Settings = None,
+    plugins: Plugins = None,
+    as_json: Json = False,
+) -> None:
+    """Fit the odometry model of a data set's training split and write the calibration file."""
+    from omnibench.data.storage import load_dataset
+    from omnibench.fit.calibrate import calibrate as fit
+    from omnibench.fit.problem import Budget
+    from omnibench.robot.calibration import write_calibration
+
+    _load(plugins)
+    calibrators.entry(calibrator, "--calibrator")
+    costs.entry(cost, "--cost")
+    if output is None and not as_json:
+        raise ConfigError("say where the calibration goes: -o calibration.yaml")
+    recordings = load_dataset(dataset)
+    with _evaluations_bar(calibrator, evaluations) as watch:
+        calibration, result = fit(
+            recordings,
+            calibrator,
+            options=_parsed(settings),
+            cost=cost,
+            box=box,
+            integration=integration,
+            budget=Budget(evaluations=evaluations, seconds=seconds),
+            seed=seed,
+            watch=watch,
+        )
+    if output is not None:
+        write_calibration(calibration, output)
+    _warn(recordings.warnings)
+    if result.at_bounds:
+        _warn([f"{', '.join(result.at_bounds)} lie on a bound of the box {box!r}; a wider box may fit better"])
+    if as_json:
+        return _print_json(calibration.model_dump(mode="json"))
+    terminal.print_calibration(terminal.make_console(), calibration, result)
+    typer.echo(f"calibration: {output}")
+    return None
+
+
+@app.command()
+def evaluate(
+    calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
+    dataset: Annotated[Path, typer.Argument(help="A data set folder.")],
+    as_json: Json = False,
+) -> None:
+    """Cost and final errors of a calibration on a data set."""
+    from omnibench.data.storage import load_dataset
+    from omnibench.fit.evaluate import evaluate as judge
+    from omnibench.robot.calibration import read_calibration
+
+    recordings = load_dataset(dataset)
+    evaluation = judge(read_calibration(calibration), recordings)
+    _warn(recordings.warnings)
+    if as_json:
+        splits = {name: errors.model_dump(exclude={"trajectories"}) for name, errors in evaluation.splits.items()}
+        return _print_json({"dataset": evaluation.dataset, "trajectories": evaluation.trajectories, "splits": splits})
+    return terminal.print_evaluation(terminal.make_console(), evaluation)
+
+
+@app.command()
+def simulate(
+    config: Annotated[Path, typer.Argument(help="A comparison config with a simulated data set.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The data set folder to write.")],
+    truth: Annotated[Path | None, typer.Option(help="Folder for what is hidden: the true matrix.")] = None,
+    dataset: Annotated[str | None, typer.Option(help="Which data set, if the config has several.")] = None,
+    table_format: Annotated[
+        Literal["parquet", "csv"], typer.Option("--format", help="Format of the tables.")
+    ] = "parquet",
+) -> None:
+    """Simulate the data set of a config; the truth goes to another folder, or nowhere."""
+    from omnibench.compare.plan import read_compare_config, simulated_source
+    from omnibench.config import to_yaml
+    from omnibench.data.simulate.flower import simulate_dataset
+    from omnibench.data.storage import save_dataset
+    from omnibench.files import write_text
+
+    chosen = read_compare_config(config)
+    name, source = simulated_source(chosen, dataset)
+    if truth is not None and truth.resolve() == output.resolve():
+        raise ConfigError("--truth: must be another folder than the data set's")
+    simulation = simulate_dataset(source, name, chosen.description)
+    save_dataset(simulation.dataset, output, table_format)
+    if truth is not None:
+        write_text(truth / "truth.yaml", to_yaml(simulation.truth))
+        typer.echo(f"truth: {truth / 'truth.yaml'}")
+    typer.echo(f"{len(simulation.dataset.trajectories)} simulated trajectories: {output}")
+
+
+@app.command("import")
+def import_(
+    importer: Annotated[str, typer.Argument(metavar="FORMAT", help="See omnibench list.")],
+    source: Annotated[Path, typer.Argument(help="File or folder of recordings.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The data set folder to write.")],
+    settings: Settings = None,
+    table_format: Annotated[
+        Literal["parquet", "csv"], typer.Option("--format", help="Format of the tables.")
+    ] = "parquet",
+    plugins: Plugins = None,
+) -> None:
+    """Turn recordings into a data set."""
+    from omnibench.data.importer import import_dataset
+    from omnibench.data.storage import save_dataset
+
+    _load(plugins)
+    importers.entry(importer, "import")
+    dataset = import_dataset(importer, source, _parsed(settings))
+    save_dataset(dataset, output, table_format)
+    _warn(dataset.warnings)
+    typer.echo(f"{len(dataset.trajectories)} trajectories: {output}")
+
+
+@app.command()
+def export(
+    calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
+    to: Annotated[str, typer.Option("--to", help="ros2_controllers or c_header.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="File to write; default: standard output.")
+    ] = None,
+) -> None:
+    """Write a calibration for other software."""
+    from omnibench.files import write_text
+    from omnibench.robot.calibration import read_calibration
+    from omnibench.robot.export import export_calibration
+
+    exported = export_calibration(read_calibration(calibration), to)
+    _warn(exported.warnings)
+    if output is None:
+        typer.echo(exported.text, nl=False)
+    else:
+        file = output / exported.file_name if output.is_dir() else output
+        write_text(file, exported.text)
+        typer.echo(f"{to}: {file}")
+
+
+@app.command()
+def inspect(dataset: Annotated[Path, typer.Argument(help="A data set folder.")], as_json: Json = False) -> None:
+    """What is in a data set, and what can be identified from it."""
+    from omnibench.data.storage import load_dataset
+    from omnibench.fit.inspect import inspect_dataset
+
+    found = inspect_dataset(load_dataset(dataset))
+    if as_json:
+        return _print_json(found.model_dump(mode="json"))
+    terminal.print_inspection(terminal.make_console(), found)
+    return _warn(found.warnings)
+
+
+@app.command("list")
+def list_(plugins: Plugins = None, as_json: Json = False) -> None:
+    """Calibrators, effects, costs and importers, and where each comes from."""
+    failures = _load(plugins)
+    if as_json:
+        return _print_json(terminal.registry_document(failures))
+    return terminal.print_registries(terminal.make_console())
+
+
+@app.command()
+def schema() -> None:
+    """JSON schema of the configs, for editors."""
+    from omnibench.compare.config import CompareConfig
+
+    _print_json(CompareConfig.model_json_schema(by_alias=True))
+
+
+@plugin_app.command("new")
+def plugin_new(
+    name: Annotated[str, typer.Argument(help="Its name in configs.")],
+    kind: Annotated[str, typer.Option(help="calibrator, importer or cost.")] = "calibrator",
+    folder: Annotated[Path, typer.Option(help="Where it goes.")] = Path("plugins"),
+) -> None:
+    """Write a working plug-in and its test."""
+    from omnibench.plugin import new_plugin
+
+    for file in new_plugin(name, kind, folder):
+        typer.echo(f"written: {file}")
+    typer.echo(f"check it: omnibench plugin check {folder / name}.py")
+
+
+@plugin_app.command("check")
+def plugin_check(
+    file: Annotated[Path, typer.Argument(help="A plug-in file.")],
+    sample: Annotated[Path | None, typer.Option(help="Recordings for an importer to read.")] = None,
+) -> None:
+    """Run the conformance tests on a plug-in; exit code 1 when one fails."""
+    from omnibench.plugin import check_plugin
+
+    report = check_plugin(file, sample)
+    for result in report.results:
+        message = f": {result.message}" if result.message else ""
+        typer.echo(f"{result.outcome:7} {result.kind} {result.name}: {result.case}{message}")
+    counts = Counter(str(result.outcome) for result in report.results)
+    typer.echo(", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
+    if report.failures:
+        raise typer.Exit(1)
+
+
+def main() -> None:
+    """Entry point: every user's mistake ends in one line and exit code 2."""
+    command = typer.main.get_command(app)
+    usage_error: Any = typer.BadParameter.__mro__[1]  # click's UsageError, wherever this Typer keeps it
+    try:
+        code = command.main(prog_name="omnibench", standalone_mode=False)
+    except usage_error as error:
+        _fail(_usage(error))
+    except Interrupted as error:
+        _fail(str(error), 130)
+    except OmnibenchError as error:
+        _fail(f"error: {error}")
+    except (KeyboardInterrupt, typer.Abort):
+        _fail("interrupted", 130)
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of our output has gone: nothing more to say
+        sys.exit(1)
+    else:
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+def _usage(error: Any) -> str:
+    message = " ".join(error.format_message().split())
+    context = error.ctx
+    command = context.command_path if context else "omnibench"
+    return f"error: {message} (see {command} --help)"
+
+
+def _fail(message: str, code: int = 2) -> None:
+    print(message, file=sys.stderr)  # noqa: T201 (the one place where errors are told)
+    sys.exit(code)
+
+
+def _load(folders: list[Path] | None) -> list[PluginFailure]:
+    default = [Path("plugins")] if folders is None and Path("plugins").is_dir() else []
+    failures = load_plugins(folders or default)
+    _warn(f"plug-in {failure.origin} cannot be imported: {failure.error}" for failure in failures)
+    return failures
+
+
+def _warn(messages: Iterable[str]) -> None:
+    for message in messages:
+        typer.echo(f"warning: {message}", err=True)
+
+
+def _print_json(document: object) -> None:
+    typer.echo(json.dumps(document, indent=1, allow_nan=False))
+
+
+def _parsed(settings: list[str] | None) -> dict[str, Any]:
+    """``key=value`` pairs, values in YAML."""
+    options: dict[str, Any] = {}
+    for setting in settings or []:
+        key, equals, value = setting.partition("=")
+        if not equals or not key:
+            raise ConfigError(f"--set {setting}: expected KEY=VALUE")
+        try:
+            options[key] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise ConfigError(f"--set {setting}: the value is not valid YAML") from None
+    return options
+
+
+def _named_paths(data: list[str] | None) -> dict[str, Path]:
+    """``[NAME=]PATH`` pairs; a path that exists as it stands needs no name."""
+    paths = {}
+    for item in data or []:
+        name, equals, location = item.partition("=")
+        if Path(item).exists() or not equals:
+            name, location = "", item
+        if not Path(location).exists():
+            raise ConfigError(f"--data {item}: no such file or folder")
+        paths[name] = Path(location)
+    return paths
+
+
+class _EvaluationsBar(AbstractContextManager["_EvaluationsBar"]):
+    """A bar of evaluations for one calibrator, on a terminal."""
+
+    def __init__(self, title: str, evaluations: int, console: Console) -> None:
+        self._progress = Progress(
+            TextColumn(title),
+            BarColumn(),
+            TextColumn("{task.fields[note]}"),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._progress.add_task("", total=evaluations, note="")
+
+    def __enter__(self) -> _EvaluationsBar:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def __call__(self, evaluations: int, best: float) -> None:
+        self._progress.update(self._task, completed=evaluations, note=f"{evaluations} evaluations, best {best:.6f}")
+
+
+def _evaluations_bar(title: str, evaluations: int) -> _EvaluationsBar:
+    return _EvaluationsBar(title, evaluations, terminal.make_console(error=True))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+"""Calibrating one robot from one data set, with one calibrator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from omnibench.data.dataset import Dataset
+from omnibench.environment import package_versions
+from omnibench.errors import ConfigError
+from omnibench.fit.calibrator import Calibrator, RunResult, run_calibrator
+from omnibench.fit.evaluate import split_errors
+from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
+from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
+from omnibench.registry import calibrators, costs
+from omnibench.robot.calibration import Calibration, Provenance, matrix_rows
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import Integration
+
+
+def calibrate(
+    dataset: Dataset,
+    calibrator: str = "closed_form",
+    *,
+    options: Mapping[str, Any] | None = None,
+    cost: str = "final_pose",
+    parameterisation: ParameterisationName | None = None,
+    box: Box = "row",
+    limits: GeometryLimits | None = None,
+    integration: Integration = "arc",
+    budget: Budget | None = None,
+    seed: int = 1,
+    watch: Callable[[int, float], None] | None = None,
+) -> tuple[Calibration, RunResult]:
+    """Fit the odometry model of a data set's training split; the calibration and how the run ended.
+
+    Raises UnknownNameError or ConfigError for wrong arguments, DataError for an empty training split, and ConfigError
+    when the calibrator gives no answer.
+    """
+    chosen: Calibrator = calibrators.create(calibrator, options)
+    objective = costs.create(cost)
+    training = training_split(dataset)
+    searched = make_parameterisation(
+        parameterisation or chosen.parameterisation, dataset.robot, training, box=box, limits=limits
+    )
+    problem = CalibrationProblem(
+        dataset.robot,
+        training,
+        objective,
+        searched,
+        integration=integration,
+        budget=budget or Budget(),
+        seed=seed,
+        watch=watch,
+    )
+    result = run_calibrator(chosen, problem)
+    if result.matrix is None:
+        raise ConfigError(f"calibrator {calibrator!r} gave no answer ({result.outcome}): {result.reason}")
+    validation = dataset.split("validation")
+    model = OdometryModel(dataset.robot, result.matrix, integration)
+    calibration = Calibration(
+        name=f"{dataset.name} {calibrator}",
+        robot=dataset.robot,
+        sample_period=dataset.sample_period,
+        matrix=matrix_rows(result.matrix),
+        integration=integration,
+        provenance=Provenance(
+            dataset=dataset.name,
+            dataset_hash=dataset.hash,
+            simulated=dataset.simulated,
+            calibrator=calibrator,
+            options=chosen.options.model_dump(mode="json"),
+            seed=seed,
+            cost=cost,
+            box=problem.box,
+            versions=package_versions(),
+            training_cost=split_errors(model, training).cost,
+            validation_cost=split_errors(model, validation).cost if validation else None,
+            outcome=result.outcome,
+            reason=result.reason,
+        ),
+    )
+    return calibration, result

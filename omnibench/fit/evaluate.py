@@ -1,0 +1,71 @@
+"""How good a calibration is on a data set: Eq. (6) and the errors of the final pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from omnibench.config import Model
+from omnibench.data.dataset import SPLITS, Dataset, Trajectory
+from omnibench.errors import DataError
+from omnibench.registry import costs
+from omnibench.robot.calibration import Calibration
+from omnibench.robot.model import OdometryModel
+
+
+class SplitErrors(Model):
+    """Cost (Eq. 6) and errors of the final pose, on one split."""
+
+    trajectories: int
+    cost: float
+    position_mean_m: float
+    position_max_m: float
+    heading_mean_rad: float
+    heading_max_rad: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A calibration's errors, and those of the design values, by split; ``all`` is every trajectory."""
+
+    dataset: str
+    simulated: bool
+    trajectories: int
+    splits: dict[str, SplitErrors]
+    design: dict[str, SplitErrors]
+
+
+def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
+    """Errors of a calibration on every split of a data set. DataError when the robots' wheels differ."""
+    if calibration.robot.wheel_names != dataset.robot.wheel_names:
+        ours, theirs = ", ".join(calibration.robot.wheel_names), ", ".join(dataset.robot.wheel_names)
+        raise DataError(f"the calibration is for wheels {ours}, the data set {dataset.name} has {theirs}")
+    present = {split: dataset.split(split) for split in SPLITS if dataset.split(split)}
+    groups: dict[str, tuple[Trajectory, ...]] = {str(name): group for name, group in present.items()}
+    groups["all"] = dataset.trajectories
+    design = OdometryModel.of_design(dataset.robot, calibration.integration)
+    return Evaluation(
+        dataset=dataset.name,
+        simulated=dataset.simulated,
+        trajectories=len(dataset.trajectories),
+        splits={name: split_errors(calibration.model, group) for name, group in groups.items()},
+        design={name: split_errors(design, group) for name, group in groups.items()},
+    )
+
+
+def split_errors(model: OdometryModel, trajectories: Sequence[Trajectory]) -> SplitErrors:
+    """Errors of a model on some trajectories."""
+    ends = np.concatenate(model.poses([trajectory.final_log for trajectory in trajectories]))
+    errors = ends - np.array([trajectory.final_pose for trajectory in trajectories])
+    positions, headings = np.linalg.norm(errors[:, :2], axis=1), np.abs(errors[:, 2])
+    cost = costs.create("final_pose").combine(errors[None], np.arange(len(errors)))
+    return SplitErrors(
+        trajectories=len(trajectories),
+        cost=float(cost[0]),
+        position_mean_m=float(positions.mean()),
+        position_max_m=float(positions.max()),
+        heading_mean_rad=float(headings.mean()),
+        heading_max_rad=float(headings.max()),
+    )

@@ -1,0 +1,133 @@
+"""What the command line prints besides tables of a comparison."""
+
+from __future__ import annotations
+
+import math
+import sys
+
+from rich.console import Console
+from rich.table import Table
+
+from omnibench.fit.calibrator import RunResult
+from omnibench.fit.evaluate import Evaluation
+from omnibench.fit.inspect import Inspection
+from omnibench.registry import REGISTRIES, Entry, PluginFailure
+from omnibench.robot.calibration import Calibration
+
+_PIPED_WIDTH = 160
+
+
+def make_console(error: bool = False) -> Console:
+    """A console that does not squeeze tables into 80 columns when it is piped."""
+    stream = sys.stderr if error else sys.stdout
+    return Console(file=stream, width=None if stream.isatty() else _PIPED_WIDTH, soft_wrap=False)
+
+
+def print_calibration(console: Console, calibration: Calibration, result: RunResult) -> None:
+    """The matrix, its deviation from the design, and how it was found."""
+    design = calibration.robot.inverse_kinematic_matrix
+    simulated = calibration.provenance is not None and calibration.provenance.simulated
+    table = Table(title=f"{calibration.name}{' (simulated data)' if simulated else ''}", title_justify="left")
+    table.add_column("")
+    for wheel in calibration.robot.wheel_names:
+        table.add_column(f"wheel {wheel}", justify="right")
+    for label, unit, row, start in zip("xyw", ("m/rad", "m/rad", "rad/rad"), calibration.matrix, design, strict=True):
+        cells = [f"{value:+.7f} ({_deviation(value, first)})" for value, first in zip(row, start, strict=True)]
+        table.add_row(f"{label} ({unit})", *cells)
+    console.print(table)
+    console.print(
+        f"{result.outcome}: {result.reason}; {result.evaluations} evaluations, {result.seconds:.2f} s",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def print_evaluation(console: Console, evaluation: Evaluation) -> None:
+    """Cost and final errors on every split, with the design values for comparison."""
+    kind = " (simulated data)" if evaluation.simulated else ""
+    table = Table(title=f"{evaluation.dataset}{kind}", title_justify="left")
+    table.add_column("split")
+    table.add_column("model")
+    for heading in ("runs", "cost (Eq. 6)", "position mean", "max", "heading mean", "max"):
+        table.add_column(heading, justify="right")
+    for split in evaluation.splits:
+        for label, errors in (("calibration", evaluation.splits[split]), ("design", evaluation.design[split])):
+            table.add_row(
+                split,
+                label,
+                str(errors.trajectories),
+                f"{errors.cost:.4f}",
+                f"{errors.position_mean_m:.4f} m",
+                f"{errors.position_max_m:.4f} m",
+                f"{math.degrees(errors.heading_mean_rad):.2f} deg",
+                f"{math.degrees(errors.heading_max_rad):.2f} deg",
+            )
+    console.print(table)
+
+
+def print_inspection(console: Console, found: Inspection) -> None:
+    """A data set in a table and its findings in words."""
+    kind = "simulated data" if found.simulated else "recorded data"
+    console.print(f"{found.dataset}: {kind}; {found.description}", highlight=False, soft_wrap=True)
+    for label, text in (("source", found.source), ("licence", found.licence)):
+        if text:
+            console.print(f"{label}: {text}", highlight=False, soft_wrap=True)
+    shortest, longest = (1000 * period for period in found.sample_period_range_s)
+    console.print(
+        f"robot {found.robot}, wheels {', '.join(found.wheels)}; {found.wheel_samples} wheel samples every "
+        f"{1000 * found.sample_period_s:g} ms ({shortest:.3g} to {longest:.3g} ms), {found.reference_poses} reference "
+        f"poses every {1000 * found.pose_period_s:.3g} ms",
+        highlight=False,
+        soft_wrap=True,
+    )
+    table = Table()
+    for heading in ("split", "runs", "commands", "repetitions", "sessions", "duration", "distance", "turned"):
+        table.add_column(heading, justify="left" if heading == "split" else "right")
+    for name, split in found.splits.items():
+        repetitions = f"{split.repetitions_min}"
+        if split.repetitions_max != split.repetitions_min:
+            repetitions += f" to {split.repetitions_max}"
+        table.add_row(
+            name,
+            str(split.trajectories),
+            str(split.commands),
+            repetitions,
+            str(split.sessions),
+            f"{split.duration_s:.0f} s",
+            f"{split.distance_m:.1f} m",
+            f"{math.degrees(split.turned_rad):.0f} deg",
+        )
+    console.print(table)
+    shares = ", ".join(f"{share:.2g}" for share in found.driven_shares)
+    console.print(f"directions of wheel rates driven: {found.driven_directions} of {len(found.wheels)} ({shares})")
+    for finding in found.findings:
+        console.print(f"- {finding}", highlight=False, soft_wrap=True)
+
+
+def print_registries(console: Console) -> None:
+    """Everything that a config can name."""
+    for registry in REGISTRIES:
+        entries = registry.entries()
+        table = Table(title=f"{registry.kind}s", title_justify="left", title_style="bold", expand=False)
+        for heading in ("name", "what", "from"):
+            table.add_column(heading, overflow="fold")
+        for entry in entries:
+            table.add_row(entry.name, entry.summary, entry.origin)
+        console.print(table if entries else f"[bold]{registry.kind}s[/bold]: none yet")
+
+
+def registry_document(failures: list[PluginFailure]) -> dict[str, object]:
+    """Everything that a config can name, with options, as one JSON document."""
+
+    def row(entry: Entry[object]) -> dict[str, object]:
+        options = entry.options.model_json_schema().get("properties", {})
+        return {"name": entry.name, "summary": entry.summary, "from": entry.origin, "options": options}
+
+    document: dict[str, object] = {
+        f"{registry.kind}s": [row(entry) for entry in registry.entries()] for registry in REGISTRIES
+    }
+    return document | {"failures": [{"from": failure.origin, "error": failure.error} for failure in failures]}
+
+
+def _deviation(value: float, design: float) -> str:
+    return f"{100 * (value / design - 1):+.2f} %" if design else "design 0"

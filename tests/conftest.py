@@ -1,0 +1,22 @@
+"""Fixtures that several rooms share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from omnibench import registry
+
+
+@pytest.fixture
+def registries_as_before() -> Iterator[None]:
+    """What a test registers or loads is gone after it."""
+    for each in registry.REGISTRIES:
+        each.entries()  # what is built in stays
+    entries, loaded = [dict(each._entries) for each in registry.REGISTRIES], dict(registry._loaded)
+    yield
+    for each, kept in zip(registry.REGISTRIES, entries, strict=True):
+        each._entries = kept
+    registry._loaded.clear()
+    registry._loaded.update(loaded)

@@ -1,0 +1,211 @@
+"""The table1 importer: Table 1 of Palacin et al. 2023 as files, in the units that it lists."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from omnibench.data.dataset import Trajectory
+from omnibench.data.importer import import_dataset
+from omnibench.data.importers.table1 import APR_02
+from omnibench.data.storage import load_dataset, save_dataset
+from omnibench.errors import ConfigError, DataError
+from omnibench.robot.kinematics import wheel_equations
+from omnibench.robot.model import OdometryModel
+
+RPM = 2 * math.pi / 60
+PERIOD, SAMPLES = 0.01, 100
+
+
+def twist(v: float, alpha_deg: float, omega: float) -> np.ndarray:
+    alpha = math.radians(alpha_deg)
+    return np.array([v * math.cos(alpha), v * math.sin(alpha), omega])
+
+
+def write_trajectory(
+    folder: Path,
+    command: tuple[float, float, float] = (0.2, 30.0, 0.35),
+    metre: float = 1.0,
+    targets: bool = True,
+    first_scan: float = 0.0,
+) -> Path:
+    """A trajectory that the design drives without error, at constant twist on an exact arc."""
+    folder.mkdir(parents=True)
+    v, alpha, omega = command
+    rpm = wheel_equations(APR_02.wheels) @ twist(*command) / RPM
+    head = ",omega_Ma,omega_Mb,omega_Mc" if targets else ""
+    told = "," + ",".join(f"{value:.12f}" for value in rpm) if targets else ""
+    (folder / "command.csv").write_text(f"v,alpha,omega,d{head}\n{v},{alpha},{omega},0.2{told}\n")
+    rows = [f"{PERIOD * k:.2f}," + ",".join(f"{value:.12f}" for value in rpm) for k in range(1, SAMPLES + 1)]
+    (folder / "wheels.csv").write_text("t,omega_a,omega_b,omega_c\n" + "\n".join(rows) + "\n")
+    (folder / "slam.csv").write_text("t,x,y,theta\n")
+    with (folder / "slam.csv").open("a") as file:
+        for t in np.arange(first_scan, PERIOD * SAMPLES + 1e-9, 0.25):
+            half = omega * t / 2
+            path = v * t * np.sinc(half / np.pi) * np.exp(1j * (math.radians(alpha) + half))
+            theta = (math.degrees(omega * t) + 180) % 360 - 180
+            file.write(f"{t:.2f},{path.real * metre:.12f},{path.imag * metre:.12f},{theta:.12f}\n")
+    return folder
+
+
+def only(root: Path, options: dict[str, object] | None = None) -> Trajectory:
+    (trajectory,) = import_dataset("table1", root, options).trajectories
+    return trajectory
+
+
+def test_rpm_and_degrees_become_si_so_that_the_design_drives_the_reference(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "t01")
+    data = import_dataset("table1", tmp_path)
+    run = data.trajectories[0]
+    (odometry,) = OdometryModel.of_design(data.robot, "arc").poses([run.reference_log])
+    np.testing.assert_allclose(odometry, run.poses[1:], atol=1e-10)
+    assert data.warnings == ()
+    assert data.sample_period == PERIOD
+
+
+def test_millimetres_are_an_option(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "mm", metre=1000)
+    write_trajectory(tmp_path / "m")
+    in_mm = only(tmp_path / "mm", {"position_unit": "mm"})
+    in_m = only(tmp_path / "m")
+    np.testing.assert_allclose(in_mm.poses, in_m.poses, atol=1e-12)
+
+
+def test_millimetres_taken_for_metres_are_warned_of(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "mm", metre=1000)
+    (warning,) = import_dataset("table1", tmp_path).warnings
+    assert "positions look like mm" in warning
+
+
+def test_the_command_is_read_in_the_units_of_table_1(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "t01", (0.2, 30.0, -0.35))
+    run = only(tmp_path)
+    assert (run.v, run.omega, run.distance, run.duration) == (0.2, -0.35, 0.2, 1.0)
+    assert run.alpha == pytest.approx(math.pi / 6)
+    assert run.command == "v0.2_a30_w-0.35_d0.2"
+    assert run.targets is not None
+    np.testing.assert_allclose(run.targets, run.rates)
+
+
+def test_the_robot_is_the_apr_02_unless_another_is_given(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "t01")
+    assert import_dataset("table1", tmp_path).robot == APR_02
+    wheels = [
+        {"name": name, "radius": 0.15, "distance": 0.2, "angle_deg": angle}
+        for name, angle in (("a", 60), ("b", 180), ("c", 300))
+    ]
+    other = import_dataset("table1", tmp_path, {"robot": {"name": "other", "wheels": wheels}}).robot
+    assert (other.name, other.wheels[2].radius) == ("other", 0.15)
+
+
+def test_eq_7_follows_from_the_default_robot() -> None:
+    np.testing.assert_allclose(
+        APR_02.inverse_kinematic_matrix,
+        [
+            [-0.0854478398400646, 0, 0.0854478398400646],
+            [0.04933333333333333, -0.09866666666666667, 0.04933333333333333],
+            [0.2529914529914529] * 3,
+        ],
+        atol=1e-15,
+    )
+
+
+def test_a_later_first_scan_becomes_time_zero(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "t01", first_scan=0.13)
+    run = only(tmp_path)
+    assert run.pose_times[0] == 0
+    assert run.times[0] == pytest.approx(0.01)
+    (odometry,) = OdometryModel.of_design(APR_02, "arc").poses([run.reference_log])
+    np.testing.assert_allclose(odometry, run.poses[1:], atol=1e-10)
+
+
+def test_folders_called_train_and_validation_split(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "train" / "t01")
+    write_trajectory(tmp_path / "validation" / "t01")
+    data = import_dataset("table1", tmp_path)
+    assert [(run.id, run.split, run.session, run.repetition) for run in data.trajectories] == [
+        ("train/t01", "train", "train", 1),
+        ("validation/t01", "validation", "validation", 1),
+    ]
+
+
+def test_without_such_folders_every_second_repetition_validates(tmp_path: Path) -> None:
+    for number in range(3):
+        write_trajectory(tmp_path / f"t{number}", (0.2, 0.0, 0.0))
+    write_trajectory(tmp_path / "t3", (0.2, 90.0, 0.0))
+    data = import_dataset("table1", tmp_path)
+    assert [run.split for run in data.trajectories] == ["train", "validation", "train", "train"]
+
+
+def test_patterns_split(tmp_path: Path) -> None:
+    for name in ("day1/t1", "day2/t1"):
+        write_trajectory(tmp_path / name)
+    data = import_dataset("table1", tmp_path, {"validation": "day1/*"})
+    assert {run.id: run.split for run in data.trajectories} == {"day1/t1": "validation", "day2/t1": "train"}
+
+
+def test_targets_are_left_out_unless_all_trajectories_have_them(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "t1")
+    write_trajectory(tmp_path / "t2", targets=False)
+    data = import_dataset("table1", tmp_path)
+    save_dataset(data, tmp_path / "out")
+    assert load_dataset(tmp_path / "out").hash == data.hash
+
+
+def test_a_trajectory_outside_the_split_folders_is_refused(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "train" / "t01")
+    write_trajectory(tmp_path / "t02")
+    with pytest.raises(DataError, match="trajectory 't02' is in no folder train or validation"):
+        import_dataset("table1", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("wheels.csv", "0.05,", "0.03,", r"wheels\.csv, row 5 \(line 6\): t goes backwards: 0\.03 after 0\.04"),
+        ("wheels.csv", "omega_b", "omegab", r"wheels\.csv: column 'omega_b' is missing; did you mean 'omegab'\?"),
+        ("slam.csv", "0.50,", "0.50;", r"slam\.csv, row 3 \(line 4\): it has 3 fields, expected 4"),
+        ("slam.csv", "0.00,", "-0.10,", r"slam\.csv, row 1 \(line 2\): t is -0\.1; times count from the start"),
+        ("command.csv", "0.2,30", "fast,30", r"command\.csv, row 1 \(line 2\): v is 'fast', expected a number"),
+        ("command.csv", "omega,", "omega,omega,", r"command\.csv: column 'omega' is there 2 times"),
+    ],
+)
+def test_a_malformed_file_is_named_with_its_row(tmp_path: Path, file: str, old: str, new: str, message: str) -> None:
+    path = write_trajectory(tmp_path / "t01") / file
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(DataError, match=message):
+        import_dataset("table1", tmp_path)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    (write_trajectory(tmp_path / "t01") / "slam.csv").unlink()
+    with pytest.raises(DataError, match=r"t01.slam\.csv: no such file"):
+        import_dataset("table1", tmp_path)
+
+
+def test_scans_after_the_wheels_only_are_refused(tmp_path: Path) -> None:
+    path = write_trajectory(tmp_path / "t01") / "slam.csv"
+    path.write_text("t,x,y,theta\n2,0,0,0\n3,0,0,0\n")
+    with pytest.raises(DataError, match=r"slam\.csv: no two poses while the wheels were recorded"):
+        import_dataset("table1", tmp_path)
+
+
+def test_two_commands_for_one_trajectory_are_refused(tmp_path: Path) -> None:
+    path = write_trajectory(tmp_path / "t01", targets=False) / "command.csv"
+    path.write_text(path.read_text() + "0.2,0,0,1\n")
+    with pytest.raises(DataError, match=r"command\.csv: it has 2 rows, expected one"):
+        import_dataset("table1", tmp_path)
+
+
+def test_an_unknown_unit_is_refused(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "t01")
+    with pytest.raises(ConfigError, match="importer 'table1': position_unit"):
+        import_dataset("table1", tmp_path, {"position_unit": "inch"})
+
+
+def test_a_folder_without_trajectories_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"no command\.csv below it"):
+        import_dataset("table1", tmp_path)

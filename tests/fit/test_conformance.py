@@ -1,0 +1,36 @@
+"""Everything that is built in keeps the contract that plug-ins are held to."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from omnibench.registry import Registry, calibrators, costs
+from omnibench.testing import CalibratorConformance, Conformance, CostConformance
+
+# The share of the start's cost at which a claim of convergence is believed. Those that are not named here are
+# baselines: they need only not be worse than the start.
+SOLVED = {"closed_form": 1e-6, "crs": 1e-5, "isres": 1e-3, "genetic": 1e-1, "parametric": 1e-5}
+
+
+def cases(registry: Registry[Any], base: type[Conformance]) -> list[Any]:
+    methods = [name for cls in base.__mro__ for name in vars(cls) if name.startswith("test_")]
+    names = [entry.name for entry in registry.entries() if entry.origin == "built in"]
+    return [pytest.param(name, method, id=f"{name}-{method[5:]}") for name in names for method in methods]
+
+
+@pytest.mark.parametrize(("name", "case"), cases(calibrators, CalibratorConformance))
+def test_a_calibrator_that_is_built_in_conforms(name: str, case: str) -> None:
+    attributes = {"name": name, "solved": SOLVED.get(name, 1.0)}
+    getattr(type("Suite", (CalibratorConformance,), attributes)(), case)()
+
+
+@pytest.mark.parametrize(("name", "case"), cases(costs, CostConformance))
+def test_a_cost_that_is_built_in_conforms(name: str, case: str) -> None:
+    getattr(type("Suite", (CostConformance,), {"name": name})(), case)()
+
+
+def test_every_search_that_claims_convergence_is_held_to_a_share() -> None:
+    built_in = {entry.name for entry in calibrators.entries() if entry.origin == "built in"}
+    assert built_in - {"theoretical", "published", "random_search"} <= set(SOLVED)

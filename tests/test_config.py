@@ -1,0 +1,237 @@
+"""Reading YAML: one line for a mistake, with its place and the nearest key, and effective copies that lose nothing."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import Field, model_validator
+
+from omnibench.config import Model, read_model, read_yaml, to_yaml, validate
+from omnibench.errors import ConfigError
+
+
+class Wheel(Model):
+    radius: float = Field(gt=0)
+    name: str = "a"
+
+
+class Circle(Model):
+    shape: Literal["circle"] = "circle"
+    diameter: float = 1.0
+
+
+class Square(Model):
+    side: float = 1.0
+
+
+class Robot(Model):
+    title: str
+    wheels: tuple[Wheel, ...] = ()
+    speeds: dict[str, Wheel] = Field({})
+    outline: Circle | Square | None = None
+    mode: Literal["euler", "arc"] = "arc"
+
+    @model_validator(mode="after")
+    def _few_wheels(self) -> Robot:
+        if len(self.wheels) > 3:
+            raise ValueError(f"{len(self.wheels)} wheels are too many")
+        return self
+
+
+@pytest.fixture
+def written(tmp_path: Path):
+    def write(text: str) -> Path:
+        (tmp_path / "robot.yaml").write_text(text, encoding="utf-8")
+        return tmp_path / "robot.yaml"
+
+    return write
+
+
+def complaint(path: Path) -> str:
+    """What reading ``path`` as a robot says, without the file in front."""
+    with pytest.raises(ConfigError) as failure:
+        read_model(Robot, path)
+    message = str(failure.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    return message.removeprefix(f"{path}: ")
+
+
+def test_a_document_is_read_into_its_model(written) -> None:
+    robot = read_model(Robot, written("title: APR-02\nwheels: [{radius: 0.148}]\n"))
+    assert (robot.title, robot.wheels[0].radius) == ("APR-02", 0.148)
+
+
+def test_a_misspelt_key_gets_the_nearest_known(written) -> None:
+    assert complaint(written("titel: x\n")).startswith("unknown key 'titel'; did you mean 'title'? known: mode, ")
+
+
+def test_a_misspelt_key_is_told_before_the_missing_one_that_it_explains(written) -> None:
+    assert complaint(written("titel: x\n")).endswith("(and 1 more)")
+
+
+def test_a_misspelt_key_deep_inside_gets_its_place_and_the_keys_known_there(written) -> None:
+    found = complaint(written("title: x\nwheels:\n  - radius: 1\n  - radius: 1\n    nmae: b\n"))
+    assert found == "unknown key 'wheels.1.nmae'; did you mean 'name'? known: name, radius"
+
+
+def test_a_misspelt_key_within_a_mapping_of_models_gets_its_place(written) -> None:
+    found = complaint(written("title: x\nspeeds: {fast: {radius: 1, raduis: 2}}\n"))
+    assert found == "unknown key 'speeds.fast.raduis'; did you mean 'radius'? known: name, radius"
+
+
+def test_a_misspelt_key_of_a_union_names_the_keys_of_its_members(written) -> None:
+    found = complaint(written("title: x\noutline: {diametre: 2}\n"))
+    assert "did you mean 'diameter'? known: diameter, shape, side" in found
+
+
+def test_a_key_that_resembles_nothing_lists_what_is_known(written) -> None:
+    assert complaint(written("title: x\nqqq: 1\n")) == "unknown key 'qqq'; known: mode, outline, speeds, title, wheels"
+
+
+def test_a_missing_key_is_named_with_its_place(written) -> None:
+    assert complaint(written("title: x\nwheels: [{name: b}]\n")) == "key 'wheels.0.radius' is missing"
+
+
+def test_a_value_of_the_wrong_type_is_named_with_what_was_given(written) -> None:
+    found = complaint(written("title: x\nwheels: [{radius: wide}]\n"))
+    assert found.startswith("wheels.0.radius: ")
+    assert found.endswith("(given: 'wide')")
+
+
+def test_a_value_out_of_range_is_named_with_what_was_given(written) -> None:
+    assert complaint(written("title: x\nwheels: [{radius: -1}]\n")).endswith("greater than 0 (given: -1)")
+
+
+def test_a_choice_that_is_not_offered_names_those_that_are(written) -> None:
+    assert "'euler' or 'arc' (given: 'exact')" in complaint(written("title: x\nmode: exact\n"))
+
+
+def test_the_words_of_a_check_of_ones_own_are_passed_on_alone(written) -> None:
+    wheels = "[{radius: 1}, {radius: 1}, {radius: 1}, {radius: 1}]"
+    assert complaint(written(f"title: x\nwheels: {wheels}\n")) == "4 wheels are too many"
+
+
+@pytest.mark.parametrize("text", ["- title: x\n- title: y\n", "just words\n", "42\n"])
+def test_something_else_than_keys_and_values_is_refused(text: str, written) -> None:
+    assert complaint(written(text)).startswith("expected keys and values, found ")
+
+
+def test_a_list_where_keys_are_expected_is_refused_with_its_place(written) -> None:
+    assert complaint(written("title: x\nspeeds: [1, 2]\n")).startswith("speeds: ")
+
+
+def test_keys_where_a_list_is_expected_are_refused_with_their_place(written) -> None:
+    assert complaint(written("title: x\nwheels: {radius: 1}\n")).startswith("wheels: ")
+
+
+def test_an_empty_document_misses_what_is_needed(written) -> None:
+    assert complaint(written("")) == "key 'title' is missing"
+
+
+def test_a_key_that_is_given_twice_is_refused_with_its_line(written) -> None:
+    assert complaint(written("title: x\nmode: arc\ntitle: y\n")) == "line 3: key 'title' is given twice"
+
+
+def test_a_key_that_is_given_twice_deep_inside_is_refused_with_its_line(written) -> None:
+    assert complaint(written("title: x\nwheels:\n- radius: 1\n  radius: 2\n")) == "line 4: key 'radius' is given twice"
+
+
+def test_the_same_key_in_two_mappings_is_no_repetition(written) -> None:
+    assert len(read_model(Robot, written("title: x\nwheels: [{radius: 1}, {radius: 2}]\n")).wheels) == 2
+
+
+def test_text_that_is_not_yaml_is_refused_in_one_line(written) -> None:
+    assert complaint(written("title: [x\nmode: {")).startswith("not valid YAML: ")
+
+
+def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    assert complaint(tmp_path / "nowhere.yaml") == "no such file"
+
+
+def test_a_folder_in_place_of_a_file_is_refused(tmp_path: Path) -> None:
+    assert complaint(tmp_path).startswith("cannot be read: ")
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "robot.yaml").write_bytes(b"\xff\xfe\x00")
+    assert complaint(tmp_path / "robot.yaml").startswith("cannot be read: ")
+
+
+def test_yaml_that_would_make_objects_is_refused(written) -> None:
+    assert complaint(written("title: !!python/object/apply:os.getcwd []\n")).startswith("not valid YAML: ")
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-6", 1e-6),
+        ("1E6", 1e6),
+        ("-2.5e+3", -2500.0),
+        ("+.5", 0.5),
+        ("1.", 1.0),
+        (".inf", np.inf),
+        ("12", 12),
+        ("0.1", 0.1),
+    ],
+)
+def test_a_number_is_a_number_however_it_is_written(text: str, value: float, written) -> None:
+    found = read_yaml(written(f"value: {text}\n"))["value"]
+    assert found == value
+    assert type(found) is type(value)
+
+
+@pytest.mark.parametrize("text", ["e6", "1e", "run-1e", "221220201643_run", "1-2"])
+def test_words_with_digits_stay_words(text: str, written) -> None:
+    assert read_yaml(written(f"value: {text}\n")) == {"value": text}
+
+
+@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1))
+def test_floats_come_back_to_the_last_bit(values: list[float]) -> None:
+    class Numbers(Model):
+        values: tuple[float, ...]
+
+    assert validated(Numbers, Numbers(values=tuple(values))).values == tuple(values)
+
+
+@given(st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc"))))
+def test_texts_come_back_as_they_were(text: str) -> None:
+    class Words(Model):
+        text: str
+
+    assert validated(Words, Words(text=text)).text == text
+
+
+def test_a_document_comes_back_as_it_was_with_every_default_spelt_out() -> None:
+    robot = Robot(title="x", wheels=(Wheel(radius=0.1),), outline=Square(side=2.0))
+    text = to_yaml(robot)
+    assert "mode: arc" in text
+    assert validated(Robot, robot) == robot
+
+
+def test_numpy_numbers_and_tuples_are_written_plainly() -> None:
+    assert to_yaml({"values": (1.5, float(np.float64(2.5)))}) == "values: [1.5, 2.5]\n"
+
+
+def test_a_model_does_not_change() -> None:
+    with pytest.raises(ValueError, match="frozen"):
+        Wheel(radius=1.0).radius = 2.0  # type: ignore[misc]
+
+
+def test_what_is_wrong_outside_a_file_gets_the_place_that_is_given() -> None:
+    with pytest.raises(ConfigError, match=r"^apr02\.yaml: budget: key 'title' is missing$"):
+        validate(Robot, {}, "apr02.yaml: budget")
+
+
+def validated(model: type[Model], document: Model) -> Model:
+    """``document`` written and read again."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "document.yaml"
+        file.write_text(to_yaml(document), encoding="utf-8")
+        return read_model(model, file)
