@@ -7,7 +7,6 @@ import sys
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -81,6 +80,7 @@ def calibrate(
     seed: Annotated[int, typer.Option(min=0)] = 1,
     evaluations: Annotated[int, typer.Option(min=1, help="Budget.")] = 60_000,
     seconds: Annotated[float, typer.Option(min=0.001, help="Budget.")] = 600.0,
+    intervals: Annotated[bool, typer.Option("--intervals", help="95 % bootstrap intervals (closed_form).")] = False,
     settings: Settings = None,
     plugins: Plugins = None,
     as_json: Json = False,
@@ -98,7 +98,7 @@ def calibrate(
         raise ConfigError("say where the calibration goes: -o calibration.yaml")
     recordings = load_dataset(dataset)
     with _evaluations_bar(calibrator, evaluations) as watch:
-        calibration, result = fit(
+        run = fit(
             recordings,
             calibrator,
             options=_parsed(settings),
@@ -107,8 +107,10 @@ def calibrate(
             integration=integration,
             budget=Budget(evaluations=evaluations, seconds=seconds),
             seed=seed,
+            intervals=intervals,
             watch=watch,
         )
+    calibration, result = run.calibration, run.result
     if output is not None:
         write_calibration(calibration, output)
     _warn(recordings.warnings)
@@ -116,7 +118,7 @@ def calibrate(
         _warn([f"{', '.join(result.at_bounds)} lie on a bound of the box {box!r}; a wider box may fit better"])
     if as_json:
         return _print_json(calibration.model_dump(mode="json"))
-    terminal.print_calibration(terminal.make_console(), calibration, result)
+    terminal.print_calibration(terminal.make_console(), run)
     typer.echo(f"calibration: {output}")
     return None
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
+
+import polars as pl
 
 from omnibench.errors import DataError
 
@@ -34,3 +37,19 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file, whole or not at all. DataError when the disk refuses."""
     with replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def write_table(path: Path, table: pl.DataFrame) -> None:
+    """Write a table as CSV or, for any other suffix, as Parquet, whole or not at all. DataError when the disk refuses."""
+    content = BytesIO()  # not straight to the disk: of that, polars tells in errors of its own
+    table.write_csv(content) if path.suffix == ".csv" else table.write_parquet(content)
+    with replacing(path) as partial:
+        partial.write_bytes(content.getvalue())
+
+
+def remove(path: Path) -> None:
+    """Remove a file, if it is there. DataError when the disk refuses."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be removed: {error.strerror or error}; remove it by hand") from None

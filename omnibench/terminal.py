@@ -8,11 +8,10 @@ import sys
 from rich.console import Console
 from rich.table import Table
 
-from omnibench.fit.calibrator import RunResult
+from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.evaluate import Evaluation
 from omnibench.fit.inspect import Inspection
 from omnibench.registry import REGISTRIES, Entry, PluginFailure
-from omnibench.robot.calibration import Calibration
 
 _PIPED_WIDTH = 160
 
@@ -23,17 +22,23 @@ def make_console(error: bool = False) -> Console:
     return Console(file=stream, width=None if stream.isatty() else _PIPED_WIDTH, soft_wrap=False)
 
 
-def print_calibration(console: Console, calibration: Calibration, result: RunResult) -> None:
-    """The matrix, its deviation from the design, and how it was found."""
+def print_calibration(console: Console, run: CalibrationRun) -> None:
+    """The matrix, its deviation from the design, its intervals if there are any, and how it was found."""
+    calibration, result = run.calibration, run.result
     design = calibration.robot.inverse_kinematic_matrix
     simulated = calibration.provenance is not None and calibration.provenance.simulated
     table = Table(title=f"{calibration.name}{' (simulated data)' if simulated else ''}", title_justify="left")
     table.add_column("")
     for wheel in calibration.robot.wheel_names:
         table.add_column(f"wheel {wheel}", justify="right")
-    for label, unit, row, start in zip("xyw", ("m/rad", "m/rad", "rad/rad"), calibration.matrix, design, strict=True):
+    labels = zip("xyw", ("m/rad", "m/rad", "rad/rad"), strict=True)
+    rows = zip(labels, calibration.matrix, design, strict=True)
+    for row_number, ((label, unit), row, start) in enumerate(rows):
         cells = [f"{value:+.7f} ({_deviation(value, first)})" for value, first in zip(row, start, strict=True)]
         table.add_row(f"{label} ({unit})", *cells)
+        if run.intervals is not None:
+            bounds = zip(run.intervals.low[row_number], run.intervals.high[row_number], strict=True)
+            table.add_row("  95 %", *(f"{low:+.7f} .. {high:+.7f}" for low, high in bounds), style="dim")
     console.print(table)
     console.print(
         f"{result.outcome}: {result.reason}; {result.evaluations} evaluations, {result.seconds:.2f} s",

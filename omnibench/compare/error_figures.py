@@ -15,12 +15,13 @@ from omnibench.compare.wording import position_unit
 from omnibench.data.dataset import Split, Trajectory
 from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem, Paragraph
 from omnibench.report.numbers import fixed
-from omnibench.report.style import AXIS, INK, plot, text
+from omnibench.report.style import INK, plot, text
 from omnibench.robot.kinematics import Array
 
 # Rates of turn from the most negative to the most positive: blue, grey, orange and steps between.
 _TURN_COLOURS = ("#0072b2", "#5b6772", "#d97706", "#aa3377", "#4fb0e8", "#7b4b2a", "#8f8f1f")
 _MANY_GROUPS = 12
+_Motion = tuple[float, float]  # speed, m/s, and rate of turn, rad/s
 
 
 def error_blocks(view: DatasetView) -> tuple[Block, ...]:
@@ -58,8 +59,19 @@ def _quantities(before: Array, after: Array) -> tuple[_Quantity, _Quantity]:
 
 
 def _is_flower(trajectories: Sequence[Trajectory]) -> bool:
-    directions = {round(math.degrees(t.alpha)) % 360 for t in trajectories if _moves(t) and t.alpha is not None}
-    return len(directions) >= 3 and all(t.alpha is not None and t.omega is not None for t in trajectories)
+    """Whether at least three directions were driven at each of a few speeds and rates of turn."""
+    if any(t.alpha is None or t.omega is None for t in trajectories):
+        return False
+    directions: dict[_Motion, set[int]] = {}
+    for trajectory in trajectories:
+        if _moves(trajectory):
+            directions.setdefault(_motion(trajectory), set()).add(round(math.degrees(trajectory.alpha or 0.0)) % 360)
+    return 0 < len(directions) <= len(_TURN_COLOURS) and all(len(found) >= 3 for found in directions.values())
+
+
+def _motion(trajectory: Trajectory) -> _Motion:
+    """Speed and rate of turn, without the digits that a measured command has."""
+    return round(trajectory.v or 0.0, 2), round(trajectory.omega or 0.0, 2)
 
 
 def _moves(trajectory: Trajectory) -> bool:
@@ -69,7 +81,7 @@ def _moves(trajectory: Trajectory) -> bool:
 def _flower_blocks(
     view: DatasetView, trajectories: Sequence[Trajectory], after: Array, label: str
 ) -> tuple[Block, ...]:
-    turn_rates = sorted({(t.v, t.omega) for t in trajectories if _moves(t)}, key=lambda key: (key[0] or 0, key[1] or 0))
+    turn_rates = sorted({_motion(t) for t in trajectories if _moves(t)})
     several_speeds = len({speed for speed, _ in turn_rates}) > 1
     legend = []
     for index, (speed, omega) in enumerate(turn_rates):
@@ -102,11 +114,9 @@ def _flower_blocks(
     return (grid, *_turns_on_the_spot(view, trajectories, after))
 
 
-def _petals(
-    trajectories: Sequence[Trajectory], key: tuple[float | None, float | None], quantity: _Quantity
-) -> tuple[Array, Array, Array]:
+def _petals(trajectories: Sequence[Trajectory], key: _Motion, quantity: _Quantity) -> tuple[Array, Array, Array]:
     """Directions (deg) and mean errors before and after of one speed and rate of turn, the first direction repeated."""
-    of_key = [i for i, t in enumerate(trajectories) if (t.v, t.omega) == key]
+    of_key = [i for i, t in enumerate(trajectories) if _moves(t) and _motion(t) == key]
     direction = np.array([round(math.degrees(trajectories[i].alpha or 0.0), 3) % 360 for i in of_key])
     angles = np.unique(direction)
     chosen = [np.array(of_key)[direction == angle] for angle in angles]
@@ -172,7 +182,7 @@ def _boxes(view: DatasetView, best: EntryStatistics, typical: ScoredRun) -> Figu
             f"Final {quantity.name} ({quantity.unit})",
             _box_figure(groups, quantity, look),
             f"Final {quantity.name} in {quantity.unit} of each group of trajectories, theoretical and {best.label}",
-            400,
+            80 + 44 * len(set(groups)),
         )
         for quantity in quantities
     )
@@ -180,7 +190,7 @@ def _boxes(view: DatasetView, best: EntryStatistics, typical: ScoredRun) -> Figu
     return FigureGrid(
         figures,
         items,
-        2,
+        1,
         "Every point is a trajectory; the box holds the middle half, its line is the median.",
     )
 
@@ -197,8 +207,9 @@ def _box_figure(groups: Sequence[str], quantity: _Quantity, look: Look) -> go.Fi
     series = [(THEORETICAL_LOOK, quantity.before)] + ([] if look is THEORETICAL_LOOK else [(look, quantity.after)])
     traces = [
         go.Box(
-            x=[text(group) for group in groups],
-            y=np.round(values, 4).tolist(),
+            y=[text(group) for group in groups],
+            x=np.round(values, 4).tolist(),
+            orientation="h",
             boxpoints="all",
             jitter=0.5,
             pointpos=0,
@@ -206,11 +217,11 @@ def _box_figure(groups: Sequence[str], quantity: _Quantity, look: Look) -> go.Fi
             marker={"color": drawn.colour, "size": 4, "opacity": 0.6},
             fillcolor="rgba(255,255,255,0)",
             legendgroup=drawn.key,
-            hovertemplate=f"{text(drawn.label)}: %{{y:.{quantity.decimals}f}} {quantity.unit}<extra></extra>",
+            hovertemplate=f"{text(drawn.label)}: %{{x:.{quantity.decimals}f}} {quantity.unit}<extra></extra>",
         )
         for drawn, values in series
     ]
-    figure = plot(*traces, boxmode="group", yaxis_title_text=f"final {quantity.name} ({quantity.unit})")
-    figure.update_yaxes(rangemode="tozero")
-    figure.update_xaxes(tickfont_color=INK, tickcolor=AXIS)
+    figure = plot(*traces, boxmode="group", xaxis_title_text=f"final {quantity.name} ({quantity.unit})")
+    figure.update_xaxes(rangemode="tozero")
+    figure.update_yaxes(tickfont_color=INK, autorange="reversed", ticks="")  # first group on top
     return figure

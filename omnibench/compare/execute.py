@@ -5,19 +5,23 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
+import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
+from types import ModuleType
 from typing import Any, Protocol
 
 from omnibench.compare.config import CalibratorEntry, CompareConfig
 from omnibench.compare.plan import PlannedRun, load_calibrators
-from omnibench.compare.store import RunStore
+from omnibench.compare.store import RunStore, StoredRun
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
+from omnibench.fit.calibrator import Outcome, RunResult, describe_error, run_calibrator
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import CalibrationProblem, make_parameterisation
 from omnibench.registry import calibrators, costs
@@ -25,6 +29,8 @@ from omnibench.robot.kinematics import Robot
 
 # A run that does not look at its budget is ended this long after its seconds are spent.
 _GRACE = 10.0
+# A process that has answered may take this long to go by itself.
+_PATIENCE = 2.0
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 
 
@@ -43,11 +49,26 @@ class _Active:
     process: ForkServerProcess
     connection: Connection
     began: float
+    evaluations: int = 0
+
+    def end(self, patience: float = _PATIENCE) -> str:
+        """See to it that the process is gone; how it went, in words."""
+        self.process.join(patience)
+        self.process.kill()
+        self.process.join()
+        self.connection.close()
+        code = self.process.exitcode or 0
+        return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+    def without_answer(self, outcome: Outcome, reason: str) -> RunResult:
+        seconds = time.monotonic() - self.began
+        return RunResult(outcome, reason, None, None, None, self.evaluations, seconds, ())
 
 
 def execute(plan: Sequence[PlannedRun], store: RunStore, progress: Progress, workers: int) -> list[RunResult]:
     """The result of every run, in the plan's order; results that the store has are taken from there.
 
+    Failed runs are not stored: what made them fail (a missing package, too little memory) may be gone next time.
     KeyboardInterrupt passes through after the running processes are ended; what had ended is in the store.
     """
     results: dict[int, RunResult] = {}
@@ -72,13 +93,12 @@ def execute(plan: Sequence[PlannedRun], store: RunStore, progress: Progress, wor
                 for index, result in _collect(active, progress):
                     results[index] = result
                     run = active.pop(index).run
-                    if not _died(result):
+                    if result.outcome is not Outcome.FAILED:
                         store.put(run.key, result)
                     progress.ended(run, result, reused=False)
         finally:
             for item in active.values():
-                item.process.kill()
-                item.process.join()
+                item.end(patience=0.0)
     return [results[index] for index in range(len(plan))]
 
 
@@ -90,6 +110,8 @@ def _processes() -> Iterator[Any]:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["omnibench.compare.execute", "omnibench.fit.sum_of_norms", "nlopt"])
     try:
+        with _interrupts_ignored():  # the processes inherit this: the parent decides what Ctrl-C ends
+            forkserver.ensure_running()
         yield context
     finally:
         for name, value in before.items():
@@ -99,18 +121,43 @@ def _processes() -> Iterator[Any]:
                 os.environ[name] = value
 
 
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():  # others cannot, and need not
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _main_module_hidden() -> Iterator[None]:
+    """A process started here does not run the user's script once more, which so needs no guard against that."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+
+
 def _start(context: Any, run: PlannedRun) -> _Active:
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(sender, run.config, _Job.of(run)), daemon=True)
-    process.start()
+    process = context.Process(target=_work, args=(sender, _Job.of(run)), daemon=True)
+    with _main_module_hidden():
+        process.start()
     sender.close()
     return _Active(run, process, receiver, time.monotonic())
 
 
 @dataclass(frozen=True)
 class _Job:
-    """What the worker needs of a run: the training data and nothing of the validation data."""
+    """What the worker needs of a run: the training data, and nothing of the validation data or where they are."""
 
+    config: CompareConfig
     robot: Robot
     trajectories: tuple[Trajectory, ...]
     entry: CalibratorEntry
@@ -120,6 +167,7 @@ class _Job:
     @classmethod
     def of(cls, run: PlannedRun) -> _Job:
         return cls(
+            config=run.config.model_copy(update={"datasets": {}}),
             robot=run.dataset.robot,
             trajectories=run.dataset.split("train"),
             entry=run.entry,
@@ -128,16 +176,33 @@ class _Job:
         )
 
 
-def _work(connection: Connection, config: CompareConfig, job: _Job) -> None:
+def _work(connection: Connection, job: _Job) -> None:
     """The worker process: solve one problem and send the result."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    try:
+        answer = StoredRun.of(_solve(job, lambda evaluations, best: connection.send((evaluations, best))))
+    except BaseException as error:  # whatever a plug-in raises, wherever, is this run's outcome
+        answer = StoredRun.of(RunResult(Outcome.FAILED, describe_error(error), None, None, None, 0, 0.0, ()))
+    with suppress(OSError):  # a plug-in may have closed it
+        connection.send(answer)
+
+
+def _end_with_parent() -> None:
+    """A run must not outlive a comparison that was killed."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # this is a worker
+    with suppress(OSError):
+        wait([parent.sentinel])
+        os._exit(1)
+
+
+def _solve(job: _Job, watch: Callable[[int, float], None]) -> RunResult:
+    config, entry = job.config, job.entry
     load_calibrators(config)
-    calibrator = calibrators.create(job.entry.name, job.entry.options)
+    calibrator = calibrators.create(entry.name, entry.options)
     cost = costs.create(config.cost.name, config.cost.options)
-    box = job.entry.box or config.box
-    searched = make_parameterisation(
-        job.parameterisation, job.robot, job.trajectories, box=box, limits=job.entry.limits
-    )
+    box = entry.box or config.box
+    searched = make_parameterisation(job.parameterisation, job.robot, job.trajectories, box=box, limits=entry.limits)
     problem = CalibrationProblem(
         job.robot,
         job.trajectories,
@@ -146,44 +211,33 @@ def _work(connection: Connection, config: CompareConfig, job: _Job) -> None:
         integration=config.integration,
         budget=config.budget,
         seed=job.seed,
-        watch=lambda evaluations, best: connection.send((evaluations, best)),
+        watch=watch,
     )
-    connection.send(run_calibrator(calibrator, problem))
+    return run_calibrator(calibrator, problem)
 
 
 def _collect(active: dict[int, _Active], progress: Progress) -> Iterator[tuple[int, RunResult]]:
     """The runs that have ended, after a moment's wait."""
     ready = wait([item.connection for item in active.values()], timeout=0.2)
     for index, item in list(active.items()):
+        seconds = item.run.config.budget.seconds
         if item.connection in ready:
             result = _receive(item, progress)
             if result is not None:
-                item.process.join()
                 yield index, result
-        elif time.monotonic() - item.began > item.run.config.budget.seconds + _GRACE:
-            item.process.kill()
-            seconds = item.run.config.budget.seconds
-            yield index, _without_answer(item, Outcome.TIME, f"ended by force: {seconds:g} s spent without an answer")
+        elif time.monotonic() - item.began > seconds + _GRACE:
+            item.end(patience=0.0)
+            yield index, item.without_answer(Outcome.TIME, f"ended by force: {seconds:g} s spent without an answer")
 
 
 def _receive(item: _Active, progress: Progress) -> RunResult | None:
     try:
         message = item.connection.recv()
     except (EOFError, OSError):
-        item.process.join()
-        return _without_answer(item, Outcome.FAILED, f"{_DIED} (exit code {item.process.exitcode})")
-    if isinstance(message, RunResult):
-        return message
-    progress.moved(item.run, *message)
+        return item.without_answer(Outcome.FAILED, f"the process died without an answer ({item.end()})")
+    if isinstance(message, StoredRun):
+        item.end()
+        return message.result()
+    item.evaluations, best = message
+    progress.moved(item.run, item.evaluations, best)
     return None
-
-
-_DIED = "the process died without an answer"
-
-
-def _died(result: RunResult) -> bool:
-    return result.outcome is Outcome.FAILED and result.reason.startswith(_DIED)
-
-
-def _without_answer(item: _Active, outcome: Outcome, reason: str) -> RunResult:
-    return RunResult(outcome, reason, None, None, None, 0, time.monotonic() - item.began, ())

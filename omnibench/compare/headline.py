@@ -6,9 +6,19 @@ import numpy as np
 
 from omnibench.compare.results import EntryStatistics
 from omnibench.compare.view import SPLIT_NAMES, THEORETICAL_NAME, DatasetView, positions_and_headings
-from omnibench.compare.wording import cost, difference_in_words, improvement, interval_in_percent, position_unit
+from omnibench.compare.wording import (
+    cost,
+    cost_decimals,
+    difference_in_words,
+    improvement,
+    improvement_in_words,
+    position_unit,
+)
 from omnibench.report.blocks import Block, Callout, Fact, Facts, Paragraph
-from omnibench.report.numbers import decimals_for, fixed, listing, percent, plural, span
+from omnibench.report.numbers import fixed, listing, percent, plural, span
+
+# A training cost this much above the lowest one was not the minimum.
+_ARRIVED = 0.01
 
 
 def headline(view: DatasetView) -> tuple[Block, ...]:
@@ -32,72 +42,95 @@ def _no_winner(view: DatasetView, best: EntryStatistics | None) -> str:
 
 
 def _verdict(view: DatasetView, best: EntryStatistics) -> str:
-    split = view.scored
-    reached, fell, before = cost(best, split), improvement(best, split), view.theoretical_cost(split)
+    split, decimals = view.scored, cost_decimals(view)
+    reached, before = cost(best, split), view.theoretical_cost(split)
     others = len(view.calibrated) > 1
-    text = f"{best.label} is {'best' if others else 'the only calibrator with an answer'}."
+    words = f"{best.label} is {'best' if others else 'the only calibrator with an answer'}."
     if reached is not None and before is not None:
-        text += (
-            f" On the {SPLIT_NAMES[split]} data its cost is {fixed(reached.value, 4)}, "
-            f"where the design values give {fixed(before, 4)}"
+        words += (
+            f" On the {SPLIT_NAMES[split]} data its cost is {fixed(reached.value, decimals)}, where the design values "
+            f"give {fixed(before, decimals)}"
         )
-    if fell is not None:
-        text += f": the error fell by {percent(fell.value)} (95 % interval {interval_in_percent(fell)})"
-        if fell.low <= 0:
-            text += ", which the noise alone could explain"
-    text += "."
+        interval = improvement(best, split)
+        if interval is not None:
+            fell, sure = improvement_in_words(best, split, 1)
+            words += f": the error fell by {fell} (95 % interval {sure})"
+            words += ", which the noise alone could explain" if interval.low <= 0 else ""
+        words += "."
     equal = [entry.label for entry in view.statistics if entry.practically_equal and not entry.is_best]
     if equal:
-        text += f" Practically equal to it: {listing(equal)}."
-    return text
+        words += f" Practically equal to it: {listing(equal)}."
+    return words
 
 
 def _tiles(view: DatasetView, best: EntryStatistics) -> tuple[Fact, ...]:
-    split = view.scored
-    reached, fell, before = cost(best, split), improvement(best, split), view.theoretical_cost(split)
+    split, decimals = view.scored, cost_decimals(view)
+    reached, before = cost(best, split), view.theoretical_cost(split)
     tiles = []
-    if reached is not None and before is not None:
+    if reached is not None:
         tiles.append(
             Fact(
                 f"Cost, {SPLIT_NAMES[split]}",
-                f"{fixed(before, 4)} → {fixed(reached.value, 4)}",
-                f"95 % interval {span(reached.low, reached.high, 4)}",
+                f"{fixed(before, decimals)} → {fixed(reached.value, decimals)}",
+                f"95 % interval {span(reached.low, reached.high, decimals)}",
             )
         )
-    if fell is not None:
-        tiles.append(Fact("Improvement", percent(fell.value), f"95 % interval {interval_in_percent(fell)}"))
+    if improvement(best, split) is not None:
+        fell, sure = improvement_in_words(best, split, 1)
+        tiles.append(Fact("Improvement", fell, f"95 % interval {sure}"))
     after = None if best.typical is None else view.errors(best.typical, split)
     if after is not None:
         (p0, h0), (p1, h1) = positions_and_headings(view.design_errors[split]), positions_and_headings(after)
-        factor, unit, _ = position_unit(float(p0.mean()), float(p1.mean()))
-        digits = max(decimals_for(factor * float(p1.mean()), 3), 0)
-        tiles.append(
+        factor, unit, digits = position_unit(float(p0.mean()), float(p1.mean()))
+        tiles += [
             Fact(
                 "Final position error, mean",
-                f"{fixed(factor * p0.mean(), min(digits, 1) if unit == 'mm' else digits)} → "
-                f"{fixed(factor * p1.mean(), min(digits, 1) if unit == 'mm' else digits)} {unit}",
-                f"worst {fixed(factor * p1.max(), 1 if unit == 'mm' else 3)} {unit}",
-            )
-        )
-        degrees = np.degrees([h0.mean(), h1.mean(), h1.max()])
-        tiles.append(
+                f"{fixed(factor * p0.mean(), digits)} → {fixed(factor * p1.mean(), digits)} {unit}",
+                f"worst {fixed(factor * p1.max(), digits)} {unit}",
+            ),
             Fact(
                 "Final heading error, mean",
-                f"{fixed(degrees[0], 2)}° → {fixed(degrees[1], 2)}°",
-                f"worst {fixed(degrees[2], 2)}°",
-            )
-        )
+                f"{fixed(np.degrees(h0.mean()), 2)}° → {fixed(np.degrees(h1.mean()), 2)}°",
+                f"worst {fixed(np.degrees(h1.max()), 2)}°",
+            ),
+        ]
     return tuple(tiles)
 
 
+def _doubts(view: DatasetView, best: EntryStatistics) -> list[str]:
+    """What speaks against reading the first place as merit: seeds that differ, a search that had not arrived."""
+    doubts = []
+    split, decimals = view.scored, cost_decimals(view)
+    records = [run.record for run in view.runs if run.record.label == best.label]
+    found = [record.train_cost if split == "train" else record.validation_cost for record in records]
+    values = [value for value in found if value is not None]
+    reached = cost(best, split)
+    if len(values) > 1 and reached is not None and max(values) - min(values) > 0.25 * (reached.high - reached.low):
+        doubts.append(
+            f"{best.label} depends on its seed: over {len(values)} seeds its {SPLIT_NAMES[split]} cost goes from "
+            f"{span(min(values), max(values), decimals)}. The verdict is about the run of median training cost."
+        )
+    lowest = min((entry.train_median for entry in view.statistics if entry.train_median is not None), default=None)
+    if best.train_median is not None and lowest and best.train_median > (1 + _ARRIVED) * lowest:
+        doubts.append(
+            f"{best.label} has not found the minimum: its training cost is {percent(best.train_median / lowest - 1)} "
+            "above the lowest. That it does better on other data may be chance, or the splits differ in more than "
+            "noise."
+        )
+    return doubts
+
+
 def _remarks(view: DatasetView, best: EntryStatistics | None) -> Callout:
-    items = []
+    items: list[str] = []
+    doubts: list[str] = []
     split = view.scored
     if split == "train":
         items.append("There is no validation split: costs and errors are those of the data that were fitted.")
     if best is not None:
+        doubts = _doubts(view, best)
+        items += doubts
         worse = [
-            f"{entry.label} ({', '.join(difference_in_words(entry.difference))})"
+            "{}: {} ({})".format(entry.label, *difference_in_words(entry.difference))
             for entry, _ in view.calibrated
             if entry.difference is not None and entry.practically_equal is False and not entry.is_best
         ]
@@ -114,4 +147,5 @@ def _remarks(view: DatasetView, best: EntryStatistics | None) -> Callout:
     bound = [entry.label for entry, run in view.calibrated if run.record.at_bounds]
     if bound:
         items.append(f"Held back by the box, with elements on a bound: {listing(bound)}. A wider box may do better.")
-    return Callout("To be kept in mind", tuple(items), "warning" if any("no answer" in i for i in items) else "plain")
+    failed = any(entry.answers < entry.runs for entry in view.statistics)
+    return Callout("To be kept in mind", tuple(items), "warning" if doubts or failed else "plain")

@@ -29,7 +29,9 @@ def matrix_blocks(view: DatasetView) -> tuple[Block, ...]:
     parameters = parameter_table(view)
     if parameters is not None:
         blocks.append(parameters)
-    blocks.append(Code(matrices_as_text(view), "Matrices with all digits: rows x, y (m/rad), heading (rad/rad)"))
+    blocks.append(
+        Code(matrices_as_text(view), "Matrices with all digits (YAML): rows x and y in m/rad, heading in rad/rad")
+    )
     return tuple(blocks)
 
 
@@ -41,7 +43,7 @@ def differences(matrix: Array, reference: Array) -> Array:
 
 
 def matrices_as_text(view: DatasetView) -> str:
-    """Every matrix with the digits that bring back the same numbers, as YAML and JSON read them."""
+    """Every matrix with the digits that bring back the same numbers, as YAML reads them."""
     named = [("theoretical", view.design_matrix)]
     named += [(entry.label, run.matrix) for entry, run in view.calibrated if run.matrix is not None]
     parts = []
@@ -63,8 +65,7 @@ def parameter_table(view: DatasetView) -> Table | None:
         cells = [Cell(f"{kind}, wheel {wheel}" if wheel else name)]
         found = [next((p for p in record.parameters or () if p.name == name), None) for _, record in fitted]
         known = next(parameter for parameter in found if parameter is not None)
-        value, unit = _shown(known.design, known.unit)
-        cells.append(Cell(f"{value} {unit}"))
+        cells.append(Cell(_shown(known.design, known.unit)))
         for parameter, (_, record) in zip(found, fitted, strict=True):
             cells.append(_parameter_cell(parameter, name in record.at_bounds))
         rows.append(Row(tuple(cells)))
@@ -73,8 +74,8 @@ def parameter_table(view: DatasetView) -> Table | None:
         "Physical parameters and their deviation from the design values",
         columns,
         tuple(rows),
-        "As section 4.2 of the paper. Several geometries share one matrix, so a parameter by itself is not a "
-        "measurement of the robot. † on a bound of its limits.",
+        "As section 4.2 of the paper. Each matrix has one such geometry, but it takes up whatever else is wrong "
+        "with the model, so a parameter by itself is not a measurement of the robot. † on a bound of its limits.",
     )
 
 
@@ -149,15 +150,14 @@ def _element_columns(view: DatasetView, with_units: bool) -> tuple[Column, ...]:
     return tuple(Column(name, units[name[1]]) for name in _element_names(view))
 
 
-def _shown(value: float, unit: str) -> tuple[str, str]:
-    """A parameter's value and unit as a person reads them: angles in degrees."""
-    return (fixed(math.degrees(value), 3), "°") if unit == "rad" else (fixed(value, 5), unit)
+def _shown(value: float, unit: str) -> str:
+    """A parameter's value with its unit as a person reads it: angles in degrees."""
+    return f"{fixed(math.degrees(value), 3)}°" if unit == "rad" else f"{fixed(value, 5)} {unit}"
 
 
 def _parameter_cell(parameter: FittedParameter | None, on_bound: bool) -> Cell:
     if parameter is None:
         return Cell(NOTHING)
-    value, unit = _shown(parameter.value, parameter.unit)
     percent = parameter.deviation_percent
     deviation = "design is 0" if percent is None else f"{fixed(percent, 2, signed=True)} %"
-    return Cell(f"{value} {unit}{' †' if on_bound else ''}", deviation)
+    return Cell(_shown(parameter.value, parameter.unit) + (" †" if on_bound else ""), deviation)

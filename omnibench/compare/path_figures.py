@@ -49,8 +49,8 @@ def path_grid(view: DatasetView) -> FigureGrid:
         tuple(look.legend for look in looks),
         2,
         f"As Fig. 5 to 7 of the paper, on {SPLIT_NAMES[view.scored]} trajectories. Right: final poses about the "
-        "reference's final position, the short strokes show the headings. The window holds the nearer ends; drag or "
-        "scroll out for the others.",
+        "reference's final position, the short strokes show the headings. The window holds the nearer ends; "
+        "Autoscale, at the top right of a plot, shows all.",
     )
 
 
@@ -77,7 +77,7 @@ def describe(trajectory: Trajectory) -> str:
     if trajectory.alpha is None or trajectory.omega is None:
         command = "" if trajectory.command is None else f"{trajectory.command}, "
         return f"{command}{trajectory.id}"
-    speed = "" if trajectory.v is None else f"{trajectory.v:g} m/s, "
+    speed = "" if trajectory.v is None else f"{trajectory.v:.3g} m/s, "
     turn = fixed(trajectory.omega, 2)
     return f"({speed}{math.degrees(trajectory.alpha):.0f}°, {turn} rad/s), {trajectory.id}"
 
@@ -124,7 +124,8 @@ def _end(view: DatasetView, trajectory: Trajectory) -> go.Figure:
     duration = trajectory.pose_times[-1]
     stamps = np.linspace((1 - _TAIL) * duration, duration, 60)
     tails = [(look, view.model(matrix).poses([trajectory.log(stamps)])[0]) for look, matrix in _models(view)]
-    half = _window([_distance_mm(poses[-1], final) for look, poses in tails if look is not THEORETICAL_LOOK])
+    calibrated = tails[1:] or tails  # the design values come first, and are far away
+    half = _window([_distance_mm(poses[-1], final) for _, poses in calibrated])
     late = trajectory.poses[trajectory.pose_times >= min(stamps[0], trajectory.pose_times[-2])]
     traces = _tail_traces(REFERENCE_LOOK, late, final, half, width=2.6)
     for look, poses in tails:
@@ -166,8 +167,6 @@ def _ends_in_words(view: DatasetView, trajectory: Trajectory) -> str:
 
 def _window(distances: Sequence[float]) -> float:
     """Half the width (mm) of a detail that holds the reference's end and the nearer half of the others at least."""
-    if not distances:
-        return 50.0
     near = [distance for distance in distances if distance <= 2.5 * float(np.median(distances))]
     return max(5.0, 1.45 * max(near))
 

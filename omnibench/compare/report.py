@@ -15,7 +15,7 @@ from omnibench.compare.results import ComparisonResult
 from omnibench.compare.search_figures import search_blocks
 from omnibench.compare.tables import cost_in_words, cost_table, entry_table, final_error_table, run_table
 from omnibench.compare.view import SPLIT_NAMES, DatasetView, views
-from omnibench.compare.wording import cost, improvement, interval_in_percent
+from omnibench.compare.wording import cost, cost_decimals, improvement_in_words
 from omnibench.config import to_yaml
 from omnibench.data.dataset import SPLITS
 from omnibench.report.blocks import (
@@ -34,8 +34,9 @@ from omnibench.report.blocks import (
     Section,
     Table,
 )
-from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, plural, significant
+from omnibench.report.numbers import NOTHING, count, fixed, listing, plural, significant
 from omnibench.report.render import write_document
+from omnibench.robot.kinematics import Array
 
 _SIMULATED = Badge("SIMULATED DATA", "warning")
 _FOLDED_ABOVE = 20  # runs
@@ -115,16 +116,16 @@ def _overview(found: list[DatasetView]) -> Table:
     for view in found:
         best = view.best
         reached = None if best is None else cost(best, view.scored)
-        fell = None if best is None else improvement(best, view.scored)
+        decimals = cost_decimals(view)
         rows.append(
             Row(
                 (
                     Cell(view.name, "simulated" if view.dataset.simulated else ""),
                     Cell(NOTHING if best is None else best.label),
                     Cell(SPLIT_NAMES[view.scored]),
-                    Cell(fixed(view.theoretical_cost(view.scored), 4)),
-                    Cell(NOTHING if reached is None else fixed(reached.value, 4)),
-                    Cell(NOTHING) if fell is None else Cell(percent(fell.value), interval_in_percent(fell)),
+                    Cell(fixed(view.theoretical_cost(view.scored), decimals)),
+                    Cell(NOTHING if reached is None else fixed(reached.value, decimals)),
+                    Cell(NOTHING) if best is None else Cell(*improvement_in_words(best, view.scored, 1)),
                 )
             )
         )
@@ -166,7 +167,7 @@ def _data_blocks(result: ComparisonResult, view: DatasetView) -> tuple[Block, ..
         Fact("Sessions", listing(sorted(map(str, sessions))) if sessions else "not known"),
         Fact(
             "Duration",
-            f"{significant(float(durations.min()), 3)} to {significant(float(durations.max()), 3)} s a run",
+            f"{_range(durations)} s a run",
             f"wheel samples every {significant(1e3 * dataset.sample_period, 3)} ms",
         ),
         Fact("Robot", dataset.robot.name, "; ".join(wheels)),
@@ -179,6 +180,11 @@ def _data_blocks(result: ComparisonResult, view: DatasetView) -> tuple[Block, ..
         Facts(tuple(fact for fact in facts if fact.value)),
         Callout("Warnings on reading the data", warnings, "warning"),
     )
+
+
+def _range(values: Array) -> str:
+    low, high = (significant(float(value), 3) for value in (values.min(), values.max()))
+    return low if low == high else f"{low} to {high}"
 
 
 def _reproduction(result: ComparisonResult) -> Section:

@@ -52,7 +52,7 @@ def search_blocks(view: DatasetView) -> tuple[Block, ...]:
     """Cost, gap and targets reached, against evaluations and against time."""
     drawn = courses(view)
     if not drawn:
-        return (Paragraph("No entry searched: there is no course to draw.", "note"),)
+        return (Paragraph("There is no course to draw: no entry searched, or none reached a cost above zero.", "note"),)
     looks = list({course.look.key: course.look for course in drawn}.values())
     legend = tuple(look.legend for look in looks)
     limit = max(24, _POINTS // len(drawn))

@@ -93,10 +93,10 @@ class _Draws:
 
 
 def _typical(group: Sequence[ScoredRun]) -> ScoredRun | None:
-    """The run of median training cost (the better one of two), of those with an answer."""
+    """The run of median training cost (the worse one of two), of those with an answer."""
     answered = [run for run in group if run.record.train_cost is not None]
     ranked = sorted(answered, key=lambda run: (run.record.train_cost, run.record.seed))
-    return ranked[(len(ranked) - 1) // 2] if ranked else None
+    return ranked[len(ranked) // 2] if ranked else None
 
 
 def _judged(run: ScoredRun) -> Array:

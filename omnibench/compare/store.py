@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from pydantic import ValidationError
-
 from omnibench.config import Model
 from omnibench.files import write_text
 from omnibench.fit.calibrator import Outcome, RunResult
@@ -28,34 +26,10 @@ class StoredRun(Model):
     history: tuple[tuple[int, float, float], ...]
     at_bounds: tuple[str, ...]
 
-
-class RunStore:
-    """Results by key in ``folder``. DataError when one cannot be written."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def get(self, key: str) -> RunResult | None:
-        """The result of a run that has ended before; a damaged file counts as none."""
-        try:
-            stored = StoredRun.model_validate_json(self._file(key).read_text(encoding="utf-8"))
-        except (OSError, ValidationError):
-            return None
-        return RunResult(
-            outcome=stored.outcome,
-            reason=stored.reason,
-            vector=_array(stored.vector),
-            matrix=_array(stored.matrix),
-            cost=stored.cost,
-            evaluations=stored.evaluations,
-            seconds=stored.seconds,
-            history=tuple(Improvement(*row) for row in stored.history),
-            at_bounds=stored.at_bounds,
-        )
-
-    def put(self, key: str, result: RunResult) -> None:
-        """Keep a result."""
-        stored = StoredRun(
+    @classmethod
+    def of(cls, result: RunResult) -> StoredRun:
+        """The file's content for a result."""
+        return cls(
             outcome=result.outcome,
             reason=result.reason,
             vector=None if result.vector is None else tuple(result.vector.tolist()),
@@ -66,7 +40,38 @@ class RunStore:
             history=tuple((step.evaluations, step.seconds, step.cost) for step in result.history),
             at_bounds=result.at_bounds,
         )
-        write_text(self._file(key), stored.model_dump_json(indent=1))
+
+    def result(self) -> RunResult:
+        """The result that was stored."""
+        return RunResult(
+            outcome=self.outcome,
+            reason=self.reason,
+            vector=_array(self.vector),
+            matrix=_array(self.matrix),
+            cost=self.cost,
+            evaluations=self.evaluations,
+            seconds=self.seconds,
+            history=tuple(Improvement(*row) for row in self.history),
+            at_bounds=self.at_bounds,
+        )
+
+
+class RunStore:
+    """Results by key in ``folder``. DataError when one cannot be written."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def get(self, key: str) -> RunResult | None:
+        """The result of a run that has ended before; a damaged file counts as none."""
+        try:
+            return StoredRun.model_validate_json(self._file(key).read_text(encoding="utf-8")).result()
+        except (OSError, ValueError):  # pydantic's and Unicode's errors among them
+            return None
+
+    def put(self, key: str, result: RunResult) -> None:
+        """Keep a result."""
+        write_text(self._file(key), StoredRun.of(result).model_dump_json(indent=1))
 
     def _file(self, key: str) -> Path:
         return self.folder / f"{key}.json"

@@ -13,7 +13,13 @@ from omnibench.compare.view import (
     is_bounded,
     positions_and_headings,
 )
-from omnibench.compare.wording import cost, difference_in_words, improvement, interval_in_percent, position_unit
+from omnibench.compare.wording import (
+    cost,
+    cost_decimals,
+    difference_in_words,
+    improvement_in_words,
+    position_unit,
+)
 from omnibench.data.dataset import Split
 from omnibench.registry import costs
 from omnibench.report.blocks import Cell, Column, Row, Table
@@ -36,9 +42,10 @@ def cost_table(view: DatasetView, split: Split) -> Table:
     """Table 2 (training) or 3 (validation) of the paper, with intervals."""
     theoretical = view.theoretical_cost(split)
     own = next((entry for entry in view.statistics if entry.calibrator == THEORETICAL_NAME), None)
-    before = fixed(theoretical, 4)
+    decimals = cost_decimals(view)
+    before = fixed(theoretical, decimals)
     ours = None if own is None else cost(own, split)
-    first = Row((entry_cell(view, None), Cell(before, _span(ours)), Cell(NOTHING), Cell(NOTHING)))
+    first = Row((entry_cell(view, None), Cell(before, _span(ours, decimals)), Cell(NOTHING), Cell(NOTHING)))
     rows = [first]
     searched = [entry for entry in view.statistics if entry.calibrator != THEORETICAL_NAME]
     rows += [_cost_row(view, entry, split, before) for entry in searched]
@@ -159,8 +166,12 @@ def entry_cell(view: DatasetView, entry: EntryStatistics | None) -> Cell:
     """An entry's name with its colour; None stands for the design values."""
     if entry is None:
         return Cell("Theoretical", "design values", THEORETICAL_LOOK.colour)
-    box = f", box {entry.box}" if is_bounded(entry.calibrator) else ", as given"
-    note = "design values" if entry.calibrator == THEORETICAL_NAME else f"{entry.parameterisation}{box}"
+    if entry.calibrator == THEORETICAL_NAME:
+        note = "design values"
+    elif not is_bounded(entry.calibrator):
+        note = f"{entry.parameterisation}, as given"
+    else:
+        note = "geometry within limits" if entry.parameterisation == "geometry" else f"matrix, box {entry.box}"
     return Cell(entry.label, note, view.looks[entry.label].colour)
 
 
@@ -172,7 +183,7 @@ def gap(value: float | None) -> str:
 
 
 def _cost_row(view: DatasetView, entry: EntryStatistics, split: Split, before: str) -> Row:
-    reached, fell = cost(entry, split), improvement(entry, split)
+    reached = cost(entry, split)
     if reached is None:
         failed = [run.record for run in view.runs if run.record.label == entry.label]
         outcome = failed[0].outcome.value if failed else "no run"
@@ -180,8 +191,8 @@ def _cost_row(view: DatasetView, entry: EntryStatistics, split: Split, before: s
     cells = (
         entry_cell(view, entry),
         Cell(before),
-        Cell(fixed(reached.value, 4), _span(reached)),
-        Cell(percent(fell.value, 2), interval_in_percent(fell)) if fell else Cell(NOTHING),
+        Cell(fixed(reached.value, cost_decimals(view)), _span(reached, cost_decimals(view))),
+        Cell(*improvement_in_words(entry, split, 2)),
     )
     return Row(cells, "best" if entry.is_best else "plain")
 
@@ -205,8 +216,8 @@ def _published_rows(view: DatasetView, split: Split) -> list[Row]:
     return rows
 
 
-def _span(interval: Interval | None) -> str:
-    return "" if interval is None else span(interval.low, interval.high, 4)
+def _span(interval: Interval | None, decimals: int) -> str:
+    return "" if interval is None else span(interval.low, interval.high, decimals)
 
 
 def _spread(entry: EntryStatistics) -> str:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from omnibench.compare.results import EntryStatistics, Interval
+from omnibench.compare.view import DatasetView
 from omnibench.data.dataset import Split
-from omnibench.report.numbers import decimals_for, fixed, span
+from omnibench.report.numbers import NOTHING, decimals_for, fixed, percent, significant, span
 
 
 def improvement(entry: EntryStatistics, split: Split) -> Interval | None:
@@ -12,14 +13,23 @@ def improvement(entry: EntryStatistics, split: Split) -> Interval | None:
     return entry.train_improvement if split == "train" else entry.validation_improvement
 
 
+def improvement_in_words(entry: EntryStatistics, split: Split, decimals: int) -> tuple[str, str]:
+    """An improvement and its interval, in per cent."""
+    found = improvement(entry, split)
+    if found is None:
+        return NOTHING, ""
+    return percent(found.value, decimals), f"{span(100 * found.low, 100 * found.high, 1)} %"
+
+
 def cost(entry: EntryStatistics, split: Split) -> Interval | None:
     """An entry's cost on a split."""
     return entry.train if split == "train" else entry.validation
 
 
-def interval_in_percent(interval: Interval) -> str:
-    """``80.9 to 82.5 %``."""
-    return f"{span(100 * interval.low, 100 * interval.high, 1)} %"
+def cost_decimals(view: DatasetView) -> int:
+    """Decimals of a data set's costs: four as in the paper, more where that leaves the lowest too few digits."""
+    costs = [interval.value for entry in view.statistics for interval in (entry.train, entry.validation) if interval]
+    return min(7, max(4, decimals_for(min(costs, default=None), 3)))
 
 
 def position_unit(*errors: float) -> tuple[float, str, int]:
@@ -29,5 +39,9 @@ def position_unit(*errors: float) -> tuple[float, str, int]:
 
 def difference_in_words(difference: Interval) -> tuple[str, str]:
     """A difference and its interval, to two digits of the larger end."""
-    digits = max(4, decimals_for(max(abs(difference.low), abs(difference.high)), 2))
+    largest = max(abs(difference.low), abs(difference.high))
+    if 0 < largest < 1e-5:
+        value, low, high = (significant(v, 2, signed=True) for v in (difference.value, difference.low, difference.high))
+        return value, f"{low} to {high}"
+    digits = max(4, decimals_for(largest, 2))
     return fixed(difference.value, digits, signed=True), span(difference.low, difference.high, digits, signed=True)

@@ -12,8 +12,9 @@ from pydantic import Field, model_validator
 
 from omnibench.config import Model, read_yaml, to_yaml, validate
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, make_dataset
+from omnibench.data.table import Table, read_table
 from omnibench.errors import ConfigError, DataError, nearest
-from omnibench.files import replacing, write_text
+from omnibench.files import remove, write_table, write_text
 from omnibench.robot.kinematics import Array, Robot
 
 FORMAT: Final = "omnibench-dataset/1"
@@ -51,10 +52,10 @@ def load_dataset(path: Path | str) -> Dataset:
     """
     folder = Path(path)
     header = _read_header(folder)
-    runs = _read_table(folder, "trajectories", ("trajectory", "split"))
+    runs = read_table(folder, "trajectories", ("trajectory", "split"))
     rates = [f"omega_{wheel}" for wheel in header.wheels]
-    wheels = _read_table(folder, "wheels", ("trajectory", "t", *rates))
-    poses = _read_table(folder, "poses", ("trajectory", "t", "x", "y", "theta"))
+    wheels = read_table(folder, "wheels", ("trajectory", "t", *rates))
+    poses = read_table(folder, "poses", ("trajectory", "t", "x", "y", "theta"))
     _check_runs(runs)
     wheel_rows = _rows_by_trajectory(runs, wheels)
     pose_rows = _rows_by_trajectory(runs, poses)
@@ -96,11 +97,10 @@ def save_dataset(dataset: Dataset, path: Path | str, table_format: Literal["parq
         # What only some trajectories have is left out of the sample tables, which may have no gaps.
         allowed = len(frame) - 1 if name == "trajectories" else 0
         kept = frame.select(column for column in frame.iter_columns() if column.null_count() <= allowed)
-        for stale in {"parquet", "csv"} - {table_format}:
-            (folder / f"{name}.{stale}").unlink(missing_ok=True)
-        with replacing(folder / f"{name}.{table_format}") as partial:
-            kept.write_parquet(partial) if table_format == "parquet" else kept.write_csv(partial)
+        write_table(folder / f"{name}.{table_format}", kept)
     write_text(folder / "dataset.yaml", to_yaml(header_of(dataset)))
+    for name in tables:  # only now: what was there before is lost when the new one is complete
+        remove(folder / f"{name}.{'csv' if table_format == 'parquet' else 'parquet'}")
 
 
 def header_of(dataset: Dataset) -> Header:
@@ -117,39 +117,8 @@ def header_of(dataset: Dataset) -> Header:
     )
 
 
-class _Table:
-    """A table and the file it came from, for messages."""
-
-    def __init__(self, file: Path, frame: pl.DataFrame) -> None:
-        self.file = file
-        self.frame = frame
-
-    def fail(self, row: int, what: str) -> DataError:
-        return DataError(f"{self.file}, row {row + 1}: {what}")
-
-    def numbers(self, column: str) -> Array:
-        """A column as finite floats (rows,)."""
-        series = self.frame[column]
-        if not series.dtype.is_numeric():
-            raise DataError(f"{self.file}: column {column!r} holds {series.dtype}, expected numbers")
-        values = series.cast(pl.Float64).fill_null(np.nan).to_numpy()
-        bad = np.flatnonzero(~np.isfinite(values))
-        if len(bad):
-            found = series[int(bad[0])]
-            raise self.fail(
-                int(bad[0]), f"{column} is {'missing' if found is None else found}; remove or repair the row"
-            )
-        return values
-
-    def stack(self, columns: Sequence[str]) -> Array | None:
-        """Optional columns as (rows, n), or None when one is not there."""
-        if not all(column in self.frame.columns for column in columns):
-            return None
-        return np.column_stack([self.numbers(column) for column in columns])
-
-
 class _WheelColumns:
-    def __init__(self, table: _Table, wheels: Sequence[str]) -> None:
+    def __init__(self, table: Table, wheels: Sequence[str]) -> None:
         self.times = table.numbers("t")
         rates = table.stack([f"omega_{wheel}" for wheel in wheels])
         assert rates is not None  # their presence was checked on reading
@@ -159,7 +128,7 @@ class _WheelColumns:
 
 
 class _PoseColumns:
-    def __init__(self, table: _Table) -> None:
+    def __init__(self, table: Table) -> None:
         self.times = table.numbers("t")
         self.poses = np.column_stack([table.numbers(column) for column in ("x", "y", "theta")])
         upper = table.stack([f"cov_{name}" for name in _COVARIANCE])
@@ -180,37 +149,14 @@ def _read_header(folder: Path) -> Header:
         raise DataError(str(error)) from None
 
 
-def _read_table(folder: Path, name: str, required: Sequence[str]) -> _Table:
-    file = next((f for f in (folder / f"{name}.parquet", folder / f"{name}.csv") if f.is_file()), None)
-    if file is None:
-        raise DataError(f"{folder}: {name}.parquet (or {name}.csv) is missing")
-    try:
-        frame = pl.read_parquet(file) if file.suffix == ".parquet" else pl.read_csv(file, infer_schema_length=None)
-    except (pl.exceptions.PolarsError, OSError) as error:
-        raise DataError(f"{file}: cannot be read: {error}") from None
-    for column in required:
-        if column not in frame.columns:
-            known = ", ".join(frame.columns)
-            raise DataError(f"{file}: column {column!r} is missing; {nearest(column, frame.columns)}found: {known}")
-    if frame.is_empty():
-        raise DataError(f"{file}: it has no rows")
-    table = _Table(file, frame)
-    missing = frame["trajectory"].is_null().arg_true()
-    if len(missing):
-        raise table.fail(int(missing[0]), "trajectory is missing")
-    table.frame = frame.with_columns(pl.col("trajectory").cast(pl.String))
-    return table
-
-
-def _check_runs(runs: _Table) -> None:
+def _check_runs(runs: Table) -> None:
     for column in (*_RUN_NUMBERS, "repetition"):
         if column in runs.frame.columns:
-            series = runs.frame[column]
-            if not series.dtype.is_numeric() and series.null_count() < len(series):
-                raise DataError(f"{runs.file}: column {column!r} holds {series.dtype}, expected numbers")
-            bad = (series.cast(pl.Float64).is_finite().not_() & series.is_not_null()).arg_true()
+            series = runs.floats(column)
+            bad = (series.is_finite().not_() & series.is_not_null()).arg_true()
             if len(bad):
                 raise runs.fail(int(bad[0]), f"{column} is {series[int(bad[0])]}; leave it empty if it is not known")
+            runs.frame = runs.frame.with_columns(series.alias(column))
     repeated = runs.frame["trajectory"].is_first_distinct().not_().arg_true()
     if len(repeated):
         row = int(repeated[0])
@@ -220,7 +166,7 @@ def _check_runs(runs: _Table) -> None:
             raise runs.fail(row, f"split is {split!r}; {nearest(str(split), SPLITS)}it must be train or validation")
 
 
-def _rows_by_trajectory(runs: _Table, table: _Table) -> list[np.ndarray[Any, np.dtype[np.intp]]]:
+def _rows_by_trajectory(runs: Table, table: Table) -> list[np.ndarray[Any, np.dtype[np.intp]]]:
     """For each run the rows of ``table`` that belong to it, in the file's order."""
     ids = runs.frame["trajectory"].to_list()
     number = {identity: index for index, identity in enumerate(ids)}
@@ -239,7 +185,7 @@ def _rows_by_trajectory(runs: _Table, table: _Table) -> list[np.ndarray[Any, np.
     return np.split(order, np.cumsum(counts)[:-1])
 
 
-def _check_wheel_times(wheels: _Table, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]) -> None:
+def _check_wheel_times(wheels: Table, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]) -> None:
     times = wheels.numbers("t")
     early = np.flatnonzero(times <= 0)
     if len(early):
@@ -250,7 +196,7 @@ def _check_wheel_times(wheels: _Table, groups: Sequence[np.ndarray[Any, np.dtype
     _check_increasing(wheels, times, groups)
 
 
-def _check_pose_times(poses: _Table, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]) -> None:
+def _check_pose_times(poses: Table, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]) -> None:
     times = poses.numbers("t")
     early = np.flatnonzero(times < 0)
     if len(early):
@@ -265,7 +211,7 @@ def _check_pose_times(poses: _Table, groups: Sequence[np.ndarray[Any, np.dtype[n
             raise poses.fail(first, f"trajectory {identity} has no reference pose after its start")
 
 
-def _check_increasing(table: _Table, times: Array, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]) -> None:
+def _check_increasing(table: Table, times: Array, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]) -> None:
     for rows in groups:
         steps = np.diff(times[rows])
         bad = np.flatnonzero(steps <= 0)

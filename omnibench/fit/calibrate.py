@@ -3,19 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from omnibench.data.dataset import Dataset
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError
+from omnibench.fit.bootstrap import ElementIntervals, bootstrap_intervals
 from omnibench.fit.calibrator import Calibrator, RunResult, run_calibrator
 from omnibench.fit.evaluate import split_errors
 from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import Calibration, Provenance, matrix_rows
+from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationRun:
+    """A calibration, how it was found and, where asked for, 95 % intervals of its elements."""
+
+    calibration: Calibration
+    result: RunResult
+    intervals: ElementIntervals | None
 
 
 def calibrate(
@@ -30,9 +42,12 @@ def calibrate(
     integration: Integration = "arc",
     budget: Budget | None = None,
     seed: int = 1,
+    intervals: bool = False,
     watch: Callable[[int, float], None] | None = None,
-) -> tuple[Calibration, RunResult]:
-    """Fit the odometry model of a data set's training split; the calibration and how the run ended.
+) -> CalibrationRun:
+    """Fit the odometry model of a data set's training split.
+
+    intervals: also draw bootstrap intervals about the optimum (closed_form only).
 
     Raises UnknownNameError or ConfigError for wrong arguments, DataError for an empty training split, and ConfigError
     when the calibrator gives no answer.
@@ -80,4 +95,10 @@ def calibrate(
             reason=result.reason,
         ),
     )
-    return calibration, result
+    return CalibrationRun(calibration, result, _intervals(problem, calibrator, result.vector) if intervals else None)
+
+
+def _intervals(problem: CalibrationProblem, calibrator: str, optimum: Array | None) -> ElementIntervals:
+    if calibrator != "closed_form" or optimum is None:
+        raise ConfigError("intervals are drawn about the exact optimum: use the calibrator closed_form")
+    return bootstrap_intervals(problem, optimum, rng=problem.rng)

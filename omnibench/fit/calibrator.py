@@ -8,7 +8,6 @@ from enum import StrEnum
 from typing import Any, ClassVar
 
 import numpy as np
-
 from pydantic import BaseModel
 
 from omnibench.errors import OmnibenchError, PluginError
@@ -85,8 +84,10 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
     vector: Array | None = None
     try:
         solution = calibrator.calibrate(problem)
+        if not isinstance(solution, Solution):
+            raise PluginError(f"calibrate returned {type(solution).__name__}, expected a Solution")
         outcome = Outcome.CONVERGED if solution.converged else Outcome.BUDGET
-        vector, reason = solution.vector, solution.reason
+        vector, reason = solution.vector, " ".join(str(solution.reason).split())
     except BudgetSpent as spent:
         outcome, reason = Outcome(spent.kind), str(spent)
         vector = problem.best_vector if np.isfinite(problem.best_cost) else None
@@ -95,7 +96,7 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
     except OmnibenchError as error:
         outcome, reason = Outcome.FAILED, str(error)
     except (Exception, SystemExit) as error:  # whatever a plug-in raises is this run's outcome
-        outcome, reason = Outcome.FAILED, " ".join(f"{type(error).__name__}: {error}".split())
+        outcome, reason = Outcome.FAILED, describe_error(error)
     seconds = problem.seconds
     cost: float | None = None
     if vector is not None:
@@ -113,6 +114,14 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
         history=tuple(problem.history),
         at_bounds=problem.at_bounds(vector) if vector is not None and calibrator.bounded else (),
     )
+
+
+def describe_error(error: BaseException) -> str:
+    """Type and message of whatever was raised, in one line."""
+    try:
+        return " ".join(f"{type(error).__name__}: {error}".split())
+    except Exception:  # its own __str__ raises
+        return type(error).__name__
 
 
 def unloadable(failure: PluginFailure) -> type[Calibrator]:

@@ -28,26 +28,33 @@ def least_squares(design: Array, target: Array, lower: Array, upper: Array) -> A
     return np.clip(x.value, lower, upper)
 
 
-def minimise_sum_of_norms(
-    residuals: Array, jacobian: Array, shares: Array, lower: Array, upper: Array, across: Array
-) -> Array:
-    """The step d (n,) in the box that minimises sum_s shares_s * norm(residuals_s + jacobian_s @ d).
+class SumOfNormsProgram:
+    """Minimises sum_s shares_s * norm(residuals_s + jacobian_s @ d) over steps d in a box, for any shares.
 
-    residuals (S, k), jacobian (S, k, n), shares (S,) >= 0, lower and upper (n,); ``across`` (q, n): directions that
-    the step must not take. Raises SolverError.
+    residuals (S, k), jacobian (S, k, n), lower and upper (n,); ``across`` (q, n): directions that the step must not
+    take.
     """
-    count, components, size = jacobian.shape
-    # Steps in units of the box and residuals in units of their size keep the program well scaled.
-    unit = np.where(upper > lower, (upper - lower) / 2, 1.0)
-    scale = max(float(shares @ np.linalg.norm(residuals, axis=1)) / float(shares.sum()), 1e-12)
-    step = cp.Variable(size)
-    columns = (jacobian * unit).reshape(count * components, size) / scale
-    moved = cp.reshape(columns @ step + residuals.ravel() / scale, (count, components), order="C")
-    constraints = [step >= lower / unit, step <= upper / unit]
-    if len(across):
-        constraints.append((across * unit) @ step == 0)
-    _solve(cp.Problem(cp.Minimize(shares @ cp.norm(moved, 2, axis=1)), constraints))
-    return np.clip(step.value * unit, lower, upper)
+
+    def __init__(self, residuals: Array, jacobian: Array, lower: Array, upper: Array, across: Array) -> None:
+        count, components, size = jacobian.shape
+        self._lower, self._upper = lower, upper
+        # Steps in units of the box and residuals in units of their size keep the program well scaled.
+        self._unit = np.where(upper > lower, (upper - lower) / 2, 1.0)
+        scale = max(float(np.linalg.norm(residuals, axis=1).mean()), 1e-12)
+        self._step = cp.Variable(size)
+        columns = (jacobian * self._unit).reshape(count * components, size) / scale
+        moved = cp.reshape(columns @ self._step + residuals.ravel() / scale, (count, components), order="C")
+        self._shares = cp.Parameter(count, nonneg=True)
+        constraints = [self._step >= lower / self._unit, self._step <= upper / self._unit]
+        if len(across):
+            constraints.append((across * self._unit) @ self._step == 0)
+        self._program = cp.Problem(cp.Minimize(self._shares @ cp.norm(moved, 2, axis=1)), constraints)
+
+    def step(self, shares: Array) -> Array:
+        """The best step (n,) for shares (S,) >= 0. Raises SolverError."""
+        self._shares.value = shares / shares.sum()
+        _solve(self._program)
+        return np.clip(self._step.value * self._unit, self._lower, self._upper)
 
 
 def _solve(problem: Any) -> None:

@@ -20,7 +20,7 @@ _PLOT_OPTIONS = {
     "displaylogo": False,
     "showSendToCloud": False,  # a report sends nothing anywhere
     "plotlyServerURL": "",
-    "modeBarButtonsToRemove": ["select2d", "lasso2d", "autoScale2d"],
+    "modeBarButtonsToRemove": ["select2d", "lasso2d"],
     "toImageButtonOptions": {"format": "svg"},
 }
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import plotly.graph_objects as go
 
 from omnibench.report.blocks import Dash
-from omnibench.report.numbers import power_of_ten, significant
+from omnibench.report.numbers import power_of_ten
 
 FONT = 'system-ui, -apple-system, "Segoe UI", "Helvetica Neue", "Liberation Sans", Arial, sans-serif'
 INK = "#1f2933"
@@ -34,6 +34,8 @@ PALETTE = (
     "#8a8f98",
     "#cc79a7",
     "#111111",
+    "#9970ab",
+    "#b8977e",
 )
 DASHES: tuple[Dash, ...] = ("solid", "dot", "dashdot")
 SYMBOLS = (
@@ -94,8 +96,9 @@ def logarithmic(figure: go.Figure, axis: Literal["x", "y"], low: float, high: fl
     decades = math.log10(high / low)
     exponents = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     if decades < 2:
-        ticks = [step * 10.0**exponent for exponent in exponents for step in (1, 2, 5)]
-        labels = [significant(tick, 1) for tick in ticks]
+        steps = (1, 1.5, 2, 3, 4, 6, 8) if decades < 1 else (1, 2, 5)
+        ticks = [step * 10.0**exponent for exponent in exponents for step in steps]
+        labels = [f"{tick:.2g}" for tick in ticks]
     else:
         stride = math.ceil(decades / 7)
         ticks = [10.0**exponent for exponent in exponents if exponent % stride == 0]

@@ -88,13 +88,13 @@ def inverse_kinematic_matrices(
 
     ``radius`` and ``distance`` (m) and ``angle`` (rad) have shape (P, N), ``roller_angle`` (rad) (N,). Returns
     (P, 3, N). Three omni wheels: Eq. (3) of Palacin et al. 2023. Otherwise the Moore-Penrose inverse of the wheel
-    equations, which is the twist of least squares for the N wheel rates.
+    equations, which is the twist of least squares for the N wheel rates. NaN or infinity for a geometry without one.
     """
     r, R, d = (np.asarray(values, dtype=float) for values in (radius, distance, angle))
     rollers = np.broadcast_to(np.asarray(roller_angle, dtype=float), r.shape[-1:])
     if r.shape[-1] == 3 and not rollers.any():
         return _eq_3(r, R, d)
-    return np.linalg.pinv(_wheel_equations(r, R, d, rollers))
+    return _pseudo_inverse(_wheel_equations(r, R, d, rollers))
 
 
 def _columns(wheels: tuple[Wheel, ...]) -> Array:
@@ -106,6 +106,13 @@ def _wheel_equations(radius: Array, distance: Array, angle: Array, rollers: Arra
     across = -np.sin(angle) + slant * np.cos(angle)
     along = np.cos(angle) + slant * np.sin(angle)
     return np.stack([across, along, distance], axis=-1) / radius[..., None]
+
+
+def _pseudo_inverse(equations: Array) -> Array:
+    finite = np.isfinite(equations).all(axis=(-2, -1))  # LAPACK raises on NaN and does not come back from infinity
+    inverse: Array = np.full(np.swapaxes(equations, -2, -1).shape, np.nan)
+    inverse[finite] = np.linalg.pinv(equations[finite])
+    return inverse
 
 
 def _eq_3(r: Array, R: Array, d: Array) -> Array:

@@ -103,12 +103,12 @@ def true_matrix(truth: Truth, robot: Robot) -> Array:
 def commands_of(config: FlowerConfig) -> list[Command]:
     """The commands, in the config's order; the direction of a turn on the spot has no meaning and is 0."""
     chosen = config.commands
-    commands = []
-    for speed, turn_rate in product(chosen.speeds, chosen.turn_rates):
-        for direction in chosen.directions_deg if speed > 0 else (0.0,):
-            if speed or turn_rate:
-                commands.append(Command(speed, math.radians(direction), turn_rate))
-    return commands
+    return [
+        Command(speed, math.radians(direction), turn_rate)
+        for speed, turn_rate in product(chosen.speeds, chosen.turn_rates)
+        for direction in (chosen.directions_deg if speed > 0 else (0.0,))
+        if speed or turn_rate
+    ]
 
 
 def _session(config: FlowerConfig, matrix: Array, split: Split, session: Session) -> Iterator[Trajectory]:

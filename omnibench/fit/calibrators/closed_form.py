@@ -8,6 +8,8 @@ the sequence converges in a few programs.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from pydantic import Field
 
@@ -18,6 +20,9 @@ from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array
+
+if TYPE_CHECKING:
+    from omnibench.fit.sum_of_norms import SumOfNormsProgram
 
 _MOST_HALVINGS = 30
 
@@ -49,8 +54,9 @@ class ClosedForm(Calibrator):
             raise ConfigError(f"closed_form needs a cost that is a sum of norms, which {problem.objective.name} is not")
         vector = self._better(problem, problem.start, linear_start(problem))
         cost = float(problem.cost(vector[None])[0])
+        shares = problem.objective.shares(problem.odometry.trajectory)
         for count in range(1, self.options.programs + 1):
-            step = cone_step(problem, problem.objective, vector)
+            step = cone_program(problem, problem.objective, vector).step(shares)
             vector_before = vector
             vector, cost = _descend(problem, vector, cost, step)
             moved = float(np.abs(vector - vector_before).max())
@@ -88,27 +94,18 @@ def linear_start(problem: CalibrationProblem) -> Array:
     return np.clip(kept, problem.lower, problem.upper)
 
 
-def cone_step(problem: CalibrationProblem, objective: SumOfNorms, vector: Array, weights: Array | None = None) -> Array:
-    """The step (n,) that minimises the cost with the poses linearised about ``vector``.
+def cone_program(problem: CalibrationProblem, objective: SumOfNorms, vector: Array) -> SumOfNormsProgram:
+    """The cost with the poses linearised about ``vector``, as a program for the best step from there."""
+    from omnibench.fit.sum_of_norms import SumOfNormsProgram
 
-    weights: how often each trajectory counts (Z,); default once.
-    """
-    from omnibench.fit.sum_of_norms import minimise_sum_of_norms
-
+    assert isinstance(problem.parameterisation, MatrixElements)  # calibrate refuses others
     matrix = problem.matrix(vector)
     used = np.flatnonzero(objective.weights)
     scale = np.array(objective.weights)[used]
     residuals = (problem.odometry.poses(matrix[None])[0] - problem.reference)[:, used] * scale
     jacobian = problem.odometry.jacobian(matrix).reshape(len(residuals), 3, -1)[:, used] * scale[:, None]
-    shares = objective.shares(problem.odometry.trajectory)
-    if weights is not None:
-        shares = shares * weights[problem.odometry.trajectory]
-    assert isinstance(problem.parameterisation, MatrixElements)  # calibrate refuses others
     across: Array = np.kron(np.eye(3), problem.parameterisation.null)
-    counted = shares > 0
-    return minimise_sum_of_norms(
-        residuals[counted], jacobian[counted], shares[counted], problem.lower - vector, problem.upper - vector, across
-    )
+    return SumOfNormsProgram(residuals, jacobian, problem.lower - vector, problem.upper - vector, across)
 
 
 def _descend(problem: CalibrationProblem, vector: Array, cost: float, step: Array) -> tuple[Array, float]:

@@ -1,0 +1,84 @@
+"""A table of a data set, Parquet or CSV: what is wrong with it is said with the file and the row."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from omnibench.errors import DataError, nearest
+from omnibench.robot.kinematics import Array
+
+# Names may consist of digits: 007 is not 7.
+_TEXTS = {column: pl.String for column in ("trajectory", "command", "split", "session")}
+
+
+class Table:
+    """A table and the file it came from. Rows of messages count from 1, the first after the header."""
+
+    def __init__(self, file: Path, frame: pl.DataFrame) -> None:
+        self.file = file
+        self.frame = frame
+
+    def fail(self, row: int, what: str) -> DataError:
+        """The error to raise for ``row``, counted from 0."""
+        return DataError(f"{self.file}, row {row + 1}: {what}")
+
+    def floats(self, column: str) -> pl.Series:
+        """A column as floats, null where a cell is empty. DataError for text and other things."""
+        series = self.frame[column]
+        if series.dtype != pl.String:
+            if not series.dtype.is_numeric() and series.null_count() < len(series):
+                raise DataError(f"{self.file}: column {column!r} holds {series.dtype}, expected numbers")
+            return series.cast(pl.Float64)
+        values = series.str.strip_chars().cast(pl.Float64, strict=False)  # one odd cell makes a CSV column text
+        odd = (values.is_null() & series.is_not_null()).arg_true()
+        if len(odd):
+            raise self.fail(int(odd[0]), f"{column} is {series[int(odd[0])]!r}, expected a number")
+        return values
+
+    def numbers(self, column: str) -> Array:
+        """A column as finite floats (rows,). DataError names the first that is not."""
+        series = self.floats(column)
+        values = series.fill_null(np.nan).to_numpy()
+        bad = np.flatnonzero(~np.isfinite(values))
+        if len(bad):
+            found = series[int(bad[0])]
+            raise self.fail(
+                int(bad[0]), f"{column} is {'missing' if found is None else found}; remove or repair the row"
+            )
+        return values
+
+    def stack(self, columns: Sequence[str]) -> Array | None:
+        """Optional columns as (rows, n), or None when one is not there."""
+        if not all(column in self.frame.columns for column in columns):
+            return None
+        return np.column_stack([self.numbers(column) for column in columns])
+
+
+def read_table(folder: Path, name: str, required: Sequence[str]) -> Table:
+    """The table called ``name`` of a data set. DataError when it, its rows or a required column are missing."""
+    file = next((f for f in (folder / f"{name}.parquet", folder / f"{name}.csv") if f.is_file()), None)
+    if file is None:
+        raise DataError(f"{folder}: {name}.parquet (or {name}.csv) is missing")
+    try:
+        if file.suffix == ".parquet":
+            frame = pl.read_parquet(file)
+        else:
+            frame = pl.read_csv(file, infer_schema_length=None, schema_overrides=_TEXTS)
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise DataError(f"{file}: cannot be read: {error}") from None
+    for column in required:
+        if column not in frame.columns:
+            known = ", ".join(frame.columns)
+            raise DataError(f"{file}: column {column!r} is missing; {nearest(column, frame.columns)}found: {known}")
+    if frame.is_empty():
+        raise DataError(f"{file}: it has no rows")
+    table = Table(file, frame)
+    missing = frame["trajectory"].is_null().arg_true()
+    if len(missing):
+        raise table.fail(int(missing[0]), "trajectory is missing")
+    table.frame = frame.with_columns(pl.col("trajectory").cast(pl.String))
+    return table

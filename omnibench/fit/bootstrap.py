@@ -1,0 +1,44 @@
+"""How far an exact optimum would move on other recordings: bootstrap intervals over trajectories."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from omnibench.errors import ConfigError
+from omnibench.fit.calibrators.closed_form import cone_program
+from omnibench.fit.cost import SumOfNorms
+from omnibench.fit.parameterisation import MatrixElements
+from omnibench.fit.problem import CalibrationProblem
+from omnibench.robot.kinematics import Array
+
+
+@dataclass(frozen=True, eq=False)
+class ElementIntervals:
+    """95 % intervals (3, N) of the matrix elements."""
+
+    low: Array
+    high: Array
+
+
+def bootstrap_intervals(
+    problem: CalibrationProblem, optimum: Array, *, resamples: int = 400, rng: np.random.Generator
+) -> ElementIntervals:
+    """Percentile intervals of the matrix elements about closed_form's ``optimum`` (n,).
+
+    Trajectories are drawn with replacement and the optimum is found again, with the poses linearised about the first
+    one: resampling moves it so little that bending is far below the width of the intervals. ConfigError for another
+    parameterisation or a cost that is no sum of norms.
+    """
+    objective = problem.objective
+    if not isinstance(problem.parameterisation, MatrixElements) or not isinstance(objective, SumOfNorms):
+        raise ConfigError("bootstrap intervals need the matrix parameterisation and a cost that is a sum of norms")
+    program = cone_program(problem, objective, optimum)
+    owner = problem.odometry.trajectory
+    shares = objective.shares(owner)
+    count = len(problem.trajectories)
+    drawn = rng.multinomial(count, np.full(count, 1 / count), size=resamples)
+    moved = np.array([optimum + program.step(shares * weights[owner]) for weights in drawn])
+    low, high = np.percentile(moved, [2.5, 97.5], axis=0).reshape(2, 3, -1)
+    return ElementIntervals(low, high)

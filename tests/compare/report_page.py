@@ -1,0 +1,56 @@
+"""A report as its reader sees it, for the tests."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+
+
+class Page(HTMLParser):
+    """The visible text of a report, its sections, its tables by caption and its plots."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.html = html
+        self.text = ""
+        self.tables: dict[str, list[list[str]]] = {}
+        self.plots = 0
+        self.sections: list[str] = []
+        self._caption, self._in, self._cell = "", [], None
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        if tag in ("script", "style", "figcaption"):
+            self._in.append(tag)
+        if tag == "figcaption":
+            self._caption = ""
+        if tag == "section":
+            self.sections.append(given.get("id") or "")
+        self.plots += "data-source" in given
+        if tag == "table":
+            self.tables.setdefault(self._caption.strip(), [])
+        if tag == "tr":
+            self.tables[self._caption.strip()].append([])
+        if tag in ("td", "th"):
+            self._cell = ""
+        if tag == "small" and self._cell is not None:
+            self._cell += " | "
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag in ("script", "style", "figcaption"):
+            self._in.pop()
+        if tag in ("td", "th") and self._cell is not None:
+            self.tables[self._caption.strip()][-1].append(self._cell.strip())
+            self._cell = None
+
+    def handle_data(self, data: str) -> None:
+        if self._in and self._in[-1] == "figcaption":
+            self._caption += data
+        if not {"script", "style"} & set(self._in):
+            self.text += data
+            if self._cell is not None:
+                self._cell += data
+
+    def row(self, caption: str, name: str) -> list[str]:
+        """The row of a table whose first cell begins with ``name``."""
+        return next(row for row in self.tables[caption] if row[0].split(" | ")[0] == name)

@@ -1,0 +1,279 @@
+"""The report of a comparison: what it says, of small comparisons that were really run."""
+
+from __future__ import annotations
+
+import math
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from report_page import Page
+from report_samples import APR02, config, flower, run
+
+from omnibench.compare.report import write_report
+from omnibench.compare.results import ComparisonResult
+from omnibench.data.dataset import make_dataset
+from omnibench.data.simulate.config import FlowerConfig
+from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.errors import DataError
+from omnibench.fit.problem import Improvement
+from omnibench.report.numbers import fixed
+from omnibench.robot.kinematics import Robot
+
+FAILING = {"name": "parametric", "label": "hopeless", "parameterisation": "matrix"}
+MECANUM = {
+    "name": "mecanum",
+    "wheels": [
+        {"name": name, "radius": 0.05, "distance": 0.35, "angle": math.radians(90 * side), "roller_angle": roller}
+        for name, side, roller in (("fl", 1, 0.785), ("fr", -1, -0.785), ("rl", 1, -0.785), ("rr", -1, 0.785))
+    ],
+}
+
+
+def page(result: ComparisonResult, folder: Path) -> Page:
+    write_report(result, folder / "report.html")
+    return Page((folder / "report.html").read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def result() -> ComparisonResult:
+    """Three calibrators that answer and one that fails, on a simulated flower."""
+    published = {"label": "GA", "source": "an article", "theoretical_train_cost": 0.1234, "train_cost": 0.0215}
+    return run(
+        config(calibrators=["theoretical", "closed_form", "random_search", FAILING], published_results=[published])
+    )
+
+
+@pytest.fixture(scope="module")
+def report(result: ComparisonResult, tmp_path_factory: pytest.TempPathFactory) -> Page:
+    return page(result, tmp_path_factory.mktemp("report"))
+
+
+def statistics(result: ComparisonResult, label: str):
+    return next(entry for entry in result.statistics if entry.label == label)
+
+
+def test_the_headline_names_the_best_and_the_improvement_with_its_interval(
+    result: ComparisonResult, report: Page
+) -> None:
+    best = next(entry for entry in result.statistics if entry.is_best)
+    fell = best.validation_improvement
+    assert f"{best.label} is best." in report.text
+    assert f"the error fell by {100 * fell.value:.1f} %" in report.text
+    assert f"(95 % interval {100 * fell.low:.1f} to {100 * fell.high:.1f} %)" in report.text
+
+
+def test_simulated_data_wear_a_badge(report: Page) -> None:
+    assert "SIMULATED DATA" in report.text
+
+
+def test_recorded_data_wear_no_badge(result: ComparisonResult, tmp_path: Path) -> None:
+    recorded = {name: replace(dataset, simulated=False) for name, dataset in result.datasets.items()}
+    assert "SIMULATED" not in page(replace(result, datasets=recorded), tmp_path).text
+
+
+@pytest.mark.parametrize(("split", "number"), [("training", 2), ("validation", 3)])
+def test_costs_stand_in_tables_like_the_papers(result: ComparisonResult, report: Page, split: str, number: int) -> None:
+    caption = f"Cost of 16 trajectories, {split}"
+    entry = statistics(result, "closed_form")
+    interval = entry.train if split == "training" else entry.validation
+    cells = report.row(caption, "closed_form")
+    assert report.tables[caption][0] == ["M⁻¹", "CF theoretical", f"CF {split}", "Improvement"]
+    assert cells[2] == f"{fixed(interval.value, 4)} | {fixed(interval.low, 4)} to {fixed(interval.high, 4)}"
+    assert f"As Table {number} of the paper" in report.text
+
+
+def test_published_figures_stand_apart_and_are_said_to_be_of_other_data(report: Page) -> None:
+    rows = report.tables["Cost of 16 trajectories, training"]
+    assert rows[-2] == ["Published, on other data: not comparable row by row"]
+    assert rows[-1] == ["GA | an article", "0.1234", "0.0215", "82.58 %"]
+    assert "Published" not in str(report.tables["Cost of 16 trajectories, validation"])
+
+
+def test_a_run_without_an_answer_is_a_row_with_its_reason(result: ComparisonResult, report: Page) -> None:
+    record = next(run.record for run in result.runs if run.record.label == "hopeless")
+    cells = report.row("Every run", "hopeless")
+    assert cells[2:4] == ["failed", record.reason]
+    assert report.row("Cost of 16 trajectories, training", "hopeless")[2] == "no answer | failed"
+    assert f"hopeless gave no answer in 2 of 2 runs (failed: {record.reason})" in report.text
+
+
+def test_every_run_has_a_row(result: ComparisonResult, report: Page) -> None:
+    assert len(report.tables["Every run"]) == 1 + len(result.runs)
+
+
+def test_entries_are_compared_with_the_best(result: ComparisonResult, report: Page) -> None:
+    best = next(entry for entry in result.statistics if entry.is_best)
+    verdicts = {row[0].split(" | ")[0]: row[-1] for row in report.tables["Entries over their seeds"]}
+    assert verdicts[best.label] == "best"
+    assert verdicts["theoretical"] == "worse"
+    assert verdicts["hopeless"] == "no answer"
+
+
+def test_final_errors_are_in_millimetres_and_degrees(result: ComparisonResult, report: Page) -> None:
+    errors = statistics(result, "closed_form").typical.validation_errors
+    cells = report.row("Error of the final pose, validation", "closed_form")
+    assert cells[1] == f"{1e3 * np.hypot(errors[:, 0], errors[:, 1]).mean():.1f}"
+    assert cells[3] == f"{np.degrees(np.abs(errors[:, 2]).mean()):.2f}"
+
+
+def test_matrices_can_be_copied_with_all_their_digits(result: ComparisonResult, report: Page) -> None:
+    for run_ in (statistics(result, label).typical for label in ("closed_form", "random_search")):
+        for value in run_.matrix.ravel():
+            assert repr(float(value)) in report.text
+
+
+def test_an_element_that_is_zero_by_design_has_no_percentage(report: Page) -> None:
+    cells = report.row("Differences from the design values", "closed_form")
+    assert cells[2].endswith("| reference is 0")
+    assert cells[1].endswith(" %")
+
+
+def test_config_versions_and_hardware_are_told(result: ComparisonResult, report: Page) -> None:
+    assert "name: closed_form" in report.text
+    assert f"numpy {result.environment.versions['numpy']}" in report.text
+    assert result.environment.platform in report.text
+    assert "omnibench compare config.yaml --output again" in report.text
+
+
+def test_notes_and_warnings_are_told(result: ComparisonResult, tmp_path: Path) -> None:
+    noted = result.config.model_copy(update={"notes": ("Not the authors' data.",)})
+    told = page(replace(result, config=noted, warnings=("plug-in x cannot be imported",)), tmp_path).text
+    assert "Not the authors' data." in told
+    assert "plug-in x cannot be imported" in told
+
+
+def test_hostile_labels_stay_words(tmp_path: Path) -> None:
+    label = "<script>alert(1)</script>"
+    calibrators = ["theoretical", {"name": "random_search", "label": label, "options": {"candidates": 50}}]
+    told = page(run(config(calibrators=calibrators, seeds=[1], description=label)), tmp_path)
+    assert label in told.text
+    assert label not in told.html
+
+
+def test_without_a_validation_split_the_training_data_are_judged(tmp_path: Path) -> None:
+    datasets = {"flower": {"simulate": flower(validation=None)}}
+    told = page(run(config(datasets=datasets, calibrators=["theoretical", "closed_form"])), tmp_path)
+    assert "There is no validation split" in told.text
+    assert "closed_form is the only calibrator with an answer. On the training data" in told.text
+    assert not [caption for caption in told.tables if "validation" in caption]
+
+
+def test_failed_runs_alone_still_make_a_report(tmp_path: Path) -> None:
+    told = page(run(config(calibrators=[FAILING], seeds=[1])), tmp_path)
+    assert "No calibrator gave an answer: 1 run" in told.text
+    assert told.row("Every run", "hopeless")[2] == "failed"
+
+
+def test_the_design_values_alone_are_no_calibration(tmp_path: Path) -> None:
+    assert "Only the design values gave an answer" in page(run(config(calibrators=["theoretical"])), tmp_path).text
+
+
+def test_the_design_values_lead_the_tables_even_if_no_entry_asks_for_them(tmp_path: Path) -> None:
+    result = run(config(calibrators=["closed_form"]))
+    told = page(result, tmp_path)
+    theoretical = fixed(result.runs[0].record.theoretical_validation_cost, 4)
+    assert told.row("Cost of 16 trajectories, validation", "Theoretical")[1] == theoretical
+    assert told.row("Cost of 16 trajectories, validation", "closed_form")[1] == theoretical
+
+
+def test_a_robot_that_is_as_designed_gains_nothing_that_noise_could_not_explain(tmp_path: Path) -> None:
+    design = {"matrix": Robot.model_validate(APR02).inverse_kinematic_matrix.tolist()}
+    datasets = {"flower": {"simulate": flower(truth=design)}}
+    told = page(run(config(datasets=datasets, calibrators=["theoretical", "closed_form"], seeds=[1])), tmp_path)
+    assert "No calibrator did better than the design values" in told.text or "noise alone could explain" in told.text
+
+
+def test_a_search_that_won_without_finding_the_minimum_is_doubted(result: ComparisonResult, tmp_path: Path) -> None:
+    lucky = [replace(e, is_best=e.label == "random_search") for e in result.statistics]
+    assert "random_search has not found the minimum" in page(replace(result, statistics=tuple(lucky)), tmp_path).text
+
+
+def test_several_data_sets_have_an_overview_and_a_part_each(tmp_path: Path) -> None:
+    one = {"simulate": flower(repetitions=1)}
+    told = page(run(config(datasets={"one": one, "two": one}, calibrators=["theoretical", "closed_form"])), tmp_path)
+    assert [row[0] for row in told.tables["Best entry of each data set"][1:]] == ["one | simulated", "two | simulated"]
+    assert {"overview", "data-1-result", "data-2-result"} <= set(told.sections)
+    assert len(told.sections) == len(set(told.sections))
+
+
+def test_parameters_are_told_with_their_deviation(tmp_path: Path) -> None:
+    search = {"search": "random_search", "search_options": {"candidates": 200}}
+    result = run(config(calibrators=["theoretical", {"name": "parametric", "options": search}], seeds=[1]))
+    radius = result.runs[1].record.parameters[0]
+    cells = page(result, tmp_path).row(
+        "Physical parameters and their deviation from the design values", "radius, wheel a"
+    )
+    assert cells[1] == "0.14800 m"
+    assert cells[2] == f"{radius.value:.5f} m | {fixed(radius.deviation_percent, 2, signed=True)} %"
+
+
+def test_four_wheels_have_twelve_elements_compared_on_the_driven_span(tmp_path: Path) -> None:
+    truth = {"tolerances": {"radius": 0.02, "seed": 1}}
+    datasets = {"mecanum": {"simulate": flower(robot=MECANUM, truth=truth)}}
+    told = page(run(config(datasets=datasets, calibrators=["theoretical", "closed_form"], seeds=[1])), tmp_path)
+    assert len(told.row("Differences from the design values", "closed_form")) == 13
+    assert "Compared on the span of wheel rates that the data drive" in told.text
+
+
+def test_data_without_directions_have_boxes_instead_of_a_flower(tmp_path: Path) -> None:
+    simulated = simulate_dataset(FlowerConfig.model_validate(flower())).dataset
+    bare = [replace(t, alpha=None, omega=None, v=None, command=None) for t in simulated.trajectories]
+    dataset = make_dataset("bare", simulated.robot, simulated.sample_period, bare)
+    told = page(run(config(datasets={"bare": {"path": "bare"}}), {"bare": dataset}), tmp_path)
+    assert "Every point is a trajectory" in told.text
+    assert "direction α" not in told.text
+
+
+def test_long_histories_and_long_runs_make_a_file_below_eight_megabytes(
+    result: ComparisonResult, tmp_path: Path
+) -> None:
+    long_runs = flower(sample_period=0.04, pose_period=0.04, train={"seed": 1, "distance": 12}, repetitions=1)
+    dataset = simulate_dataset(FlowerConfig.model_validate(long_runs)).dataset
+    steps = [Improvement(2 * k, 1e-3 * k, 0.02 + math.exp(-1e-3 * k)) for k in range(1, 20_000)]
+    searched = next(run for run in result.runs if run.record.label == "random_search")
+    many = [
+        replace(searched, history=tuple(steps), record=searched.record.model_copy(update={"seed": seed}))
+        for seed in range(100)
+    ]
+    small = run(
+        config(datasets={"flower": {"path": "x"}}, calibrators=["theoretical", "closed_form"]), {"flower": dataset}
+    )
+    told = page(replace(small, runs=(*small.runs, *many)), tmp_path)
+    assert len(told.html) < 8e6
+    assert told.row("Every run", "random_search")
+
+
+def test_a_report_that_cannot_be_written_is_one_line(result: ComparisonResult, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(DataError, match="cannot be written"):
+        write_report(result, tmp_path / "file" / "report.html")
+
+
+def test_a_browser_draws_every_plot_and_finds_no_fault(result: ComparisonResult, tmp_path: Path) -> None:
+    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if browser is None:
+        pytest.skip("no Chromium on this machine to draw the report with")
+    drawn, log = in_browser(browser, result, tmp_path)
+    assert 'data-plots="drawn"' in drawn
+    plots = re.findall(r'<figure class="plot">.*?</figure>', drawn, re.DOTALL)
+    assert len(plots) >= 20
+    assert all('class="main-svg"' in plot and ("<path" in plot) for plot in plots)
+    assert "CONSOLE" not in log
+
+
+def in_browser(browser: str, result: ComparisonResult, folder: Path) -> tuple[str, str]:
+    """The report's page after its scripts have run, and what the browser logged."""
+    write_report(result, folder / "report.html")
+    flags = [
+        *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
+        *("--disable-background-networking", "--disable-component-update", "--enable-logging=stderr"),
+        *(f"--user-data-dir={folder / 'profile'}", "--virtual-time-budget=20000", "--dump-dom"),
+    ]
+    page_url = (folder / "report.html").as_uri()
+    done = subprocess.run([browser, *flags, page_url], capture_output=True, text=True, timeout=120, check=False)
+    return done.stdout, done.stderr

@@ -1,0 +1,91 @@
+"""Numbers as a person reads them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from omnibench.report.numbers import (
+    NOTHING,
+    decimals_for,
+    fixed,
+    listing,
+    percent,
+    plural,
+    power_of_ten,
+    seconds,
+    significant,
+)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.12345, "0.1235"),
+        (-0.5, "−0.5000"),
+        (12345.0, "12,345.0000"),
+        (-1e-9, "0.0000"),
+        (None, NOTHING),
+        (math.nan, NOTHING),
+        (math.inf, "∞"),
+    ],
+)
+def test_a_fixed_number_has_its_decimals_and_a_true_minus(value: float | None, text: str) -> None:
+    assert fixed(value, 4) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"),
+        (0.021434, "0.0214"),
+        (2.04e-8, "2.04 × 10⁻⁸"),
+        (9.996e-8, "1.00 × 10⁻⁷"),
+        (1234567.0, "1.23 × 10⁶"),
+        (637.0, "637"),
+    ],
+)
+def test_significant_digits_use_powers_of_ten_where_zeros_would_be_counted(value: float, text: str) -> None:
+    assert significant(value, 3) == text
+
+
+@given(st.floats(min_value=-1e12, max_value=1e12, allow_nan=False).filter(lambda value: abs(value) > 1e-300))
+def test_significant_digits_read_back_to_the_same_value(value: float) -> None:
+    words = significant(value, 4).replace("−", "-").replace(",", "")
+    if " × 10" in words:
+        mantissa, exponent = words.split(" × 10")
+        power = exponent.translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789"))
+        words = f"{mantissa}e{power}"
+    assert float(words) == pytest.approx(value, rel=6e-4)
+
+
+@given(st.floats(min_value=1e-6, max_value=1e6))
+def test_decimals_show_the_digits_that_were_asked_for(value: float) -> None:
+    assert float(fixed(value, decimals_for(value, 3)).replace(",", "")) == pytest.approx(value, rel=6e-3)
+
+
+@pytest.mark.parametrize(("value", "text"), [(5e-5, "< 1 ms"), (0.0823, "82 ms"), (26.54, "26.5 s"), (637.2, "637 s")])
+def test_a_duration_has_a_unit_that_suits_it(value: float, text: str) -> None:
+    assert seconds(value) == text
+
+
+def test_a_share_is_told_in_per_cent() -> None:
+    assert percent(0.8394, 2) == "83.94 %"
+    assert percent(None) == NOTHING
+
+
+def test_a_listing_ends_with_and_and_counts_what_it_leaves_out() -> None:
+    assert listing(["a"]) == "a"
+    assert listing(["a", "b", "c"]) == "a, b and c"
+    assert listing(["a", "b", "c", "d"], limit=2) == "a, b and 2 more"
+
+
+def test_plurals_are_english() -> None:
+    assert [plural(1, "run"), plural(2, "run"), plural(180, "trajectory")] == ["1 run", "2 runs", "180 trajectories"]
+
+
+def test_powers_of_ten_are_set_as_such() -> None:
+    assert [power_of_ten(exponent) for exponent in (-10, -1, 0, 3, 4)] == ["10⁻¹⁰", "0.1", "1", "1,000", "10⁴"]

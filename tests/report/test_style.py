@@ -1,0 +1,51 @@
+"""Colours and axes of plots."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from omnibench.report.style import PALETTE, REFERENCE, THEORETICAL, colours, logarithmic, plot, text
+
+
+def test_an_entry_gets_the_colour_that_it_wants() -> None:
+    assert colours({"crs": "#e69f00", "other": None})["crs"] == ("#e69f00", "solid")
+
+
+def test_the_second_to_want_a_colour_gets_another() -> None:
+    given_styles = colours({"first": "#0072b2", "second": "#0072b2"})
+    assert given_styles["first"] == ("#0072b2", "solid")
+    assert given_styles["second"] != given_styles["first"]
+
+
+@given(st.lists(st.sampled_from([*PALETTE, None]), max_size=30))
+def test_up_to_thirty_entries_look_different(wanted: list[str | None]) -> None:
+    styles = colours({f"entry {index}": colour for index, colour in enumerate(wanted)})
+    assert len(set(styles.values())) == len(wanted)
+    assert not {REFERENCE, THEORETICAL} & {colour for colour, _ in styles.values()}
+
+
+@given(
+    st.floats(min_value=-12, max_value=6),
+    st.floats(min_value=0, max_value=14),
+)
+def test_a_logarithmic_axis_holds_its_data_and_has_labels(low: float, decades: float) -> None:
+    figure = plot()
+    logarithmic(figure, "y", 10**low, 10 ** (low + decades))
+    bottom, top = figure.layout.yaxis.range
+    assert bottom <= low
+    assert low + decades <= top
+    ticks = [math.log10(tick) for tick in figure.layout.yaxis.tickvals]
+    assert len(ticks) == len(figure.layout.yaxis.ticktext)
+    assert sum(bottom <= tick <= top for tick in ticks) <= 10
+    if decades >= 1:
+        assert any(bottom <= tick <= top for tick in ticks)
+
+
+@pytest.mark.parametrize("name", ["a<b>", "x & y", "</script>"])
+def test_names_cannot_be_markup_in_a_plot(name: str) -> None:
+    assert "<" not in text(name)
+    assert "& " not in text(name)
