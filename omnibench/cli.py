@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import Counter
-from collections.abc import Iterable
-from contextlib import AbstractContextManager
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager, redirect_stdout
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NoReturn
 
 import typer
-import yaml
+from pydantic import BaseModel
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from omnibench import terminal
+from omnibench.config import parse_yaml, to_json
 from omnibench.errors import ConfigError, Interrupted, OmnibenchError
 from omnibench.registry import PluginFailure, calibrators, costs, importers, load_plugins
 
@@ -49,7 +49,9 @@ def compare(
     data: Annotated[
         list[str] | None, typer.Option("--data", metavar="[NAME=]PATH", help="Where the data (set NAME) is.")
     ] = None,
-    plugins: Plugins = None,
+    plugins: Annotated[
+        list[Path] | None, typer.Option("--plugins", help="Folder of plug-ins besides the config's; may be repeated.")
+    ] = None,
 ) -> None:
     """Run every calibrator of a config on the same data and budget; score them and write a report."""
     from omnibench.compare.plan import read_compare_config
@@ -67,6 +69,8 @@ def compare(
     out = terminal.make_console()
     print_result(out, result)
     out.print(f"report: {result.output / 'report.html'}", highlight=False, soft_wrap=True)
+    if all(run.matrix is None for run in result.runs):
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -75,6 +79,9 @@ def calibrate(
     output: Annotated[Path | None, typer.Option("-o", "--output", help="The calibration file to write.")] = None,
     calibrator: Annotated[str, typer.Option(help="See omnibench list.")] = "closed_form",
     cost: Annotated[str, typer.Option(help="See omnibench list.")] = "final_pose",
+    parameterisation: Annotated[
+        Literal["matrix", "geometry"] | None, typer.Option(help="What is searched. Default: the calibrator's own.")
+    ] = None,
     box: Annotated[Literal["paper", "row"], typer.Option(help="paper: +-10 % of each element; row: wider.")] = "row",
     integration: Annotated[Literal["euler", "arc"], typer.Option(help="Euler: the paper's step.")] = "arc",
     seed: Annotated[int, typer.Option(min=0)] = 1,
@@ -97,12 +104,13 @@ def calibrate(
     if output is None and not as_json:
         raise ConfigError("say where the calibration goes: -o calibration.yaml")
     recordings = load_dataset(dataset)
-    with _evaluations_bar(calibrator, evaluations) as watch:
+    with redirect_stdout(sys.stderr), _evaluations_bar(calibrator, evaluations) as watch:
         run = fit(
             recordings,
             calibrator,
             options=_parsed(settings),
             cost=cost,
+            parameterisation=parameterisation,
             box=box,
             integration=integration,
             budget=Budget(evaluations=evaluations, seconds=seconds),
@@ -116,8 +124,10 @@ def calibrate(
     _warn(recordings.warnings)
     if result.at_bounds:
         _warn([f"{', '.join(result.at_bounds)} lie on a bound of the box {box!r}; a wider box may fit better"])
+    if result.held:
+        _warn([f"{', '.join(result.held)} have no width in the box {box!r} and keep their start values"])
     if as_json:
-        return _print_json(calibration.model_dump(mode="json"))
+        return _print_json(calibration)
     terminal.print_calibration(terminal.make_console(), run)
     typer.echo(f"calibration: {output}")
     return None
@@ -162,8 +172,8 @@ def simulate(
 
     chosen = read_compare_config(config)
     name, source = simulated_source(chosen, dataset)
-    if truth is not None and truth.resolve() == output.resolve():
-        raise ConfigError("--truth: must be another folder than the data set's")
+    if truth is not None and truth.resolve().is_relative_to(output.resolve()):
+        raise ConfigError("--truth: must be a folder apart from the data set's")
     simulation = simulate_dataset(source, name, chosen.description)
     save_dataset(simulation.dataset, output, table_format)
     if truth is not None:
@@ -226,7 +236,7 @@ def inspect(dataset: Annotated[Path, typer.Argument(help="A data set folder.")],
 
     found = inspect_dataset(load_dataset(dataset))
     if as_json:
-        return _print_json(found.model_dump(mode="json"))
+        return _print_json(found)
     terminal.print_inspection(terminal.make_console(), found)
     return _warn(found.warnings)
 
@@ -287,6 +297,8 @@ def main() -> None:
     try:
         code = command.main(prog_name="omnibench", standalone_mode=False)
     except usage_error as error:
+        if type(error).__name__ == "NoArgsIsHelpError":  # nothing was typed: the message is the whole help
+            _fail(error.format_message())
         _fail(_usage(error))
     except Interrupted as error:
         _fail(str(error), 130)
@@ -297,25 +309,32 @@ def main() -> None:
     except BrokenPipeError:
         sys.stderr.close()  # the reader of our output has gone: nothing more to say
         sys.exit(1)
+    except MemoryError:
+        _fail("error: this needs more memory than there is; make the data or the budget smaller")
+    except OSError as error:  # a disk or a terminal that refuses where nobody expected it
+        _fail(f"error: {error.filename or 'output'}: {error.strerror or error}")
     else:
+        if code == 130:  # Typer's newer versions turn Ctrl-C into this
+            _fail("interrupted", 130)
         sys.exit(code if isinstance(code, int) else 0)
 
 
 def _usage(error: Any) -> str:
-    message = " ".join(error.format_message().split())
+    message = " ".join(error.format_message().split()).replace("Value error, ", "")
     context = error.ctx
     command = context.command_path if context else "omnibench"
     return f"error: {message} (see {command} --help)"
 
 
-def _fail(message: str, code: int = 2) -> None:
+def _fail(message: str, code: int = 2) -> NoReturn:
     print(message, file=sys.stderr)  # noqa: T201 (the one place where errors are told)
     sys.exit(code)
 
 
 def _load(folders: list[Path] | None) -> list[PluginFailure]:
     default = [Path("plugins")] if folders is None and Path("plugins").is_dir() else []
-    failures = load_plugins(folders or default)
+    with redirect_stdout(sys.stderr):  # what a plug-in prints is not our output
+        failures = load_plugins(folders or default)
     _warn(f"plug-in {failure.origin} cannot be imported: {failure.error}" for failure in failures)
     return failures
 
@@ -325,8 +344,8 @@ def _warn(messages: Iterable[str]) -> None:
         typer.echo(f"warning: {message}", err=True)
 
 
-def _print_json(document: object) -> None:
-    typer.echo(json.dumps(document, indent=1, allow_nan=False))
+def _print_json(document: Mapping[str, Any] | BaseModel) -> None:
+    typer.echo(to_json(document))
 
 
 def _parsed(settings: list[str] | None) -> dict[str, Any]:
@@ -336,10 +355,7 @@ def _parsed(settings: list[str] | None) -> dict[str, Any]:
         key, equals, value = setting.partition("=")
         if not equals or not key:
             raise ConfigError(f"--set {setting}: expected KEY=VALUE")
-        try:
-            options[key] = yaml.safe_load(value)
-        except yaml.YAMLError:
-            raise ConfigError(f"--set {setting}: the value is not valid YAML") from None
+        options[key] = parse_yaml(value, f"--set {setting}")
     return options
 
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic_core import ErrorDetails, to_jsonable_python
 
 from omnibench.errors import ConfigError, nearest
 
@@ -54,15 +54,24 @@ _Loader.add_implicit_resolver(
 def read_yaml(path: Path) -> Any:
     """The content of a YAML file; ConfigError in one line when it cannot be read."""
     try:
-        return yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: not valid YAML: {error}") from None
+    return parse_yaml(text, str(path))
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """The content of YAML text; ConfigError in one line, with ``where`` in front, when it is not valid."""
+    try:
+        return yaml.load(text, Loader=_Loader)
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
+        raise ConfigError(f"{where}: {error}") from None
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: a date or number that cannot be, as 2023-99-99
+        raise ConfigError(f"{where}: not valid YAML: {error}") from None
+    except RecursionError:
+        raise ConfigError(f"{where}: not valid YAML: nested too deeply") from None
 
 
 def read_model(model: type[M], path: Path) -> M:
@@ -141,3 +150,8 @@ def to_yaml(document: BaseModel | Mapping[str, Any]) -> str:
     # A JSON round trip drops types that YAML would tag (tuples, NumPy numbers).
     plain = json.loads(json.dumps(data))
     return yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+
+
+def to_json(document: BaseModel | Mapping[str, Any]) -> str:
+    """A document as strict JSON; infinity and NaN, which JSON does not have, become null."""
+    return json.dumps(to_jsonable_python(document, inf_nan_mode="null"), indent=1)

@@ -6,11 +6,17 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 
 
+def one_line(text: str) -> str:
+    """A text from anywhere as one line that any terminal and any file can hold."""
+    line = " ".join(text.split())
+    return line if line.isprintable() else "".join(each if each.isprintable() else "?" for each in line)
+
+
 class OmnibenchError(Exception):
     """Something the user can put right. The message is one line: the thing, the place, the way out."""
 
     def __init__(self, message: str) -> None:
-        super().__init__(" ".join(message.split()))
+        super().__init__(one_line(message))
 
 
 class ConfigError(OmnibenchError):

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
+from typing import Literal
 
 import polars as pl
 
 from omnibench.errors import DataError
+
+TableFormat = Literal["parquet", "csv"]
 
 
 @contextmanager
@@ -19,18 +22,32 @@ def replacing(path: Path) -> Iterator[Path]:
 
     DataError names the path when its folder cannot be made or the disk refuses (full, read-only, no permission).
     """
+    path = path.resolve()  # a link goes on pointing to the file
+    if path.exists() and not path.is_file():  # a device or a pipe is written to, never replaced
+        try:
+            yield path
+        except OSError as error:
+            raise _refused(path, error) from None
+        return
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise DataError(f"{path}: cannot be written: {path.parent} is not a folder; choose another place") from None
+    except OSError as error:
+        raise _refused(path, error) from None
+    try:
         yield partial
         partial.replace(path)
     except OSError as error:
-        raise DataError(
-            f"{path}: cannot be written: {error.strerror or error}; free space or choose another place"
-        ) from None
+        raise _refused(path, error) from None
     finally:
-        if partial.parent.is_dir():
+        with suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+def _refused(path: Path, error: OSError) -> DataError:
+    return DataError(f"{path}: cannot be written: {error.strerror or error}; free space or choose another place")
 
 
 def write_text(path: Path, text: str) -> None:
@@ -40,11 +57,22 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_table(path: Path, table: pl.DataFrame) -> None:
-    """Write a table as CSV or, for any other suffix, as Parquet, whole or not at all. DataError when the disk refuses."""
-    content = BytesIO()  # not straight to the disk: of that, polars tells in errors of its own
-    table.write_csv(content) if path.suffix == ".csv" else table.write_parquet(content)
-    with replacing(path) as partial:
-        partial.write_bytes(content.getvalue())
+    """Write a table, whole or not at all: CSV if ``path`` says so, else Parquet. DataError when the disk refuses."""
+    write_files({path: encode_table(table, "csv" if path.suffix == ".csv" else "parquet")})
+
+
+def encode_table(table: pl.DataFrame, table_format: TableFormat) -> bytes:
+    """The content of a table's file; polars itself would tell of a full disk in errors of its own."""
+    content = BytesIO()
+    table.write_parquet(content) if table_format == "parquet" else table.write_csv(content)
+    return content.getvalue()
+
+
+def write_files(contents: Mapping[Path, bytes]) -> None:
+    """Write files that belong together: when the disk refuses one (DataError), all are as they were."""
+    with ExitStack() as files:
+        for path, content in contents.items():
+            files.enter_context(replacing(path)).write_bytes(content)
 
 
 def remove(path: Path) -> None:

@@ -21,7 +21,7 @@ from typing import Any, Generic, TypeVar
 from pydantic import BaseModel, ConfigDict
 
 from omnibench.config import validate
-from omnibench.errors import PluginError, UnknownNameError
+from omnibench.errors import OmnibenchError, PluginError, UnknownNameError
 
 T = TypeVar("T")
 C = TypeVar("C", bound=type)
@@ -50,7 +50,7 @@ class Entry(Generic[T]):
     @property
     def summary(self) -> str:
         """First line of the class's docstring."""
-        return (inspect.getdoc(self.cls) or "").split("\n", 1)[0]
+        return (inspect.getdoc(self.cls) or "").split("\n", 1)[0].replace("``", "")
 
     @property
     def options(self) -> type[BaseModel]:
@@ -77,6 +77,7 @@ class Registry(Generic[T]):
     def __init__(self, kind: str, builtin: str) -> None:
         self.kind = kind
         self.group = f"omnibench.{kind}s"
+        self.contract: type = object  # what its classes derive from; set by the module that defines it
         self._builtin = builtin
         self._entries: dict[str, Entry[T]] = {}
         self._complete = False
@@ -84,13 +85,18 @@ class Registry(Generic[T]):
     def register(self, name: str) -> Callable[[C], C]:
         """Class decorator: make the class known as ``name``.
 
-        Raises PluginError when the name is taken by another class.
+        Raises PluginError when the name is taken by another class, or the class does not keep the contract.
         """
 
         def decorate(cls: C) -> C:
             taken = self._entries.get(name)
             if taken is not None and taken.cls is not cls:
                 raise PluginError(f"{self.kind} {name!r} is registered already, by {taken.origin}; choose another name")
+            if self.contract not in cls.__mro__:
+                raise PluginError(f"{self.kind} {name!r}: the class must derive from {self.contract.__name__}")
+            options = getattr(cls, "Options", Options)
+            if not (isinstance(options, type) and issubclass(options, BaseModel)):
+                raise PluginError(f"{self.kind} {name!r}: Options must be a class derived from omnibench's Options")
             cls.name = name  # type: ignore[attr-defined]
             self._entries[name] = Entry(name, cls, _origin(cls))
             return cls
@@ -110,10 +116,16 @@ class Registry(Generic[T]):
         return self._entries[name]
 
     def create(self, name: str, options: Mapping[str, Any] | None = None, where: str = "") -> T:
-        """An instance of the class called ``name`` with validated ``options``."""
+        """An instance of the class called ``name`` with validated ``options``. PluginError when it cannot be made."""
         entry = self.entry(name, where)
         place = f"{where}: {self.kind} {name!r}" if where else f"{self.kind} {name!r}"
-        return entry.cls(validate(entry.options, options or {}, place))  # type: ignore[call-arg]
+        validated = validate(entry.options, options or {}, place)
+        try:
+            return entry.cls(validated)  # type: ignore[call-arg]
+        except OmnibenchError:
+            raise
+        except Exception as error:  # a plug-in may raise anything
+            raise PluginError(f"{place} cannot be made: {type(error).__name__}: {error}") from error
 
     def _load_builtin(self) -> None:
         if self._complete:
@@ -170,6 +182,8 @@ def _load_entry_points() -> list[PluginFailure]:
 
 
 def _attempt(origin: str, load: Callable[[], object]) -> PluginFailure | None:
+    for registry in REGISTRIES:  # so that a plug-in cannot take a built-in name unnoticed, nor take it away by failing
+        registry._load_builtin()
     before = [dict(registry._entries) for registry in REGISTRIES]
     try:
         load()
@@ -181,8 +195,6 @@ def _attempt(origin: str, load: Callable[[], object]) -> PluginFailure | None:
 
 
 def _import_file(path: Path) -> None:
-    for registry in REGISTRIES:  # so that a plug-in cannot take a built-in name unnoticed
-        registry._load_builtin()
     digest = hashlib.sha256(str(path).encode()).hexdigest()[:8]
     name = f"omnibench_plugin_{path.stem}_{digest}"
     spec = importlib.util.spec_from_file_location(name, path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Sequence
 
 from rich.console import Console
 from rich.table import Table
@@ -11,15 +12,17 @@ from rich.table import Table
 from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.evaluate import Evaluation
 from omnibench.fit.inspect import Inspection
+from omnibench.fit.parameterisation import FittedParameter
 from omnibench.registry import REGISTRIES, Entry, PluginFailure
 
 _PIPED_WIDTH = 160
 
 
 def make_console(error: bool = False) -> Console:
-    """A console that does not squeeze tables into 80 columns when it is piped."""
+    """A console that shows texts as they are, and does not squeeze tables into 80 columns when it is piped."""
     stream = sys.stderr if error else sys.stdout
-    return Console(file=stream, width=None if stream.isatty() else _PIPED_WIDTH, soft_wrap=False)
+    width = None if stream.isatty() else _PIPED_WIDTH
+    return Console(file=stream, width=width, markup=False, emoji=False, highlight=False)
 
 
 def print_calibration(console: Console, run: CalibrationRun) -> None:
@@ -40,11 +43,28 @@ def print_calibration(console: Console, run: CalibrationRun) -> None:
             bounds = zip(run.intervals.low[row_number], run.intervals.high[row_number], strict=True)
             table.add_row("  95 %", *(f"{low:+.7f} .. {high:+.7f}" for low, high in bounds), style="dim")
     console.print(table)
+    if run.parameters is not None:
+        _print_parameters(console, run.parameters)
     console.print(
         f"{result.outcome}: {result.reason}; {result.evaluations} evaluations, {result.seconds:.2f} s",
-        highlight=False,
         soft_wrap=True,
     )
+
+
+def _print_parameters(console: Console, parameters: Sequence[FittedParameter]) -> None:
+    table = Table(title="physical parameters", title_justify="left")
+    for heading in ("parameter", "design", "fitted", "deviation"):
+        table.add_column(heading, justify="left" if heading == "parameter" else "right")
+    for parameter in parameters:
+        angle = parameter.unit == "rad"
+        shown = [math.degrees(value) if angle else value for value in (parameter.design, parameter.value)]
+        deviation = parameter.deviation_percent
+        table.add_row(
+            parameter.name,
+            *(f"{value:.3f} deg" if angle else f"{value:.5f} m" for value in shown),
+            "design 0" if deviation is None else f"{deviation:+.2f} %",
+        )
+    console.print(table)
 
 
 def print_evaluation(console: Console, evaluation: Evaluation) -> None:
@@ -73,16 +93,16 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
 def print_inspection(console: Console, found: Inspection) -> None:
     """A data set in a table and its findings in words."""
     kind = "simulated data" if found.simulated else "recorded data"
-    console.print(f"{found.dataset}: {kind}; {found.description}", highlight=False, soft_wrap=True)
+    described = f"; {found.description}" if found.description else ""
+    console.print(f"{found.dataset}: {kind}{described}", soft_wrap=True)
     for label, text in (("source", found.source), ("licence", found.licence)):
         if text:
-            console.print(f"{label}: {text}", highlight=False, soft_wrap=True)
+            console.print(f"{label}: {text}", soft_wrap=True)
     shortest, longest = (1000 * period for period in found.sample_period_range_s)
     console.print(
         f"robot {found.robot}, wheels {', '.join(found.wheels)}; {found.wheel_samples} wheel samples every "
         f"{1000 * found.sample_period_s:g} ms ({shortest:.3g} to {longest:.3g} ms), {found.reference_poses} reference "
         f"poses every {1000 * found.pose_period_s:.3g} ms",
-        highlight=False,
         soft_wrap=True,
     )
     table = Table()
@@ -106,7 +126,7 @@ def print_inspection(console: Console, found: Inspection) -> None:
     shares = ", ".join(f"{share:.2g}" for share in found.driven_shares)
     console.print(f"directions of wheel rates driven: {found.driven_directions} of {len(found.wheels)} ({shares})")
     for finding in found.findings:
-        console.print(f"- {finding}", highlight=False, soft_wrap=True)
+        console.print(f"- {finding}", soft_wrap=True)
 
 
 def print_registries(console: Console) -> None:
@@ -118,7 +138,7 @@ def print_registries(console: Console) -> None:
             table.add_column(heading, overflow="fold")
         for entry in entries:
             table.add_row(entry.name, entry.summary, entry.origin)
-        console.print(table if entries else f"[bold]{registry.kind}s[/bold]: none yet")
+        console.print(table if entries else f"{registry.kind}s: none yet")
 
 
 def registry_document(failures: list[PluginFailure]) -> dict[str, object]:

@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
+from hypothesis import settings
 
 from omnibench import registry
+
+settings.register_profile("omnibench", deadline=None)  # the machine may be busy
+settings.load_profile("omnibench")
 
 
 @pytest.fixture

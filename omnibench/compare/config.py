@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
@@ -50,7 +50,9 @@ class CalibratorEntry(Model):
     """One line of the comparison."""
 
     name: str = Field(description="a calibrator, see omnibench list")
-    label: str | None = Field(None, description="what tables call it; default: the name and, if it differs, the box")
+    label: Annotated[str, Field(min_length=1, max_length=60)] | None = Field(
+        None, description="what tables call it; default: the name and, if it differs, the box"
+    )
     options: dict[str, Any] = {}
     parameterisation: ParameterisationName | None = Field(None, description="default: the calibrator's own")
     box: Box | None = Field(None, description="default: the config's box")
@@ -60,7 +62,7 @@ class CalibratorEntry(Model):
 class Bootstrap(Model):
     """Resampling of trajectories behind the intervals."""
 
-    resamples: int = Field(2000, ge=100)
+    resamples: int = Field(2000, ge=100, le=100_000)
     seed: int = Field(0, ge=0)
 
 
@@ -78,10 +80,10 @@ class PublishedResult(Model):
 class CompareConfig(Model):
     """Data sets x calibrators x seeds, with one cost and one budget for all."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=60)
     description: str = ""
     notes: tuple[str, ...] = Field((), description="what a reader of the report must know")
-    datasets: dict[str, DatasetSource] = Field(min_length=1)
+    datasets: dict[Annotated[str, Field(min_length=1, max_length=60)], DatasetSource] = Field(min_length=1)
     cost: CostChoice = CostChoice()
     integration: Integration = "arc"
     box: Box = "row"
@@ -93,14 +95,14 @@ class CompareConfig(Model):
     bootstrap: Bootstrap = Bootstrap()
     published_results: tuple[PublishedResult, ...] = ()
 
-    @field_validator("calibrators", mode="before")
+    @field_validator("calibrators", mode="before", json_schema_input_type=tuple[str | CalibratorEntry, ...])
     @classmethod
     def _names_stand_for_entries(cls, entries: Any) -> Any:
         if isinstance(entries, list | tuple):
             return [{"name": entry} if isinstance(entry, str) else entry for entry in entries]
         return entries
 
-    @field_validator("cost", mode="before")
+    @field_validator("cost", mode="before", json_schema_input_type=str | CostChoice)
     @classmethod
     def _name_stands_for_cost(cls, cost: Any) -> Any:
         return {"name": cost} if isinstance(cost, str) else cost
@@ -110,6 +112,6 @@ class CompareConfig(Model):
     def _seeds_differ(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
         if len(set(seeds)) < len(seeds):
             raise ValueError("a seed is given twice")
-        if min(seeds) < 0:
-            raise ValueError("seeds must not be negative")
+        if not all(0 <= seed < 2**63 for seed in seeds):
+            raise ValueError("seeds must not be negative, and below 2^63")
         return seeds

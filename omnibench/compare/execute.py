@@ -221,10 +221,9 @@ def _collect(active: dict[int, _Active], progress: Progress) -> Iterator[tuple[i
     ready = wait([item.connection for item in active.values()], timeout=0.2)
     for index, item in list(active.items()):
         seconds = item.run.config.budget.seconds
-        if item.connection in ready:
-            result = _receive(item, progress)
-            if result is not None:
-                yield index, result
+        result = _receive(item, progress) if item.connection in ready else None
+        if result is not None:
+            yield index, result
         elif time.monotonic() - item.began > seconds + _GRACE:
             item.end(patience=0.0)
             yield index, item.without_answer(Outcome.TIME, f"ended by force: {seconds:g} s spent without an answer")

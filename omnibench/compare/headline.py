@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from omnibench.compare.results import EntryStatistics
+from omnibench.compare.tables import on_bounds
 from omnibench.compare.view import SPLIT_NAMES, THEORETICAL_NAME, DatasetView, positions_and_headings
 from omnibench.compare.wording import (
     cost,
@@ -44,8 +45,7 @@ def _no_winner(view: DatasetView, best: EntryStatistics | None) -> str:
 def _verdict(view: DatasetView, best: EntryStatistics) -> str:
     split, decimals = view.scored, cost_decimals(view)
     reached, before = cost(best, split), view.theoretical_cost(split)
-    others = len(view.calibrated) > 1
-    words = f"{best.label} is {'best' if others else 'the only calibrator with an answer'}."
+    words = f"{_place(view, best)}."
     if reached is not None and before is not None:
         words += (
             f" On the {SPLIT_NAMES[split]} data its cost is {fixed(reached.value, decimals)}, where the design values "
@@ -57,10 +57,25 @@ def _verdict(view: DatasetView, best: EntryStatistics) -> str:
             words += f": the error fell by {fell} (95 % interval {sure})"
             words += ", which the noise alone could explain" if interval.low <= 0 else ""
         words += "."
-    equal = [entry.label for entry in view.statistics if entry.practically_equal and not entry.is_best]
-    if equal:
-        words += f" Practically equal to it: {listing(equal)}."
     return words
+
+
+def _place(view: DatasetView, best: EntryStatistics) -> str:
+    """Who is best; where noise could have chosen, what else did."""
+    if len(view.calibrated) == 1:
+        return f"{best.label} is the only calibrator with an answer"
+    level = [entry.label for entry in view.level]
+    if len(level) == 1:
+        return f"{best.label} is best"
+    return (
+        f"{_number(len(level))} entries are level on the {SPLIT_NAMES[view.scored]} data: {listing(level, 20)}; "
+        f"{best.label} has the lowest training cost of them"
+    )
+
+
+def _number(number: int) -> str:
+    words = ("Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve")
+    return words[number - 2] if number <= 12 else str(number)
 
 
 def _tiles(view: DatasetView, best: EntryStatistics) -> tuple[Fact, ...]:
@@ -117,7 +132,48 @@ def _doubts(view: DatasetView, best: EntryStatistics) -> list[str]:
             "above the lowest. That it does better on other data may be chance, or the splits differ in more than "
             "noise."
         )
+    lower = [
+        "{}: {} ({})".format(entry.label, *difference_in_words(entry.difference))
+        for entry, _ in view.calibrated
+        if entry.difference is not None and entry.practically_equal is False and entry.difference.value < 0
+    ]
+    if lower:
+        doubts.append(
+            f"Below {best.label} in {SPLIT_NAMES[split]} cost, as the mean difference with its 95 % interval, though "
+            f"above it in training cost: {listing(lower, 20)}."
+        )
     return doubts
+
+
+def _worse_commands(view: DatasetView, best: EntryStatistics) -> list[str]:
+    """Commands on which the best entry does worse than the design values, the worst first."""
+    if best.typical is None or best.calibrator == THEORETICAL_NAME:
+        return []
+    split, run = view.scored, best.typical
+    before = run.theoretical_train_costs if split == "train" else run.theoretical_validation_costs
+    after = run.train_costs if split == "train" else run.validation_costs
+    rows: dict[str, list[int]] = {}
+    for index, trajectory in enumerate(view.dataset.split(split)):
+        if trajectory.command is not None:
+            rows.setdefault(trajectory.command, []).append(index)
+    if before is None or after is None or not rows:
+        return []
+    means = [(name, float(before[chosen].mean()), float(after[chosen].mean())) for name, chosen in rows.items()]
+    worse = sorted((row for row in means if row[2] > row[1]), key=lambda row: row[1] - row[2])
+    if not worse:
+        return []
+    digits = cost_decimals(view)
+    told = [f"{name} {fixed(was, digits)} → {fixed(now, digits)}" for name, was, now in worse]
+    return [
+        f"{best.label} does worse than the design values on {len(worse)} of {plural(len(means), 'command')} of the "
+        f"{SPLIT_NAMES[split]} data, as the mean cost of each, design values → {best.label}: "
+        f"{listing(told, len(told))}."
+    ]
+
+
+def _repeats_commands(view: DatasetView) -> bool:
+    commands = [trajectory.command for trajectory in view.dataset.split(view.scored) if trajectory.command is not None]
+    return len(set(commands)) < len(commands)
 
 
 def _remarks(view: DatasetView, best: EntryStatistics | None) -> Callout:
@@ -127,12 +183,12 @@ def _remarks(view: DatasetView, best: EntryStatistics | None) -> Callout:
     if split == "train":
         items.append("There is no validation split: costs and errors are those of the data that were fitted.")
     if best is not None:
-        doubts = _doubts(view, best)
+        doubts = _doubts(view, best) + _worse_commands(view, best)
         items += doubts
         worse = [
             "{}: {} ({})".format(entry.label, *difference_in_words(entry.difference))
             for entry, _ in view.calibrated
-            if entry.difference is not None and entry.practically_equal is False and not entry.is_best
+            if entry.difference is not None and entry.practically_equal is False and entry.difference.value > 0
         ]
         if worse:
             items.append(
@@ -144,8 +200,13 @@ def _remarks(view: DatasetView, best: EntryStatistics | None) -> Callout:
         if bad:
             reasons = listing(list(dict.fromkeys(f"{record.outcome}: {record.reason}" for record in bad)), 2)
             items.append(f"{entry.label} gave no answer in {len(bad)} of {plural(entry.runs, 'run')} ({reasons}).")
-    bound = [entry.label for entry, run in view.calibrated if run.record.at_bounds]
+    bound = [entry.label for entry, run in view.calibrated if on_bounds(run.record)]
     if bound:
         items.append(f"Held back by the box, with elements on a bound: {listing(bound)}. A wider box may do better.")
+    if _repeats_commands(view):
+        items.append(
+            "The intervals are over trajectories like these. Runs of one command share what the model misses there, so "
+            "for commands that were not driven here the spread is larger."
+        )
     failed = any(entry.answers < entry.runs for entry in view.statistics)
     return Callout("To be kept in mind", tuple(items), "warning" if doubts or failed else "plain")

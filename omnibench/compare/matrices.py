@@ -7,9 +7,10 @@ import math
 
 import numpy as np
 
-from omnibench.compare.results import FittedParameter
-from omnibench.compare.tables import entry_cell
+from omnibench.compare.results import RunRecord
+from omnibench.compare.tables import entry_cell, on_bounds
 from omnibench.compare.view import DatasetView
+from omnibench.fit.parameterisation import FittedParameter
 from omnibench.fit.span import driven_span
 from omnibench.report.blocks import Block, Cell, Code, Column, Paragraph, Row, Table
 from omnibench.report.numbers import NOTHING, fixed, significant
@@ -67,7 +68,7 @@ def parameter_table(view: DatasetView) -> Table | None:
         known = next(parameter for parameter in found if parameter is not None)
         cells.append(Cell(_shown(known.design, known.unit)))
         for parameter, (_, record) in zip(found, fitted, strict=True):
-            cells.append(_parameter_cell(parameter, name in record.at_bounds))
+            cells.append(_parameter_cell(parameter, _marks(record).get(name, "")))
         rows.append(Row(tuple(cells)))
     columns = (Column("Parameter", numeric=False), Column("design"), *(Column(entry.label) for entry, _ in fitted))
     return Table(
@@ -75,7 +76,8 @@ def parameter_table(view: DatasetView) -> Table | None:
         columns,
         tuple(rows),
         "As section 4.2 of the paper. Each matrix has one such geometry, but it takes up whatever else is wrong "
-        "with the model, so a parameter by itself is not a measurement of the robot. † on a bound of its limits.",
+        "with the model, so a parameter by itself is not a measurement of the robot. † on a bound of its limits."
+        + (" ‡ held by limits without width." if any(record.held for _, record in fitted) else ""),
     )
 
 
@@ -84,18 +86,19 @@ def _element_table(view: DatasetView) -> Table:
     for entry, run in view.calibrated:
         if run.matrix is None:
             continue
-        bound = run.record.at_bounds if entry.parameterisation == "matrix" else ()
+        marks = _marks(run.record) if entry.parameterisation == "matrix" else {}
         cells = [
-            Cell(fixed(float(value), 6) + ("†" if name in bound else ""))
+            Cell(fixed(float(value), 6) + marks.get(name, ""))
             for name, value in zip(_element_names(view), run.matrix.ravel(), strict=True)
         ]
         rows.append(Row((entry_cell(view, entry), *cells), "best" if entry.is_best else "plain"))
+    held = any(run.record.held for entry, run in view.calibrated if entry.parameterisation == "matrix")
     return Table(
         "Inverse kinematic matrices M⁻¹",
         (Column("M⁻¹", numeric=False), *_element_columns(view, with_units=True)),
         tuple(rows),
         f"Columns of each row in the order of the wheels: {', '.join(view.dataset.robot.wheel_names)}. "
-        "† on a bound of its box.",
+        f"† on a bound of its box.{' ‡ held by the box, which has no width there.' if held else ''}",
     )
 
 
@@ -155,9 +158,13 @@ def _shown(value: float, unit: str) -> str:
     return f"{fixed(math.degrees(value), 3)}°" if unit == "rad" else f"{fixed(value, 5)} {unit}"
 
 
-def _parameter_cell(parameter: FittedParameter | None, on_bound: bool) -> Cell:
+def _marks(record: RunRecord) -> dict[str, str]:
+    return {**dict.fromkeys(on_bounds(record), "†"), **dict.fromkeys(record.held, "‡")}
+
+
+def _parameter_cell(parameter: FittedParameter | None, mark: str) -> Cell:
     if parameter is None:
         return Cell(NOTHING)
     percent = parameter.deviation_percent
     deviation = "design is 0" if percent is None else f"{fixed(percent, 2, signed=True)} %"
-    return Cell(_shown(parameter.value, parameter.unit) + (" †" if on_bound else ""), deviation)
+    return Cell(_shown(parameter.value, parameter.unit) + (mark and f" {mark}"), deviation)

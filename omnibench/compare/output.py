@@ -8,17 +8,20 @@ from collections.abc import Iterable
 from dataclasses import asdict, fields
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import polars as pl
 
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.results import ComparisonResult, EntryStatistics, Interval, ScoredRun
-from omnibench.config import to_yaml
+from omnibench.compare.results import ComparisonResult, EntryStatistics, Interval, RunRecord, ScoredRun
+from omnibench.config import read_yaml, to_json, to_yaml
 from omnibench.data.dataset import Dataset
 from omnibench.errors import DataError
-from omnibench.files import replacing, write_text
-from omnibench.robot.calibration import Calibration, Provenance, write_calibration
+from omnibench.files import remove, write_table, write_text
+from omnibench.robot.calibration import Calibration, Provenance, Row, write_calibration
+
+# The first line of config.yaml tells a folder of results from a folder that happens to hold such a file.
+_MARK = "# The effective config of a comparison; the results beside it were made with it."
 
 
 def prepare_output(config: CompareConfig, folder: Path | None) -> Path:
@@ -27,34 +30,56 @@ def prepare_output(config: CompareConfig, folder: Path | None) -> Path:
     Default: ``results/<config name>/<time>``, with a link ``latest``. DataError when it cannot be written to, or
     holds another comparison.
     """
+    chosen = folder or _new_folder(Path("results") / config.name)
+    if chosen.is_file():
+        raise DataError(f"{chosen}: is a file; name a folder for the results")
+    if chosen.is_dir() and any(chosen.iterdir()):
+        _check_comparison(chosen, config)
+    write_text(chosen / "config.yaml", f"{_MARK}\n{to_yaml(config)}")
     if folder is None:
-        parent = Path("results") / config.name
-        folder = parent / datetime.now().strftime("%Y-%m-%dT%H-%M-%S")
-        write_text(folder / "config.yaml", to_yaml(config))
-        _link(parent / "latest", folder.name)
-        return folder
-    if folder.is_file():
-        raise DataError(f"{folder}: is a file; name a folder for the results")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / "config.yaml").is_file():
+        _link(chosen.parent / "latest", chosen.name)
+    return chosen
+
+
+def _new_folder(parent: Path) -> Path:
+    """A folder called by the time, that no other comparison takes in the same second."""
+    name = datetime.now().strftime("%Y-%m-%dT%H-%M-%S")
+    count = 1
+    while True:
+        folder = parent / (name if count == 1 else f"{name}-{count}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            count += 1
+        except OSError:
+            return folder  # what is wrong is told when the first file is written
+        else:
+            return folder
+
+
+def _check_comparison(folder: Path, config: CompareConfig) -> None:
+    try:
+        ours = (folder / "config.yaml").read_text(encoding="utf-8").startswith(_MARK)
+    except (OSError, UnicodeDecodeError):
+        ours = False
+    if not ours:
         raise DataError(f"{folder}: holds other files; name a new folder, or one of an earlier comparison")
-    write_text(folder / "config.yaml", to_yaml(config))
-    return folder
+    name = read_yaml(folder / "config.yaml").get("name")
+    if name != config.name:
+        raise DataError(f"{folder}: holds the comparison {name!r}; name another folder for {config.name!r}")
 
 
 def write_results(result: ComparisonResult) -> None:
     """Write summary.json, the tables and the calibration of every entry's typical run."""
-    write_text(result.output / "summary.json", json.dumps(summary(result), indent=1, allow_nan=False) + "\n")
-    for name, rows in (
-        ("runs", [_run_row(run) for run in result.runs]),
-        ("errors", list(_error_rows(result))),
-        ("history", list(_history_rows(result.runs))),
-        ("statistics", [_statistics_row(entry) for entry in result.statistics]),
-    ):
-        with replacing(result.output / f"{name}.parquet") as partial:
-            pl.DataFrame(rows, infer_schema_length=None).write_parquet(partial)
+    write_text(result.output / "summary.json", to_json(summary(result)) + "\n")
+    for name, table in _tables(result).items():
+        write_table(result.output / f"{name}.parquet", table)
+    written: set[str] = set()
+    for stale in (result.output / "calibrations").glob("*.yaml"):  # of entries that the config may no longer have
+        remove(stale)
     for entry in result.statistics:
         if entry.typical is not None and entry.calibrator != "theoretical":
-            file = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"{entry.dataset}-{entry.label}").strip("_")
+            file = _file_name(f"{entry.dataset}-{entry.label}", written)
             calibration = calibration_of(entry.typical, result)
             write_calibration(calibration, result.output / "calibrations" / f"{file}.yaml")
 
@@ -103,6 +128,17 @@ def calibration_of(run: ScoredRun, result: ComparisonResult) -> Calibration:
     )
 
 
+def _file_name(title: str, taken: set[str]) -> str:
+    """A title as a file name that is not taken yet, letter case aside; it is then."""
+    plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", title).strip("_")
+    name, count = plain, 1
+    while name.lower() in taken:
+        count += 1
+        name = f"{plain}-{count}"
+    taken.add(name.lower())
+    return name
+
+
 def _link(link: Path, target: str) -> None:
     """Point ``link`` at the newest results; without links in the file system it is left out."""
     temporary = link.with_name(f".{link.name}.{target}")
@@ -111,6 +147,40 @@ def _link(link: Path, target: str) -> None:
         temporary.replace(link)
     except OSError:
         temporary.unlink(missing_ok=True)
+
+
+# Column types, which values alone do not tell where all are missing.
+_RUN = {"dataset": pl.String, "label": pl.String, "seed": pl.Int64}
+_HISTORY_COLUMNS = _RUN | {"evaluations": pl.Int64, "seconds": pl.Float64, "best_cost": pl.Float64}
+_ERROR_COLUMNS = (
+    _RUN
+    | {"split": pl.String, "trajectory": pl.String, "command": pl.String}
+    | dict.fromkeys(("x_error_m", "y_error_m", "heading_error_rad", "cost"), pl.Float64)
+)
+_COLUMN_OF: dict[Any, Any] = {
+    float | None: pl.Float64,
+    str | None: pl.String,
+    bool | None: pl.Boolean,
+    tuple[str, ...]: pl.List(pl.String),
+    tuple[Row, Row, Row] | None: pl.List(pl.List(pl.Float64)),
+    Interval | None: pl.Struct(dict.fromkeys(("value", "low", "high"), pl.Float64)),
+}
+
+
+def _tables(result: ComparisonResult) -> dict[str, pl.DataFrame]:
+    return {
+        "runs": _table([_run_row(run) for run in result.runs], RunRecord),
+        "errors": pl.DataFrame(list(_error_rows(result)), _ERROR_COLUMNS),
+        "history": pl.DataFrame(list(_history_rows(result.runs)), _HISTORY_COLUMNS),
+        "statistics": _table([_statistics_row(entry) for entry in result.statistics], EntryStatistics),
+    }
+
+
+def _table(rows: list[dict[str, Any]], kind: type) -> pl.DataFrame:
+    """Rows of one kind, at least one."""
+    hints = get_type_hints(kind, include_extras=True).items()
+    types = {name: _COLUMN_OF[hint] for name, hint in hints if hint in _COLUMN_OF and name in rows[0]}
+    return pl.DataFrame(rows, schema_overrides=types, infer_schema_length=None)
 
 
 def _run_row(run: ScoredRun) -> dict[str, Any]:

@@ -161,7 +161,7 @@ def _ends_in_words(view: DatasetView, trajectory: Trajectory) -> str:
     best = view.best
     if best is not None and best.typical is not None and best.typical.matrix is not None:
         (pose,) = view.model(best.typical.matrix).poses([trajectory.final_log])
-        parts.append(f"best {_distance_mm(pose[-1], trajectory.final_pose):.0f} mm")
+        parts.append(f"{best.label} {_distance_mm(pose[-1], trajectory.final_pose):.0f} mm")
     return ", ".join(parts)
 
 

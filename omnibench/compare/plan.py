@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
-from collections.abc import Mapping
+import re
+import sys
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
 from omnibench.compare.config import CalibratorEntry, CompareConfig, DatasetSource
-from omnibench.config import read_model
+from omnibench.config import read_model, validate
 from omnibench.data.dataset import Dataset
 from omnibench.data.importer import import_dataset
 from omnibench.data.simulate.config import FlowerConfig
 from omnibench.data.simulate.flower import simulate_dataset
 from omnibench.data.storage import load_dataset
-from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
 from omnibench.fit.calibrator import unloadable
-from omnibench.fit.parameterisation import ParameterisationName
+from omnibench.fit.parameterisation import ParameterisationName, held_by
 from omnibench.fit.problem import make_parameterisation, training_split
 from omnibench.registry import PluginFailure, calibrators, costs, load_plugins
 
@@ -36,13 +39,12 @@ class PlannedRun:
     label: str
     parameterisation: ParameterisationName
     box: str
+    held: tuple[str, ...]
     seed: int
 
     @cached_property
     def key(self) -> str:
-        """Names the run's result: changes with anything that the result depends on, the calibrator's code too."""
-        cls = calibrators.entry(self.entry.name).cls
-        source = inspect.getsourcefile(cls)
+        """Names the run's result: changes with anything that the result depends on, the code too."""
         facts = {
             "data": self.dataset.hash,
             "cost": self.config.cost.model_dump(mode="json"),
@@ -51,16 +53,17 @@ class PlannedRun:
             "box": self.config.box if isinstance(self.config.box, str) else self.config.box.model_dump(mode="json"),
             "budget": self.config.budget.model_dump(mode="json"),
             "seed": self.seed,
-            "code": hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else "",
+            "code": _code(self.entry, self.config.cost.name),
         }
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:20]
 
 
-def read_compare_config(path: Path, data: Mapping[str, Path] | None = None) -> CompareConfig:
-    """The config at ``path`` with its paths made absolute; ``data`` replaces the sources of data sets by name.
+def read_compare_config(path: Path | str, data: Mapping[str, Path] | None = None) -> CompareConfig:
+    """The config at ``path`` with its paths, which are relative to it, made absolute.
 
-    The name "" stands for the only data set. ConfigError in one line.
+    ``data`` replaces the sources of data sets by name. The name "" stands for the only data set. ConfigError in one line.
     """
+    path = Path(path)
     config = read_model(CompareConfig, path)
     sources = dict(config.datasets)
     for name, location in (data or {}).items():
@@ -82,12 +85,22 @@ def read_compare_config(path: Path, data: Mapping[str, Path] | None = None) -> C
 def load_calibrators(config: CompareConfig) -> list[PluginFailure]:
     """Load the config's plug-ins. One that cannot be imported fails in its row, and the others run."""
     failures = load_plugins(config.plugins)
-    known = {entry.name for entry in calibrators.entries()}
+    missing = {entry.name for entry in config.calibrators} - {entry.name for entry in calibrators.entries()}
     for failure in failures:
-        name = Path(failure.origin).stem
-        if name not in known and any(entry.name == name for entry in config.calibrators):
+        for name in missing & _names_in(Path(failure.origin)):
             calibrators.register(name)(unloadable(failure))
+            missing.remove(name)
+    if missing and failures:
+        lost = "; ".join(f"plug-in {failure.origin} cannot be imported: {failure.error}" for failure in failures)
+        known = [entry.name for entry in calibrators.entries()]
+        raise PluginError(f"{UnknownNameError('calibrator', min(missing), known, f'config {config.name}')}; {lost}")
     return failures
+
+
+def _names_in(plugin: Path) -> set[str]:
+    """The names under which a plug-in file would register calibrators: its own, and those that its text registers."""
+    text = plugin.read_text(encoding="utf-8", errors="replace") if plugin.is_file() else ""
+    return {plugin.stem, *re.findall(r"""calibrators\s*\.\s*register\(\s*["']([^"']+)["']""", text)}
 
 
 def load_datasets(config: CompareConfig) -> dict[str, Dataset]:
@@ -128,14 +141,26 @@ def effective_config(config: CompareConfig) -> CompareConfig:
     entries = []
     for index, entry in enumerate(config.calibrators):
         place = f"config {config.name}: calibrators.{index}"
-        options = calibrators.create(entry.name, entry.options, place).options
-        entries.append(entry.model_copy(update={"options": _plain(options)}))
+        options = _effective_options(entry, place)
+        entries.append(entry.model_copy(update={"options": options.model_dump(mode="json")}))
     return config.model_copy(
         update={
             "calibrators": tuple(entries),
-            "cost": cost.model_copy(update={"options": _plain(cost_options)}),
+            "cost": cost.model_copy(update={"options": cost_options.model_dump(mode="json")}),
         }
     )
+
+
+def _effective_options(entry: CalibratorEntry, place: str) -> BaseModel:
+    known = calibrators.entry(entry.name, place)
+    options = validate(known.options, entry.options, f"{place}: calibrator {entry.name!r}")
+    try:
+        calibrators.create(entry.name, entry.options)  # some look at their options once more
+    except PluginError:
+        pass  # its run fails in its row
+    except OmnibenchError as error:
+        raise ConfigError(f"{place}: {error}") from None
+    return options
 
 
 def make_plan(config: CompareConfig, datasets: Mapping[str, Dataset]) -> list[PlannedRun]:
@@ -146,10 +171,12 @@ def make_plan(config: CompareConfig, datasets: Mapping[str, Dataset]) -> list[Pl
         for entry in config.calibrators:
             cls = calibrators.entry(entry.name).cls
             parameterisation = entry.parameterisation or cls.parameterisation
-            box = _box_name(config, entry, dataset, parameterisation)
+            box, held = _box(config, entry, dataset, parameterisation)
             label = _label(config, entry, parameterisation, box, labels)
             seeds = config.seeds if cls.stochastic else config.seeds[:1]
-            plan += [PlannedRun(config, name, dataset, entry, label, parameterisation, box, seed) for seed in seeds]
+            plan += [
+                PlannedRun(config, name, dataset, entry, label, parameterisation, box, held, seed) for seed in seeds
+            ]
     return plan
 
 
@@ -157,11 +184,12 @@ def make_plan(config: CompareConfig, datasets: Mapping[str, Dataset]) -> list[Pl
 UNBOUNDED = "none"
 
 
-def _box_name(
+def _box(
     config: CompareConfig, entry: CalibratorEntry, dataset: Dataset, parameterisation: ParameterisationName
-) -> str:
+) -> tuple[str, tuple[str, ...]]:
+    """The name of an entry's box, and the elements that it holds at their start."""
     if not calibrators.entry(entry.name).cls.bounded:
-        return UNBOUNDED
+        return UNBOUNDED, ()
     try:
         searched = make_parameterisation(
             parameterisation,
@@ -170,7 +198,7 @@ def _box_name(
             box=entry.box or config.box,
             limits=entry.limits,
         )
-        return searched.bounds.name
+        return searched.bounds.name, held_by(searched)
     except ConfigError as error:
         raise ConfigError(f"config {config.name}: calibrator {entry.name!r}: {error}") from None
 
@@ -189,11 +217,6 @@ def _label(config: CompareConfig, entry: CalibratorEntry, parameterisation: str,
     return label
 
 
-def _plain(options: Any) -> dict[str, Any]:
-    plain: dict[str, Any] = options.model_dump(mode="json")
-    return plain
-
-
 def _relocated(source: DatasetSource, location: Path) -> DatasetSource:
     if source.import_ is not None and not (location / "dataset.yaml").is_file():
         return source.model_copy(update={"import_": source.import_.model_copy(update={"source": location})})
@@ -204,6 +227,38 @@ def _anchored(source: DatasetSource, folder: Path) -> DatasetSource:
     if source.path is not None:
         return source.model_copy(update={"path": (folder / source.path).resolve()})
     if source.import_ is not None:
-        anchored = (folder / source.import_.source).resolve()
-        return source.model_copy(update={"import_": source.import_.model_copy(update={"source": anchored})})
+        anchored = {
+            "source": (folder / source.import_.source).resolve(),
+            "options": {key: _anchored_value(value, folder) for key, value in source.import_.options.items()},
+        }
+        return source.model_copy(update={"import_": source.import_.model_copy(update=anchored)})
     return source
+
+
+def _anchored_value(value: Any, folder: Path) -> Any:
+    """An importer's option; one that names a file beside the config means that file, wherever one stands."""
+    if isinstance(value, str) and value and not value.isnumeric() and (folder / value).is_file():
+        return str((folder / value).resolve())
+    return value
+
+
+def _code(entry: CalibratorEntry, cost: str) -> str:
+    """Hash of the code behind a run: what all share, the calibrator's file, its search's and the cost's."""
+    named = {entry.name, *(value for value in entry.options.values() if isinstance(value, str))}
+    classes = [known.cls for known in calibrators.entries() if known.name in named] + [costs.entry(cost).cls]
+    modules = [sys.modules.get(cls.__module__) for cls in classes]
+    files = {file for module in modules if (file := getattr(module, "__file__", None))}
+    return _digest(sorted(Path(file) for file in files)) + _shared_code()
+
+
+@cache
+def _shared_code() -> str:
+    package = Path(__file__).parents[1]
+    return _digest(sorted([*package.glob("robot/*.py"), *package.glob("fit/*.py")]))
+
+
+def _digest(files: Iterable[Path]) -> str:
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()

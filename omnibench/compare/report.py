@@ -15,7 +15,7 @@ from omnibench.compare.results import ComparisonResult
 from omnibench.compare.search_figures import search_blocks
 from omnibench.compare.tables import cost_in_words, cost_table, entry_table, final_error_table, run_table
 from omnibench.compare.view import SPLIT_NAMES, DatasetView, views
-from omnibench.compare.wording import cost, cost_decimals, improvement_in_words
+from omnibench.compare.wording import cost, cost_decimals, improvement_in_words, level_in_words
 from omnibench.config import to_yaml
 from omnibench.data.dataset import SPLITS
 from omnibench.report.blocks import (
@@ -121,7 +121,7 @@ def _overview(found: list[DatasetView]) -> Table:
             Row(
                 (
                     Cell(view.name, "simulated" if view.dataset.simulated else ""),
-                    Cell(NOTHING if best is None else best.label),
+                    Cell(NOTHING) if best is None else Cell(best.label, level_in_words(view)),
                     Cell(SPLIT_NAMES[view.scored]),
                     Cell(fixed(view.theoretical_cost(view.scored), decimals)),
                     Cell(NOTHING if reached is None else fixed(reached.value, decimals)),
@@ -140,7 +140,8 @@ def _overview(found: list[DatasetView]) -> Table:
             Column("Improvement"),
         ),
         tuple(rows),
-        f"CF is the cost {cost_in_words(found[0])} Small print: 95 % bootstrap intervals.",
+        f"CF is the cost {cost_in_words(found[0])} Small print: 95 % bootstrap intervals. Of several that are level, "
+        "the entry of lowest training cost is named.",
     )
 
 

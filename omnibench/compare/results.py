@@ -13,20 +13,10 @@ from omnibench.config import Model
 from omnibench.data.dataset import Dataset
 from omnibench.environment import Environment
 from omnibench.fit.calibrator import Outcome
-from omnibench.fit.parameterisation import ParameterisationName
+from omnibench.fit.parameterisation import FittedParameter, ParameterisationName
 from omnibench.fit.problem import Improvement
 from omnibench.robot.calibration import Row
 from omnibench.robot.kinematics import Array
-
-
-class FittedParameter(Model):
-    """A physical parameter and how far it lies from its design value, as in section 4.2 of the paper."""
-
-    name: str
-    value: float
-    unit: str
-    design: float
-    deviation_percent: float | None  # None where the design value is 0
 
 
 class RunRecord(Model):
@@ -56,6 +46,7 @@ class RunRecord(Model):
     matrix: tuple[Row, Row, Row] | None
     parameters: tuple[FittedParameter, ...] | None
     at_bounds: tuple[str, ...]
+    held: tuple[str, ...]  # elements that the box holds at their start value
     gap: float | None  # train_cost / exact optimum in the box ``gap_box`` - 1
     gap_box: str | None
 

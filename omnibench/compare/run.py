@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from omnibench.compare.config import CompareConfig
@@ -11,13 +12,15 @@ from omnibench.compare.execute import Progress, execute
 from omnibench.compare.output import prepare_output, write_results
 from omnibench.compare.plan import PlannedRun, effective_config, load_calibrators, load_datasets, make_plan
 from omnibench.compare.report import write_report
-from omnibench.compare.results import ComparisonResult
+from omnibench.compare.results import ComparisonResult, ScoredRun
 from omnibench.compare.scoring import score
-from omnibench.compare.statistics import entry_statistics
+from omnibench.compare.statistics import entry_statistics, is_mean
 from omnibench.compare.store import RunStore
+from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
 from omnibench.errors import Interrupted
 from omnibench.fit.calibrator import RunResult
+from omnibench.registry import PluginFailure
 
 
 class Silent:
@@ -42,30 +45,41 @@ def run_comparison(
     datasets = load_datasets(config)
     plan = make_plan(config, datasets)
     folder = prepare_output(config, output)
-    results = _executed(plan, folder, progress or Silent(), config.workers or os.cpu_count() or 1)
-    runs = score(plan, results, datasets)
-    result = ComparisonResult(
-        config=config,
-        output=folder,
-        datasets=datasets,
-        runs=runs,
-        statistics=entry_statistics(runs, config.bootstrap),
-        environment=environment(),
-        warnings=(
-            *(f"plug-in {failure.origin} cannot be imported: {failure.error}" for failure in failures),
-            *(f"data set {name}: {warning}" for name, dataset in datasets.items() for warning in dataset.warnings),
-        ),
-    )
-    write_results(result)
-    write_report(result, folder / "report.html")
+    store = RunStore(folder / "runs")
+    with _resumable(plan, store, folder):
+        results = execute(plan, store, progress or Silent(), config.workers or os.cpu_count() or 1)
+        runs = score(plan, results, datasets)
+        result = ComparisonResult(
+            config=config,
+            output=folder,
+            datasets=datasets,
+            runs=runs,
+            statistics=entry_statistics(runs, config.bootstrap),
+            environment=environment(),
+            warnings=tuple(_warnings(failures, datasets, runs)),
+        )
+        write_results(result)
+        write_report(result, folder / "report.html")
     return result
 
 
-def _executed(plan: Sequence[PlannedRun], folder: Path, progress: Progress, workers: int) -> list[RunResult]:
-    store = RunStore(folder / "runs")
+@contextmanager
+def _resumable(plan: Sequence[PlannedRun], store: RunStore, folder: Path) -> Iterator[None]:
+    """Ctrl-C says what is kept and how to go on."""
     try:
-        return execute(plan, store, progress, workers)
+        yield
     except KeyboardInterrupt:
         kept = sum(store.get(run.key) is not None for run in plan)
         message = f"interrupted; {kept} of {len(plan)} runs are kept in {folder}: run again with --output {folder}"
         raise Interrupted(message) from None
+
+
+def _warnings(
+    failures: Iterable[PluginFailure], datasets: Mapping[str, Dataset], runs: Iterable[ScoredRun]
+) -> Iterator[str]:
+    for failure in failures:
+        yield f"plug-in {failure.origin} cannot be imported: {failure.error}"
+    for name, dataset in datasets.items():
+        yield from (f"data set {name}: {warning}" for warning in dataset.warnings)
+    if not all(is_mean(run) for run in runs):
+        yield "the cost is no mean over trajectories: intervals and differences are of the mean of their own costs"

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from omnibench.compare.plan import UNBOUNDED, PlannedRun
-from omnibench.compare.results import FittedParameter, RunRecord, ScoredRun
+from omnibench.compare.results import RunRecord, ScoredRun
 from omnibench.data.dataset import Dataset, Split, Trajectory
-from omnibench.fit.calibrator import Outcome, RunResult
+from omnibench.errors import PluginError
+from omnibench.fit.calibrator import Outcome, RunResult, describe_error
 from omnibench.fit.cost import Cost
-from omnibench.fit.parameterisation import WheelGeometry, make_bounds
-from omnibench.registry import costs
+from omnibench.fit.parameterisation import Box, FittedParameter, fitted_parameters, make_bounds
+from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import matrix_rows
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryBatch
 
 
@@ -30,12 +31,14 @@ class SplitScorer:
         self._final = np.array([trajectory.final_pose for trajectory in trajectories])
 
     def cost(self, matrix: Array) -> float:
-        """The cost of a matrix (3, N) on the split."""
-        return float(self._cost.combine(self._errors(matrix)[None], self._odometry.trajectory)[0])
+        """The cost of a matrix (3, N) on the split. PluginError when the cost raises or is not a finite number."""
+        errors = self._errors(matrix)[None]
+        return float(self._checked(1, lambda: self._cost.combine(errors, self._odometry.trajectory))[0])
 
     def costs(self, matrix: Array) -> Array:
-        """The cost (Z,) of every trajectory."""
-        return self._cost.of_each(self._errors(matrix), self._odometry.trajectory)
+        """The cost (Z,) of every trajectory. PluginError when the cost raises or is not a finite number."""
+        errors = self._errors(matrix)
+        return self._checked(len(self._final), lambda: self._cost.of_each(errors, self._odometry.trajectory))
 
     def final_errors(self, matrix: Array) -> Array:
         """Odometry minus reference (Z, 3) at the last reference pose of every trajectory, m, m, rad."""
@@ -43,6 +46,17 @@ class SplitScorer:
 
     def _errors(self, matrix: Array) -> Array:
         return self._odometry.poses(matrix[None])[0] - self._reference
+
+    def _checked(self, count: int, costs: Callable[[], Array]) -> Array:
+        """Costs (count,), by a cost that may be a plug-in's."""
+        try:
+            values = np.asarray(costs(), dtype=float)
+        except Exception as error:
+            raise PluginError(f"cost {self._cost.name!r} raised {describe_error(error)}") from error
+        if values.shape != (count,) or not np.isfinite(values).all():
+            given = f"an array of shape {values.shape}" if values.shape != (count,) else "NaN or infinity"
+            raise PluginError(f"cost {self._cost.name!r} gave {given} for finite errors, expected {count} finite costs")
+        return values
 
 
 def score(
@@ -57,7 +71,8 @@ def score(
                 cost = costs.create(run.config.cost.name, run.config.cost.options)
                 scorers[run.dataset_name, split] = SplitScorer(trajectories, cost, run.config.integration)
     scored = [_score_one(run, result, scorers) for run, result in zip(plan, results, strict=True)]
-    return tuple(_with_gap(run, scored, datasets[run.record.dataset].robot) for run in scored)
+    exact = [(run, done) for run, done in zip(plan, scored, strict=True) if _is_exact(done.record)]
+    return tuple(_with_gap(run, done, exact) for run, done in zip(plan, scored, strict=True))
 
 
 def position_error(errors: Array) -> float:
@@ -106,6 +121,7 @@ def _score_one(run: PlannedRun, result: RunResult, scorers: Mapping[tuple[str, S
         matrix=None if matrix is None else matrix_rows(matrix),
         parameters=_parameters(run, result),
         at_bounds=result.at_bounds,
+        held=run.held,
         gap=None,
         gap_box=None,
     )
@@ -128,42 +144,37 @@ def _improvement(cost: float | None, theoretical: float | None) -> float | None:
 def _parameters(run: PlannedRun, result: RunResult) -> tuple[FittedParameter, ...] | None:
     if run.parameterisation != "geometry" or result.vector is None:
         return None
-    geometry = WheelGeometry(run.dataset.robot, run.entry.limits)
-    return tuple(
-        FittedParameter(
-            name=name,
-            value=float(value),
-            unit="rad" if name.startswith("angle") else "m",
-            design=float(design),
-            deviation_percent=float(100 * (value - design) / design) if design else None,
-        )
-        for name, value, design in zip(geometry.names, result.vector, geometry.start, strict=True)
-    )
+    return fitted_parameters(run.dataset.robot, result.vector)
 
 
-def _with_gap(run: ScoredRun, runs: Sequence[ScoredRun], robot: Robot) -> ScoredRun:
-    """The gap above closed_form's optimum in the same box.
+def _is_exact(record: RunRecord) -> bool:
+    """Whether a run's training cost is the optimum in its box, and one to divide by."""
+    exact = calibrators.entry(record.calibrator).cls.exact
+    return exact and record.outcome is Outcome.CONVERGED and bool(record.train_cost)
+
+
+def _with_gap(run: PlannedRun, scored: ScoredRun, exact: Sequence[tuple[PlannedRun, ScoredRun]]) -> ScoredRun:
+    """The gap above the exact optimum in the same box.
 
     A geometry, or an answer without a box, is compared with the optimum over a box that contains its matrix.
     """
-    record = run.record
-    if record.train_cost is None or run.matrix is None:
-        return run
-    for other in runs:
-        exact = other.record
-        if exact.calibrator != "closed_form" or exact.outcome is not Outcome.CONVERGED or not exact.train_cost:
+    cost, matrix = scored.record.train_cost, scored.matrix
+    if cost is None or matrix is None:
+        return scored
+    elsewhere = run.parameterisation == "geometry" or run.box == UNBOUNDED
+    for other, optimum in exact:
+        if other.dataset_name != run.dataset_name or optimum.record.train_cost is None:
             continue
-        if exact.dataset != record.dataset:
-            continue
-        elsewhere = record.parameterisation == "geometry" or record.box == UNBOUNDED
-        if exact.box == record.box or (elsewhere and _contains(robot, exact.box, run.matrix)):
-            gap = record.train_cost / exact.train_cost - 1
-            return replace(run, record=record.model_copy(update={"gap": gap, "gap_box": exact.box}))
-    return run
+        if _contains(other, matrix) if elsewhere else _box(other) == _box(run):
+            gap = cost / optimum.record.train_cost - 1
+            return replace(scored, record=scored.record.model_copy(update={"gap": gap, "gap_box": other.box}))
+    return scored
 
 
-def _contains(robot: Robot, box: str, matrix: Array) -> bool:
-    if box not in ("paper", "row"):
-        return False
-    bounds = make_bounds(robot, "paper" if box == "paper" else "row")
+def _box(run: PlannedRun) -> Box:
+    return run.entry.box or run.config.box
+
+
+def _contains(run: PlannedRun, matrix: Array) -> bool:
+    bounds = make_bounds(run.dataset.robot, _box(run))
     return bool(((matrix.ravel() >= bounds.lower) & (matrix.ravel() <= bounds.upper)).all())

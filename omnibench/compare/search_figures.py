@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,7 +15,7 @@ from omnibench.compare.results import ScoredRun
 from omnibench.compare.view import THEORETICAL_LOOK, DatasetView, Look, is_bounded
 from omnibench.fit.problem import Improvement
 from omnibench.report.blocks import Block, Figure, FigureGrid, Paragraph
-from omnibench.report.numbers import significant
+from omnibench.report.numbers import listing, significant
 from omnibench.report.style import logarithmic, plot, text
 from omnibench.robot.kinematics import Array
 
@@ -31,7 +31,8 @@ _POINTS = 12_000  # of one plot, shared by its runs
 class Course:
     """A run's best cost (K,) against evaluations and seconds (K,), with its final answer as the last point.
 
-    best_known: the lowest training cost that any run reached in the same box.
+    best_known: the exact optimum that the record's gap is measured from; where that is not known, the lowest training
+    cost that any run reached in the same box.
     """
 
     run: ScoredRun
@@ -92,14 +93,10 @@ def search_blocks(view: DatasetView) -> tuple[Block, ...]:
 def courses(view: DatasetView) -> list[Course]:
     """The runs that searched, in the order of the results; a matrix that is given or kept is no search."""
     searched = [run for run in view.runs if run.record.evaluations > 1 and is_bounded(run.record.calibrator)]
-    best_known: dict[str, float] = {}
-    for run in searched:
-        reached = [run.record.train_cost] if run.record.train_cost is not None else []
-        box = box_of(run)
-        best_known[box] = min([best_known.get(box, math.inf), *reached])
+    lowest = _lowest_costs(view)
     found = []
     for run in searched:
-        history, known = _with_answer(run), best_known[box_of(run)]
+        history, known = _with_answer(run), _best_known(run, lowest[_box_key(view, run)])
         if history and 0 < known < math.inf:
             found.append(
                 Course(
@@ -114,9 +111,26 @@ def courses(view: DatasetView) -> list[Course]:
     return found
 
 
-def box_of(run: ScoredRun) -> str:
-    """The box whose best known cost a run is measured by: for a geometry the box of matrices that contains it."""
-    return run.record.gap_box or run.record.box
+def _best_known(run: ScoredRun, lowest: float) -> float:
+    """The cost that a run's gap is measured from."""
+    record = run.record
+    if record.gap is None or record.train_cost is None:
+        return lowest
+    return record.train_cost / (1 + record.gap)
+
+
+def _lowest_costs(view: DatasetView) -> Mapping[Hashable, float]:
+    """The lowest training cost that was reached in each box; infinite where nothing was."""
+    lowest: dict[Hashable, float] = {}
+    for run in view.runs:
+        box, cost = _box_key(view, run), run.record.train_cost
+        lowest[box] = min(lowest.get(box, math.inf), math.inf if cost is None else cost)
+    return lowest
+
+
+def _box_key(view: DatasetView, run: ScoredRun) -> Hashable:
+    """What a run searched: runs with equal keys can be measured by each other's costs."""
+    return view.boxes.get(run.record.label, run.record.label), is_bounded(run.record.calibrator)
 
 
 def targets_reached(group: Sequence[Course], runs: int, axis: Axis) -> tuple[Array, Array]:
@@ -261,8 +275,16 @@ def _along(course: Course, axis: Axis) -> Array:
 
 
 def _caption(drawn: Sequence[Course]) -> str:
-    known = {box_of(course.run): course.best_known for course in drawn}
-    costs = ", ".join(f"box {box}: {significant(value, 8)}" for box, value in known.items())
+    known: dict[tuple[str, str], list[str]] = {}
+    for course in drawn:
+        record = course.run.record
+        labels = known.setdefault((record.gap_box or record.box, significant(course.best_known, 8)), [])
+        labels += [] if record.label in labels else [record.label]
+    shared = Counter(box for box, _ in known)
+    costs = "; ".join(
+        f"box {box}{f' of {listing(labels)}' if shared[box] > 1 else ''}: {value}"
+        for (box, value), labels in known.items()
+    )
     return (
         f"One line a seed, marked where the run ended. Best known training cost: {costs}. Gaps below {_FLOOR:.0e} are "
         "drawn at that value. Targets are relative gaps above the best known cost in the same box, from 1 down to 1e-8 "

@@ -18,34 +18,50 @@ NEGLIGIBLE_SHARE = 0.1
 def entry_statistics(runs: Sequence[ScoredRun], bootstrap: Bootstrap) -> tuple[EntryStatistics, ...]:
     """Statistics of every entry on every data set, in the order of the runs.
 
-    The best entry of a data set has the lowest validation cost (training cost where there is no validation split) in
-    its typical run. An entry is practically equal to it when the 95 % interval of their paired difference contains
-    zero or the difference is below a tenth of the standard error of the best entry's cost.
+    An entry is practically equal to another when the 95 % interval of the paired difference of their typical runs'
+    validation costs (training costs where there is no validation split) contains zero, or the difference is below a
+    tenth of the standard error of the other's cost. The best entry of a data set has the lowest training cost among
+    those that are practically equal to the one of lowest validation cost.
     """
     groups: dict[tuple[str, str], list[ScoredRun]] = {}
     for run in runs:
         groups.setdefault((run.record.dataset, run.record.label), []).append(run)
     typical = {key: _typical(group) for key, group in groups.items()}
+    draws = _Draws(bootstrap)
     statistics = []
     for (dataset, label), group in groups.items():
         rivals = [run for (name, _), run in typical.items() if name == dataset and run is not None]
-        best = min(rivals, key=_judged_cost, default=None)
-        statistics.append(_statistics(group, typical[dataset, label], best, bootstrap))
+        best = _best(rivals, draws)
+        statistics.append(_statistics(group, typical[dataset, label], best, draws))
     return tuple(statistics)
+
+
+def _best(rivals: Sequence[ScoredRun], draws: _Draws) -> ScoredRun | None:
+    """Noise does not choose between entries that are practically equal: the training cost does."""
+    if not rivals:
+        return None
+    lowest = min(rivals, key=_judged_cost)
+    level = [run for run in rivals if _against_best(run, lowest, draws)[1]]
+    return min(level, key=lambda run: (run.record.train_cost or 0.0, _judged_cost(run)))
+
+
+def is_mean(run: ScoredRun) -> bool:
+    """Whether the run's cost is the mean of its trajectories' costs, as the intervals and differences suppose."""
+    cost, costs = run.record.train_cost, run.train_costs
+    return cost is None or costs is None or bool(np.isclose(costs.mean(), cost, rtol=1e-6, atol=0.0))
 
 
 def _statistics(
     group: Sequence[ScoredRun],
     typical: ScoredRun | None,
     best: ScoredRun | None,
-    bootstrap: Bootstrap,
+    draws: _Draws,
 ) -> EntryStatistics:
     record = group[0].record
     costs = [run.record.train_cost for run in group if run.record.train_cost is not None]
     gaps = [run.record.gap for run in group if run.record.gap is not None]
     train = None if typical is None else typical.train_costs
     validation = None if typical is None else typical.validation_costs
-    draws = _Draws(bootstrap)
     difference, equal = None, None
     if typical is not None and best is not None:
         difference, equal = _against_best(typical, best, draws)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+
 from omnibench.config import Model
 from omnibench.files import write_text
 from omnibench.fit.calibrator import Outcome, RunResult

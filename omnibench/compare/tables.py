@@ -18,6 +18,7 @@ from omnibench.compare.wording import (
     cost_decimals,
     difference_in_words,
     improvement_in_words,
+    level_in_words,
     position_unit,
 )
 from omnibench.data.dataset import Split
@@ -41,10 +42,9 @@ from omnibench.robot.kinematics import Array
 def cost_table(view: DatasetView, split: Split) -> Table:
     """Table 2 (training) or 3 (validation) of the paper, with intervals."""
     theoretical = view.theoretical_cost(split)
-    own = next((entry for entry in view.statistics if entry.calibrator == THEORETICAL_NAME), None)
     decimals = cost_decimals(view)
     before = fixed(theoretical, decimals)
-    ours = None if own is None else cost(own, split)
+    ours = None if view.theoretical is None else cost(view.theoretical, split)
     first = Row((entry_cell(view, None), Cell(before, _span(ours, decimals)), Cell(NOTHING), Cell(NOTHING)))
     rows = [first]
     searched = [entry for entry in view.statistics if entry.calibrator != THEORETICAL_NAME]
@@ -114,10 +114,9 @@ def entry_table(view: DatasetView) -> Table:
                     Cell(f"{entry.answers} of {entry.runs}"),
                     Cell(fixed(entry.train_median, digits), _spread(entry)),
                     Cell(gap(entry.gap_median)),
-                    Cell(count(entry.evaluations_median)),
-                    Cell(seconds(entry.seconds_median)),
+                    Cell(count(entry.evaluations_median), seconds(entry.seconds_median)),
                     _difference(entry),
-                    _verdict(entry),
+                    _verdict(view, entry),
                 ),
                 "best" if entry.is_best else "plain" if entry.answers else "failed",
             )
@@ -129,8 +128,7 @@ def entry_table(view: DatasetView) -> Table:
             Column("Answers of runs"),
             Column("CF training, median"),
             Column("Gap above exact optimum", "relative"),
-            Column("Evaluations, median"),
-            Column("Time, median"),
+            Column("Evaluations and time, median"),
             Column(f"Difference from the best in CF {SPLIT_NAMES[view.scored]}"),
             Column("Verdict", numeric=False),
         ),
@@ -138,7 +136,8 @@ def entry_table(view: DatasetView) -> Table:
         note="Spread: interquartile range over seeds. Gap: training cost relative to the exact optimum in the same box "
         f"(closed_form), minus one; {NOTHING} where that is not known. Difference: paired over trajectories, with its "
         "95 % bootstrap interval. Practically equal: that interval contains zero, or the difference is below a tenth "
-        "of the standard error of the best entry's cost.",
+        "of the standard error of the best entry's cost. Best: the lowest training cost of the entries that are "
+        f"practically equal to the one of lowest {SPLIT_NAMES[view.scored]} cost.{_held_in_words(view)}",
     )
 
 
@@ -150,12 +149,10 @@ def run_table(view: DatasetView) -> Table:
             Column("Entry", numeric=False),
             Column("Seed"),
             Column("Outcome", numeric=False),
-            Column("Reason", numeric=False),
             Column("CF training"),
             Column("CF validation"),
             Column("Gap"),
-            Column("Evaluations"),
-            Column("Time"),
+            Column("Evaluations and time"),
             Column("On a bound", numeric=False),
         ),
         rows=tuple(_run_row(view, run.record) for run in view.runs),
@@ -165,7 +162,7 @@ def run_table(view: DatasetView) -> Table:
 def entry_cell(view: DatasetView, entry: EntryStatistics | None) -> Cell:
     """An entry's name with its colour; None stands for the design values."""
     if entry is None:
-        return Cell("Theoretical", "design values", THEORETICAL_LOOK.colour)
+        return Cell(THEORETICAL_NAME, "design values", THEORETICAL_LOOK.colour)
     if entry.calibrator == THEORETICAL_NAME:
         note = "design values"
     elif not is_bounded(entry.calibrator):
@@ -173,6 +170,11 @@ def entry_cell(view: DatasetView, entry: EntryStatistics | None) -> Cell:
     else:
         note = "geometry within limits" if entry.parameterisation == "geometry" else f"matrix, box {entry.box}"
     return Cell(entry.label, note, view.looks[entry.label].colour)
+
+
+def on_bounds(record: RunRecord) -> list[str]:
+    """Elements that the search moved to a bound; not those that the box holds, which had nowhere to go."""
+    return [name for name in record.at_bounds if name not in record.held]
 
 
 def gap(value: float | None) -> str:
@@ -232,14 +234,28 @@ def _difference(entry: EntryStatistics) -> Cell:
     return Cell(*difference_in_words(entry.difference))
 
 
-def _verdict(entry: EntryStatistics) -> Cell:
+def _verdict(view: DatasetView, entry: EntryStatistics) -> Cell:
     if entry.typical is None:
         return Cell("no answer")
     if entry.is_best:
-        return Cell("best")
-    if entry.practically_equal is None:
+        return Cell("best", level_in_words(view))
+    if entry.practically_equal is None or entry.difference is None:
         return Cell(NOTHING)
-    return Cell("practically equal" if entry.practically_equal else "worse")
+    if entry.practically_equal:
+        return Cell("practically equal")
+    if entry.difference.value > 0:
+        return Cell("worse")
+    return Cell("lower cost here", "higher training cost")
+
+
+def _held_in_words(view: DatasetView) -> str:
+    """Elements without width, and the entries whose box holds them."""
+    held: dict[tuple[str, ...], list[str]] = {}
+    for entry, run in view.calibrated:
+        if run.record.held:
+            held.setdefault(run.record.held, []).append(entry.label)
+    told = [f"{listing(list(names), 12)} ({listing(labels, 20)})" for names, labels in held.items()]
+    return f" Held at the design value by a box without width there: {'; '.join(told)}." if told else ""
 
 
 def _run_row(view: DatasetView, record: RunRecord) -> Row:
@@ -247,13 +263,11 @@ def _run_row(view: DatasetView, record: RunRecord) -> Row:
     cells = (
         Cell(record.label, colour=view.looks[record.label].colour),
         Cell(str(record.seed)),
-        Cell(record.outcome.value),
-        Cell(record.reason),
+        Cell(record.outcome.value, record.reason),
         Cell(fixed(record.train_cost, 6)),
         Cell(fixed(record.validation_cost, 6)),
         Cell(gap(record.gap)),
-        Cell(count(record.evaluations)),
-        Cell(seconds(record.seconds)),
-        Cell(listing(list(record.at_bounds), 9) if answered and record.at_bounds else NOTHING),
+        Cell(count(record.evaluations), seconds(record.seconds)),
+        Cell(", ".join(on_bounds(record)) if answered and on_bounds(record) else NOTHING),
     )
     return Row(cells, "plain" if answered else "failed")

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from omnibench.compare.config import CompareConfig
+from omnibench.compare.plan import PlannedRun, make_plan
 from omnibench.compare.results import ComparisonResult, EntryStatistics, ScoredRun
+from omnibench.compare.statistics import entry_statistics
 from omnibench.data.dataset import Dataset, Split
+from omnibench.fit.parameterisation import GeometryLimits
 from omnibench.registry import calibrators
 from omnibench.report.blocks import Dash, LegendItem
 from omnibench.report.style import REFERENCE, SYMBOLS, THEORETICAL, colours
@@ -53,8 +56,9 @@ THEORETICAL_LOOK = Look("theoretical", "theoretical (design values)", THEORETICA
 class DatasetView:
     """One data set of the comparison.
 
-    looks: by label, the same in the whole report. design_errors: final pose errors (Z, 3) in m, m, rad of the design
-    matrix on each split that has trajectories.
+    looks: by label, the same in the whole report. boxes: by label, what the entry searched; equal where two entries
+    searched the same. theoretical: costs of the design values with their intervals. design_errors: final pose errors
+    (Z, 3) in m, m, rad of the design matrix on each split that has trajectories.
     """
 
     name: str
@@ -63,6 +67,8 @@ class DatasetView:
     runs: tuple[ScoredRun, ...]
     statistics: tuple[EntryStatistics, ...]
     looks: Mapping[str, Look]
+    boxes: Mapping[str, Hashable]
+    theoretical: EntryStatistics | None
     design_errors: Mapping[Split, Array]
 
     @property
@@ -74,6 +80,11 @@ class DatasetView:
     def best(self) -> EntryStatistics | None:
         """The best entry, unless nothing gave an answer."""
         return next((entry for entry in self.statistics if entry.is_best and entry.typical is not None), None)
+
+    @property
+    def level(self) -> list[EntryStatistics]:
+        """Entries that are practically equal to the best, itself among them."""
+        return [entry for entry in self.statistics if entry.practically_equal or entry.is_best]
 
     @property
     def calibrated(self) -> list[tuple[EntryStatistics, ScoredRun]]:
@@ -121,7 +132,8 @@ def is_bounded(calibrator: str) -> bool:
 def views(result: ComparisonResult) -> list[DatasetView]:
     """The data sets of a comparison, in the config's order."""
     looks = _looks(result)
-    return [_view(result, name, looks) for name in result.datasets]
+    plan = make_plan(result.config, result.datasets)
+    return [_view(result, name, looks, plan) for name in result.datasets]
 
 
 def positions_and_headings(errors: Array) -> tuple[Array, Array]:
@@ -129,19 +141,48 @@ def positions_and_headings(errors: Array) -> tuple[Array, Array]:
     return np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2])
 
 
-def _view(result: ComparisonResult, name: str, looks: Mapping[str, Look]) -> DatasetView:
+def _view(result: ComparisonResult, name: str, looks: Mapping[str, Look], plan: Sequence[PlannedRun]) -> DatasetView:
     dataset = result.datasets[name]
     splits: tuple[Split, ...] = ("train", "validation")
     present = [split for split in splits if dataset.split(split)]
+    runs = tuple(run for run in result.runs if run.record.dataset == name)
     return DatasetView(
         name=name,
         config=result.config,
         dataset=dataset,
-        runs=tuple(run for run in result.runs if run.record.dataset == name),
+        runs=runs,
         statistics=tuple(entry for entry in result.statistics if entry.dataset == name),
         looks=looks,
+        boxes={run.label: _searched(run) for run in plan if run.dataset_name == name},
+        theoretical=_theoretical(result, runs[0]) if runs else None,
         design_errors={split: _design_errors(result, dataset, split) for split in present},
     )
+
+
+def _searched(run: PlannedRun) -> Hashable:
+    """The content of a run's box: a name like ``custom`` may stand for several."""
+    if run.parameterisation == "geometry":
+        return run.parameterisation, run.entry.limits or GeometryLimits()
+    return run.parameterisation, run.entry.box or run.config.box
+
+
+def _theoretical(result: ComparisonResult, run: ScoredRun) -> EntryStatistics:
+    """Statistics of the design values, which every run holds the costs of, as if they were its answer."""
+    record = run.record.model_copy(
+        update={
+            "label": THEORETICAL_NAME,
+            "train_cost": run.record.theoretical_train_cost,
+            "validation_cost": run.record.theoretical_validation_cost,
+        }
+    )
+    design = replace(
+        run,
+        record=record,
+        train_costs=run.theoretical_train_costs,
+        validation_costs=run.theoretical_validation_costs,
+    )
+    (statistics,) = entry_statistics([design], result.config.bootstrap)
+    return statistics
 
 
 def _design_errors(result: ComparisonResult, dataset: Dataset, split: Split) -> Array:

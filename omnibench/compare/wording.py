@@ -21,6 +21,11 @@ def improvement_in_words(entry: EntryStatistics, split: Split, decimals: int) ->
     return percent(found.value, decimals), f"{span(100 * found.low, 100 * found.high, 1)} %"
 
 
+def level_in_words(view: DatasetView) -> str:
+    """That others are practically equal to the best, if so."""
+    return f"of {len(view.level)} that are level" if len(view.level) > 1 else ""
+
+
 def cost(entry: EntryStatistics, split: Split) -> Interval | None:
     """An entry's cost on a split."""
     return entry.train if split == "train" else entry.validation

@@ -1,95 +1,145 @@
-"""Values that are numbers but cannot be right: units and wheels told from the size of what they predict."""
+"""Values that are numbers but cannot be right: units and wheels with which the recordings would make more sense."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import OdometryBatch, WheelLog
 
-_RPM = 2 * math.pi / 60
 _DEGREE = math.pi / 180
+# What a column may have been recorded in: the factor to the SI unit, and the warning.
+_RATES = (
+    (1.0, ""),
+    (2 * math.pi / 60, "wheel rates look like rpm; omega_* must be rad/s"),
+    (_DEGREE, "wheel rates look like deg/s; omega_* must be rad/s"),
+)
+_HEADINGS = ((1.0, ""), (_DEGREE, "theta looks like degrees; it must be rad"))
+_POSITIONS = (
+    (1.0, ""),
+    (1e-3, "positions look like mm; x and y must be m"),
+    (1e-2, "positions look like cm; x and y must be m"),
+)
 _MOST_TRAJECTORIES = 24
-_STAMPS = 4
+# Calibration errors, slip and noise stay below this misfit of the design model; wrong units and wheels do not.
+_SUSPICIOUS = 0.15
+_EXPLAINED = 0.35  # share of the misfit that an explanation may leave
 
 
-def implausible(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array], headings: Sequence[Array]) -> list[str]:
+def implausible(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array]) -> list[str]:
     """Warnings about units and wheels, from a comparison of the reference with the design model's odometry.
 
-    ``poses`` are as recorded, ``headings`` the unwrapped ones (rad).
+    ``poses`` (K, 3) of each log are as recorded, at the log's stamps; headings may be wrapped.
     """
-    every = max(1, len(logs) // _MOST_TRAJECTORIES)
-    logs, poses, headings = logs[::every], poses[::every], headings[::every]
-    odometry = OdometryModel.of_design(robot, "arc").poses(logs)
-    moved = _extent([pose[:, :2] for pose in odometry])
-    turned = _extent([pose[:, 2:] for pose in odometry])
-    moved_reference = _extent([pose[:, :2] for pose in poses])
-    turned_reference = _extent([heading[:, None] for heading in headings])
-    turned_as_recorded = _extent([pose[:, 2:] for pose in poses])
-    largest = max(float(np.abs(pose[:, 2]).max()) for pose in poses)
-
-    if moved == 0 and turned == 0:
+    if not any(log.rates.any() for log in logs):
         return ["the wheels never turn; check the omega_* columns"]
-    warnings = []
-    degrees = largest > 2 * math.pi + 0.5 and _about(turned_as_recorded, turned / _DEGREE)
-    if degrees:
-        warnings.append("theta looks like degrees; it must be rad")
-    for unit, factor in (("rpm", _RPM), ("deg/s", _DEGREE)):
-        turns_agree = degrees or turned < 0.3 * len(logs) or _about(turned_reference, turned * factor)
-        if moved > 0 and _about(moved_reference, moved * factor) and turns_agree:
-            return [*warnings, f"wheel rates look like {unit}; omega_* must be rad/s"]
-    for unit, factor in (("mm", 1000.0), ("cm", 100.0)):
-        if moved > 0 and _about(moved_reference, moved * factor):
-            return [*warnings, f"positions look like {unit}; x and y must be m"]
-    return warnings or _swapped_wheels(robot, logs, poses, headings)
+    every = math.ceil(len(logs) / _MOST_TRAJECTORIES)
+    recording = _Recording(robot, logs[::every], poses[::every])
+    design = robot.inverse_kinematic_matrix
+    misfit = recording.misfits(design[None])[0]
+    if misfit < _SUSPICIOUS:
+        return []
+    units = [each for each in _odd_units(recording, design) if each.misfit < _EXPLAINED * misfit]
+    single = [each for each in units if len(each.warnings) == 1]  # the simplest explanation first
+    found = single or [*units, *_odd_wheels(recording, design)]
+    best = min(found, key=lambda each: each.misfit, default=None)
+    return list(best.warnings) if best and best.misfit < _EXPLAINED * misfit else []
 
 
-def _extent(paths: Sequence[Array]) -> float:
-    """Farthest that each path comes from its start, summed."""
-    return sum(float(np.linalg.norm(path - path[0], axis=1).max()) for path in paths)
+@dataclass(frozen=True)
+class _Explanation:
+    """What may be wrong, and the misfit that would be left."""
+
+    warnings: tuple[str, ...]
+    misfit: float
 
 
-def _about(value: float, expected: float, factor: float = 1.6) -> bool:
-    return expected > 0 and 1 / factor < value / expected < factor
+class _Recording:
+    """Some moments of some runs: the path since the start of the run, and the turn since the moment before."""
+
+    def __init__(self, robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array]) -> None:
+        moments = [_moments(log, robot.inverse_kinematic_matrix[2]) for log in logs]
+        seen_from_start = [
+            WheelLog(log.times, log.rates, np.zeros(3), log.stamps[chosen])
+            for log, chosen in zip(logs, moments, strict=True)
+        ]
+        self._odometry = OdometryBatch(seen_from_start, "arc")
+        self._poses = np.concatenate([pose[chosen] for pose, chosen in zip(poses, moments, strict=True)])
+        self._starts = np.array([pose[0] for pose in poses])[self._odometry.trajectory]
+        self._first = np.diff(self._odometry.trajectory, prepend=-1) > 0
+        self._length = float(np.mean([wheel.distance for wheel in robot.wheels]))  # of the robot, m
+        self.wheels = robot.wheel_names
+
+    def misfits(self, matrices: Array, metre: float = 1.0, radian: float = 1.0) -> Array:
+        """How badly matrices (P, 3, N) explain the reference: (P,), 0 exactly, 1 not at all.
+
+        metre, radian: what a unit of the recorded positions and headings is.
+        """
+        odometry = self._odometry.poses(matrices)
+        moved = (self._poses - self._starts) * [metre, metre, radian]
+        path = (moved[:, 0] + 1j * moved[:, 1]) * np.exp(-1j * radian * self._starts[:, 2])
+        driven = odometry[..., 0] + 1j * odometry[..., 1]
+        turned = self._turns(odometry[..., 2])
+        # Whole turns between two moments leave no trace in the headings.
+        missed = np.remainder(turned - self._turns(moved[:, 2]) + math.pi, 2 * math.pi) - math.pi
+        lengths = (np.abs(driven) + np.abs(path)).sum(axis=1)
+        angles = (np.abs(turned) + np.abs(turned - missed)).sum(axis=1)
+        # At every moment noise and slip alone may make out a radian and the robot's size, and more while it turns.
+        count, rims = len(self._poses), np.abs(turned).sum(axis=1)
+        position = np.abs(driven - path).sum(axis=1) / (lengths + self._length * (rims + count))
+        heading = np.abs(missed).sum(axis=1) / (angles + count)
+        runs = np.count_nonzero(self._first)
+        still = (lengths < runs * self._length) & (angles < runs)  # that nothing moves explains nothing
+        return np.where(still, 1.0, np.maximum(position, heading))
+
+    def _turns(self, headings: Array) -> Array:
+        """Turns (..., S) since the moment before from headings since the start."""
+        turns: Array = headings - np.where(self._first, 0.0, np.roll(headings, 1, axis=-1))
+        return turns
 
 
-def _swapped_wheels(
-    robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array], headings: Sequence[Array]
-) -> list[str]:
-    names = robot.wheel_names
+def _moments(log: WheelLog, row_3: Array) -> NDArray[np.intp]:
+    """Indices of the stamps of a log between which the odometry turns by a radian or more, and of the last."""
+    turned = np.cumsum((log.rates @ row_3) * np.diff(log.times, prepend=0.0))
+    headings = np.interp(log.stamps, np.append(0.0, log.times), np.append(0.0, turned))
+    chosen, last = [], headings[0]
+    for index, heading in enumerate(headings):
+        if abs(heading - last) >= 1.0:
+            chosen.append(index)
+            last = heading
+    return np.unique([*chosen, len(headings) - 1])
+
+
+def _odd_units(recording: _Recording, design: Array) -> list[_Explanation]:
+    matrices = np.array([factor * design for factor, _ in _RATES])
+    found = []
+    for (metre, position), (radian, heading) in product(_POSITIONS, _HEADINGS):
+        for misfit, (_, rate) in zip(recording.misfits(matrices, metre, radian), _RATES, strict=True):
+            found.append(_Explanation(tuple(text for text in (rate, heading, position) if text), float(misfit)))
+    return found
+
+
+def _odd_wheels(recording: _Recording, design: Array) -> list[_Explanation]:
+    """The order and signs of the wheels that explain the reference best, if there are not too many to try."""
+    names = recording.wheels
     if len(names) > 4:
         return []
-    chosen = [np.unique(np.linspace(0, len(log.stamps) - 1, _STAMPS + 1).astype(int))[1:] for log in logs]
-    if not all(len(indices) for indices in chosen):
-        return []
-    batch = OdometryBatch(
-        [WheelLog(log.times, log.rates, log.start, log.stamps[i]) for log, i in zip(logs, chosen, strict=True)], "arc"
-    )
-    reference = np.concatenate(
-        [np.column_stack([p[i, :2], h[i]]) for p, h, i in zip(poses, headings, chosen, strict=True)]
-    )
-    start = np.concatenate([np.tile(log.start, (len(i), 1)) for log, i in zip(logs, chosen, strict=True)])
     arrangements = list(product(permutations(range(len(names))), product((1, -1), repeat=len(names))))
-    design = robot.inverse_kinematic_matrix
-    matrices = np.array([_rearranged(design, order, signs) for order, signs in arrangements])
-    lever = float(np.mean([wheel.distance for wheel in robot.wheels]))  # weighs rad against m
-    weights = np.array([1.0, 1.0, lever])
-    errors = np.abs((batch.poses(matrices) - reference) * weights).sum((1, 2))
-    motion = np.abs((reference - start) * weights).sum()
-    best = int(errors.argmin())
-    if errors[0] < 0.5 * motion or errors[best] > 0.3 * errors[0]:
-        return []
+    misfits = recording.misfits(np.array([_rearranged(design, order, signs) for order, signs in arrangements]))
+    best = int(misfits.argmin())
     order, signs = arrangements[best]
     shown = ", ".join(
         f"{name} <- {'-' if sign < 0 else ''}{names[column]}"
         for name, column, sign in zip(names, order, signs, strict=True)
     )
-    return [f"wheels look swapped or sign-flipped; the reference fits with omega of {shown}"]
+    warning = f"wheels look swapped or sign-flipped; the reference fits with omega of {shown}"
+    return [_Explanation((warning,), float(misfits[best]))]
 
 
 def _rearranged(matrix: Array, order: Sequence[int], signs: Sequence[int]) -> Array:

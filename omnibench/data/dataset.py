@@ -131,7 +131,7 @@ def make_dataset(
         seen.add(trajectory.id)
     logs = [trajectory.log(trajectory.pose_times) for trajectory in raw]
     headings, doubts = unwrap(robot, logs, [trajectory.poses[:, 2] for trajectory in raw])
-    warnings = implausible(robot, logs, [trajectory.poses for trajectory in raw], headings)
+    warnings = implausible(robot, logs, [trajectory.poses for trajectory in raw])
     if doubts and not warnings:
         shown = ", ".join(raw[index].id for index in doubts[:5])
         warnings = [f"headings of {len(doubts)} trajectories may be unwrapped wrongly (reference too sparse): {shown}"]

@@ -21,7 +21,8 @@ def unwrap(robot: Robot, logs: Sequence[WheelLog], headings: Sequence[Array]) ->
     meanwhile. Doubtful: the two still differ by more than a quarter turn within one gap of the reference.
     """
     model = OdometryModel.of_design(robot, "arc")
-    unwrapped, doubtful = [], []
+    unwrapped: list[Array] = []
+    doubtful: list[int] = []
     for index, (odometry, heading) in enumerate(zip(model.poses(logs), headings, strict=True)):
         steps, expected = np.diff(heading), np.diff(odometry[:, 2])
         turns = np.round((expected - steps) / TURN)

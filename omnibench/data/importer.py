@@ -29,6 +29,9 @@ class Importer(ABC):
         """
 
 
+importers.contract = Importer
+
+
 def import_dataset(name: str, source: Path | str, options: Mapping[str, Any] | None = None) -> Dataset:
     """Read ``source`` with the importer called ``name``. UnknownNameError, ConfigError or DataError in one line."""
     importer: Importer = importers.create(name, options)

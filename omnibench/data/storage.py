@@ -14,7 +14,7 @@ from omnibench.config import Model, read_yaml, to_yaml, validate
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, make_dataset
 from omnibench.data.table import Table, read_table
 from omnibench.errors import ConfigError, DataError, nearest
-from omnibench.files import remove, write_table, write_text
+from omnibench.files import TableFormat, encode_table, remove, write_files
 from omnibench.robot.kinematics import Array, Robot
 
 FORMAT: Final = "omnibench-dataset/1"
@@ -79,7 +79,7 @@ def load_dataset(path: Path | str) -> Dataset:
     )
 
 
-def save_dataset(dataset: Dataset, path: Path | str, table_format: Literal["parquet", "csv"] = "parquet") -> None:
+def save_dataset(dataset: Dataset, path: Path | str, table_format: TableFormat = "parquet") -> None:
     """Write a data set folder. DataError when the disk refuses, or when the folder holds something else."""
     folder = Path(path)
     if folder.is_file():
@@ -93,13 +93,14 @@ def save_dataset(dataset: Dataset, path: Path | str, table_format: Literal["parq
         "wheels": pl.concat([_wheel_frame(trajectory, dataset.robot) for trajectory in dataset.trajectories]),
         "poses": pl.concat([_pose_frame(trajectory) for trajectory in dataset.trajectories]),
     }
+    contents = {folder / "dataset.yaml": to_yaml(header_of(dataset)).encode()}
     for name, frame in tables.items():
         # What only some trajectories have is left out of the sample tables, which may have no gaps.
         allowed = len(frame) - 1 if name == "trajectories" else 0
         kept = frame.select(column for column in frame.iter_columns() if column.null_count() <= allowed)
-        write_table(folder / f"{name}.{table_format}", kept)
-    write_text(folder / "dataset.yaml", to_yaml(header_of(dataset)))
-    for name in tables:  # only now: what was there before is lost when the new one is complete
+        contents[folder / f"{name}.{table_format}"] = encode_table(kept, table_format)
+    write_files(contents)
+    for name in tables:  # of a data set in the other format that was there before
         remove(folder / f"{name}.{'csv' if table_format == 'parquet' else 'parquet'}")
 
 
@@ -157,6 +158,12 @@ def _check_runs(runs: Table) -> None:
             if len(bad):
                 raise runs.fail(int(bad[0]), f"{column} is {series[int(bad[0])]}; leave it empty if it is not known")
             runs.frame = runs.frame.with_columns(series.alias(column))
+    if "repetition" in runs.frame.columns:
+        broken = (runs.frame["repetition"] % 1 != 0).arg_true()
+        if len(broken):
+            raise runs.fail(
+                int(broken[0]), f"repetition is {runs.frame['repetition'][int(broken[0])]}, not a whole number"
+            )
     repeated = runs.frame["trajectory"].is_first_distinct().not_().arg_true()
     if len(repeated):
         row = int(repeated[0])

@@ -12,7 +12,10 @@ from omnibench.errors import DataError, nearest
 from omnibench.robot.kinematics import Array
 
 # Names may consist of digits: 007 is not 7.
-_TEXTS = {column: pl.String for column in ("trajectory", "command", "split", "session")}
+_TEXTS = dict.fromkeys(("trajectory", "command", "split", "session"), pl.String)
+
+
+_LARGEST = 1e9
 
 
 class Table:
@@ -49,6 +52,9 @@ class Table:
             raise self.fail(
                 int(bad[0]), f"{column} is {'missing' if found is None else found}; remove or repair the row"
             )
+        huge = np.flatnonzero(np.abs(values) > _LARGEST)
+        if len(huge):
+            raise self.fail(int(huge[0]), f"{column} is {values[huge[0]]:g}, which no robot can reach; check the units")
         return values
 
     def stack(self, columns: Sequence[str]) -> Array | None:
@@ -60,9 +66,12 @@ class Table:
 
 def read_table(folder: Path, name: str, required: Sequence[str]) -> Table:
     """The table called ``name`` of a data set. DataError when it, its rows or a required column are missing."""
-    file = next((f for f in (folder / f"{name}.parquet", folder / f"{name}.csv") if f.is_file()), None)
-    if file is None:
+    files = [file for file in (folder / f"{name}.parquet", folder / f"{name}.csv") if file.is_file()]
+    if not files:
         raise DataError(f"{folder}: {name}.parquet (or {name}.csv) is missing")
+    if len(files) > 1:
+        raise DataError(f"{folder}: both {name}.parquet and {name}.csv are there; remove the one that is not meant")
+    (file,) = files
     try:
         if file.suffix == ".parquet":
             frame = pl.read_parquet(file)
@@ -77,6 +86,8 @@ def read_table(folder: Path, name: str, required: Sequence[str]) -> Table:
     if frame.is_empty():
         raise DataError(f"{file}: it has no rows")
     table = Table(file, frame)
+    if frame["trajectory"].dtype.is_nested():
+        raise DataError(f"{file}: column 'trajectory' holds {frame['trajectory'].dtype}, expected names or numbers")
     missing = frame["trajectory"].is_null().arg_true()
     if len(missing):
         raise table.fail(int(missing[0]), "trajectory is missing")

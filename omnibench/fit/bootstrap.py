@@ -39,6 +39,6 @@ def bootstrap_intervals(
     shares = objective.shares(owner)
     count = len(problem.trajectories)
     drawn = rng.multinomial(count, np.full(count, 1 / count), size=resamples)
-    moved = np.array([optimum + program.step(shares * weights[owner]) for weights in drawn])
-    low, high = np.percentile(moved, [2.5, 97.5], axis=0).reshape(2, 3, -1)
+    moved = np.array([problem.matrix(optimum + program.step(shares * weights[owner])) for weights in drawn])
+    low, high = np.percentile(moved, [2.5, 97.5], axis=0)
     return ElementIntervals(low, high)

@@ -2,32 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from omnibench.data.dataset import Dataset
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError
 from omnibench.fit.bootstrap import ElementIntervals, bootstrap_intervals
 from omnibench.fit.calibrator import Calibrator, RunResult, run_calibrator
-from omnibench.fit.evaluate import split_errors
-from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
+from omnibench.fit.cost import Cost
+from omnibench.fit.parameterisation import (
+    Box,
+    FittedParameter,
+    GeometryLimits,
+    ParameterisationName,
+    fitted_parameters,
+)
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import Calibration, Provenance, matrix_rows
-from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationRun:
-    """A calibration, how it was found and, where asked for, 95 % intervals of its elements."""
+    """A calibration, how it was found and, where asked for, 95 % intervals of its elements.
+
+    parameters: radius, distance and angle of each wheel, where these were searched.
+    """
 
     calibration: Calibration
     result: RunResult
     intervals: ElementIntervals | None
+    parameters: tuple[FittedParameter, ...] | None
 
 
 def calibrate(
@@ -53,7 +62,9 @@ def calibrate(
     when the calibrator gives no answer.
     """
     chosen: Calibrator = calibrators.create(calibrator, options)
-    objective = costs.create(cost)
+    if intervals and not chosen.exact:
+        raise ConfigError("intervals are drawn about the exact optimum: use the calibrator closed_form")
+    objective: Cost = costs.create(cost)
     training = training_split(dataset)
     searched = make_parameterisation(
         parameterisation or chosen.parameterisation, dataset.robot, training, box=box, limits=limits
@@ -69,7 +80,7 @@ def calibrate(
         watch=watch,
     )
     result = run_calibrator(chosen, problem)
-    if result.matrix is None:
+    if result.matrix is None or result.vector is None:
         raise ConfigError(f"calibrator {calibrator!r} gave no answer ({result.outcome}): {result.reason}")
     validation = dataset.split("validation")
     model = OdometryModel(dataset.robot, result.matrix, integration)
@@ -89,16 +100,19 @@ def calibrate(
             cost=cost,
             box=problem.box,
             versions=package_versions(),
-            training_cost=split_errors(model, training).cost,
-            validation_cost=split_errors(model, validation).cost if validation else None,
+            training_cost=result.cost,
+            validation_cost=_cost(objective, model, validation) if validation else None,
             outcome=result.outcome,
             reason=result.reason,
         ),
     )
-    return CalibrationRun(calibration, result, _intervals(problem, calibrator, result.vector) if intervals else None)
+    drawn = bootstrap_intervals(problem, result.vector, rng=problem.rng) if intervals else None
+    geometry = problem.parameterisation.name == "geometry"
+    parameters = fitted_parameters(dataset.robot, result.vector) if geometry else None
+    return CalibrationRun(calibration, result, drawn, parameters)
 
 
-def _intervals(problem: CalibrationProblem, calibrator: str, optimum: Array | None) -> ElementIntervals:
-    if calibrator != "closed_form" or optimum is None:
-        raise ConfigError("intervals are drawn about the exact optimum: use the calibrator closed_form")
-    return bootstrap_intervals(problem, optimum, rng=problem.rng)
+def _cost(objective: Cost, model: OdometryModel, trajectories: Sequence[Trajectory]) -> float:
+    odometry = objective.batch(trajectories, model.integration)
+    errors = odometry.poses(model.matrix[None]) - objective.reference(trajectories)
+    return float(objective.combine(errors, odometry.trajectory)[0])

@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import BaseModel
 
-from omnibench.errors import OmnibenchError, PluginError
+from omnibench.errors import OmnibenchError, PluginError, one_line
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
-from omnibench.registry import AnyOptions, Options, PluginFailure
+from omnibench.registry import AnyOptions, Options, PluginFailure, calibrators
 from omnibench.robot.kinematics import Array
 
 
@@ -45,6 +45,7 @@ class Calibrator(ABC):
     parameterisation: what it searches unless the config says otherwise.
     bounded: False for answers that do not depend on the box (a published matrix).
     stochastic: False where the seed makes no difference, so that one run is enough.
+    exact: True where a converged answer is the optimum in the box, which others are measured against.
     """
 
     Options: ClassVar[type[BaseModel]] = Options
@@ -52,6 +53,7 @@ class Calibrator(ABC):
     parameterisation: ClassVar[ParameterisationName] = "matrix"
     bounded: ClassVar[bool] = True
     stochastic: ClassVar[bool] = True
+    exact: ClassVar[bool] = False
 
     def __init__(self, options: Any) -> None:
         self.options = options
@@ -62,6 +64,9 @@ class Calibrator(ABC):
 
         Raise OmnibenchError when the problem cannot be solved this way.
         """
+
+
+calibrators.contract = Calibrator
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,32 +82,37 @@ class RunResult:
     seconds: float
     history: tuple[Improvement, ...]
     at_bounds: tuple[str, ...] = ()
+    held: tuple[str, ...] = ()
 
 
 def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunResult:
     """Run a calibrator to its end, whatever that is."""
-    vector: Array | None = None
+    answer: Any = None
     try:
         solution = calibrator.calibrate(problem)
         if not isinstance(solution, Solution):
             raise PluginError(f"calibrate returned {type(solution).__name__}, expected a Solution")
         outcome = Outcome.CONVERGED if solution.converged else Outcome.BUDGET
-        vector, reason = solution.vector, " ".join(str(solution.reason).split())
+        answer, reason = solution.vector, one_line(str(solution.reason))
     except BudgetSpent as spent:
         outcome, reason = Outcome(spent.kind), str(spent)
-        vector = problem.best_vector if np.isfinite(problem.best_cost) else None
-        if vector is None:
+        if np.isfinite(problem.best_cost):
+            answer = problem.best_vector
+        else:
             outcome, reason = Outcome.INVALID, f"{reason}, and no candidate in the box had a finite cost"
     except OmnibenchError as error:
         outcome, reason = Outcome.FAILED, str(error)
     except (Exception, SystemExit) as error:  # whatever a plug-in raises is this run's outcome
         outcome, reason = Outcome.FAILED, describe_error(error)
     seconds = problem.seconds
-    cost: float | None = None
-    if vector is not None:
-        vector, cost, flaw = _examine(calibrator, problem, vector)
-        if flaw:
-            outcome, reason = Outcome.INVALID, flaw
+    vector, cost = None, None
+    if outcome not in (Outcome.FAILED, Outcome.INVALID):
+        try:
+            vector, cost, flaw = _examine(calibrator, problem, answer)
+            if flaw:
+                outcome, reason = Outcome.INVALID, flaw
+        except Exception as error:  # a cost may be a plug-in's, too
+            outcome, reason = Outcome.FAILED, describe_error(error)
     return RunResult(
         outcome=outcome,
         reason=reason,
@@ -113,13 +123,14 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
         seconds=seconds,
         history=tuple(problem.history),
         at_bounds=problem.at_bounds(vector) if vector is not None and calibrator.bounded else (),
+        held=problem.held if calibrator.bounded else (),
     )
 
 
 def describe_error(error: BaseException) -> str:
     """Type and message of whatever was raised, in one line."""
     try:
-        return " ".join(f"{type(error).__name__}: {error}".split())
+        return one_line(f"{type(error).__name__}: {error}").removesuffix(":")
     except Exception:  # its own __str__ raises
         return type(error).__name__
 

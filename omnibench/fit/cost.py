@@ -48,6 +48,9 @@ class Cost(ABC):
         return np.concatenate([t.poses[-1:] if self.stamps == "final" else t.poses[1:] for t in trajectories])
 
 
+costs.contract = Cost
+
+
 class SumOfNorms(Cost):
     """The mean over trajectories of the mean norm of weighted pose errors at the stamps.
 

@@ -6,7 +6,10 @@ import numpy as np
 
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset
-from omnibench.fit.span import direction_in_words, driven_span
+from omnibench.fit.span import DrivenSpan, direction_in_words, driven_span
+
+# Below this share of the strongest direction of wheel rates a motion is called hardly driven.
+_WEAK_SHARE = 0.2
 
 
 class SplitContent(Model):
@@ -49,11 +52,11 @@ class Inspection(Model):
 
 
 def inspect_dataset(dataset: Dataset) -> Inspection:
-    """Count, measure, and look for directions of wheel rates that the recordings do not drive."""
+    """Count, measure, and look for directions of wheel rates that the training runs do not drive, or hardly."""
     trajectories = dataset.trajectories
     periods = np.concatenate([np.diff(t.times, prepend=0.0) for t in trajectories])
     pose_periods = np.concatenate([np.diff(t.pose_times) for t in trajectories])
-    span = driven_span(trajectories)
+    span = driven_span(dataset.split("train") or trajectories)
     undriven = tuple(direction_in_words(direction, dataset.robot.wheel_names) for direction in span.null)
     return Inspection(
         dataset=dataset.name,
@@ -75,7 +78,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
         driven_directions=len(span.driven),
         driven_shares=tuple(span.shares.tolist()),
         undriven=undriven,
-        findings=tuple(_findings(dataset, undriven)),
+        findings=tuple(_findings(dataset, span)),
         warnings=dataset.warnings,
     )
 
@@ -96,15 +99,23 @@ def _content(dataset: Dataset, split: str) -> SplitContent:
     )
 
 
-def _findings(dataset: Dataset, undriven: tuple[str, ...]) -> list[str]:
+def _findings(dataset: Dataset, span: DrivenSpan) -> list[str]:
     findings = []
-    wheels = len(dataset.robot.wheels)
-    for direction in undriven:
-        expected = ", as for any robot on four wheels that does not slip" if wheels == 4 and len(undriven) == 1 else ""
+    names = dataset.robot.wheel_names
+    for direction in span.null:
+        alone = len(names) == 4 and len(span.null) == 1
+        expected = ", as for any robot on four wheels that does not slip" if alone else ""
         findings.append(
-            f"no run drives the wheels along {direction}{expected}: the matrix is not determined along it, "
-            "and calibration keeps the design values there"
+            f"no run drives the wheels along {direction_in_words(direction, names)}{expected}: the matrix is not "
+            "determined along it, and calibration keeps the design values there"
         )
+    for direction, share in zip(span.driven, span.shares, strict=False):
+        if share < _WEAK_SHARE:
+            words = direction_in_words(direction, names)
+            findings.append(
+                f"the runs hardly drive the wheels along {words} ({100 * share:.1f} % of the strongest): what the "
+                "matrix says of that motion rests on slips and noise; drive it on purpose"
+            )
     if not dataset.split("train"):
         findings.append("no trajectory is marked train: nothing can be calibrated")
     if not dataset.split("validation"):

@@ -32,6 +32,9 @@ class NloptOptions(Options):
 def search(problem: CalibrationProblem, algorithm: int, options: NloptOptions) -> Solution:
     """Minimise ``problem.cost`` from its start with an NLopt algorithm; BudgetSpent passes through."""
     variables = int(problem.free.sum())
+    if variables == 0:  # NLopt would call that an invalid argument
+        problem.cost(problem.start[None])
+        return Solution(problem.start, "the box leaves nothing to search")
     spent: list[BaseException] = []
     optimiser = nlopt.opt(algorithm, variables)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 import numpy as np
-from pydantic import Field, FiniteFloat
+from pydantic import Field, FiniteFloat, field_validator
 
 from omnibench.config import Model
 from omnibench.errors import ConfigError
@@ -33,6 +33,13 @@ class GeometryLimits(Model):
     radius: Deviation = Field(0.10, description="share of the wheel radius")
     distance: Deviation = Field(0.20, description="share of the distance from wheel to centre")
     angle_deg: Deviation = Field(3.0, description="degrees of the wheel's direction")
+
+    @field_validator("radius", "distance")
+    @classmethod
+    def _stays_positive(cls, deviation: Deviation) -> Deviation:
+        if _range(deviation)[0] <= -1:
+            raise ValueError("a wheel cannot lose its whole radius or distance; give a share below 1")
+        return deviation
 
 
 @dataclass(frozen=True)
@@ -131,6 +138,39 @@ class WheelGeometry:
         radius, distance, angle = np.moveaxis(np.asarray(vectors, dtype=float).reshape(len(vectors), 3, -1), 1, 0)
         rollers = np.array([wheel.roller_angle for wheel in self.robot.wheels])
         return inverse_kinematic_matrices(radius, distance, angle, rollers)
+
+
+def held_by(parameterisation: Parameterisation) -> tuple[str, ...]:
+    """Names of the elements to which the box leaves no width: they keep their start value."""
+    bounds = parameterisation.bounds
+    widths = zip(parameterisation.names, bounds.lower, bounds.upper, strict=True)
+    return tuple(name for name, low, high in widths if low == high)
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """A physical parameter and how far it lies from its design value, as in section 4.2 of the paper."""
+
+    name: str
+    value: float
+    unit: str
+    design: float
+    deviation_percent: float | None  # None where the design value is 0
+
+
+def fitted_parameters(robot: Robot, vector: Array) -> tuple[FittedParameter, ...]:
+    """The physical parameters that a vector (3N,) of the geometry parameterisation means."""
+    geometry = WheelGeometry(robot)
+    return tuple(
+        FittedParameter(
+            name=name,
+            value=float(value),
+            unit="rad" if name.startswith("angle") else "m",
+            design=float(design),
+            deviation_percent=float(100 * (value - design) / design) if design else None,
+        )
+        for name, value, design in zip(geometry.names, vector, geometry.start, strict=True)
+    )
 
 
 def make_bounds(robot: Robot, box: Box) -> Bounds:

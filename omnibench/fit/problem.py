@@ -22,6 +22,7 @@ from omnibench.fit.parameterisation import (
     Parameterisation,
     ParameterisationName,
     WheelGeometry,
+    held_by,
 )
 from omnibench.fit.span import driven_span
 from omnibench.robot.kinematics import Array, Robot
@@ -76,7 +77,7 @@ class CalibrationProblem:
         watch: Callable[[int, float], None] | None = None,
     ) -> None:
         if not trajectories:
-            raise DataError("no training trajectories; nothing can be calibrated")
+            raise DataError("no trajectories; nothing can be calibrated")
         self.robot = robot
         self.trajectories = tuple(trajectories)
         self.objective = cost
@@ -165,6 +166,11 @@ class CalibrationProblem:
         on_bound = self.free & ((vector <= self.lower + margin) | (vector >= self.upper - margin))
         return tuple(name for name, touching in zip(self.names, on_bound, strict=True) if touching)
 
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Names of the elements that the box holds at their start value."""
+        return held_by(self.parameterisation)
+
     def matrix(self, vector: Array) -> Array:
         """The inverse kinematic matrix (3, N) of one vector (n,)."""
         return self.parameterisation.matrices(vector[None])[0]
@@ -209,8 +215,7 @@ def make_parameterisation(
     """The parameterisation called ``name``. ConfigError when its box excludes the start."""
     if name == "geometry":
         return WheelGeometry(robot, limits)
-    null = driven_span(trajectories).null if len(robot.wheels) > 3 else np.zeros((0, 3))
-    return MatrixElements(robot, box, null)
+    return MatrixElements(robot, box, driven_span(trajectories).null)
 
 
 def _frozen(array: NDArray[Any]) -> NDArray[Any]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
+from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
 # Below this share of the strongest direction a direction is noise, not motion.
@@ -27,20 +28,25 @@ class DrivenSpan:
 
 
 def driven_span(trajectories: Sequence[Trajectory]) -> DrivenSpan:
-    """The span of the wheel angles driven between reference poses.
+    """The span of the wheel angles driven between reference poses. DataError when there are no trajectories.
 
     Angles between poses, not rates: encoder noise averages out of them, motion does not.
     """
+    if not trajectories:
+        raise DataError("no trajectories; nothing can be calibrated")
     increments = [np.diff(_angles_at_poses(trajectory), axis=0) for trajectory in trajectories]
-    _, strengths, directions = np.linalg.svd(np.concatenate(increments), full_matrices=True)
-    wheels = directions.shape[0]
-    shares = np.zeros(wheels)
-    if strengths[0] > 0:
-        shares[: len(strengths)] = strengths / strengths[0]
+    wheels = increments[0].shape[1]
+    # Rows of zeros, so that there are directions for every wheel however few the increments.
+    _, strengths, directions = np.linalg.svd(
+        np.concatenate([*increments, np.zeros((wheels, wheels))]), full_matrices=False
+    )
+    shares: Array = strengths / strengths[0] if strengths[0] > 0 else np.zeros(wheels)
     rank = int((shares > _NULL_SHARE).sum())
     null = directions[rank:]
-    largest = np.take_along_axis(null, np.abs(null).argmax(1, keepdims=True), 1) if len(null) else null
-    return DrivenSpan(directions[:rank], null * np.sign(largest) if len(null) else null, shares)
+    # The sign is that of the first large element, so that a direction has the same name on any data.
+    leading = (np.abs(null) > 0.5 * np.abs(null).max(axis=1, keepdims=True)).argmax(axis=1)
+    null = null * np.sign(null[np.arange(len(null)), leading])[:, None]
+    return DrivenSpan(directions[:rank], null, shares)
 
 
 def direction_in_words(direction: Array, wheels: Sequence[str]) -> str:

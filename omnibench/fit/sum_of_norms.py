@@ -14,6 +14,8 @@ from omnibench.robot.kinematics import Array
 # Tighter than Clarabel's defaults (1e-8): the optimum is a reference that searches are measured against.
 _ACCURACY = {"tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12, "tol_feas": 1e-12}
 
+_MOST_PREPARED = 5000
+
 
 class SolverError(OmnibenchError):
     """The solver did not reach an optimum."""
@@ -31,37 +33,36 @@ def least_squares(design: Array, target: Array, lower: Array, upper: Array) -> A
 class SumOfNormsProgram:
     """Minimises sum_s shares_s * norm(residuals_s + jacobian_s @ d) over steps d in a box, for any shares.
 
-    residuals (S, k), jacobian (S, k, n), lower and upper (n,); ``across`` (q, n): directions that the step must not
-    take.
+    residuals (S, k), jacobian (S, k, n), lower and upper (n,).
     """
 
-    def __init__(self, residuals: Array, jacobian: Array, lower: Array, upper: Array, across: Array) -> None:
+    def __init__(self, residuals: Array, jacobian: Array, lower: Array, upper: Array) -> None:
         count, components, size = jacobian.shape
         self._lower, self._upper = lower, upper
         # Steps in units of the box and residuals in units of their size keep the program well scaled.
         self._unit = np.where(upper > lower, (upper - lower) / 2, 1.0)
-        scale = max(float(np.linalg.norm(residuals, axis=1).mean()), 1e-12)
+        reach = jacobian * self._unit
+        scale = max(float(np.linalg.norm(residuals, axis=1).mean()), 1e-6 * float(np.abs(reach).max()), 1e-12)
         self._step = cp.Variable(size)
-        columns = (jacobian * self._unit).reshape(count * components, size) / scale
+        columns = reach.reshape(count * components, size) / scale
         moved = cp.reshape(columns @ self._step + residuals.ravel() / scale, (count, components), order="C")
         self._shares = cp.Parameter(count, nonneg=True)
         constraints = [self._step >= lower / self._unit, self._step <= upper / self._unit]
-        if len(across):
-            constraints.append((across * self._unit) @ self._step == 0)
         self._program = cp.Problem(cp.Minimize(self._shares @ cp.norm(moved, 2, axis=1)), constraints)
 
     def step(self, shares: Array) -> Array:
         """The best step (n,) for shares (S,) >= 0. Raises SolverError."""
         self._shares.value = shares / shares.sum()
-        _solve(self._program)
+        # cvxpy prepares a program for other shares at a memory that grows with the square of their number.
+        _solve(self._program, ignore_dpp=len(shares) > _MOST_PREPARED)
         return np.clip(self._step.value * self._unit, self._lower, self._upper)
 
 
-def _solve(problem: Any) -> None:
+def _solve(problem: Any, ignore_dpp: bool = False) -> None:
     try:
         with warnings.catch_warnings():  # the status is looked at below, and steps are only taken downhill
             warnings.simplefilter("ignore", UserWarning)
-            problem.solve(solver=cp.CLARABEL, **_ACCURACY)
+            problem.solve(solver=cp.CLARABEL, ignore_dpp=ignore_dpp, **_ACCURACY)
     except cp.error.SolverError as error:
         raise SolverError(f"Clarabel failed: {error}") from None
     if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):

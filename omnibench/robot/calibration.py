@@ -18,6 +18,7 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 
 FORMAT: Final = "omnibench-calibration/1"
+_LARGEST_ELEMENT = 1e3  # m or rad per rad of wheel
 Row = tuple[FiniteFloat, ...]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
@@ -80,6 +81,10 @@ class Calibration(Model):
         for index, row in enumerate(self.matrix, 1):
             if len(row) != wheels:
                 raise ValueError(f"row {index} of the matrix has {len(row)} values, the robot has {wheels} wheels")
+        if np.abs(self.matrix).max() > _LARGEST_ELEMENT:
+            raise ValueError(
+                f"matrix holds {np.abs(self.matrix).max():g}, which no wheel can drive in m or rad per rad"
+            )
         if self.covariance is not None:
             size = 3 * wheels + sum(len(term.parameters) for term in self.effects)
             if [len(row) for row in self.covariance] != [size] * size:
@@ -102,21 +107,22 @@ def matrix_rows(matrix: Array) -> tuple[Row, Row, Row]:
     return first, second, third
 
 
-def read_calibration(path: Path) -> Calibration:
+def read_calibration(path: Path | str) -> Calibration:
     """Read and check a calibration file. DataError names the file and what is wrong."""
+    path = Path(path)
     try:
         content = read_yaml(path)
         found = content.get("format") if isinstance(content, dict) else None
         if found != FORMAT:
             raise DataError(f"{path}: format is {found!r}, expected {FORMAT!r}; is this a calibration file?")
         calibration = validate(Calibration, content, str(path))
+        for term in calibration.effects:
+            effects.entry(term.name, str(path))
     except ConfigError as error:
         raise DataError(str(error)) from None
-    for term in calibration.effects:
-        effects.entry(term.name, str(path))
     return calibration
 
 
-def write_calibration(calibration: Calibration, path: Path) -> None:
+def write_calibration(calibration: Calibration, path: Path | str) -> None:
     """Write a calibration file; it is complete or it is not there. DataError when it cannot be written."""
-    write_text(path, to_yaml(calibration))
+    write_text(Path(path), to_yaml(calibration))

@@ -28,8 +28,8 @@ class Wheel(Model):
     """
 
     name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_]+$", description="ends the column names: omega_<name>")
-    radius: float = Field(gt=0, allow_inf_nan=False, description="m")
-    distance: float = Field(gt=0, allow_inf_nan=False, description="lever arm about the robot's centre, m")
+    radius: float = Field(ge=1e-6, le=1e3, allow_inf_nan=False, description="m")
+    distance: float = Field(ge=1e-6, le=1e3, allow_inf_nan=False, description="lever arm about the robot's centre, m")
     angle: float = Field(allow_inf_nan=False, description="direction of the axle, rad")
     roller_angle: float = Field(0.0, gt=-1.5, lt=1.5, allow_inf_nan=False, description="0 omni, +-pi/4 mecanum; rad")
 

@@ -7,9 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from report_page import Page
+
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
-from omnibench.compare.results import ComparisonResult
+from omnibench.compare.report import write_report
+from omnibench.compare.results import ComparisonResult, EntryStatistics
 from omnibench.compare.scoring import score
 from omnibench.compare.statistics import entry_statistics
 from omnibench.data.dataset import Dataset
@@ -93,3 +96,14 @@ def solve(planned: PlannedRun) -> RunResult:
         seed=planned.seed,
     )
     return run_calibrator(calibrators.create(planned.entry.name, planned.entry.options), problem)
+
+
+def page(result: ComparisonResult, folder: Path) -> Page:
+    """The comparison's report as its reader sees it."""
+    write_report(result, folder / "report.html")
+    return Page((folder / "report.html").read_text(encoding="utf-8"))
+
+
+def statistics(result: ComparisonResult, label: str) -> EntryStatistics:
+    """Statistics of an entry."""
+    return next(entry for entry in result.statistics if entry.label == label)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from report_samples import config, flower, run
+from report_samples import APR02, config, flower, run
 
 from omnibench.compare.matrices import differences
 from omnibench.compare.path_figures import chosen_trajectories, describe
@@ -15,6 +15,7 @@ from omnibench.compare.search_figures import TARGETS, courses, targets_reached, 
 from omnibench.compare.view import views
 from omnibench.data.simulate.config import FlowerConfig
 from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.robot.kinematics import Robot
 from omnibench.robot.published import published_matrix
 
 
@@ -84,6 +85,39 @@ def test_targets_are_counted_by_hand_for_a_random_search(view) -> None:
     _, share = targets_reached([course], 1, "evaluations")
     lowest = course.costs.min() / course.best_known - 1
     assert len(share) == np.count_nonzero(lowest <= TARGETS)
+
+
+def explicit(share: float) -> dict:
+    """A box of so wide a share of the row's largest element on both sides."""
+    start = Robot.model_validate(APR02).inverse_kinematic_matrix
+    width = share * np.abs(start).max(axis=1, keepdims=True)
+    return {"lower": (start - width).tolist(), "upper": (start + width).tolist()}
+
+
+def test_boxes_that_share_a_name_do_not_share_a_best_known_cost() -> None:
+    calibrators = [
+        {"name": name, "label": f"{name} {share}", "box": explicit(share)}
+        for share in (0.02, 0.2)
+        for name in ("closed_form", "random_search")
+    ]
+    (found,) = views(run(config(calibrators=calibrators, seeds=[1])))
+    drawn = {course.run.record.label: course for course in courses(found)}
+    assert {course.run.record.box for course in drawn.values()} == {"custom"}
+    for course in drawn.values():
+        assert course.costs[-1] / course.best_known - 1 == pytest.approx(course.run.record.gap, abs=1e-12)
+    assert drawn["closed_form 0.02"].best_known > drawn["closed_form 0.2"].best_known
+
+
+def test_without_an_exact_optimum_equal_boxes_share_the_lowest_cost() -> None:
+    calibrators = [
+        {"name": "random_search", "label": label, "box": explicit(share), "options": {"candidates": candidates}}
+        for label, share, candidates in (("few", 0.2, 20), ("many", 0.2, 1000), ("narrow", 0.02, 1000))
+    ]
+    (found,) = views(run(config(calibrators=calibrators, seeds=[1])))
+    drawn = {course.run.record.label: course for course in courses(found)}
+    costs = {label: course.run.record.train_cost for label, course in drawn.items()}
+    assert drawn["few"].best_known == drawn["many"].best_known == min(costs["few"], costs["many"])
+    assert drawn["narrow"].best_known == costs["narrow"]
 
 
 def test_a_run_without_a_course_counts_as_targets_missed(view) -> None:

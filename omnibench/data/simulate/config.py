@@ -8,12 +8,16 @@ from typing import Annotated, Literal
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
 from omnibench.config import Model
+from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import Integration
 from omnibench.robot.published import PUBLISHED
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+_MOST_ROWS = 1e8
 
 
 class Tolerances(Model):
@@ -37,6 +41,8 @@ class Truth(Model):
         given = [name for name in ("published", "matrix", "tolerances") if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"give one of published, matrix, tolerances (given: {', '.join(given) or 'none'})")
+        if self.published is not None and self.published not in PUBLISHED:
+            raise ValueError(str(UnknownNameError("published matrix", self.published, PUBLISHED)))
         return self
 
 
@@ -96,7 +102,24 @@ class FlowerConfig(Model):
             raise ValueError(f"truth.matrix must have 3 rows of {len(self.robot.wheels)} values")
         if self.truth.published is not None and len(self.robot.wheels) != 3:
             raise ValueError("truth.published matrices are for three wheels")
-        shortest = min(s.distance for s in (self.train, self.validation) if s) / max(*self.commands.speeds, 1e-9)
+        shortest = min(session.distance for session in self._sessions()) / max(*self.commands.speeds, 1e-9)
         if math.isfinite(shortest) and shortest < self.sample_period:
             raise ValueError("runs are shorter than one sample; raise distance or lower sample_period")
+        if self._rows() > _MOST_ROWS:
+            raise ValueError(
+                f"this is {self._rows():.1g} wheel samples and poses, more than {_MOST_ROWS:.0e}; "
+                "check the periods, distances, speeds and repetitions"
+            )
         return self
+
+    def _rows(self) -> float:
+        """Wheel samples and poses in all."""
+        chosen = self.commands
+        driven = [session.distance / speed for session in self._sessions() for speed in chosen.speeds if speed]
+        turns = chosen.turn_duration * len(self._sessions()) * (0.0 in chosen.speeds)
+        runs = len(chosen.turn_rates) * self.repetitions
+        seconds = runs * (len(chosen.directions_deg) * sum(driven) + turns)
+        return seconds / self.sample_period + seconds / self.pose_period
+
+    def _sessions(self) -> list[Session]:
+        return [session for session in (self.train, self.validation) if session is not None]

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from omnibench.fit.sum_of_norms import SumOfNormsProgram
 
 _MOST_HALVINGS = 30
+_NO_ERROR = 1e-10  # m, rad: next to rounding, where a program finds no direction
 
 
 class ClosedFormOptions(Options):
@@ -41,6 +42,7 @@ class ClosedForm(Calibrator):
     Options = ClosedFormOptions
     options: ClosedFormOptions
     stochastic = False
+    exact = True
 
     def __init__(self, options: ClosedFormOptions) -> None:
         super().__init__(options)
@@ -56,10 +58,14 @@ class ClosedForm(Calibrator):
         cost = float(problem.cost(vector[None])[0])
         shares = problem.objective.shares(problem.odometry.trajectory)
         for count in range(1, self.options.programs + 1):
+            if cost < _NO_ERROR:
+                return Solution(vector, f"no error is left after {count - 1} cone programs")
             step = cone_program(problem, problem.objective, vector).step(shares)
-            vector_before = vector
-            vector, cost = _descend(problem, vector, cost, step)
-            moved = float(np.abs(vector - vector_before).max())
+            before = problem.matrix(vector)
+            vector, cost, descended = _descend(problem, vector, cost, step)
+            if not descended:
+                return Solution(vector, f"no part of the step lowers the cost after {count} cone programs")
+            moved = float(np.abs(problem.matrix(vector) - before).max())
             if moved < self.options.tolerance:
                 return Solution(vector, f"step below {self.options.tolerance:g} after {count} cone programs")
         reason = f"step still {moved:.1e} after {self.options.programs} cone programs"
@@ -89,9 +95,7 @@ def linear_start(problem: CalibrationProblem) -> Array:
         np.concatenate([lower[0], lower[1]]),
         np.concatenate([upper[0], upper[1]]),
     )
-    # Along directions that the data do not drive, least squares would go anywhere.
-    kept = problem.matrix(np.concatenate([rows_12, row_3])).ravel()
-    return np.clip(kept, problem.lower, problem.upper)
+    return _settled(problem, np.concatenate([rows_12, row_3]))
 
 
 def cone_program(problem: CalibrationProblem, objective: SumOfNorms, vector: Array) -> SumOfNormsProgram:
@@ -103,19 +107,28 @@ def cone_program(problem: CalibrationProblem, objective: SumOfNorms, vector: Arr
     used = np.flatnonzero(objective.weights)
     scale = np.array(objective.weights)[used]
     residuals = (problem.odometry.poses(matrix[None])[0] - problem.reference)[:, used] * scale
-    jacobian = problem.odometry.jacobian(matrix).reshape(len(residuals), 3, -1)[:, used] * scale[:, None]
-    across: Array = np.kron(np.eye(3), problem.parameterisation.null)
-    return SumOfNormsProgram(residuals, jacobian, problem.lower - vector, problem.upper - vector, across)
+    jacobian = problem.odometry.jacobian(matrix)[:, used] * scale[:, None, None]
+    # Of a step along directions that the data do not drive, the matrix takes no notice.
+    null = problem.parameterisation.null
+    jacobian = (jacobian - jacobian @ null.T @ null).reshape(len(residuals), len(used), -1)
+    return SumOfNormsProgram(residuals, jacobian, problem.lower - vector, problem.upper - vector)
 
 
-def _descend(problem: CalibrationProblem, vector: Array, cost: float, step: Array) -> tuple[Array, float]:
-    """Take the step, or as much of it as lowers the cost."""
-    trial = np.clip(vector + step, problem.lower, problem.upper)
+def _descend(problem: CalibrationProblem, vector: Array, cost: float, step: Array) -> tuple[Array, float, bool]:
+    """Take the step, or as much of it as lowers the cost; whether any does."""
+    trial = _settled(problem, vector + step)
     for _ in range(_MOST_HALVINGS):
         trial_cost = float(problem.cost(trial[None])[0])
         if trial_cost <= cost:
-            return trial, trial_cost
+            return trial, trial_cost, True
         if np.abs(trial - vector).max() < 1e-12:
             break
         trial = (trial + vector) / 2
-    return vector, cost
+    return vector, cost, False
+
+
+def _settled(problem: CalibrationProblem, vector: Array) -> Array:
+    """A vector (n,) in the box that means the same matrix: its elements, where these lie in the box too."""
+    vector = np.clip(vector, problem.lower, problem.upper)
+    elements = problem.matrix(vector).ravel()
+    return elements if bool(problem.inside(elements[None])[0]) else vector

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
@@ -42,6 +43,8 @@ class Genetic(Calibrator):
         count = self.options.population or (200 if variables > 5 else 50)
         generations = self.options.generations or 100 * variables
         mutate = _AdaptiveFeasible() if self.options.mutation == "adaptive_feasible" else _Gaussian(generations)
+        if np.ceil(self.options.elite * count) + 2 > count:
+            raise ConfigError(f"genetic: an elite of {self.options.elite:g} leaves no children in {count}; lower it")
         people: Array = problem.rng.uniform(size=(count, variables))
         people[0] = problem.to_unit(problem.start)[0]  # the paper starts from the theoretical matrix
         scores = _scores(problem, people)

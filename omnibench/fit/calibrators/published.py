@@ -20,9 +20,12 @@ class PublishedOptions(Options):
     )
 
     @model_validator(mode="after")
-    def _name_is_known(self) -> PublishedOptions:
-        if isinstance(self.matrix, str) and self.matrix not in PUBLISHED:
-            raise ValueError(f"matrix {self.matrix!r} is not one of {', '.join(PUBLISHED)}")
+    def _is_a_matrix(self) -> PublishedOptions:
+        if isinstance(self.matrix, str):
+            if self.matrix not in PUBLISHED:
+                raise ValueError(f"matrix {self.matrix!r} is not one of {', '.join(PUBLISHED)}")
+        elif len(self.matrix) != 3 or len({len(row) for row in self.matrix}) != 1:
+            raise ValueError(f"matrix must have 3 rows of N values, found {[len(row) for row in self.matrix]}")
         return self
 
 

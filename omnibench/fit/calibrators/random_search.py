@@ -11,7 +11,7 @@ from omnibench.registry import Options, calibrators
 class RandomSearchOptions(Options):
     """How many candidates are tried."""
 
-    candidates: int = Field(10_000, gt=0, description="candidates in all")
+    candidates: int | None = Field(None, gt=0, description="candidates in all; default: the whole budget")
     batch: int = Field(100, gt=0, description="candidates evaluated at once")
 
 
@@ -25,7 +25,8 @@ class RandomSearch(Calibrator):
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Draw candidates until their number is reached or the budget is spent."""
         problem.cost(problem.start[None])  # so that the answer is never worse
-        for first in range(0, self.options.candidates, self.options.batch):
-            count = min(self.options.batch, self.options.candidates - first)
+        wanted = self.options.candidates or problem.budget.evaluations
+        for first in range(0, wanted, self.options.batch):
+            count = min(self.options.batch, wanted - first)
             problem.cost(problem.from_unit(problem.rng.uniform(size=(count, np.count_nonzero(problem.free)))))
-        return Solution(problem.best_vector, f"{self.options.candidates} candidates tried")
+        return Solution(problem.best_vector, f"{wanted} candidates tried", converged=False)

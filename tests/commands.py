@@ -1,0 +1,180 @@
+"""omnibench as a user runs it: real processes, small configs."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import yaml
+
+from omnibench import cli
+from omnibench.compare.config import CompareConfig
+from omnibench.compare.results import ComparisonResult
+from omnibench.compare.run import run_comparison
+
+ROOT = Path(__file__).resolve().parents[1]
+CONFIGS = ROOT / "configs"
+RECORDINGS = ROOT.parent / "shared" / "data"
+COMMAND = (sys.executable, "-m", "omnibench.cli")
+ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+
+# What every plug-in file of the tests begins with.
+PLUGIN_IMPORTS = """
+import os, sys, threading, time
+import numpy as np
+from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.registry import Options, calibrators
+"""
+
+
+def omnibench(
+    *arguments: object, cwd: Path | None = None, timeout: float = 120, **others: Any
+) -> subprocess.CompletedProcess[str]:
+    """One command, run to its end, with what it printed."""
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)],
+        cwd=cwd,
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+        **others,
+    )
+
+
+def compared(config: Path, output: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """A comparison that must end well."""
+    run = omnibench("compare", config, "--output", output, *arguments)
+    assert run.returncode == 0, run.stderr
+    assert "Traceback" not in run.stderr
+    return run
+
+
+def compared_here(output: Path, **changes: Any) -> ComparisonResult:
+    """The small comparison, changed, run from this process, which is faster."""
+    return run_comparison(CompareConfig.model_validate(small(**changes)), output)
+
+
+def assert_refused(run: Printed | subprocess.CompletedProcess[str], *parts: str) -> None:
+    """One line on standard error that says all ``parts``, nothing on standard output, exit code 2."""
+    assert run.returncode == 2, run.stdout + run.stderr
+    assert run.stdout == ""
+    assert run.stderr.startswith("error: ")
+    assert run.stderr.count("\n") == 1, run.stderr
+    for part in parts:
+        assert part in run.stderr
+
+
+def flower(**changes: Any) -> dict[str, Any]:
+    """Six short simulated runs to train and six to validate: what a config says under ``simulate``."""
+    angles = (1.0471975511965976, 3.141592653589793, 5.235987755982989)
+    wheels = [
+        {"name": name, "radius": 0.148, "distance": 0.195, "angle": angle}
+        for name, angle in zip("abc", angles, strict=True)
+    ]
+    return {
+        "robot": {"name": "APR-02", "wheels": wheels},
+        "sample_period": 0.05,
+        "commands": {"speeds": [0.2], "directions_deg": [0, 120, 240], "turn_rates": [-0.35, 0.35]},
+        "repetitions": 1,
+        "truth": {"published": "palacin2023_eq8"},
+        "noise": {"encoder": 0.02, "pose_position": 0.005, "pose_heading": 0.005},
+        "train": {"seed": 1, "distance": 1.0},
+        "validation": {"seed": 2, "distance": 1.0},
+        **changes,
+    }
+
+
+def search(label: str = "search", candidates: int = 300, **options: Any) -> dict[str, Any]:
+    """A config's entry for a random search."""
+    return {"name": "random_search", "label": label, "options": {"candidates": candidates, **options}}
+
+
+def small(**changes: Any) -> dict[str, Any]:
+    """A comparison of three calibrators that takes a second: a config's content."""
+    return {
+        "name": "small",
+        "datasets": {"flower": {"simulate": flower()}},
+        "budget": {"evaluations": 2000, "seconds": 60},
+        "calibrators": ["theoretical", "closed_form", search()],
+        "workers": 2,
+        "bootstrap": {"resamples": 200},
+        **changes,
+    }
+
+
+def write_config(folder: Path, **changes: Any) -> Path:
+    """A small comparison's config in ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "small.yaml"
+    file.write_text(yaml.safe_dump(small(**changes)), encoding="utf-8")
+    return file
+
+
+def write_plugin(folder: Path, name: str, body: str) -> Path:
+    """A plug-in file with the imports that calibrators need."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.py").write_text(PLUGIN_IMPORTS + body, encoding="utf-8")
+    return folder
+
+
+def summary(output: Path) -> dict[str, Any]:
+    """summary.json of a comparison."""
+    content: dict[str, Any] = json.loads((output / "summary.json").read_text(encoding="utf-8"))
+    return content
+
+
+def rows(output: Path) -> dict[str, dict[str, Any]]:
+    """The runs of a comparison by label; with several seeds the last."""
+    return {run["label"]: run for run in summary(output)["runs"]}
+
+
+class Printed(NamedTuple):
+    """How a command ended and what it printed."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+Command = Callable[..., Printed]
+
+
+def commands_of_this_process(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Commands run in this process: the same code as the installed command, a second faster."""
+
+    def command(*arguments: object) -> Printed:
+        monkeypatch.setattr(sys, "argv", ["omnibench", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        printed = capfd.readouterr()
+        assert "Traceback" not in printed.err
+        return Printed(int(ended.value.code or 0), printed.out, printed.err)
+
+    return command
+
+
+class Prepared(NamedTuple):
+    """A small config, its data set and truth, and a calibration."""
+
+    config: Path
+    data: Path
+    truth: Path
+    calibration: Path
+
+
+def prepare(folder: Path) -> Prepared:
+    """What most commands need, made by the commands themselves."""
+    config = write_config(folder)
+    data, truth, calibration = folder / "data", folder / "truth", folder / "calibration.yaml"
+    for arguments in (("simulate", config, "-o", data, "--truth", truth), ("calibrate", data, "-o", calibration)):
+        run = omnibench(*arguments)
+        assert run.returncode == 0, run.stderr
+    return Prepared(config, data, truth, calibration)

@@ -1,0 +1,111 @@
+"""Gaps above the exact optimum are measured within one box."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import small
+
+from omnibench.compare.config import CompareConfig
+from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
+from omnibench.compare.results import RunRecord
+from omnibench.compare.scoring import heading_error, position_error, score
+from omnibench.fit.calibrator import Outcome, RunResult
+from omnibench.robot.published import published_matrix
+
+TRUE = published_matrix("palacin2023_eq8")
+WIDE = {"lower": [[-1.0] * 3] * 3, "upper": [[1.0] * 3] * 3}
+WIDER = {"lower": [[-2.0] * 3] * 3, "upper": [[2.0] * 3] * 3}
+
+
+def records(
+    entries: list[dict[str, Any] | str], shares: dict[str, float | None], **changes: Any
+) -> dict[str, RunRecord]:
+    """Rows of entries whose answers lie a share of the way from the true matrix to the design; None: no answer."""
+    config = CompareConfig.model_validate(small(calibrators=entries, **changes))
+    datasets = load_datasets(config)
+    plan = make_plan(config, datasets)
+    runs = score(plan, [result(run, shares[run.label]) for run in plan], datasets)
+    return {run.record.label: run.record for run in runs}
+
+
+def result(run: PlannedRun, share: float | None, outcome: Outcome = Outcome.CONVERGED) -> RunResult:
+    if share is None:
+        return RunResult(Outcome.FAILED, "because", None, None, None, 0, 0.0, ())
+    matrix = TRUE + share * (run.dataset.robot.inverse_kinematic_matrix - TRUE)
+    return RunResult(outcome, "so", matrix.ravel(), matrix, 0.0, 1, 0.1, ())
+
+
+def test_a_gap_is_the_share_of_cost_above_the_optimum() -> None:
+    rows = records(["closed_form", "crs"], {"closed_form": 0.0, "crs": 0.1})
+    assert rows["closed_form"].gap == 0.0
+    assert rows["crs"].train_cost is not None
+    assert rows["closed_form"].train_cost is not None
+    assert rows["crs"].gap == pytest.approx(rows["crs"].train_cost / rows["closed_form"].train_cost - 1)
+    assert rows["crs"].gap_box == "row"
+
+
+def test_an_optimum_in_another_box_gives_no_gap() -> None:
+    rows = records([{"name": "closed_form", "box": "paper"}, "crs"], {"closed_form (paper box)": 0.0, "crs": 0.1})
+    assert (rows["crs"].gap, rows["crs"].gap_box) == (None, None)
+
+
+def test_each_box_has_its_own_optimum() -> None:
+    entries = ["closed_form", {"name": "closed_form", "box": "paper"}, "crs", {"name": "crs", "box": "paper"}]
+    labels = ("closed_form", "closed_form (paper box)", "crs", "crs (paper box)")
+    rows = records(entries, dict(zip(labels, (0.0, 0.05, 0.1, 0.1), strict=True)))
+    assert (rows["crs"].gap_box, rows["crs (paper box)"].gap_box) == ("row", "paper")
+    assert rows["crs"].gap != rows["crs (paper box)"].gap
+
+
+def test_two_boxes_of_ones_own_are_two_boxes() -> None:
+    entries = [{"name": "closed_form", "box": WIDE}, {"name": "crs", "box": WIDER}, {"name": "isres", "box": WIDE}]
+    labels = ("closed_form (custom box)", "crs (custom box)", "isres (custom box)")
+    rows = records(entries, dict(zip(labels, (0.0, 0.1, 0.1), strict=True)))
+    assert rows["crs (custom box)"].gap is None
+    assert rows["isres (custom box)"].gap is not None
+
+
+def test_no_gap_is_measured_against_an_optimum_that_was_not_reached() -> None:
+    config = CompareConfig.model_validate(small(calibrators=["closed_form", "crs"]))
+    datasets = load_datasets(config)
+    plan = make_plan(config, datasets)
+    runs = score(plan, [result(plan[0], 0.0, Outcome.BUDGET), result(plan[1], 0.1)], datasets)
+    assert [run.record.gap for run in runs] == [None, None]
+
+
+def test_no_gap_is_measured_where_closed_form_failed() -> None:
+    assert records(["closed_form", "crs"], {"closed_form": None, "crs": 0.1})["crs"].gap is None
+
+
+def test_an_answer_without_a_box_is_compared_where_the_box_contains_it() -> None:
+    entries = [{"name": "closed_form", "box": "paper"}, "closed_form", "theoretical", "published"]
+    labels = ("closed_form (paper box)", "closed_form", "theoretical", "published")
+    rows = records(entries, dict(zip(labels, (0.5, 0.0, 1.0, 0.0), strict=True)))
+    assert rows["theoretical"].gap_box == "paper"
+    assert rows["published"].gap_box == "row"  # the true matrix is outside the paper's box
+
+
+def test_a_geometry_is_compared_where_the_box_contains_its_matrix() -> None:
+    rows = records(["closed_form", "parametric"], {"closed_form": 0.0, "parametric": 0.1})
+    assert rows["parametric"].gap_box == "row"
+
+
+def test_a_run_without_an_answer_has_no_figures_but_the_theoretical_ones() -> None:
+    row = records(["crs"], {"crs": None})["crs"]
+    assert row.theoretical_train_cost > 0
+    assert {row.train_cost, row.validation_cost, row.train_position_m, row.matrix, row.gap} == {None}
+
+
+def test_the_improvement_is_the_share_of_the_theoretical_cost_that_is_gone() -> None:
+    row = records(["crs"], {"crs": 0.0})["crs"]
+    assert row.train_cost is not None
+    assert row.train_improvement == pytest.approx(1 - row.train_cost / row.theoretical_train_cost)
+
+
+def test_final_errors_are_mean_distances_and_mean_absolute_headings() -> None:
+    errors = np.array([[3.0, 4.0, -0.1], [0.0, 0.0, 0.3]])
+    assert position_error(errors) == pytest.approx(2.5)
+    assert heading_error(errors) == pytest.approx(0.2)

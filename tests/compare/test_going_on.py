@@ -1,0 +1,280 @@
+"""Runs that are there are not run again, whatever ended the comparison before."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from commands import COMMAND, ENVIRONMENT, compared, flower, search, small, summary, write_config, write_plugin
+
+from omnibench.compare.config import CompareConfig
+from omnibench.compare.plan import PlannedRun
+from omnibench.compare.run import run_comparison
+from omnibench.data.simulate.config import FlowerConfig
+from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.storage import save_dataset
+from omnibench.fit.calibrator import RunResult
+
+pytestmark = pytest.mark.usefixtures("registries_as_before")
+
+LONG = {"candidates": 30_000, "batch": 30}
+SEARCHES = ["theoretical", search("first", **LONG), search("second", **LONG), search("third", 400)]
+
+
+class Stopped(NamedTuple):
+    """A comparison that Ctrl-C ended: what it printed, and the files that were there then."""
+
+    config: Path
+    output: Path
+    returncode: int
+    stderr: str
+    group: int
+    files: dict[str, tuple[int, bytes]]
+
+
+def files_of(folder: Path) -> dict[str, tuple[int, bytes]]:
+    """Time of change and content of every file."""
+    files = (file for file in folder.rglob("*") if file.is_file())
+    return {str(file.relative_to(folder)): (file.stat().st_mtime_ns, file.read_bytes()) for file in files}
+
+
+def started(config: Path, output: Path) -> subprocess.Popen[str]:
+    """A comparison in a process group of its own, whose first run has ended."""
+    process = subprocess.Popen(
+        [*COMMAND, "compare", str(config), "--output", str(output)],
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stderr is not None
+    assert process.stderr.readline().startswith("[1/4] flower theoretical")
+    return process
+
+
+def alive(group: int) -> list[str]:
+    """Commands of the processes of a session that have not ended."""
+    listed = subprocess.run(["ps", "-o", "stat=,args=", "-s", str(group)], capture_output=True, text=True, check=False)
+    return [line for line in listed.stdout.splitlines() if not line.startswith("Z")]
+
+
+def wait_until_gone(group: int) -> list[str]:
+    deadline = time.monotonic() + 10
+    while (left := alive(group)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return left
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory: pytest.TempPathFactory) -> Stopped:
+    folder = tmp_path_factory.mktemp("stopped")
+    config = write_config(folder, calibrators=SEARCHES, budget={"evaluations": 40_000}, workers=1)
+    process = started(config, folder / "out")
+    time.sleep(0.3)  # into the next run
+    os.killpg(process.pid, signal.SIGINT)
+    _, stderr = process.communicate(timeout=30)
+    return Stopped(config, folder / "out", process.returncode, stderr, process.pid, files_of(folder / "out"))
+
+
+def test_ctrl_c_exits_with_130(stopped: Stopped) -> None:
+    assert stopped.returncode == 130
+
+
+def test_ctrl_c_says_in_one_line_what_is_kept_and_how_to_go_on(stopped: Stopped) -> None:
+    line = f"interrupted; 1 of 4 runs are kept in {stopped.output}: run again with --output {stopped.output}"
+    assert [text for text in stopped.stderr.splitlines() if text] == [line]
+
+
+def test_ctrl_c_leaves_no_process_behind(stopped: Stopped) -> None:
+    assert wait_until_gone(stopped.group) == []
+
+
+def test_ctrl_c_leaves_whole_files_only(stopped: Stopped) -> None:
+    assert {Path(name).suffix for name in stopped.files} == {".yaml", ".json"}
+    assert sum(name.startswith("runs/") for name in stopped.files) == 1
+
+
+def test_going_on_keeps_what_had_ended_and_gives_what_an_uninterrupted_comparison_gives(
+    stopped: Stopped, tmp_path: Path
+) -> None:
+    run = compared(stopped.config, stopped.output)
+    assert "theoretical seed 1: converged, cost 0.138732, 1 evaluations, 0.0 s, kept from an earlier run" in run.stderr
+    assert run.stderr.count("kept from an earlier run") == 1
+    after = files_of(stopped.output)
+    kept = {name: content for name, content in stopped.files.items() if name.startswith("runs/")}
+    assert kept == {name: after[name] for name in kept}
+    compared(stopped.config, tmp_path / "whole", "--data", whole_data(tmp_path))
+    assert without_seconds(stopped.output) == without_seconds(tmp_path / "whole")
+
+
+def whole_data(folder: Path) -> Path:
+    """The small config's data as a folder: read from a disk, they are the same."""
+    save_dataset(simulate_dataset(FlowerConfig.model_validate(flower()), "flower").dataset, folder / "data")
+    return folder / "data"
+
+
+def without_seconds(output: Path) -> list[dict[str, Any]]:
+    return [{name: value for name, value in run.items() if name != "seconds"} for run in summary(output)["runs"]]
+
+
+def test_ctrl_c_before_the_first_run_ends_in_one_line(tmp_path: Path) -> None:
+    config = write_config(tmp_path, calibrators=SEARCHES)
+    program = "import os, signal, sys, threading; sys.argv[0] = 'omnibench'; import omnibench.cli as cli; "
+    program += "threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start(); cli.main()"
+    run = subprocess.run(
+        [COMMAND[0], "-c", program, "compare", str(config), "--output", str(tmp_path / "out")],
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert run.returncode == 130
+    assert [line.split(";")[0] for line in run.stderr.splitlines() if line] == ["interrupted"]
+
+
+ASLEEP = """
+@calibrators.register("asleep")
+class Asleep(Calibrator):
+    "Does not look whether anybody waits for it."
+
+    def calibrate(self, problem):
+        time.sleep(300)
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGKILL"])
+def test_the_runs_end_with_a_comparison_that_is_killed(name: str, tmp_path: Path) -> None:
+    plugins = write_plugin(tmp_path / "plugins", "asleep", ASLEEP)
+    entries = ["theoretical", "asleep", *SEARCHES[1:3]]
+    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=entries, workers=3)
+    process = started(config, tmp_path / "out")
+    process.send_signal(signal.Signals[name])
+    _, stderr = process.communicate(timeout=30)
+    assert "Traceback" not in stderr
+    assert wait_until_gone(process.pid) == []
+
+
+class Watch:
+    """Progress that notes which labels were run and which were there."""
+
+    def __init__(self) -> None:
+        self.ran: list[str] = []
+        self.kept: list[str] = []
+
+    def planned(self, runs: int) -> None: ...
+    def began(self, run: PlannedRun) -> None: ...
+    def moved(self, run: PlannedRun, evaluations: int, best: float) -> None: ...
+
+    def ended(self, run: PlannedRun, result: RunResult, reused: bool) -> None:  # noqa: ARG002
+        (self.kept if reused else self.ran).append(f"{run.label} {run.seed}")
+
+
+def ran_and_kept(output: Path, **changes: Any) -> tuple[set[str], set[str]]:
+    """Compare a small config, changed, and say which runs were run and which were there."""
+    watch = Watch()
+    run_comparison(CompareConfig.model_validate(small(**changes)), output, watch)
+    return set(watch.ran), set(watch.kept)
+
+
+ALL = {"theoretical 1", "closed_form 1", "search 1"}
+
+
+@pytest.fixture(scope="module")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("once") / "out"
+    ran_and_kept(output)
+    return output
+
+
+@pytest.fixture
+def output(once: Path, tmp_path: Path) -> Path:
+    """Results of the small comparison."""
+    shutil.copytree(once, tmp_path / "out")
+    return tmp_path / "out"
+
+
+def test_nothing_is_run_again_when_nothing_changed(output: Path) -> None:
+    before, rows = files_of(output / "runs"), summary(output)["runs"]
+    assert ran_and_kept(output) == (set(), ALL)
+    assert files_of(output / "runs") == before
+    assert summary(output)["runs"] == rows
+
+
+@pytest.mark.parametrize(
+    ("changes", "ran"),
+    [
+        ({"calibrators": ["theoretical", "closed_form", search(candidates=301)]}, {"search 1"}),
+        ({"calibrators": ["theoretical", {"name": "closed_form", "box": "paper", "label": "c"}, search()]}, {"c 1"}),
+        ({"seeds": [1, 2]}, {"search 2"}),
+        ({"budget": {"evaluations": 2001, "seconds": 60}}, ALL),
+        ({"cost": "final_position"}, ALL),
+        ({"integration": "euler"}, ALL),
+        ({"datasets": {"flower": {"simulate": flower(sample_period=0.1)}}}, ALL),
+        ({"workers": 1, "bootstrap": {"resamples": 300}, "description": "other words"}, set()),
+    ],
+    ids=lambda value: ", ".join(sorted(value)) or "nothing",
+)
+def test_only_what_a_change_touches_is_run_again(output: Path, changes: dict[str, Any], ran: set[str]) -> None:
+    assert ran_and_kept(output, **changes)[0] == ran
+
+
+def test_a_new_label_is_no_new_run(output: Path) -> None:
+    ran, kept = ran_and_kept(output, calibrators=["theoretical", "closed_form", search("another name")])
+    assert (ran, kept) == (set(), {"theoretical 1", "closed_form 1", "another name 1"})
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", b"\xff\xfe", b'{"outcome": "converged"}'])
+def test_a_damaged_run_is_run_again(output: Path, damage: bytes) -> None:
+    whole = {file.name: file.read_bytes() for file in (output / "runs").iterdir()}
+    (damaged := next((output / "runs").iterdir())).write_bytes(damage)
+    ran, kept = ran_and_kept(output)
+    assert (len(ran), len(kept)) == (1, 2)
+    assert len(damaged.read_bytes()) > len(damage)
+    assert {file.name for file in (output / "runs").iterdir()} == set(whole)
+
+
+PLUGIN = """
+@calibrators.register("mine")
+class Mine(Calibrator):
+    "Scales the start."
+
+    def calibrate(self, problem):
+        return Solution(problem.start * {factor}, "scaled")
+"""
+
+
+def test_a_changed_plugin_is_run_again_and_the_others_are_not(tmp_path: Path) -> None:
+    plugins = write_plugin(tmp_path / "plugins", "mine", PLUGIN.format(factor=1.0))
+    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=["theoretical", "mine"])
+    compared(config, tmp_path / "out")
+    write_plugin(plugins, "mine", PLUGIN.format(factor=1.01))
+    run = compared(config, tmp_path / "out")
+    assert run.stderr.count("kept from an earlier run") == 1
+    mine = next(run for run in summary(tmp_path / "out")["runs"] if run["label"] == "mine")
+    assert mine["train_cost"] != mine["theoretical_train_cost"]
+
+
+def test_a_plugin_that_is_repaired_is_run(tmp_path: Path) -> None:
+    plugins = write_plugin(tmp_path / "plugins", "mine", PLUGIN.format(factor="a_name_that_is_not_there"))
+    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=["mine"])
+    compared(config, tmp_path / "out")
+    assert [run["outcome"] for run in summary(tmp_path / "out")["runs"]] == ["failed"]
+    write_plugin(plugins, "mine", PLUGIN.format(factor=1.0))
+    compared(config, tmp_path / "out")
+    assert [run["outcome"] for run in summary(tmp_path / "out")["runs"]] == ["converged"]
+
+
+def test_the_same_seed_gives_the_same_results_with_any_number_of_workers(tmp_path: Path) -> None:
+    entries = ["theoretical", "closed_form", search(), {"name": "genetic", "options": {"generations": 4}}]
+    for workers in (1, 3):
+        ran_and_kept(tmp_path / str(workers), calibrators=entries, seeds=[1, 7], workers=workers)
+    assert without_seconds(tmp_path / "1") == without_seconds(tmp_path / "3")
+    assert len(without_seconds(tmp_path / "1")) == 6

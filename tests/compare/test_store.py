@@ -1,0 +1,60 @@
+"""The file of a run gives back what was put into it."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from omnibench.compare.store import RunStore
+from omnibench.errors import DataError
+from omnibench.fit.calibrator import Outcome, RunResult
+from omnibench.fit.problem import Improvement
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+WORDS = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), max_size=20)
+ANSWERS = st.lists(FINITE, min_size=9, max_size=9).map(np.array)
+
+
+@settings(max_examples=40)
+@given(
+    outcome=st.sampled_from(Outcome),
+    reason=WORDS,
+    vector=st.none() | ANSWERS,
+    history=st.lists(st.tuples(st.integers(1, 10**9), FINITE, FINITE), max_size=4),
+    at_bounds=st.lists(WORDS, max_size=3),
+)
+def test_a_result_comes_back_to_the_last_bit(
+    outcome: Outcome,
+    reason: str,
+    vector: np.ndarray | None,
+    history: list[tuple[int, float, float]],
+    at_bounds: list[str],
+) -> None:
+    matrix = None if vector is None else vector.reshape(3, 3)
+    cost = None if vector is None else float(vector[0])
+    steps = tuple(Improvement(*step) for step in history)
+    put = RunResult(outcome, reason, vector, matrix, cost, 17, 0.1, steps, tuple(at_bounds))
+    with tempfile.TemporaryDirectory() as folder:
+        RunStore(Path(folder)).put("key", put)
+        got = RunStore(Path(folder)).get("key")
+    assert got is not None
+    for name in ("outcome", "reason", "cost", "evaluations", "seconds", "history", "at_bounds"):
+        assert getattr(got, name) == getattr(put, name)
+    for name in ("vector", "matrix"):
+        before, after = getattr(put, name), getattr(got, name)
+        assert (before is None and after is None) or np.array_equal(before, after)
+
+
+def test_a_run_that_is_not_there_is_none(tmp_path: Path) -> None:
+    assert RunStore(tmp_path / "runs").get("key") is None
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "runs").write_text("a file")
+    with pytest.raises(DataError, match=r"runs/key\.json: cannot be written: .*runs is not a folder"):
+        RunStore(tmp_path / "runs").put("key", RunResult(Outcome.TIME, "", None, None, None, 0, 0.0, ()))

@@ -1,0 +1,244 @@
+"""Units and wheels that cannot be right are named in a warning; sound recordings give none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+from itertools import permutations, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from omnibench.config import validate
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.data.importer import import_dataset
+from omnibench.data.simulate.config import FlowerConfig
+from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.registry import load_plugin_file
+from omnibench.robot.kinematics import Array
+
+ROOT = Path(__file__).resolve().parents[2]
+RECORDINGS = ROOT.parent / "shared" / "data"
+RPM = 2 * math.pi / 60
+Change = Callable[[Trajectory], Trajectory]
+
+
+def commands(*turn_rates: float, speed: float = 0.2, directions: Sequence[float] = range(0, 360, 30)) -> dict[str, Any]:
+    return {"speeds": [speed], "directions_deg": list(directions), "turn_rates": list(turn_rates)}
+
+
+FLOWER = commands(-0.35, 0.0, 0.35)
+MOTIONS = {
+    "flower": FLOWER,
+    "straight runs only": commands(0.0),
+    "forward only": commands(0.0, directions=[0]),
+    "one turning run": commands(0.35, directions=[90]),
+    "turns on the spot only": commands(-0.35, 0.35, speed=0.0),
+    "fast turns on the spot": commands(-2.0, 2.0, speed=0.0),
+}
+
+
+@cache
+def recorded(motion: str = "flower", robot: str = "apr02", sparse: bool = False) -> Dataset:
+    """One simulated run of every command, off the design and noisy; with the first and last pose only if sparse."""
+    content = yaml.safe_load((ROOT / "configs" / f"{robot}.yaml").read_text())
+    (dataset,) = content["datasets"].values()
+    settings = {**dataset["simulate"], "repetitions": 1, "validation": None}
+    if robot == "apr02":
+        settings["commands"] = MOTIONS[motion]
+    simulated = simulate_dataset(validate(FlowerConfig, settings, robot)).dataset
+    if not sparse:
+        return simulated
+    ends = [replace(t, pose_times=t.pose_times[[0, -1]], poses=t.poses[[0, -1]]) for t in simulated.trajectories]
+    return replace(simulated, trajectories=tuple(ends))
+
+
+def warnings_of(dataset: Dataset, *changes: Change) -> str:
+    runs = list(dataset.trajectories)
+    for change in changes:
+        runs = [change(run) for run in runs]
+    return "; ".join(make_dataset("changed", dataset.robot, dataset.sample_period, runs).warnings)
+
+
+def rates(change: Callable[[Array], Array]) -> Change:
+    return lambda run: replace(run, rates=change(run.rates))
+
+
+def headings(change: Callable[[Array], Array]) -> Change:
+    return lambda run: replace(run, poses=np.column_stack([run.poses[:, :2], change(run.poses[:, 2])]))
+
+
+def positions(factor: float) -> Change:
+    return lambda run: replace(run, poses=run.poses * [factor, factor, 1.0])
+
+
+def shifted(x: float, y: float, heading: float) -> Change:
+    """The same run somewhere else on the floor."""
+
+    def change(run: Trajectory) -> Trajectory:
+        path = (run.poses[:, 0] + 1j * run.poses[:, 1]) * np.exp(1j * heading) + x + 1j * y
+        return replace(run, poses=np.column_stack([path.real, path.imag, run.poses[:, 2] + heading]))
+
+    return change
+
+
+IN_RPM = rates(lambda values: values / RPM)
+IN_DEGREES_PER_SECOND = rates(np.degrees)
+IN_DEGREES = headings(np.degrees)
+IN_DEGREES_WITHIN_180 = headings(lambda values: (np.degrees(values) + 180) % 360 - 180)
+IN_DEGREES_WITHIN_360 = headings(lambda values: np.degrees(values) % 360)
+IN_MM, IN_CM = positions(1000.0), positions(100.0)
+
+MISTAKES = {
+    "rpm": (IN_RPM, "wheel rates look like rpm; omega_* must be rad/s"),
+    "degrees per second": (IN_DEGREES_PER_SECOND, "wheel rates look like deg/s; omega_* must be rad/s"),
+    "degrees": (IN_DEGREES, "theta looks like degrees; it must be rad"),
+    "degrees within 180": (IN_DEGREES_WITHIN_180, "theta looks like degrees; it must be rad"),
+    "degrees within 360": (IN_DEGREES_WITHIN_360, "theta looks like degrees; it must be rad"),
+    "mm": (IN_MM, "positions look like mm; x and y must be m"),
+    "cm": (IN_CM, "positions look like cm; x and y must be m"),
+}
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+@pytest.mark.parametrize("robot", ["apr02", "mecanum"])
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_wrong_unit_is_named(mistake: str, robot: str, sparse: bool) -> None:
+    change, warning = MISTAKES[mistake]
+    assert warnings_of(recorded(robot=robot, sparse=sparse), change) == warning
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_wrong_unit_is_named_wherever_the_robot_started(mistake: str) -> None:
+    change, warning = MISTAKES[mistake]
+    assert warnings_of(recorded(), shifted(-40.0, 25.0, 2.5), change) == warning
+
+
+@pytest.mark.parametrize("mistake", ["rpm", "degrees per second", "mm", "cm"])
+@pytest.mark.parametrize("motion", ["straight runs only", "forward only", "one turning run"])
+def test_wrong_rates_and_positions_are_named_in_simpler_motions_too(motion: str, mistake: str) -> None:
+    change, warning = MISTAKES[mistake]
+    assert warnings_of(recorded(motion), change) == warning
+
+
+@pytest.mark.parametrize("mistake", ["rpm", "degrees", "degrees within 180", "degrees within 360"])
+@pytest.mark.parametrize("motion", ["turns on the spot only", "one turning run"])
+def test_wrong_angles_are_named_where_the_robot_turns(motion: str, mistake: str) -> None:
+    change, warning = MISTAKES[mistake]
+    assert warnings_of(recorded(motion), change) == warning
+
+
+@pytest.mark.parametrize(
+    ("changes", "units"),
+    [
+        ((IN_MM, IN_DEGREES_WITHIN_180), ("degrees", "mm")),
+        ((IN_RPM, IN_DEGREES_WITHIN_180), ("rpm", "degrees")),
+        ((IN_RPM, IN_MM, IN_DEGREES_WITHIN_180), ("rpm", "degrees", "mm")),  # Table 1 of the article
+    ],
+)
+def test_several_wrong_units_are_all_named(changes: tuple[Change, ...], units: tuple[str, ...]) -> None:
+    assert warnings_of(recorded(), *changes) == "; ".join(MISTAKES[unit][1] for unit in units)
+
+
+def rearranged(order: Sequence[int], signs: Sequence[int]) -> Change:
+    return rates(lambda values: values[:, list(order)] * signs)
+
+
+def arrangements(wheels: int) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    every = product(permutations(range(wheels)), product((1, -1), repeat=wheels))
+    return [(order, signs) for order, signs in every if order != tuple(range(wheels)) or min(signs) < 0]
+
+
+@pytest.mark.parametrize(("order", "signs"), arrangements(3))
+def test_every_exchange_of_three_wheels_is_told_with_the_way_back(
+    order: tuple[int, ...], signs: tuple[int, ...]
+) -> None:
+    names = "abc"
+    # Recorded column i holds signs[i] * wheel order[i]; the warning names the column that each wheel is found in.
+    found_in = {wheel: (column, sign) for column, (wheel, sign) in enumerate(zip(order, signs, strict=True))}
+    way_back = ", ".join(
+        f"{names[wheel]} <- {'-' if sign < 0 else ''}{names[column]}"
+        for wheel, (column, sign) in sorted(found_in.items())
+    )
+    warning = warnings_of(recorded(), rearranged(order, signs))
+    assert warning == f"wheels look swapped or sign-flipped; the reference fits with omega of {way_back}"
+
+
+@pytest.mark.parametrize(("order", "signs"), arrangements(4)[5::60])
+def test_exchanged_mecanum_wheels_are_told(order: tuple[int, ...], signs: tuple[int, ...]) -> None:
+    assert "swapped or sign-flipped" in warnings_of(recorded(robot="mecanum"), rearranged(order, signs))
+
+
+@pytest.mark.parametrize("motion", ["straight runs only", "turns on the spot only", "one turning run"])
+@pytest.mark.parametrize("signs", [(-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, -1, -1)])
+def test_flipped_signs_are_told_in_simpler_motions_too(motion: str, signs: tuple[int, ...]) -> None:
+    assert "swapped or sign-flipped" in warnings_of(recorded(motion), rearranged((0, 1, 2), signs))
+
+
+def test_wheels_that_never_turn_are_told() -> None:
+    warning = warnings_of(recorded(), rates(np.zeros_like))
+    assert warning == "the wheels never turn; check the omega_* columns"
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_sound_recordings_give_no_warning(motion: str, sparse: bool) -> None:
+    assert warnings_of(recorded(motion, sparse=sparse)) == ""
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_sound_recordings_of_mecanum_wheels_give_no_warning(sparse: bool) -> None:
+    assert warnings_of(recorded(robot="mecanum", sparse=sparse)) == ""
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_sound_recordings_give_no_warning_wherever_the_robot_started(motion: str) -> None:
+    assert warnings_of(recorded(motion), shifted(-40.0, 25.0, 2.5)) == ""
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_sound_recordings_with_wrapped_headings_give_no_warning(motion: str) -> None:
+    wrapped = headings(lambda values: (values + math.pi) % (2 * math.pi) - math.pi)
+    assert warnings_of(recorded(motion), shifted(0.0, 0.0, 3.0), wrapped) == ""
+
+
+def test_a_robot_that_hardly_moved_gives_no_warning() -> None:
+    def hardly(run: Trajectory) -> Trajectory:
+        return replace(run, rates=run.rates * 1e-3, poses=run.poses * 1e-3)
+
+    assert warnings_of(recorded(), hardly) == ""
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.25])
+def test_a_robot_a_quarter_off_its_design_gives_no_warning(scale: float) -> None:
+    assert warnings_of(recorded("straight runs only"), rates(lambda values: values * scale)) == ""
+
+
+@pytest.mark.parametrize(("importer", "folder"), [("optiodom", "optiodom/omni3"), ("robotino", "robotino")])
+def test_real_recordings_give_no_warning(importer: str, folder: str) -> None:
+    if not (RECORDINGS / folder).is_dir():
+        pytest.skip(f"the recordings are not at {RECORDINGS / folder}")
+    assert load_plugin_file(ROOT / "plugins" / "robotino.py") is None
+    dataset = import_dataset(importer, RECORDINGS / folder)
+    few = replace(dataset, trajectories=dataset.trajectories[::4])
+    assert warnings_of(few) == ""
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_wrong_units_of_a_real_robot_are_named(mistake: str) -> None:
+    folder = RECORDINGS / "optiodom" / "omni3"
+    if not folder.is_dir():
+        pytest.skip(f"the recordings are not at {folder}")
+    change, warning = MISTAKES[mistake]
+    assert warnings_of(real_omni3(folder), change) == warning
+
+
+@cache
+def real_omni3(folder: Path) -> Dataset:
+    dataset = import_dataset("optiodom", folder)
+    return replace(dataset, trajectories=dataset.trajectories[::8])

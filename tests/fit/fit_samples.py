@@ -1,0 +1,82 @@
+"""Small recordings and problems that several tests of the fit share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+
+from omnibench.data.dataset import Trajectory
+from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.parameterisation import Box, ExplicitBox, GeometryLimits, ParameterisationName
+from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
+from omnibench.registry import Options, costs
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import Integration
+from omnibench.testing.synthetic import synthetic_robot, synthetic_trajectories
+
+Wheels = Literal[3, 4]
+
+
+def noisy_trajectories(
+    wheels: Wheels = 3, noise: float = 0.01, seed: int = 0, integration: Integration = "arc"
+) -> tuple[Trajectory, ...]:
+    """Twelve runs of a robot off its design, with noise (m, m, rad) on every reference pose but the start."""
+    rng = np.random.default_rng(seed)
+
+    def disturbed(poses: Array) -> Array:
+        return poses + np.vstack([np.zeros(3), noise * rng.standard_normal((len(poses) - 1, 3))])
+
+    runs = synthetic_trajectories(synthetic_robot(wheels), integration)
+    return tuple(replace(run, poses=disturbed(run.poses)) for run in runs)
+
+
+def make_problem(
+    trajectories: Sequence[Trajectory] | None = None,
+    *,
+    wheels: Wheels = 3,
+    cost: str = "final_pose",
+    parameterisation: ParameterisationName = "matrix",
+    box: Box = "row",
+    limits: GeometryLimits | None = None,
+    integration: Integration = "arc",
+    evaluations: int = 60_000,
+    seconds: float = 600.0,
+    seed: int = 1,
+    watch: Callable[[int, float], None] | None = None,
+) -> CalibrationProblem:
+    """A problem on ``trajectories``, by default noisy ones."""
+    robot = synthetic_robot(wheels)
+    runs = noisy_trajectories(wheels, integration=integration) if trajectories is None else trajectories
+    return CalibrationProblem(
+        robot,
+        runs,
+        costs.create(cost),
+        make_parameterisation(parameterisation, robot, runs, box=box, limits=limits),
+        integration=integration,
+        budget=Budget(evaluations=evaluations, seconds=seconds),
+        seed=seed,
+        watch=watch,
+    )
+
+
+def box_between(lower: Array, upper: Array) -> ExplicitBox:
+    """An explicit box of two matrices (3, N)."""
+    low, high = (tuple(tuple(row) for row in side.tolist()) for side in (lower, upper))
+    return ExplicitBox(lower=low, upper=high)
+
+
+class Scripted(Calibrator):
+    """A calibrator that does what a test says."""
+
+    name = "scripted"
+
+    def __init__(self, script: Callable[[CalibrationProblem], Any]) -> None:
+        super().__init__(Options())
+        self._script = script
+
+    def calibrate(self, problem: CalibrationProblem) -> Solution:
+        answer: Solution = self._script(problem)
+        return answer

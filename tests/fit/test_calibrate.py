@@ -1,0 +1,179 @@
+"""Calibrating one robot from one data set."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fit_samples import noisy_trajectories
+
+from omnibench.data.dataset import Dataset, make_dataset
+from omnibench.environment import package_versions
+from omnibench.errors import ConfigError, DataError, UnknownNameError
+from omnibench.fit.calibrate import calibrate
+from omnibench.fit.calibrator import Outcome
+from omnibench.fit.evaluate import evaluate
+from omnibench.fit.parameterisation import GeometryLimits
+from omnibench.fit.problem import Budget
+from omnibench.registry import costs
+from omnibench.robot.calibration import read_calibration, write_calibration
+from omnibench.testing.synthetic import synthetic_robot
+
+ROBOT = synthetic_robot()
+
+
+@pytest.fixture(scope="module")
+def dataset() -> Dataset:
+    """Eight runs to train and four to validate."""
+    runs = noisy_trajectories()
+    held_out = (replace(run, split="validation") for run in runs[8:])
+    return make_dataset("synthetic", ROBOT, 0.2, [*runs[:8], *held_out], simulated=True)
+
+
+def test_the_provenance_tells_where_a_calibration_comes_from(dataset: Dataset) -> None:
+    run = calibrate(dataset, "crs", options={"tolerance": 1e-3}, cost="trajectory", box="paper", seed=7)
+    origin = run.calibration.provenance
+    assert origin is not None
+    assert (origin.dataset, origin.dataset_hash, origin.simulated) == ("synthetic", dataset.hash, True)
+    assert (origin.calibrator, origin.seed, origin.cost, origin.box) == ("crs", 7, "trajectory", "paper")
+    assert origin.options == {"population": None, "tolerance": 1e-3, "step": 1e-8}
+    assert origin.versions == package_versions()
+    assert (origin.outcome, origin.reason) == ("converged", run.result.reason)
+
+
+@pytest.mark.parametrize("cost", ["final_pose", "final_position", "final_heading", "trajectory"])
+def test_the_costs_of_the_provenance_are_of_the_cost_it_names(dataset: Dataset, cost: str) -> None:
+    run = calibrate(dataset, cost=cost)
+    origin = run.calibration.provenance
+    assert origin is not None
+    assert origin.training_cost == run.result.cost
+    objective = costs.create(cost)
+    batch = objective.batch(dataset.split("validation"), "arc")
+    errors = batch.poses(run.calibration.matrix_array[None]) - objective.reference(dataset.split("validation"))
+    assert origin.validation_cost == pytest.approx(objective.combine(errors, batch.trajectory)[0], rel=1e-12)
+
+
+def test_eq_6_of_the_provenance_is_that_of_evaluate(dataset: Dataset) -> None:
+    calibration = calibrate(dataset).calibration
+    splits = evaluate(calibration, dataset).splits
+    assert calibration.provenance is not None
+    assert calibration.provenance.training_cost == pytest.approx(splits["train"].cost, rel=1e-12)
+    assert calibration.provenance.validation_cost == pytest.approx(splits["validation"].cost, rel=1e-12)
+
+
+def test_without_validation_runs_there_is_no_validation_cost() -> None:
+    calibration = calibrate(make_dataset("train only", ROBOT, 0.2, noisy_trajectories())).calibration
+    assert calibration.provenance is not None
+    assert calibration.provenance.validation_cost is None
+
+
+def test_the_calibration_has_the_robot_the_matrix_and_the_integration(dataset: Dataset) -> None:
+    run = calibrate(dataset, integration="euler")
+    assert (run.calibration.robot, run.calibration.sample_period) == (ROBOT, 0.2)
+    assert run.calibration.integration == "euler"
+    np.testing.assert_array_equal(run.calibration.matrix_array, run.result.matrix)
+
+
+def test_a_calibration_can_be_written_and_read(dataset: Dataset, tmp_path: Path) -> None:
+    calibration = calibrate(dataset).calibration
+    write_calibration(calibration, tmp_path / "calibration.yaml")
+    assert read_calibration(tmp_path / "calibration.yaml") == calibration
+
+
+def test_only_training_runs_matter(dataset: Dataset) -> None:
+    spoilt = [
+        replace(run, poses=run.poses * [1.2, 1.0, 1.0]) if run.split == "validation" else run
+        for run in dataset.trajectories
+    ]
+    other = make_dataset("spoilt", ROBOT, 0.2, spoilt)
+    first, second = (calibrate(each).calibration.matrix for each in (dataset, other))
+    assert first == second
+
+
+def test_the_same_seed_gives_the_same_calibration(dataset: Dataset) -> None:
+    matrices = [
+        calibrate(dataset, "crs", seed=seed, budget=Budget(evaluations=500)).calibration.matrix for seed in (1, 1, 2)
+    ]
+    assert matrices[0] == matrices[1] != matrices[2]
+
+
+def test_a_spent_budget_still_gives_a_calibration(dataset: Dataset) -> None:
+    run = calibrate(dataset, "crs", budget=Budget(evaluations=100))
+    assert run.result.outcome is Outcome.BUDGET
+    assert run.calibration.provenance is not None
+    assert run.calibration.provenance.outcome == "budget"
+
+
+def test_parametric_searches_the_geometry_without_being_told(dataset: Dataset) -> None:
+    limits = GeometryLimits(radius=0.05, distance=0.1, angle_deg=0.0)
+    run = calibrate(dataset, "parametric", limits=limits, budget=Budget(evaluations=300))
+    assert run.calibration.provenance is not None
+    assert run.calibration.provenance.box == "limits"
+    assert run.result.vector is not None
+    np.testing.assert_array_equal(run.result.vector[6:], [wheel.angle for wheel in ROBOT.wheels])
+
+
+def test_any_search_can_take_either_parameterisation(dataset: Dataset) -> None:
+    run = calibrate(dataset, "crs", parameterisation="geometry", budget=Budget(evaluations=300))
+    assert run.result.vector is not None
+    assert run.result.vector[0] == pytest.approx(0.148, rel=0.1)
+
+
+def test_intervals_are_drawn_on_demand(dataset: Dataset) -> None:
+    assert calibrate(dataset).intervals is None
+    intervals = calibrate(dataset, intervals=True).intervals
+    assert intervals is not None
+    assert (intervals.low <= intervals.high).all()
+
+
+def test_progress_is_shown(dataset: Dataset) -> None:
+    shown: list[tuple[int, float]] = []
+    calibrate(dataset, "crs", budget=Budget(seconds=0.4), watch=lambda count, best: shown.append((count, best)))
+    assert shown
+    assert shown == sorted(shown, key=lambda each: each[0])
+
+
+def refused(dataset: Dataset, error: type[Exception], **arguments: Any) -> str:
+    with pytest.raises(error) as refusal:
+        calibrate(dataset, **arguments)
+    assert "\n" not in str(refusal.value)
+    return str(refusal.value)
+
+
+def test_an_empty_training_split_is_refused_in_one_line() -> None:
+    held_out = [replace(run, split="validation") for run in noisy_trajectories()]
+    message = refused(make_dataset("held out", ROBOT, 0.2, held_out), DataError)
+    assert message == ("data set held out: the training split is empty; set split to train for some trajectories")
+
+
+def test_an_unknown_calibrator_is_answered_with_the_nearest_and_all(dataset: Dataset) -> None:
+    message = refused(dataset, UnknownNameError, calibrator="closed_from")
+    assert message.startswith("unknown calibrator 'closed_from'; did you mean 'closed_form'? known: ")
+    for name in ("crs", "genetic", "isres", "parametric", "theoretical"):
+        assert name in message
+
+
+def test_an_unknown_cost_is_answered_with_all(dataset: Dataset) -> None:
+    assert "unknown cost 'final'; " in refused(dataset, UnknownNameError, cost="final")
+
+
+def test_an_unknown_option_is_answered_with_the_nearest(dataset: Dataset) -> None:
+    message = refused(dataset, ConfigError, calibrator="crs", options={"populations": 3})
+    assert "calibrator 'crs': unknown key 'populations'; did you mean 'population'?" in message
+
+
+def test_a_calibrator_that_gives_no_answer_says_why(dataset: Dataset) -> None:
+    message = refused(dataset, ConfigError, parameterisation="geometry")
+    assert message.startswith("calibrator 'closed_form' gave no answer (failed): closed_form works on the matrix")
+
+
+def test_intervals_of_a_search_are_refused_before_it_runs(dataset: Dataset) -> None:
+    shown: list[int] = []
+    message = refused(
+        dataset, ConfigError, calibrator="crs", intervals=True, watch=lambda count, _: shown.append(count)
+    )
+    assert "use the calibrator closed_form" in message
+    assert not shown

@@ -1,0 +1,87 @@
+"""How good a calibration is on a data set."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fit_samples import noisy_trajectories
+
+from omnibench.data.dataset import Dataset, make_dataset
+from omnibench.errors import DataError
+from omnibench.fit.evaluate import evaluate, split_errors
+from omnibench.robot.calibration import Calibration, matrix_rows
+from omnibench.robot.kinematics import Robot
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import Integration
+from omnibench.testing.synthetic import synthetic_robot, true_robot
+
+ROBOT = synthetic_robot()
+TRUTH = true_robot(ROBOT).inverse_kinematic_matrix
+
+
+def dataset(validating: int = 4) -> Dataset:
+    """Twelve runs, the last of which validate."""
+    runs = noisy_trajectories()
+    split = len(runs) - validating
+    held_out = (replace(run, split="validation") for run in runs[split:])
+    return make_dataset("synthetic", ROBOT, 0.2, [*runs[:split], *held_out], simulated=True)
+
+
+def calibration(robot: Robot = ROBOT, integration: Integration = "arc") -> Calibration:
+    return Calibration(name="truth", robot=robot, sample_period=0.2, matrix=matrix_rows(TRUTH), integration=integration)
+
+
+def test_errors_are_those_of_the_final_pose() -> None:
+    runs = dataset().trajectories
+    model = OdometryModel(ROBOT, TRUTH, "arc")
+    errors = [model.poses([run.final_log])[0][0] - run.poses[-1] for run in runs]
+    positions = [math.hypot(error[0], error[1]) for error in errors]
+    headings = [abs(error[2]) for error in errors]
+    found = split_errors(model, runs)
+    assert found.trajectories == 12
+    assert found.cost == pytest.approx(np.mean([math.hypot(*error) for error in errors]), abs=1e-14)
+    assert found.position_mean_m == pytest.approx(np.mean(positions), abs=1e-14)
+    assert found.position_max_m == pytest.approx(max(positions), abs=1e-14)
+    assert found.heading_mean_rad == pytest.approx(np.mean(headings), abs=1e-14)
+    assert found.heading_max_rad == pytest.approx(max(headings), abs=1e-14)
+
+
+def test_every_split_that_is_there_is_evaluated_and_all_together() -> None:
+    found = evaluate(calibration(), dataset())
+    assert {name: errors.trajectories for name, errors in found.splits.items()} == {
+        "train": 8,
+        "validation": 4,
+        "all": 12,
+    }
+    assert found.splits["all"].cost == pytest.approx(
+        (8 * found.splits["train"].cost + 4 * found.splits["validation"].cost) / 12
+    )
+    assert (found.dataset, found.simulated, found.trajectories) == ("synthetic", True, 12)
+
+
+def test_a_split_that_is_empty_is_left_out() -> None:
+    assert set(evaluate(calibration(), dataset(validating=0)).splits) == {"train", "all"}
+
+
+def test_the_design_is_evaluated_beside_the_calibration() -> None:
+    found = evaluate(calibration(), dataset())
+    design = split_errors(OdometryModel.of_design(ROBOT, "arc"), dataset().trajectories)
+    assert found.design["all"] == design
+    assert found.splits["all"].cost < 0.5 * design.cost
+
+
+def test_the_calibrations_own_integration_is_used() -> None:
+    euler, arc = (evaluate(calibration(integration=each), dataset()) for each in ("euler", "arc"))
+    assert euler.splits["all"].cost != arc.splits["all"].cost
+    assert euler.design["all"].cost != arc.design["all"].cost
+
+
+def test_a_calibration_of_other_wheels_is_refused_in_one_line() -> None:
+    renamed = tuple(wheel.model_copy(update={"name": f"{wheel.name}1"}) for wheel in ROBOT.wheels)
+    other = ROBOT.model_copy(update={"wheels": renamed})
+    with pytest.raises(DataError) as refusal:
+        evaluate(calibration(other), dataset())
+    assert str(refusal.value) == "the calibration is for wheels a1, b1, c1, the data set synthetic has a, b, c"

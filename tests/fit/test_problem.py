@@ -1,0 +1,332 @@
+"""The calibration problem: what it counts, keeps and shows, and what nobody can see through it."""
+
+from __future__ import annotations
+
+import gc
+import pickle
+from collections.abc import Iterator
+from dataclasses import replace
+from types import BuiltinFunctionType, FunctionType, MethodDescriptorType, ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from fit_samples import box_between, make_problem, noisy_trajectories
+from hypothesis import given
+from hypothesis import strategies as st
+
+from omnibench.data.dataset import Trajectory, make_dataset
+from omnibench.errors import DataError
+from omnibench.fit.calibrate import calibrate
+from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.parameterisation import GeometryLimits
+from omnibench.fit.problem import BudgetSpent, CalibrationProblem
+from omnibench.registry import calibrators
+from omnibench.robot.kinematics import Array
+from omnibench.testing.synthetic import synthetic_robot
+
+
+def population(problem: CalibrationProblem, count: int, seed: int = 0) -> Array:
+    rng = np.random.default_rng(seed)
+    return problem.from_unit(rng.uniform(size=(count, int(problem.free.sum()))))
+
+
+def test_every_candidate_counts() -> None:
+    problem = make_problem()
+    problem.cost(problem.start)
+    problem.cost(population(problem, 7))
+    assert (problem.evaluations, problem.remaining) == (8, 60_000 - 8)
+
+
+def test_values_for_the_verdict_do_not_count() -> None:
+    problem = make_problem()
+    problem.values(population(problem, 7))
+    assert problem.evaluations == 0
+    assert problem.best_cost == np.inf
+
+
+def test_a_population_is_cut_at_the_budget_and_what_was_evaluated_is_kept() -> None:
+    problem, unlimited = make_problem(evaluations=5), make_problem()
+    candidates = population(problem, 9)
+    with pytest.raises(BudgetSpent, match="budget of 5 evaluations spent"):
+        problem.cost(candidates)
+    assert problem.evaluations == 5
+    assert problem.best_cost == unlimited.cost(candidates)[:5].min()
+
+
+def test_a_population_that_fits_exactly_is_answered() -> None:
+    problem = make_problem(evaluations=5)
+    assert problem.cost(population(problem, 5)).shape == (5,)
+
+
+def test_nothing_is_evaluated_when_the_budget_is_spent() -> None:
+    problem = make_problem(evaluations=1)
+    problem.cost(problem.start)
+    for _ in range(2):
+        with pytest.raises(BudgetSpent) as spent:
+            problem.cost(problem.start)
+        assert spent.value.kind == "budget"
+    assert problem.evaluations == 1
+
+
+def test_nothing_is_evaluated_when_the_time_is_spent() -> None:
+    problem = make_problem(seconds=1e-9)
+    with pytest.raises(BudgetSpent, match="time budget of 1e-09 s spent") as spent:
+        problem.cost(problem.start)
+    assert spent.value.kind == "time"
+    assert problem.evaluations == 0
+
+
+@pytest.mark.parametrize("wheels", [3, 4])
+@pytest.mark.parametrize("parameterisation", ["matrix", "geometry"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0, 1e300])
+def test_a_candidate_that_cannot_be_evaluated_leaves_the_others_alone(
+    wheels: Any, parameterisation: Any, value: float
+) -> None:
+    problem = make_problem(wheels=wheels, parameterisation=parameterisation)
+    candidates = np.tile(problem.start, (3, 1))
+    candidates[1] = value
+    costs = problem.cost(candidates)
+    assert costs[0] == pytest.approx(problem.values(problem.start[None])[0], rel=1e-12)
+    assert costs[2] == costs[0]
+    assert not costs[1] <= costs[0]
+
+
+def test_candidates_that_are_nan_cost_nan_and_are_never_the_best() -> None:
+    problem = make_problem()
+    assert np.isnan(problem.cost(np.full((2, 9), np.nan))).all()
+    assert problem.best_cost == np.inf
+    np.testing.assert_array_equal(problem.best_vector, problem.start)
+
+
+def test_a_candidate_outside_the_box_costs_but_is_never_the_best() -> None:
+    problem = make_problem(box="paper")
+    outside = problem.start.copy()
+    outside[0] = problem.lower[0] - 1e-6
+    assert np.isfinite(problem.cost(outside)[0])
+    assert problem.best_cost == np.inf
+
+
+def test_candidates_of_another_shape_are_a_programming_error() -> None:
+    problem = make_problem()
+    with pytest.raises(ValueError, match=r"candidates have shape \(2, 8\), expected \(P, 9\)"):
+        problem.cost(np.zeros((2, 8)))
+    assert problem.evaluations == 0
+
+
+def test_candidates_are_left_unchanged_and_answers_do_not_depend_on_them_later() -> None:
+    problem = make_problem()
+    candidates = population(problem, 4)
+    kept = candidates.copy()
+    problem.cost(candidates)
+    np.testing.assert_array_equal(candidates, kept)
+    best = problem.best_vector.copy()
+    candidates[:] = 0.0
+    np.testing.assert_array_equal(problem.best_vector, best)
+
+
+@given(sizes=st.lists(st.integers(1, 6), min_size=1, max_size=8), seed=st.integers(0, 2**16))
+def test_evaluations_and_costs_of_the_history_only_move_one_way(sizes: list[int], seed: int) -> None:
+    problem = make_problem(RUNS)
+    for index, size in enumerate(sizes):
+        problem.cost(population(problem, size, seed + index))
+    evaluations = [step.evaluations for step in problem.history]
+    seconds = [step.seconds for step in problem.history]
+    costs = [step.cost for step in problem.history]
+    assert evaluations == sorted(set(evaluations))
+    assert seconds == sorted(seconds)
+    assert costs == sorted(set(costs), reverse=True)
+    assert costs[-1] == problem.best_cost
+    assert evaluations[-1] <= problem.evaluations == sum(sizes)
+
+
+RUNS = noisy_trajectories()
+
+
+def test_the_seed_decides_the_random_numbers() -> None:
+    draws = [make_problem(RUNS, seed=seed).rng.random(3).tolist() for seed in (4, 4, 5)]
+    assert draws[0] == draws[1] != draws[2]
+
+
+def test_progress_is_shown_while_candidates_are_evaluated() -> None:
+    shown: list[tuple[int, float]] = []
+    problem = make_problem(watch=lambda count, best: shown.append((count, best)))
+    while not shown:
+        problem.cost(problem.start)
+    assert shown[0] == (problem.evaluations, problem.best_cost)
+
+
+@pytest.mark.parametrize("name", ["start", "lower", "upper", "free", "reference", "best_vector"])
+def test_what_a_calibrator_is_given_cannot_be_overwritten(name: str) -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        getattr(make_problem(), name)[0] = 0
+
+
+class TestUnitCube:
+    """Searches work in the unit cube of the elements that are free."""
+
+    def test_its_corners_are_the_box(self) -> None:
+        problem = make_problem()
+        np.testing.assert_allclose(problem.from_unit(np.zeros(9))[0], problem.lower, rtol=1e-15)
+        np.testing.assert_allclose(problem.from_unit(np.ones(9))[0], problem.upper, rtol=1e-15)
+
+    @given(seed=st.integers(0, 2**16), box=st.sampled_from(["row", "paper"]))
+    def test_points_come_back(self, seed: int, box: Any) -> None:
+        problem = make_problem(RUNS, box=box)
+        points = np.random.default_rng(seed).uniform(size=(5, int(problem.free.sum())))
+        np.testing.assert_allclose(problem.to_unit(problem.from_unit(points)), points, atol=1e-13)
+
+    @given(points=st.lists(st.floats(-1e3, 1e3), min_size=9, max_size=9))
+    def test_it_never_leads_outside_the_box(self, points: list[float]) -> None:
+        problem = make_problem(RUNS)
+        vectors = problem.from_unit(np.array(points))
+        assert ((vectors >= problem.lower) & (vectors <= problem.upper)).all()
+
+    def test_points_of_vectors_outside_are_on_its_surface(self) -> None:
+        problem = make_problem()
+        np.testing.assert_array_equal(problem.to_unit(problem.upper + 1.0)[0], np.ones(9))
+
+    def test_frozen_elements_keep_their_start(self) -> None:
+        problem = make_problem(box="paper")
+        frozen = np.flatnonzero(~problem.free)
+        assert problem.names[frozen[0]] == "m12"
+        assert len(frozen) == 1
+        vectors = problem.from_unit(np.random.default_rng(0).uniform(size=(4, 8)))
+        np.testing.assert_array_equal(vectors[:, frozen], np.tile(problem.start[frozen], (4, 1)))
+
+    def test_a_box_without_any_width_has_one_point(self) -> None:
+        design = synthetic_robot().inverse_kinematic_matrix
+        problem = make_problem(box=box_between(design, design))
+        np.testing.assert_array_equal(problem.from_unit(np.zeros((2, 0))), [problem.start, problem.start])
+
+
+class TestBox:
+    """Inside, and on the surface."""
+
+    def test_its_corners_are_inside(self) -> None:
+        problem = make_problem(box="paper")
+        assert problem.inside(np.array([problem.lower, problem.upper, problem.start])).all()
+
+    def test_rounding_is_forgiven_and_no_more(self) -> None:
+        problem = make_problem()
+        assert problem.inside(problem.upper * (1 + 1e-14 * np.sign(problem.upper)))
+        beyond = problem.upper.copy()
+        beyond[4] += 1e-9
+        assert not problem.inside(beyond)
+
+    @pytest.mark.parametrize("value", [np.nan, np.inf])
+    def test_what_is_not_finite_is_outside(self, value: float) -> None:
+        assert not make_problem().inside(np.full(9, value))
+
+    def test_elements_on_a_bound_are_named(self) -> None:
+        problem = make_problem()
+        vector = problem.start.copy()
+        vector[[1, 8]] = problem.upper[1], problem.lower[8]
+        assert problem.at_bounds(vector) == ("m12", "m33")
+
+    def test_frozen_elements_are_not_said_to_be_on_a_bound(self) -> None:
+        problem = make_problem(box="paper")
+        assert problem.at_bounds(problem.start) == ()
+
+
+def test_limits_of_the_geometry_are_its_box() -> None:
+    problem = make_problem(parameterisation="geometry", limits=GeometryLimits(angle_deg=0.0))
+    assert problem.box == "limits"
+    assert [name for name, free in zip(problem.names, problem.free, strict=True) if not free] == [
+        "angle_a",
+        "angle_b",
+        "angle_c",
+    ]
+
+
+def test_no_trajectories_are_refused() -> None:
+    with pytest.raises(DataError, match="no trajectories; nothing can be calibrated"):
+        make_problem(())
+
+
+# What a module, class or function drags along is the program, not the problem's data.
+_PROGRAM = (ModuleType, type, FunctionType, BuiltinFunctionType, MethodDescriptorType)
+
+
+def reachable(root: object) -> Iterator[object]:
+    """Every object that attributes, items, closures and array bases lead to."""
+    seen: set[int] = set()
+    waiting: list[object] = [root]
+    while waiting:
+        item = waiting.pop()
+        if id(item) in seen:
+            continue
+        seen.add(id(item))
+        yield item
+        if isinstance(item, np.ndarray):
+            waiting.append(item.base)
+        if isinstance(item, FunctionType):
+            waiting += [cell.cell_contents for cell in item.__closure__ or ()]
+        elif not isinstance(item, _PROGRAM):
+            waiting += gc.get_referents(item)
+
+
+def arrays_of(runs: tuple[Trajectory, ...]) -> list[Array]:
+    return [array for run in runs for array in (run.rates, run.poses, run.angles, run.targets) if array is not None]
+
+
+def holds(owner: Array, array: Array) -> bool:
+    """Whether the numbers of ``array`` lie somewhere in ``owner``."""
+    if owner.dtype != array.dtype or owner.size < array.size:
+        return False
+    return np.ascontiguousarray(array).tobytes() in np.ascontiguousarray(owner).tobytes()
+
+
+@pytest.mark.usefixtures("registries_as_before")
+class TestValidationData:
+    """A calibrator cannot see the validation data, whatever it follows from its problem."""
+
+    @pytest.fixture
+    def seen(self) -> tuple[CalibrationProblem, tuple[Trajectory, ...], tuple[Trajectory, ...]]:
+        """The problem that a calibrator was given, and the runs of both splits."""
+        problems: list[CalibrationProblem] = []
+
+        @calibrators.register("spy")
+        class Spy(Calibrator):
+            """Keeps its problem."""
+
+            def calibrate(self, problem: CalibrationProblem) -> Solution:
+                problems.append(problem)
+                problem.cost(problem.start)
+                return Solution(problem.start, "seen enough")
+
+        train = noisy_trajectories(seed=1)
+        held_out = [replace(run, id=f"v{run.id}", split="validation") for run in noisy_trajectories(seed=2)]
+        runs = [
+            replace(run, rates=run.rates + 1e-6 * index, angles=np.cumsum(run.rates, axis=0) + index)
+            for index, run in enumerate((*train, *held_out))
+        ]
+        dataset = make_dataset("both", synthetic_robot(), 0.2, runs)
+        calibrate(dataset, "spy")
+        return problems[0], dataset.split("train"), dataset.split("validation")
+
+    def test_no_array_of_a_validation_run_is_reachable(self, seen: Any) -> None:
+        problem, _, validation = seen
+        arrays = [item for item in reachable(problem) if isinstance(item, np.ndarray)]
+        for hidden in arrays_of(validation):
+            assert not any(np.shares_memory(array, hidden) or holds(array, hidden) for array in arrays)
+
+    def test_the_search_does_find_the_training_runs(self, seen: Any) -> None:
+        problem, training, _ = seen
+        arrays = [item for item in reachable(problem) if isinstance(item, np.ndarray)]
+        for shown in arrays_of(training):
+            assert any(holds(array, shown) for array in arrays)
+
+    def test_every_trajectory_that_is_reachable_is_a_training_run(self, seen: Any) -> None:
+        problem, training, _ = seen
+        runs = [item for item in reachable(problem) if isinstance(item, Trajectory)]
+        assert {run.id for run in runs} == {run.id for run in training}
+
+    def test_a_pickled_problem_does_not_hold_a_validation_run(self, seen: Any) -> None:
+        problem, training, validation = seen
+        content = pickle.dumps(problem)
+        assert all(np.ascontiguousarray(run.poses).tobytes() in content for run in training)
+        for run in validation:
+            assert np.ascontiguousarray(run.poses).tobytes() not in content
+            assert np.ascontiguousarray(run.rates).tobytes() not in content
+            assert run.id.encode() not in content

@@ -1,0 +1,99 @@
+"""The directions of wheel rates that recordings drive."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fit_samples import noisy_trajectories
+from hypothesis import given
+from hypothesis import strategies as st
+
+from omnibench.data.dataset import Trajectory
+from omnibench.errors import DataError
+from omnibench.fit.span import direction_in_words, driven_span
+from omnibench.robot.kinematics import Array, wheel_equations
+from omnibench.testing.synthetic import synthetic_robot
+
+
+def run_at(rates: Array, samples: int = 10, poses: int = 6) -> Trajectory:
+    """A run at constant wheel rates (N,) for 2 s."""
+    times = 0.2 * np.arange(1, samples + 1)
+    stamps = np.linspace(0, times[-1], poses)
+    return Trajectory("run", "train", times, np.tile(rates, (samples, 1)), stamps, np.zeros((poses, 3)))
+
+
+def test_three_wheels_that_are_all_driven_leave_no_direction() -> None:
+    span = driven_span(noisy_trajectories(3))
+    assert span.driven.shape == (3, 3)
+    assert span.null.shape == (0, 3)
+
+
+def test_mecanum_wheels_leave_the_direction_that_would_make_them_slip() -> None:
+    span = driven_span(noisy_trajectories(4))
+    robot = synthetic_robot(4)
+    assert span.driven.shape == (3, 4)
+    assert span.null.shape == (1, 4)
+    np.testing.assert_allclose(span.null @ wheel_equations(robot.wheels), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_direction_that_mecanum_wheels_leave_has_the_same_name_on_any_data(seed: int) -> None:
+    # Positive rates drive counter-clockwise, so forward is negative on the left.
+    rng = np.random.default_rng(seed)
+    runs = [replace(r, rates=r.rates + 0.02 * rng.standard_normal(r.rates.shape)) for r in noisy_trajectories(4)]
+    (null,) = driven_span(runs).null
+    assert direction_in_words(null, synthetic_robot(4).wheel_names) == "fl - fr - rl + rr"
+
+
+def test_a_direction_is_named_with_its_shares() -> None:
+    assert direction_in_words(np.array([-0.25, 0.001, 0.5]), ("a", "b", "c")) == "- 0.5 a + c"
+
+
+def test_encoder_noise_does_not_count_as_driving() -> None:
+    rng = np.random.default_rng(0)
+    runs = [replace(r, rates=r.rates + 0.02 * rng.standard_normal(r.rates.shape)) for r in noisy_trajectories(4)]
+    assert driven_span(runs).null.shape == (1, 4)
+
+
+@given(rank=st.integers(1, 4), wheels=st.integers(4, 6), seed=st.integers(0, 2**16))
+def test_driven_and_null_directions_project_onto_complements(rank: int, wheels: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    directions = np.linalg.qr(rng.normal(size=(wheels, wheels)))[0][:rank]
+    span = driven_span([run_at(3.0 * direction) for direction in directions])
+    assert len(span.driven) == rank
+    both = np.vstack([span.driven, span.null])
+    np.testing.assert_allclose(both @ both.T, np.eye(wheels), atol=1e-12)
+    np.testing.assert_allclose(span.null @ directions.T, 0, atol=1e-12)
+
+
+def test_shares_are_of_the_direction_that_is_driven_most() -> None:
+    span = driven_span([run_at(np.array([4.0, 0, 0])), run_at(np.array([0, 1.0, 0]))])
+    np.testing.assert_allclose(span.shares, [1.0, 0.25, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("poses", [2, 3])
+def test_few_increments_still_give_a_direction_for_every_wheel(poses: int) -> None:
+    span = driven_span([run_at(np.array([1.0, 2.0, 2.0, 0.0]), poses=poses)])
+    assert (span.driven.shape, span.null.shape, span.shares.shape) == ((1, 4), (3, 4), (4,))
+    np.testing.assert_allclose(np.abs(span.driven[0]), [1 / 3, 2 / 3, 2 / 3, 0], atol=1e-12)
+
+
+def test_wheels_that_never_turn_drive_nothing() -> None:
+    span = driven_span([run_at(np.zeros(3))])
+    assert (span.driven.shape, span.null.shape) == ((0, 3), (3, 3))
+
+
+def test_hundreds_of_thousands_of_poses_are_no_burden() -> None:
+    samples = 300_000
+    rates = np.random.default_rng(0).normal(size=(samples, 3))
+    times = 0.01 * np.arange(1, samples + 1)
+    stamps = np.append(0.0, times)
+    span = driven_span([Trajectory("long", "train", times, rates, stamps, np.zeros((samples + 1, 3)))])
+    assert span.driven.shape == (3, 3)
+
+
+def test_no_trajectories_are_refused() -> None:
+    with pytest.raises(DataError, match="no trajectories"):
+        driven_span([])

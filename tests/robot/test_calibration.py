@@ -1,0 +1,220 @@
+"""The calibration file, omnibench-calibration/1."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from omnibench.errors import DataError, OmnibenchError
+from omnibench.registry import Options, effects
+from omnibench.robot.calibration import (
+    Calibration,
+    EffectTerm,
+    Noise,
+    Provenance,
+    matrix_rows,
+    read_calibration,
+    write_calibration,
+)
+from omnibench.robot.kinematics import Robot, Wheel
+from omnibench.robot.published import published_matrix
+
+ROBOT = Robot(
+    name="APR-02",
+    wheels=tuple(
+        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle))
+        for name, angle in zip("abc", (60, 180, 300), strict=True)
+    ),
+)
+PROVENANCE = Provenance(
+    dataset="flower",
+    dataset_hash="0123abcd",
+    simulated=True,
+    calibrator="closed_form",
+    options={"tolerance": 1e-9, "programs": 50},
+    seed=7,
+    cost="final_pose",
+    box="paper",
+    versions={"numpy": "2.4.6"},
+    training_cost=0.0215,
+    validation_cost=0.0228,
+    outcome="converged",
+    reason="step below 1e-09 after 4 cone programs: done",
+)
+
+
+def a_calibration(**changes: Any) -> Calibration:
+    given_values: dict[str, Any] = {
+        "name": "flower closed_form",
+        "robot": ROBOT,
+        "sample_period": 0.01,
+        "matrix": matrix_rows(published_matrix("palacin2023_eq8")),
+        "integration": "euler",
+    }
+    return Calibration(**(given_values | changes))
+
+
+def broken(folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    """A calibration file whose content was changed."""
+    file = folder / "calibration.yaml"
+    write_calibration(a_calibration(), file)
+    content = yaml.safe_load(file.read_text())
+    change(content)
+    file.write_text(yaml.safe_dump(content))
+    return file
+
+
+number = st.floats(-1e3, 1e3)  # larger ones are refused
+row = st.tuples(number, number, number)
+
+
+@given(matrix=st.tuples(row, row, row), period=st.floats(min_value=0, exclude_min=True, allow_infinity=False))
+def test_matrix_and_period_come_back_to_the_last_bit(
+    tmp_path_factory: pytest.TempPathFactory, matrix: Any, period: float
+) -> None:
+    file = tmp_path_factory.getbasetemp() / "bits.yaml"
+    write_calibration(a_calibration(matrix=matrix, sample_period=period), file)
+    found = read_calibration(file)
+    assert found.matrix_array.tobytes() == np.array(matrix).tobytes()
+    assert found.sample_period == period
+
+
+def test_everything_in_a_calibration_comes_back(tmp_path: Path) -> None:
+    covariance = np.random.default_rng(0).normal(size=(9, 9))
+    written = a_calibration(
+        integration="arc",
+        created=datetime(2023, 1, 12, 13, 14, 15, tzinfo=UTC),
+        noise=Noise(pose_position=0.0055, walk_heading=1 / 3),
+        covariance=tuple(tuple(values) for values in (covariance @ covariance.T).tolist()),
+        session="2023-01-12",
+        provenance=PROVENANCE,
+    )
+    write_calibration(written, tmp_path / "calibration.yaml")
+    assert read_calibration(tmp_path / "calibration.yaml") == written
+
+
+@pytest.mark.usefixtures("registries_as_before")
+def test_a_known_effect_comes_back_with_its_parameters(tmp_path: Path) -> None:
+    @effects.register("slip")
+    class Slip:
+        """Wheels that slip."""
+
+        Options = Options
+
+    written = a_calibration(effects=(EffectTerm(name="slip", parameters={"k": 0.1, "tau": 1 / 3}),))
+    write_calibration(written, tmp_path / "calibration.yaml")
+    assert read_calibration(tmp_path / "calibration.yaml") == written
+
+
+def test_the_file_holds_what_the_design_says(tmp_path: Path) -> None:
+    write_calibration(a_calibration(provenance=PROVENANCE), tmp_path / "calibration.yaml")
+    content = yaml.safe_load((tmp_path / "calibration.yaml").read_text())
+    assert content["format"] == "omnibench-calibration/1"
+    assert list(content) == [
+        *("format", "name", "created", "robot", "sample_period", "matrix", "integration", "effects"),
+        *("noise", "covariance", "session", "provenance"),
+    ]
+
+
+def test_the_model_of_a_calibration_has_its_matrix_and_integration() -> None:
+    model = a_calibration(integration="arc").model
+    assert model.integration == "arc"
+    np.testing.assert_array_equal(model.matrix, published_matrix("palacin2023_eq8"))
+
+
+def test_a_calibration_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    write_calibration(a_calibration(), file)
+    before = file.read_text()
+    (tmp_path / "a_file").write_text("")
+    with pytest.raises(DataError, match="cannot be written"):
+        write_calibration(a_calibration(), tmp_path / "a_file" / "calibration.yaml")
+    assert file.read_text() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a_file", "calibration.yaml"]
+
+
+def put(key: str, value: Any) -> Callable[[dict[str, Any]], object]:
+    return lambda content: content.update({key: value})
+
+
+def rows(*lengths: int) -> list[list[float]]:
+    return [[0.1] * length for length in lengths]
+
+
+REFUSED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "an unknown key": (put("matrixx", 1), "unknown key 'matrixx'; did you mean 'matrix'?"),
+    "an unknown key within": (
+        lambda content: content["robot"]["wheels"][1].update(radios=1),
+        "unknown key 'robot.wheels.1.radios'; did you mean 'radius'?",
+    ),
+    "another format": (put("format", "omnibench-dataset/1"), "format is 'omnibench-dataset/1', expected"),
+    "no format": (lambda content: content.pop("format"), "format is None, expected 'omnibench-calibration/1'"),
+    "a missing key": (lambda content: content.pop("integration"), "key 'integration' is missing"),
+    "a row too short": (put("matrix", rows(3, 2, 3)), "row 2 of the matrix has 2 values, the robot has 3 wheels"),
+    "a row too few": (put("matrix", rows(3, 3)), "key 'matrix.2' is missing"),
+    "a row too many": (put("matrix", rows(3, 3, 3, 3)), "matrix: "),
+    "NaN in the matrix": (put("matrix", [[math.nan] * 3] * 3), "matrix.0.0: Input should be a finite number"),
+    "infinity in the matrix": (put("matrix", [[math.inf] * 3] * 3), "matrix.0.0: Input should be a finite number"),
+    "text in the matrix": (put("matrix", [["x"] * 3] * 3), "matrix.0.0: "),
+    "a covariance of another shape": (put("covariance", rows(*[3] * 3)), "covariance is not 9 x 9"),
+    "NaN in the noise": (put("noise", {"pose_position": math.nan}), "noise.pose_position: "),
+    "negative noise": (put("noise", {"walk_heading": -0.1}), "noise.walk_heading: "),
+    "a period of zero": (put("sample_period", 0), "sample_period: "),
+    "an infinite period": (put("sample_period", math.inf), "sample_period: "),
+    "an unknown integration": (put("integration", "runge_kutta"), "integration: "),
+    "an unknown effect": (put("effects", [{"name": "sllip"}]), "unknown effect 'sllip'; "),
+    "an infinite parameter of an effect": (
+        put("effects", [{"name": "slip", "parameters": {"k": math.inf}}]),
+        "effects.0.parameters.k: ",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_file_that_is_wrong_is_refused_in_one_line_that_names_it(tmp_path: Path, case: str) -> None:
+    change, words = REFUSED[case]
+    file = broken(tmp_path, change)
+    with pytest.raises(DataError) as refusal:
+        read_calibration(file)
+    assert str(refusal.value).startswith(f"{file}: ")
+    assert words in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.usefixtures("registries_as_before")
+def test_an_unknown_effect_is_answered_with_the_nearest_one(tmp_path: Path) -> None:
+    effects.register("centripetal_slip")(type("Slip", (), {"Options": Options}))
+    file = broken(tmp_path, put("effects", [{"name": "centripetal_slipp"}]))
+    with pytest.raises(OmnibenchError, match="did you mean 'centripetal_slip'"):
+        read_calibration(file)
+
+
+@pytest.mark.parametrize("content", ["", "- a\n- b\n", "just text", "a: [1"])
+def test_a_file_that_is_no_mapping_is_refused_in_one_line_that_names_it(tmp_path: Path, content: str) -> None:
+    file = tmp_path / "calibration.yaml"
+    file.write_text(content)
+    with pytest.raises(DataError) as refusal:
+        read_calibration(file)
+    assert str(file) in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"missing\.yaml: no such file"):
+        read_calibration(tmp_path / "missing.yaml")
+
+
+def test_binary_content_is_refused_in_one_line_that_names_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    file.write_bytes(b"\x89PNG\xff\xfe\x00\x01")
+    with pytest.raises(DataError, match=r"calibration\.yaml: cannot be read"):
+        read_calibration(file)

@@ -1,0 +1,291 @@
+"""Odometry: Eq. (1) and (2), exact arcs, batches, streams and derivatives."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import Integration, OdometryBatch, OdometryStream, WheelLog
+from omnibench.robot.published import published_matrix
+
+BOTH: tuple[Integration, ...] = ("euler", "arc")
+ROBOT = Robot(
+    name="APR-02",
+    wheels=tuple(
+        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle))
+        for name, angle in zip("abc", (60, 180, 300), strict=True)
+    ),
+)
+MATRIX = published_matrix("palacin2023_eq8")
+
+
+def a_log(seed: int, samples: int = 40, stamps: int = 7, wheels: int = 3) -> WheelLog:
+    """Random rates, irregular samples, and stamps anywhere from 0 on, some of them within one sample."""
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(rng.uniform(0.002, 0.2, samples))
+    inside = np.sort(rng.uniform(0, times[-1], stamps - 2))
+    return WheelLog(
+        times=times,
+        rates=rng.normal(0, 4, (samples, wheels)),
+        start=rng.normal(0, 2, 3),
+        stamps=np.concatenate([[0.0], inside, times[-1:]]),
+    )
+
+
+def at_the_end(log: WheelLog) -> WheelLog:
+    return replace(log, stamps=log.times[-1:])
+
+
+def constant_twist(twist: Array, times: Array, stamps: Array, start: Array | None = None) -> WheelLog:
+    rates = np.tile(np.linalg.solve(MATRIX, twist), (len(times), 1))
+    return WheelLog(times, rates, np.zeros(3) if start is None else start, stamps)
+
+
+def on_the_circle(twist: Array, stamps: Array, start: Array) -> Array:
+    """Poses (S, 3) of a robot that keeps its twist."""
+    vx, vy, w = twist
+    turned = w * stamps
+    # The integral of exp(i w t); its limit for w = 0 is t.
+    arc = stamps if w == 0 else np.expm1(1j * turned) / (1j * w)
+    path = (vx + 1j * vy) * arc * np.exp(1j * start[2])
+    return np.column_stack([start[0] + path.real, start[1] + path.imag, start[2] + turned])
+
+
+def streamed(log: WheelLog, matrix: Array, integration: Integration) -> Array:
+    """Poses (S, 3) at the stamps, sample by sample; a stamp within a sample is a shorter sample."""
+    poses = []
+    for stamp in log.stamps:
+        stream, before = OdometryStream(matrix, integration, log.start), 0.0
+        for time, rates in zip(log.times, log.rates, strict=True):
+            stream.step(rates, min(time, stamp) - before)
+            before = min(time, stamp)
+        poses.append(stream.pose)
+    return np.array(poses)
+
+
+def eq_1_and_2(log: WheelLog, matrix: Array) -> Array:
+    """The pose (3,) after the last sample, as the article writes it."""
+    pose, before = log.start, 0.0
+    for time, rates in zip(log.times, log.rates, strict=True):
+        cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+        rotation = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        pose = pose + (time - before) * rotation @ matrix @ rates
+        before = time
+    return pose
+
+
+def test_euler_is_eq_1_and_2_as_written() -> None:
+    log = at_the_end(a_log(1))
+    (pose,) = OdometryBatch([log], "euler").poses(MATRIX[None])[0]
+    np.testing.assert_allclose(pose, eq_1_and_2(log, MATRIX), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("integration", BOTH)
+@given(seed=st.integers(0, 2**32 - 1), samples=st.integers(1, 60), stamps=st.integers(2, 12))
+def test_a_batch_equals_a_stream(integration: Integration, seed: int, samples: int, stamps: int) -> None:
+    log = a_log(seed, samples, stamps)
+    poses = OdometryBatch([log], integration).poses(MATRIX[None])[0]
+    np.testing.assert_allclose(poses, streamed(log, MATRIX, integration), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("integration", BOTH)
+@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0, 1))
+def test_one_stamp_within_the_last_sample_equals_a_stream(integration: Integration, seed: int, share: float) -> None:
+    log = a_log(seed, samples=12)
+    log = replace(log, stamps=log.times[-2:-1] + share * np.diff(log.times[-2:]))
+    poses = OdometryBatch([log], integration).poses(MATRIX[None])[0]
+    np.testing.assert_allclose(poses, streamed(log, MATRIX, integration), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("integration", BOTH)
+def test_a_final_stamp_gives_the_same_pose_alone_and_among_others(integration: Integration) -> None:
+    log = a_log(2)
+    among_others = OdometryBatch([log], integration).poses(MATRIX[None])[0, -1]
+    alone = OdometryBatch([at_the_end(log)], integration).poses(MATRIX[None])[0, 0]
+    np.testing.assert_allclose(alone, among_others, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("integration", BOTH)
+@pytest.mark.parametrize("wheels", [3, 4, 6])
+def test_any_number_of_wheels_streams_as_in_a_batch(integration: Integration, wheels: int) -> None:
+    matrix = np.random.default_rng(5).normal(0, 0.1, (3, wheels))
+    log = a_log(3, wheels=wheels)
+    poses = OdometryBatch([log], integration).poses(matrix[None])[0]
+    np.testing.assert_allclose(poses, streamed(log, matrix, integration), rtol=0, atol=1e-12)
+
+
+@given(
+    velocity=st.tuples(st.floats(-1, 1), st.floats(-1, 1)),
+    turn=st.floats(-3, 3).filter(lambda w: w == 0 or abs(w) > 1e-100),
+    seed=st.integers(0, 2**32 - 1),
+    samples=st.integers(1, 30),
+)
+def test_arcs_lie_on_the_circle_whatever_the_sampling(
+    velocity: tuple[float, float], turn: float, seed: int, samples: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(rng.uniform(0.01, 0.5, samples))
+    stamps = np.sort(rng.uniform(0, times[-1], 5))
+    start, twist = rng.normal(0, 1, 3), np.array([*velocity, turn])
+    poses = OdometryBatch([constant_twist(twist, times, stamps, start)], "arc").poses(MATRIX[None])[0]
+    np.testing.assert_allclose(poses, on_the_circle(twist, stamps, start), rtol=0, atol=1e-12)
+
+
+def test_arcs_pass_smoothly_from_turning_to_straight() -> None:
+    times = np.arange(0.1, 3.05, 0.1)
+    logs = [constant_twist(np.array([0.3, 0.1, w]), times, times[-1:]) for w in (0.0, 1e-300, 1e-16, 1e-10)]
+    poses = OdometryBatch(logs, "arc").poses(MATRIX[None])[0]
+    np.testing.assert_allclose(poses, np.tile(poses[0], (4, 1)), rtol=0, atol=1e-9)
+
+
+def test_euler_comes_to_the_arc_at_first_order_in_the_period() -> None:
+    twist, stamps, start = np.array([0.2, 0.1, 0.35]), np.array([6.0]), np.zeros(3)
+    errors = []
+    for samples in (300, 600, 1200, 2400):
+        times = np.arange(1, samples + 1) * (6.0 / samples)
+        poses = OdometryBatch([constant_twist(twist, times, times[-1:])], "euler").poses(MATRIX[None])[0]
+        errors.append(np.linalg.norm(poses - on_the_circle(twist, stamps, start)))
+    np.testing.assert_allclose(np.divide(errors[1:], errors[:-1]), 0.5, atol=2e-3)
+
+
+def test_euler_and_arc_agree_on_the_heading() -> None:
+    logs = [a_log(seed) for seed in range(3)]
+    euler, arc = (OdometryBatch(logs, each).poses(MATRIX[None])[0, :, 2] for each in BOTH)
+    np.testing.assert_array_equal(euler, arc)
+
+
+@pytest.mark.parametrize("integration", BOTH)
+@given(angle=st.floats(-10, 10), seed=st.integers(0, 2**16))
+def test_rotating_the_start_pose_rotates_the_path(integration: Integration, angle: float, seed: int) -> None:
+    log = a_log(seed, samples=10)
+    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    turned = replace(log, start=np.append(rotation @ log.start[:2], log.start[2] + angle))
+    plain, rotated = (OdometryBatch([each], integration).poses(MATRIX[None])[0] for each in (log, turned))
+    np.testing.assert_allclose(rotated[:, :2], plain[:, :2] @ rotation.T, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(rotated[:, 2], plain[:, 2] + angle, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("integration", BOTH)
+@pytest.mark.parametrize("final_only", [True, False])
+def test_trajectories_of_any_lengths_share_a_batch(integration: Integration, final_only: bool) -> None:
+    logs = [a_log(seed, samples, stamps=3 + seed) for seed, samples in enumerate((3, 200, 1, 57))]
+    logs = [at_the_end(log) for log in logs] if final_only else logs
+    together = OdometryBatch(logs, integration)
+    poses = together.poses(MATRIX[None])[0]
+    for index, log in enumerate(logs):
+        alone = OdometryBatch([log], integration).poses(MATRIX[None])[0]
+        np.testing.assert_allclose(poses[together.trajectory == index], alone, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("integration", BOTH)
+@pytest.mark.parametrize("final_only", [True, False])
+def test_a_population_is_evaluated_as_one_at_a_time(integration: Integration, final_only: bool) -> None:
+    logs = [a_log(seed, samples=900) for seed in range(8)]
+    batch = OdometryBatch([at_the_end(log) for log in logs] if final_only else logs, integration)
+    population = MATRIX * np.random.default_rng(0).uniform(0.9, 1.1, (50, 3, 3))  # several blocks
+    one_at_a_time = np.concatenate([batch.poses(matrix[None]) for matrix in population])
+    np.testing.assert_allclose(batch.poses(population), one_at_a_time, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("integration", BOTH)
+def test_a_candidate_that_is_nan_leaves_the_others_alone(integration: Integration) -> None:
+    batch = OdometryBatch([at_the_end(a_log(seed)) for seed in range(4)], integration)
+    population = np.array([MATRIX, np.full((3, 3), np.nan), MATRIX])
+    with np.errstate(all="ignore"):
+        first, spoilt, last = batch.poses(population)
+    assert np.isnan(spoilt).all()
+    np.testing.assert_allclose(first, batch.poses(MATRIX[None])[0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(last, first, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("integration", BOTH)
+@pytest.mark.parametrize("final_only", [True, False])
+def test_a_stamp_after_the_last_sample_has_the_pose_at_its_end(integration: Integration, final_only: bool) -> None:
+    log = a_log(6)
+    late = replace(log, stamps=log.times[-1:] + 5.0 if final_only else np.append(log.stamps, log.times[-1] + 5.0))
+    pose = OdometryBatch([late], integration).poses(MATRIX[None])[0, -1]
+    np.testing.assert_allclose(pose, streamed(at_the_end(log), MATRIX, integration)[0], rtol=0, atol=1e-12)
+
+
+def test_a_stamp_at_zero_has_the_start_pose() -> None:
+    log = a_log(7)
+    np.testing.assert_array_equal(OdometryBatch([log], "arc").poses(MATRIX[None])[0, 0], log.start)
+
+
+@pytest.mark.parametrize("integration", BOTH)
+def test_headings_are_not_wrapped(integration: Integration) -> None:
+    times = np.arange(0.1, 60.05, 0.1)
+    log = constant_twist(np.array([0.0, 0.0, 1.0]), times, times[-1:])
+    assert OdometryBatch([log], integration).poses(MATRIX[None])[0, 0, 2] == pytest.approx(60.0, abs=1e-9)
+
+
+def test_driven_angles_add_up_to_each_stamp() -> None:
+    log = a_log(8)
+    within = np.clip(log.stamps[:, None] - np.append(0.0, log.times[:-1]), 0.0, np.diff(log.times, prepend=0.0))
+    np.testing.assert_allclose(OdometryBatch([log], "arc").driven, within @ log.rates, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("integration", BOTH)
+@pytest.mark.parametrize("final_only", [True, False])
+@pytest.mark.parametrize("wheels", [3, 4])
+def test_the_jacobian_equals_central_differences(integration: Integration, final_only: bool, wheels: int) -> None:
+    logs = [a_log(seed, samples=30, wheels=wheels) for seed in range(3)]
+    logs[1] = replace(logs[1], rates=np.zeros((30, wheels)))  # the arc of a robot at rest has its own branch
+    batch = OdometryBatch([at_the_end(log) for log in logs] if final_only else logs, integration)
+    matrix = np.random.default_rng(1).normal(0, 0.1, (3, wheels))
+    step = 1e-5
+    shifts = step * np.eye(3 * wheels).reshape(-1, 3, wheels)
+    differences = (batch.poses(matrix + shifts) - batch.poses(matrix - shifts)) / (2 * step)
+    expected = np.moveaxis(differences, 0, -1).reshape(-1, 3, 3, wheels)
+    np.testing.assert_allclose(batch.jacobian(matrix), expected, rtol=0, atol=1e-7)
+
+
+@given(turn=st.floats(1e-9, 0.1))
+def test_the_jacobian_of_an_arc_has_no_seam_near_straight_runs(turn: float) -> None:
+    # sinc's slope is a series below half turns of 1e-2 rad and a quotient above.
+    log = WheelLog(np.array([1.0]), np.linalg.solve(MATRIX, [0.3, 0.1, turn])[None], np.zeros(3), np.array([1.0]))
+    batch = OdometryBatch([log], "arc")
+    step = 1e-4
+    shift = np.zeros((3, 3))
+    shift[2, 0] = step
+    expected = (batch.poses((MATRIX + shift)[None]) - batch.poses((MATRIX - shift)[None]))[0, 0] / (2 * step)
+    np.testing.assert_allclose(batch.jacobian(MATRIX)[0, :, 2, 0], expected, rtol=0, atol=1e-7)
+
+
+def test_positions_are_linear_in_rows_1_and_2_once_the_headings_are_known() -> None:
+    logs = [a_log(seed, samples) for seed, samples in ((1, 40), (2, 7))]
+    batch = OdometryBatch(logs, "euler")
+    headings = [
+        log.start[2] + np.append(0.0, np.cumsum(log.rates @ MATRIX[2] * np.diff(log.times, prepend=0.0))[:-1])
+        for log in logs
+    ]
+    path = batch.position_design(headings) @ (MATRIX[0] + 1j * MATRIX[1])
+    starts = np.array([log.start for log in logs])[batch.trajectory]
+    positions = starts[:, :2] + np.column_stack([path.real, path.imag])
+    np.testing.assert_allclose(positions, batch.poses(MATRIX[None])[0, :, :2], rtol=0, atol=1e-12)
+
+
+def test_a_model_gives_the_poses_of_each_log_by_itself() -> None:
+    logs = [a_log(1, stamps=4), a_log(2, stamps=9)]
+    model = OdometryModel(ROBOT, MATRIX, "arc")
+    for log, poses in zip(logs, model.poses(logs), strict=True):
+        np.testing.assert_allclose(poses, streamed(log, MATRIX, "arc"), rtol=0, atol=1e-12)
+
+
+def test_a_models_stream_starts_at_the_origin_unless_told() -> None:
+    model = OdometryModel.of_design(ROBOT, "arc")
+    np.testing.assert_array_equal(model.stream().pose, np.zeros(3))
+    np.testing.assert_array_equal(model.stream(np.array([1.0, 2.0, 3.0])).pose, [1.0, 2.0, 3.0])
+
+
+def test_a_stream_does_not_change_the_start_it_was_given() -> None:
+    start = np.zeros(3)
+    OdometryStream(MATRIX, "arc", start).step(np.ones(3), 0.1)
+    np.testing.assert_array_equal(start, np.zeros(3))

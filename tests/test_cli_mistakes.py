@@ -1,0 +1,206 @@
+"""A user's mistake and a disk that refuses: one line on standard error, exit code 2, nothing lost."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from commands import (
+    COMMAND,
+    ENVIRONMENT,
+    Command,
+    Prepared,
+    assert_refused,
+    commands_of_this_process,
+    omnibench,
+    prepare,
+)
+
+from omnibench.data.storage import load_dataset
+
+pytestmark = pytest.mark.usefixtures("registries_as_before")
+
+
+@pytest.fixture
+def command(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
+    """Commands, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return commands_of_this_process(capfd, monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
+    return prepare(tmp_path_factory.mktemp("prepared"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["compre"], ["No such command 'compre'. Did you mean 'compare'? (see omnibench --help)"]),
+        (["compare"], ["Missing argument 'config'", "(see omnibench compare --help)"]),
+        (["compare", "a.yaml", "b.yaml"], ["unexpected extra argument"]),
+        (["compare", "nowhere.yaml"], ["nowhere.yaml: no such file"]),
+        (["compare", "CONFIG", "--outptu", "x"], ["No such option", "--output"]),
+        (["compare", "CONFIG", "--output"], ["--output"]),
+        (["compare", "CONFIG", "--data", "nowhere"], ["--data nowhere: no such file or folder"]),
+        (["compare", "CONFIG", "--data", "flower=nowhere"], ["--data flower=nowhere: no such file or folder"]),
+        (["compare", "CONFIG", "--data", "flwer=DATA"], ["unknown data set 'flwer'; did you mean 'flower'?"]),
+        (["compare", "CONFIG", "--data", "CONFIG"], ["no such folder; a data set is a folder with dataset.yaml in it"]),
+        (["compare", "CONFIG", "--plugins", "nowhere"], ["plug-in folder ", "nowhere does not exist"]),
+        (["compare", "CONFIG", "--output", "x" * 300], ["File name too long"]),
+        (["compare", "."], [".: cannot be read: "]),
+        (["compare", "DATA/dataset.yaml"], ["unknown key 'format'"]),
+        (["calibrate", "DATA"], ["say where the calibration goes: -o calibration.yaml"]),
+        (["calibrate", "nowhere", "-o", "x"], ["nowhere: no such folder"]),
+        (
+            ["calibrate", "DATA", "-o", "x", "--calibrator", "crss"],
+            ["--calibrator: unknown calibrator 'crss'; did you"],
+        ),
+        (["calibrate", "DATA", "-o", "x", "--cost", "final"], ["--cost: unknown cost 'final'; did you mean 'final_"]),
+        (["calibrate", "DATA", "-o", "x", "--box", "papr"], ["--box", "'papr' is not one of 'paper', 'row'"]),
+        (["calibrate", "DATA", "-o", "x", "--seed", "-1"], ["--seed"]),
+        (["calibrate", "DATA", "-o", "x", "--evaluations", "many"], ["--evaluations", "valid integer"]),
+        (["calibrate", "DATA", "-o", "x", "--seconds", "nan"], ["--seconds"]),
+        (["calibrate", "DATA", "-o", "x", "--set", "tolerance"], ["--set tolerance: expected KEY=VALUE"]),
+        (["calibrate", "DATA", "-o", "x", "--set", "=3"], ["--set =3: expected KEY=VALUE"]),
+        (["calibrate", "DATA", "-o", "x", "--set", "tolerance=["], ["--set tolerance=[: not valid YAML"]),
+        (["calibrate", "DATA", "-o", "x", "--set", "a=2023-99-99"], ["--set a=2023-99-99: not valid YAML: month must"]),
+        (
+            ["calibrate", "DATA", "-o", "x", "--set", "tolerence=1"],
+            ["unknown key 'tolerence'; did you mean 'tolerance'"],
+        ),
+        (["calibrate", "DATA", "-o", "DATA"], ["cannot be written: Is a directory"]),
+        (["calibrate", "DATA", "-o", "CONFIG/x"], ["cannot be written", "small.yaml is not a folder"]),
+        (["evaluate", "CALIBRATION"], ["Missing argument 'dataset'"]),
+        (["evaluate", "CONFIG", "DATA"], ["format is None, expected 'omnibench-calibration/1'"]),
+        (["evaluate", "nowhere.yaml", "DATA"], ["nowhere.yaml: no such file"]),
+        (["evaluate", "CALIBRATION", "nowhere"], ["nowhere: no such folder"]),
+        (["export", "CALIBRATION"], ["Missing option '--to'"]),
+        (["export", "CALIBRATION", "--to", "c_heder"], ["unknown export format 'c_heder'; did you mean 'c_header'?"]),
+        (["export", "CALIBRATION", "--to", "c_header", "-o", "CONFIG/x"], ["small.yaml is not a folder"]),
+        (["simulate", "CONFIG"], ["Missing option"]),
+        (["simulate", "CONFIG", "-o", "CONFIG"], ["is a file; name a folder for the data set"]),
+        (["simulate", "CONFIG", "-o", "CONFIG/x"], ["cannot be written", "is not a folder"]),
+        (["simulate", "CONFIG", "-o", "x", "--truth", "x"], ["--truth: must be a folder apart from the data set's"]),
+        (["simulate", "CONFIG", "-o", "x", "--dataset", "flour"], ["unknown simulated data set 'flour'; did you mean"]),
+        (["simulate", "CONFIG", "-o", "x", "--format", "xml"], ["'xml' is not one of 'parquet', 'csv'"]),
+        (["import", "csvv", "DATA", "-o", "x"], ["import: unknown importer 'csvv'; did you mean 'csv'?"]),
+        (["import", "optiodom", "nowhere", "-o", "x"], ["nowhere: no such file or folder"]),
+        (["import", "table1", "DATA", "-o", "x", "--set", "splt=1"], ["unknown key 'splt'"]),
+        (["inspect", "CONFIG"], ["no such folder; a data set is a folder with dataset.yaml in it"]),
+        (["list", "--plugins", "nowhere"], ["plug-in folder nowhere does not exist"]),
+        (["plugin", "new"], ["Missing argument 'name'"]),
+        (["plugin", "new", "My-Search"], ["'My-Search' cannot name a plug-in"]),
+        (["plugin", "new", "mine", "--kind", "costt"], ["unknown kind of plug-in 'costt'; did you mean 'cost'?"]),
+        (["plugin", "check", "nowhere.py"], ["nowhere.py: no such file"]),
+        (["plugin", "chek", "x"], ["No such command 'chek'"]),
+    ],
+    ids=lambda value: " ".join(value)[:50],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(
+    arguments: list[str], parts: list[str], command: Command, prepared: Prepared
+) -> None:
+    places = {"CONFIG": prepared.config, "DATA": prepared.data, "CALIBRATION": prepared.calibration}
+
+    def placed(argument: str) -> str:
+        for name, path in places.items():
+            argument = argument.replace(name, str(path))
+        return argument
+
+    assert_refused(command(*map(placed, arguments)), *parts)
+
+
+@pytest.mark.parametrize(
+    ("table", "damage", "part"),
+    [
+        ("wheels", lambda text: text.replace("omega_b", "omega_x", 1), "wheels.csv: "),
+        ("wheels", lambda text: text.replace("train-001,0.1,", "train-001,nan,", 1), "wheels.csv, row 2: "),
+        ("wheels", lambda text: text.replace("train-001,0.05,", "train-001,0.0,", 1), "wheels.csv, row 1: "),
+        ("poses", lambda text: text.replace("train-002,", "train-001,"), "train-00"),
+        ("poses", lambda text: text.replace("train-001,0.5,", "train-001,0.1,", 1), "poses.csv, row 3: "),
+        ("trajectories", lambda text: text.replace("train-002,", "train-001,", 1), "trajectories.csv, row 2: "),
+        ("trajectories", lambda text: text.replace(",train,train", ",training,train", 1), "trajectories.csv, row 1: "),
+        ("dataset", lambda text: text.replace("sample_period", "sample_perid"), "did you mean 'sample_period'?"),
+        ("dataset", lambda text: text.replace("dataset/1", "dataset/2"), "omnibench-dataset/1"),
+    ],
+)
+def test_a_reading_rule_reaches_the_user_as_one_line(
+    table: str, damage: Callable[[str], str], part: str, command: Command, prepared: Prepared, tmp_path: Path
+) -> None:
+    assert command("simulate", prepared.config, "-o", tmp_path / "data", "--format", "csv").returncode == 0
+    file = tmp_path / "data" / f"{table}.{'yaml' if table == 'dataset' else 'csv'}"
+    whole = file.read_text()
+    file.write_text(damage(whole))
+    assert file.read_text() != whole
+    assert_refused(command("inspect", tmp_path / "data"), part)
+    assert_refused(command("compare", prepared.config, "--data", tmp_path / "data", "--output", tmp_path / "out"), part)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_mistake_is_one_line_in_a_real_process_too(tmp_path: Path) -> None:
+    assert_refused(omnibench("compare", tmp_path / "nowhere.yaml"), "nowhere.yaml: no such file")
+
+
+def test_nothing_typed_shows_the_help(command: Command) -> None:
+    printed = command()
+    assert printed.returncode == 2
+    assert printed.stderr.startswith("Usage: omnibench [OPTIONS] COMMAND")
+    assert "\n  compare " in printed.stderr
+    assert printed.stdout == ""
+
+
+def test_a_reader_that_has_gone_is_no_error(prepared: Prepared) -> None:
+    shell = f"{COMMAND[0]} -m omnibench.cli inspect {prepared.data} --json | true; exit ${{PIPESTATUS[0]}}"
+    run = subprocess.run(
+        ["bash", "-c", shell], env=ENVIRONMENT, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert run.returncode in (0, 1)
+    assert run.stderr == ""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_a_full_disk_behind_standard_output_is_one_line() -> None:
+    with open("/dev/full", "w") as full:
+        run = subprocess.run(
+            [*COMMAND, "schema"],
+            env=ENVIRONMENT,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert (run.returncode, run.stderr) == (2, "error: output: No space left on device\n")
+
+
+@pytest.mark.parametrize("name", ["simulate", "calibrate", "plugin"])
+def test_a_full_disk_is_one_line_and_leaves_no_half_file(name: str, prepared: Prepared, tmp_path: Path) -> None:
+    arguments: dict[str, tuple[object, ...]] = {
+        "simulate": ("simulate", prepared.config, "-o", tmp_path / "new"),
+        "calibrate": ("calibrate", prepared.data, "-o", tmp_path / "new" / "c.yaml"),
+        "plugin": ("plugin", "new", "mine", "--folder", tmp_path / "new"),
+    }
+    run = omnibench(*arguments[name], preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100)))
+    assert_refused(run, str(tmp_path / "new"), "cannot be written: File too large; free space or choose another place")
+    assert [file for file in (tmp_path / "new").rglob("*") if file.is_file()] == []
+
+
+def test_a_data_set_that_does_not_fit_leaves_the_one_that_was_there(prepared: Prepared, tmp_path: Path) -> None:
+    assert omnibench("simulate", prepared.config, "-o", tmp_path / "data", "--format", "csv").returncode == 0
+    before = load_dataset(tmp_path / "data").hash
+    run = omnibench(
+        *("simulate", prepared.config, "-o", tmp_path / "data"),
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100)),
+    )
+    assert run.returncode == 2
+    assert load_dataset(tmp_path / "data").hash == before
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_without_permission_is_one_line(prepared: Prepared, tmp_path: Path) -> None:
+    (tmp_path / "locked").mkdir(mode=0o500)
+    assert_refused(omnibench("simulate", prepared.config, "-o", tmp_path / "locked" / "x"), "Permission denied")
