@@ -6,6 +6,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager, redirect_stdout
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
 
@@ -125,7 +126,7 @@ def calibrate(
     if result.at_bounds:
         _warn([f"{', '.join(result.at_bounds)} lie on a bound of the box {box!r}; a wider box may fit better"])
     if result.held:
-        _warn([f"{', '.join(result.held)} have no width in the box {box!r} and keep their start values"])
+        _warn([f"{', '.join(result.held)} keep their start values (box {box!r}, cost {cost!r})"])
     if as_json:
         return _print_json(calibration)
     terminal.print_calibration(terminal.make_console(), run)
@@ -292,6 +293,9 @@ def plugin_check(
 
 def main() -> None:
     """Entry point: every user's mistake ends in one line and exit code 2."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without a letter shows another, and no traceback
     command = typer.main.get_command(app)
     usage_error: Any = typer.BadParameter.__mro__[1]  # click's UsageError, wherever this Typer keeps it
     try:

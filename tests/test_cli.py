@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,9 @@ import numpy as np
 import pytest
 import yaml
 from commands import (
+    COMMAND,
     CONFIGS,
+    ENVIRONMENT,
     RECORDINGS,
     Command,
     Prepared,
@@ -144,6 +148,23 @@ def test_inspect_prints_one_document(command: Command, prepared: Prepared) -> No
     assert (found["dataset"], found["trajectories"], found["simulated"]) == ("flower", 12, True)
     assert found["splits"]["train"]["trajectories"] == 6
     assert found["undriven"] == found["warnings"] == []
+
+
+def test_a_terminal_without_a_letter_shows_another(prepared: Prepared, tmp_path: Path) -> None:
+    for file in prepared.data.iterdir():
+        shutil.copy(file, tmp_path)
+    header = (tmp_path / "dataset.yaml").read_text()
+    (tmp_path / "dataset.yaml").write_text(header.replace("name: flower", "name: Größe"))
+    run = subprocess.run(
+        [*COMMAND, "inspect", str(tmp_path)],
+        env=ENVIRONMENT | {"PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (run.returncode, run.stderr) == (0, "")
+    assert run.stdout.startswith("Gr??e: simulated data")
 
 
 def test_inspect_warns_of_units_that_cannot_be_right(command: Command, prepared: Prepared, tmp_path: Path) -> None:

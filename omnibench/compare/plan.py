@@ -23,7 +23,7 @@ from omnibench.data.simulate.flower import simulate_dataset
 from omnibench.data.storage import load_dataset
 from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
 from omnibench.fit.calibrator import unloadable
-from omnibench.fit.parameterisation import ParameterisationName, held_by
+from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import make_parameterisation, training_split
 from omnibench.registry import PluginFailure, calibrators, costs, load_plugins
 
@@ -39,7 +39,6 @@ class PlannedRun:
     label: str
     parameterisation: ParameterisationName
     box: str
-    held: tuple[str, ...]
     seed: int
 
     @cached_property
@@ -61,7 +60,7 @@ class PlannedRun:
 def read_compare_config(path: Path | str, data: Mapping[str, Path] | None = None) -> CompareConfig:
     """The config at ``path`` with its paths, which are relative to it, made absolute.
 
-    ``data`` replaces the sources of data sets by name. The name "" stands for the only data set. ConfigError in one line.
+    ``data`` replaces the sources of data sets by name; the name "" stands for the only one. ConfigError in one line.
     """
     path = Path(path)
     config = read_model(CompareConfig, path)
@@ -90,10 +89,6 @@ def load_calibrators(config: CompareConfig) -> list[PluginFailure]:
         for name in missing & _names_in(Path(failure.origin)):
             calibrators.register(name)(unloadable(failure))
             missing.remove(name)
-    if missing and failures:
-        lost = "; ".join(f"plug-in {failure.origin} cannot be imported: {failure.error}" for failure in failures)
-        known = [entry.name for entry in calibrators.entries()]
-        raise PluginError(f"{UnknownNameError('calibrator', min(missing), known, f'config {config.name}')}; {lost}")
     return failures
 
 
@@ -171,12 +166,10 @@ def make_plan(config: CompareConfig, datasets: Mapping[str, Dataset]) -> list[Pl
         for entry in config.calibrators:
             cls = calibrators.entry(entry.name).cls
             parameterisation = entry.parameterisation or cls.parameterisation
-            box, held = _box(config, entry, dataset, parameterisation)
+            box = _box_name(config, entry, dataset, parameterisation)
             label = _label(config, entry, parameterisation, box, labels)
             seeds = config.seeds if cls.stochastic else config.seeds[:1]
-            plan += [
-                PlannedRun(config, name, dataset, entry, label, parameterisation, box, held, seed) for seed in seeds
-            ]
+            plan += [PlannedRun(config, name, dataset, entry, label, parameterisation, box, seed) for seed in seeds]
     return plan
 
 
@@ -184,12 +177,11 @@ def make_plan(config: CompareConfig, datasets: Mapping[str, Dataset]) -> list[Pl
 UNBOUNDED = "none"
 
 
-def _box(
+def _box_name(
     config: CompareConfig, entry: CalibratorEntry, dataset: Dataset, parameterisation: ParameterisationName
-) -> tuple[str, tuple[str, ...]]:
-    """The name of an entry's box, and the elements that it holds at their start."""
+) -> str:
     if not calibrators.entry(entry.name).cls.bounded:
-        return UNBOUNDED, ()
+        return UNBOUNDED
     try:
         searched = make_parameterisation(
             parameterisation,
@@ -198,7 +190,7 @@ def _box(
             box=entry.box or config.box,
             limits=entry.limits,
         )
-        return searched.bounds.name, held_by(searched)
+        return searched.bounds.name
     except ConfigError as error:
         raise ConfigError(f"config {config.name}: calibrator {entry.name!r}: {error}") from None
 

@@ -46,7 +46,7 @@ class RunRecord(Model):
     matrix: tuple[Row, Row, Row] | None
     parameters: tuple[FittedParameter, ...] | None
     at_bounds: tuple[str, ...]
-    held: tuple[str, ...]  # elements that the box holds at their start value
+    held: tuple[str, ...]  # elements that keep their start value: the box or the cost leaves no choice
     gap: float | None  # train_cost / exact optimum in the box ``gap_box`` - 1
     gap_box: str | None
 

@@ -18,7 +18,7 @@ from omnibench.compare.statistics import entry_statistics, is_mean
 from omnibench.compare.store import RunStore
 from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
-from omnibench.errors import Interrupted
+from omnibench.errors import ConfigError, Interrupted, UnknownNameError
 from omnibench.fit.calibrator import RunResult
 from omnibench.registry import PluginFailure
 
@@ -41,8 +41,9 @@ def run_comparison(
     user can put right, and Interrupted on Ctrl-C, when everything that had ended is kept.
     """
     failures = load_calibrators(config)
-    config = effective_config(config)
-    datasets = load_datasets(config)
+    with _blaming(failures):
+        config = effective_config(config)
+        datasets = load_datasets(config)
     plan = make_plan(config, datasets)
     folder = prepare_output(config, output)
     store = RunStore(folder / "runs")
@@ -64,6 +65,15 @@ def run_comparison(
 
 
 @contextmanager
+def _blaming(failures: Sequence[PluginFailure]) -> Iterator[None]:
+    """A name that nobody knows may be that of a plug-in which cannot be imported."""
+    try:
+        yield
+    except UnknownNameError as error:
+        raise ConfigError("; ".join([str(error), *map(_in_words, failures)])) from None
+
+
+@contextmanager
 def _resumable(plan: Sequence[PlannedRun], store: RunStore, folder: Path) -> Iterator[None]:
     """Ctrl-C says what is kept and how to go on."""
     try:
@@ -77,9 +87,12 @@ def _resumable(plan: Sequence[PlannedRun], store: RunStore, folder: Path) -> Ite
 def _warnings(
     failures: Iterable[PluginFailure], datasets: Mapping[str, Dataset], runs: Iterable[ScoredRun]
 ) -> Iterator[str]:
-    for failure in failures:
-        yield f"plug-in {failure.origin} cannot be imported: {failure.error}"
+    yield from map(_in_words, failures)
     for name, dataset in datasets.items():
         yield from (f"data set {name}: {warning}" for warning in dataset.warnings)
     if not all(is_mean(run) for run in runs):
         yield "the cost is no mean over trajectories: intervals and differences are of the mean of their own costs"
+
+
+def _in_words(failure: PluginFailure) -> str:
+    return f"plug-in {failure.origin} cannot be imported: {failure.error}"

@@ -121,7 +121,7 @@ def _score_one(run: PlannedRun, result: RunResult, scorers: Mapping[tuple[str, S
         matrix=None if matrix is None else matrix_rows(matrix),
         parameters=_parameters(run, result),
         at_bounds=result.at_bounds,
-        held=run.held,
+        held=result.held,
         gap=None,
         gap_box=None,
     )

@@ -26,6 +26,7 @@ class StoredRun(Model):
     seconds: float
     history: tuple[tuple[int, float, float], ...]
     at_bounds: tuple[str, ...]
+    held: tuple[str, ...]
 
     @classmethod
     def of(cls, result: RunResult) -> StoredRun:
@@ -40,6 +41,7 @@ class StoredRun(Model):
             seconds=result.seconds,
             history=tuple((step.evaluations, step.seconds, step.cost) for step in result.history),
             at_bounds=result.at_bounds,
+            held=result.held,
         )
 
     def result(self) -> RunResult:
@@ -54,6 +56,7 @@ class StoredRun(Model):
             seconds=self.seconds,
             history=tuple(Improvement(*row) for row in self.history),
             at_bounds=self.at_bounds,
+            held=self.held,
         )
 
 

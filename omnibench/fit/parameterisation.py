@@ -140,13 +140,6 @@ class WheelGeometry:
         return inverse_kinematic_matrices(radius, distance, angle, rollers)
 
 
-def held_by(parameterisation: Parameterisation) -> tuple[str, ...]:
-    """Names of the elements to which the box leaves no width: they keep their start value."""
-    bounds = parameterisation.bounds
-    widths = zip(parameterisation.names, bounds.lower, bounds.upper, strict=True)
-    return tuple(name for name, low, high in widths if low == high)
-
-
 @dataclass(frozen=True)
 class FittedParameter:
     """A physical parameter and how far it lies from its design value, as in section 4.2 of the paper."""

@@ -14,7 +14,7 @@ from pydantic import Field
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import DataError
-from omnibench.fit.cost import Cost
+from omnibench.fit.cost import Cost, SumOfNorms
 from omnibench.fit.parameterisation import (
     Box,
     GeometryLimits,
@@ -22,7 +22,6 @@ from omnibench.fit.parameterisation import (
     Parameterisation,
     ParameterisationName,
     WheelGeometry,
-    held_by,
 )
 from omnibench.fit.span import driven_span
 from omnibench.robot.kinematics import Array, Robot
@@ -88,11 +87,14 @@ class CalibrationProblem:
         self.rng = np.random.default_rng(seed)
         bounds = parameterisation.bounds
         self.box = bounds.name
-        self.start, self.lower, self.upper = (_frozen(v) for v in (parameterisation.start, bounds.lower, bounds.upper))
         self.names = parameterisation.names
-        self.free: NDArray[np.bool_] = _frozen(self.upper > self.lower)
         self.odometry = cost.batch(self.trajectories, integration)
         self.reference = _frozen(cost.reference(self.trajectories))
+        self.start = _frozen(parameterisation.start)
+        matters = self._matters()
+        self.lower = _frozen(np.where(matters, bounds.lower, self.start))
+        self.upper = _frozen(np.where(matters, bounds.upper, self.start))
+        self.free: NDArray[np.bool_] = _frozen(self.upper > self.lower)
         self.evaluations = 0
         self.best_vector = self.start
         self.best_cost = np.inf
@@ -168,12 +170,22 @@ class CalibrationProblem:
 
     @property
     def held(self) -> tuple[str, ...]:
-        """Names of the elements that the box holds at their start value."""
-        return held_by(self.parameterisation)
+        """Names of the elements that keep their start value: the box leaves no width, or the cost does not see them."""
+        return tuple(name for name, free in zip(self.names, self.free, strict=True) if not free)
 
     def matrix(self, vector: Array) -> Array:
         """The inverse kinematic matrix (3, N) of one vector (n,)."""
         return self.parameterisation.matrices(vector[None])[0]
+
+    def _matters(self) -> NDArray[np.bool_]:
+        """Which elements (n,) the cost depends on: a cost of headings alone sees row 3 of the matrix only."""
+        cost = self.objective
+        if not (
+            isinstance(cost, SumOfNorms) and 0.0 in cost.weights and isinstance(self.parameterisation, MatrixElements)
+        ):
+            return np.ones(len(self.start), dtype=bool)
+        slopes: Array = np.abs(self.odometry.jacobian(self.matrix(self.start))).max(axis=0)  # (3, 3, N)
+        return np.asarray((np.abs(cost.weights) @ slopes.reshape(3, -1)) > 0)
 
     def _check_budget(self) -> None:
         if self.remaining <= 0:

@@ -50,8 +50,9 @@ def driven_span(trajectories: Sequence[Trajectory]) -> DrivenSpan:
 
 
 def direction_in_words(direction: Array, wheels: Sequence[str]) -> str:
-    """A direction of wheel rates as ``a - b + 0.5 c``, scaled to its largest element."""
-    scaled = direction / np.abs(direction).max()
+    """A direction of wheel rates as ``a - b + 0.5 c``, scaled to its largest element; its sign has no meaning."""
+    large = np.abs(direction) > 0.5 * np.abs(direction).max()
+    scaled = direction * np.sign(direction[large][0]) / np.abs(direction).max()
     terms = [(value, name) for value, name in zip(scaled, wheels, strict=True) if abs(value) > 0.02]
     text = " ".join(
         f"{'-' if value < 0 else '+'} {'' if abs(abs(value) - 1) < 0.02 else f'{abs(value):.2g} '}{name}"

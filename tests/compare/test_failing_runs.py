@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from commands import compared, omnibench, rows, summary, write_config, write_plugin
+from commands import compared, compared_here, omnibench, rows, summary, write_config, write_plugin
+
+from omnibench.errors import OmnibenchError
 
 CALIBRATOR = """
 @calibrators.register("{name}")
@@ -158,17 +160,33 @@ def test_failed_runs_are_not_kept_and_the_others_are(comparison: Compared) -> No
     assert len(list((comparison.output / "runs").iterdir())) == kept
 
 
-def test_everything_failing_still_gives_results(tmp_path: Path) -> None:
+def test_when_everything_fails_there_are_results_and_exit_code_1(tmp_path: Path) -> None:
     plugins = write_plugin(tmp_path / "plugins", "raises", CALIBRATOR.format(name="raises", body=BODIES["raises"]))
-    compared(write_config(tmp_path, plugins=[str(plugins)], calibrators=["raises"]), tmp_path / "out")
+    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=["raises"])
+    run = omnibench("compare", config, "--output", tmp_path / "out")
+    assert run.returncode == 1
+    assert "Traceback" not in run.stderr
     assert rows(tmp_path / "out")["raises"]["outcome"] == "failed"
     assert (tmp_path / "out" / "report.html").is_file()
 
 
-def test_an_unknown_calibrator_beside_a_broken_plugin_names_both(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"calibrators": ["of_a_third_name"]}, "unknown calibrator 'of_a_third_name'"),
+        ({"cost": "of_a_third_name"}, "unknown cost 'of_a_third_name'"),
+        (
+            {"datasets": {"x": {"import": {"format": "of_a_third_name", "source": "."}}}},
+            "unknown importer 'of_a_third_name'",
+        ),
+    ],
+    ids=["calibrator", "cost", "importer"],
+)
+@pytest.mark.usefixtures("registries_as_before")
+def test_an_unknown_name_beside_a_broken_plugin_names_both(changes: dict[str, Any], name: str, tmp_path: Path) -> None:
     plugins = write_plugin(tmp_path / "plugins", "broken", BROKEN)
-    run = omnibench("compare", write_config(tmp_path, plugins=[str(plugins)], calibrators=["of_a_third_name"]))
-    assert run.returncode == 2
-    assert "unknown calibrator 'of_a_third_name'" in run.stderr
-    assert "broken.py cannot be imported: ModuleNotFoundError" in run.stderr
-    assert "Traceback" not in run.stderr
+    with pytest.raises(OmnibenchError) as failure:
+        compared_here(tmp_path / "out", plugins=[str(plugins)], **changes)
+    assert name in str(failure.value)
+    assert "broken.py cannot be imported: ModuleNotFoundError" in str(failure.value)
+    assert "\n" not in str(failure.value)

@@ -121,6 +121,16 @@ def test_the_best_entry_has_the_lowest_validation_cost_not_the_lowest_training_c
     assert difference.value == pytest.approx(1.0)
 
 
+def test_between_entries_within_the_noise_the_training_cost_decides_which_is_best() -> None:
+    noise = np.random.default_rng(0).normal(size=100)
+    lowest = scored("lowest", np.full(100, 2.0), 2 + 0.1 * noise)
+    level = scored("level", np.full(100, 1.0), 2 + 0.1 * noise + 1e-4)
+    worse = scored("worse", np.full(100, 0.5), 3 + 0.1 * noise)
+    entries = of([lowest, level, worse])
+    assert [label for label, entry in entries.items() if entry.is_best] == ["level"]
+    assert (entries["lowest"].practically_equal, entries["worse"].practically_equal) == (True, False)
+
+
 def test_without_validation_data_the_training_cost_decides() -> None:
     entries = of([scored("a", np.full(8, 1.0)), scored("b", np.full(8, 2.0))])
     assert (entries["a"].is_best, entries["b"].is_best) == (True, False)

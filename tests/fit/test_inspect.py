@@ -147,3 +147,9 @@ def test_a_real_recording_of_hours_is_inspected() -> None:
     assert inspection.trajectories == 67
     assert inspection.driven_directions == 3
     assert inspection.findings == ()
+
+
+def test_a_motion_that_is_hardly_driven_is_told_with_its_share() -> None:
+    runs = [replace(run, rates=run.rates - 0.95 * run.rates.mean(axis=1, keepdims=True)) for run in commanded()]
+    findings = inspect_dataset(dataset(runs)).findings
+    assert any(finding.startswith("the runs hardly drive the wheels along a + b + c (") for finding in findings)

@@ -330,3 +330,12 @@ class TestValidationData:
             assert np.ascontiguousarray(run.poses).tobytes() not in content
             assert np.ascontiguousarray(run.rates).tobytes() not in content
             assert run.id.encode() not in content
+
+
+def test_elements_that_the_cost_does_not_see_keep_their_start_values() -> None:
+    dataset = make_dataset("synthetic", synthetic_robot(3), 0.2, noisy_trajectories())
+    run = calibrate(dataset, "genetic", cost="final_heading", options={"generations": 3})
+    design = dataset.robot.inverse_kinematic_matrix
+    assert run.result.held == ("m11", "m12", "m13", "m21", "m22", "m23")
+    assert np.array_equal(run.calibration.matrix_array[:2], design[:2])
+    assert not np.array_equal(run.calibration.matrix_array[2], design[2])

@@ -164,6 +164,7 @@ REFUSED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "a row too many": (put("matrix", rows(3, 3, 3, 3)), "matrix: "),
     "NaN in the matrix": (put("matrix", [[math.nan] * 3] * 3), "matrix.0.0: Input should be a finite number"),
     "infinity in the matrix": (put("matrix", [[math.inf] * 3] * 3), "matrix.0.0: Input should be a finite number"),
+    "an element that no wheel has": (put("matrix", [[1e6] * 3] * 3), "matrix holds 1e+06, which no wheel can drive"),
     "text in the matrix": (put("matrix", [["x"] * 3] * 3), "matrix.0.0: "),
     "a covariance of another shape": (put("covariance", rows(*[3] * 3)), "covariance is not 9 x 9"),
     "NaN in the noise": (put("noise", {"pose_position": math.nan}), "noise.pose_position: "),

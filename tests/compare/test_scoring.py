@@ -1,18 +1,23 @@
-"""Gaps above the exact optimum are measured within one box."""
+"""From a run's matrix to its row: gaps are measured within one box, and costs may be a plug-in's."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from commands import small
+from commands import compared_here, small, write_plugin
+from numpy.typing import NDArray
 
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
 from omnibench.compare.results import RunRecord
-from omnibench.compare.scoring import heading_error, position_error, score
+from omnibench.compare.scoring import SplitScorer, heading_error, position_error, score
+from omnibench.errors import PluginError
 from omnibench.fit.calibrator import Outcome, RunResult
+from omnibench.fit.cost import Cost
+from omnibench.robot.kinematics import Array
 from omnibench.robot.published import published_matrix
 
 TRUE = published_matrix("palacin2023_eq8")
@@ -109,3 +114,65 @@ def test_final_errors_are_mean_distances_and_mean_absolute_headings() -> None:
     errors = np.array([[3.0, 4.0, -0.1], [0.0, 0.0, 0.3]])
     assert position_error(errors) == pytest.approx(2.5)
     assert heading_error(errors) == pytest.approx(0.2)
+
+
+class Raising(Cost):
+    name = "mine"
+
+    def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:  # noqa: ARG002
+        raise ZeroDivisionError("no\nway")
+
+
+class Undefined(Cost):
+    name = "mine"
+
+    def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:  # noqa: ARG002
+        return np.full(len(errors), np.nan)
+
+
+class Shapeless(Cost):
+    name = "mine"
+
+    def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:  # noqa: ARG002
+        return np.array(3.0)
+
+
+@pytest.mark.parametrize(
+    ("cost", "complaint"),
+    [
+        (Raising, "cost 'mine' raised ZeroDivisionError: no way"),
+        (Undefined, "cost 'mine' gave NaN or infinity for finite errors, expected {} finite costs"),
+        (Shapeless, "cost 'mine' gave an array of shape () for finite errors, expected {} finite costs"),
+    ],
+)
+def test_a_cost_that_is_no_cost_is_one_line(cost: type[Cost], complaint: str) -> None:
+    dataset = load_datasets(CompareConfig.model_validate(small()))["flower"]
+    scorer = SplitScorer(dataset.split("train"), cost(None), "arc")
+    of_all, of_each = (1, scorer.cost), (6, scorer.costs)
+    for count, measure in (of_all, of_each) if cost is not Shapeless else (of_all,):
+        with pytest.raises(PluginError) as failure:
+            measure(TRUE)
+        assert str(failure.value).startswith(complaint.format(count))
+
+
+ROOT_MEAN_SQUARE = """
+from omnibench.fit.cost import Cost
+from omnibench.registry import costs
+
+@costs.register("root_mean_square")
+class RootMeanSquare(Cost):
+    "Root of the mean square."
+
+    def combine(self, errors, trajectory):
+        return np.sqrt(np.square(errors).sum(axis=-1).mean(axis=-1))
+"""
+
+
+@pytest.mark.usefixtures("registries_as_before")
+def test_a_cost_that_is_no_mean_over_trajectories_is_warned_of(tmp_path: Path) -> None:
+    plugins = write_plugin(tmp_path / "plugins", "root_mean_square", ROOT_MEAN_SQUARE)
+    result = compared_here(
+        tmp_path / "out", plugins=[str(plugins)], cost="root_mean_square", calibrators=["theoretical"]
+    )
+    assert [warning for warning in result.warnings if "the cost is no mean over trajectories" in warning]
+    assert compared_here(tmp_path / "other", calibrators=["theoretical"]).warnings == ()

@@ -1,0 +1,53 @@
+"""Files are written whole or not at all, and what is no ordinary file is written to, not replaced."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from omnibench.errors import DataError, one_line
+from omnibench.files import write_text
+
+
+def test_a_link_goes_on_pointing_to_the_file_that_is_written(tmp_path: Path) -> None:
+    (tmp_path / "file.yaml").write_text("old")
+    (tmp_path / "link.yaml").symlink_to("file.yaml")
+    write_text(tmp_path / "link.yaml", "new")
+    assert (tmp_path / "link.yaml").is_symlink()
+    assert (tmp_path / "file.yaml").read_text() == "new"
+
+
+def test_a_pipe_is_written_to_and_stays_a_pipe(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        write_text(pipe, "through")
+        assert os.read(reader, 100) == b"through"
+    finally:
+        os.close(reader)
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+
+
+def test_a_full_device_is_one_line(tmp_path: Path) -> None:
+    device = tmp_path / "full"
+    try:
+        os.mknod(device, stat.S_IFCHR | 0o600, os.makedev(1, 7))  # as /dev/full, but not the system's own
+        device.write_text("x")
+    except PermissionError:
+        pytest.skip("devices cannot be made here")
+    except OSError:
+        with pytest.raises(DataError, match="No space left on device; free space or choose another place"):
+            write_text(device, "x")
+        assert stat.S_ISCHR(device.stat().st_mode)
+    else:
+        pytest.fail("the device took what it was given")
+
+
+def test_a_text_from_anywhere_becomes_one_line_that_can_be_written(tmp_path: Path) -> None:
+    line = one_line("a\nb\x1b[31m\ud800 c")
+    assert line == "a b?[31m? c"
+    write_text(tmp_path / "reason", line)
