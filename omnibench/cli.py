@@ -5,15 +5,13 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from contextlib import AbstractContextManager, redirect_stdout
+from contextlib import redirect_stdout
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
 
 import typer
 from pydantic import BaseModel
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from omnibench import terminal
 from omnibench.config import parse_yaml, to_json
@@ -105,7 +103,7 @@ def calibrate(
     if output is None and not as_json:
         raise ConfigError("say where the calibration goes: -o calibration.yaml")
     recordings = load_dataset(dataset)
-    with redirect_stdout(sys.stderr), _evaluations_bar(calibrator, evaluations) as watch:
+    with redirect_stdout(sys.stderr), terminal.EvaluationsBar(calibrator, evaluations) as watch:
         run = fit(
             recordings,
             calibrator,
@@ -374,36 +372,6 @@ def _named_paths(data: list[str] | None) -> dict[str, Path]:
             raise ConfigError(f"--data {item}: no such file or folder")
         paths[name] = Path(location)
     return paths
-
-
-class _EvaluationsBar(AbstractContextManager["_EvaluationsBar"]):
-    """A bar of evaluations for one calibrator, on a terminal."""
-
-    def __init__(self, title: str, evaluations: int, console: Console) -> None:
-        self._progress = Progress(
-            TextColumn(title),
-            BarColumn(),
-            TextColumn("{task.fields[note]}"),
-            TimeElapsedColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-        self._task = self._progress.add_task("", total=evaluations, note="")
-
-    def __enter__(self) -> _EvaluationsBar:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def __call__(self, evaluations: int, best: float) -> None:
-        self._progress.update(self._task, completed=evaluations, note=f"{evaluations} evaluations, best {best:.6f}")
-
-
-def _evaluations_bar(title: str, evaluations: int) -> _EvaluationsBar:
-    return _EvaluationsBar(title, evaluations, terminal.make_console(error=True))
 
 
 if __name__ == "__main__":

@@ -20,17 +20,15 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
-from omnibench.config import validate
+from omnibench.config import Model, validate
 from omnibench.errors import OmnibenchError, PluginError, UnknownNameError
 
 T = TypeVar("T")
 C = TypeVar("C", bound=type)
 
 
-class Options(BaseModel):
+class Options(Model):
     """Base of every ``Options`` model: unknown keys are refused, values do not change."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class AnyOptions(BaseModel):

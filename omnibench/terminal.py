@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from omnibench.fit.calibrate import CalibrationRun
@@ -23,6 +24,33 @@ def make_console(error: bool = False) -> Console:
     stream = sys.stderr if error else sys.stdout
     width = None if stream.isatty() else _PIPED_WIDTH
     return Console(file=stream, width=width, markup=False, emoji=False, highlight=False)
+
+
+class EvaluationsBar:
+    """A bar of evaluations for one calibrator, on a terminal."""
+
+    def __init__(self, title: str, evaluations: int) -> None:
+        console = make_console(error=True)
+        self._progress = Progress(
+            TextColumn(title),
+            BarColumn(),
+            TextColumn("{task.fields[note]}"),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._progress.add_task("", total=evaluations, note="")
+
+    def __enter__(self) -> EvaluationsBar:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def __call__(self, evaluations: int, best: float) -> None:
+        self._progress.update(self._task, completed=evaluations, note=f"{evaluations} evaluations, best {best:.6f}")
 
 
 def print_calibration(console: Console, run: CalibrationRun) -> None:

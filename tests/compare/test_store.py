@@ -38,12 +38,12 @@ def test_a_result_comes_back_to_the_last_bit(
     matrix = None if vector is None else vector.reshape(3, 3)
     cost = None if vector is None else float(vector[0])
     steps = tuple(Improvement(*step) for step in history)
-    put = RunResult(outcome, reason, vector, matrix, cost, 17, 0.1, steps, tuple(at_bounds))
+    put = RunResult(outcome, reason, vector, matrix, cost, 17, 0.1, steps, tuple(at_bounds), ("m12",))
     with tempfile.TemporaryDirectory() as folder:
         RunStore(Path(folder)).put("key", put)
         got = RunStore(Path(folder)).get("key")
     assert got is not None
-    for name in ("outcome", "reason", "cost", "evaluations", "seconds", "history", "at_bounds"):
+    for name in ("outcome", "reason", "cost", "evaluations", "seconds", "history", "at_bounds", "held"):
         assert getattr(got, name) == getattr(put, name)
     for name in ("vector", "matrix"):
         before, after = getattr(put, name), getattr(got, name)

@@ -277,6 +277,7 @@ def test_the_noise_scale_of_a_session_multiplies_the_references_noise_only() -> 
         for scale in (0.0, 1.0, 2.0)
     )
     for none, once, twice in zip(quiet, single, double, strict=True):
+        assert np.abs(once.poses[1:, :2] - none.poses[1:, :2]).min() > 0
         np.testing.assert_allclose(twice.poses - none.poses, 2 * (once.poses - none.poses), atol=1e-12)
         np.testing.assert_array_equal(once.rates, twice.rates)
 

@@ -21,16 +21,19 @@ Wheels = Literal[3, 4]
 
 
 def noisy_trajectories(
-    wheels: Wheels = 3, noise: float = 0.01, seed: int = 0, integration: Integration = "arc"
+    wheels: Wheels = 3, noise: float = 0.01, seed: int = 0, integration: Integration = "arc", encoder: float = 0.02
 ) -> tuple[Trajectory, ...]:
-    """Twelve runs of a robot off its design, with noise (m, m, rad) on every reference pose but the start."""
+    """Twelve runs of a robot off its design.
+
+    noise: of every reference pose but the start, m, m, rad. encoder: of every wheel rate, rad/s.
+    """
     rng = np.random.default_rng(seed)
 
-    def disturbed(poses: Array) -> Array:
-        return poses + np.vstack([np.zeros(3), noise * rng.standard_normal((len(poses) - 1, 3))])
+    def disturbed(run: Trajectory) -> Trajectory:
+        poses = run.poses + np.vstack([np.zeros(3), noise * rng.standard_normal((len(run.poses) - 1, 3))])
+        return replace(run, poses=poses, rates=run.rates + encoder * rng.standard_normal(run.rates.shape))
 
-    runs = synthetic_trajectories(synthetic_robot(wheels), integration)
-    return tuple(replace(run, poses=disturbed(run.poses)) for run in runs)
+    return tuple(disturbed(run) for run in synthetic_trajectories(synthetic_robot(wheels), integration))
 
 
 def make_problem(

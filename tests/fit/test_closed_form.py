@@ -121,6 +121,16 @@ def test_no_change_within_the_box_lowers_the_cost_of_other_noise(seed: int, inte
     assert problem.values(local_rivals(problem, result.vector, 2_000)).min() > result.cost - 1e-9
 
 
+def test_steps_that_overshoot_are_shortened() -> None:
+    # Errors of half a metre bend the paths so much that full steps lead nowhere.
+    problem = make_problem(noisy_trajectories(noise=0.5, seed=4)[:6], cost="final_position")
+    result = closed_form(problem, programs=200)
+    assert result.outcome is Outcome.CONVERGED
+    assert result.vector is not None
+    assert result.cost is not None
+    assert problem.values(local_rivals(problem, result.vector, 2_000)).min() > result.cost - 1e-9
+
+
 @pytest.mark.parametrize(
     ("wheels", "box", "seed"),
     [(3, "paper", 1), (3, "row", 2), (3, "tight", 3), (4, "row", 4), (4, "tight", 5), (4, "lopsided", 6)],

@@ -101,7 +101,7 @@ def test_the_direction_that_mecanum_wheels_cannot_drive_is_named_as_expected() -
     inspection = inspect_dataset(dataset(runs, wheels=4))
     assert inspection.undriven == ("fl - fr - rl + rr",)
     assert inspection.driven_directions == 3
-    assert inspection.driven_shares[3] < 1e-9
+    assert inspection.driven_shares[3] < 1e-2 < inspection.driven_shares[2]
     assert inspection.findings[0] == (
         "no run drives the wheels along fl - fr - rl + rr, as for any robot on four wheels that does not slip: "
         "the matrix is not determined along it, and calibration keeps the design values there"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from fit_samples import noisy_trajectories
@@ -31,7 +29,7 @@ def test_three_wheels_that_are_all_driven_leave_no_direction() -> None:
 
 
 def test_mecanum_wheels_leave_the_direction_that_would_make_them_slip() -> None:
-    span = driven_span(noisy_trajectories(4))
+    span = driven_span(noisy_trajectories(4, encoder=0.0))
     robot = synthetic_robot(4)
     assert span.driven.shape == (3, 4)
     assert span.null.shape == (1, 4)
@@ -41,9 +39,7 @@ def test_mecanum_wheels_leave_the_direction_that_would_make_them_slip() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_the_direction_that_mecanum_wheels_leave_has_the_same_name_on_any_data(seed: int) -> None:
     # Positive rates drive counter-clockwise, so forward is negative on the left.
-    rng = np.random.default_rng(seed)
-    runs = [replace(r, rates=r.rates + 0.02 * rng.standard_normal(r.rates.shape)) for r in noisy_trajectories(4)]
-    (null,) = driven_span(runs).null
+    (null,) = driven_span(noisy_trajectories(4, seed=seed)).null
     assert direction_in_words(null, synthetic_robot(4).wheel_names) == "fl - fr - rl + rr"
 
 
@@ -52,9 +48,9 @@ def test_a_direction_is_named_with_its_shares() -> None:
 
 
 def test_encoder_noise_does_not_count_as_driving() -> None:
-    rng = np.random.default_rng(0)
-    runs = [replace(r, rates=r.rates + 0.02 * rng.standard_normal(r.rates.shape)) for r in noisy_trajectories(4)]
-    assert driven_span(runs).null.shape == (1, 4)
+    noisy, exact = (driven_span(noisy_trajectories(4, encoder=encoder)) for encoder in (0.05, 0.0))
+    assert noisy.null.shape == exact.null.shape == (1, 4)
+    assert noisy.shares[3] > 1e-4 > 1e-12 > exact.shares[3]
 
 
 @given(rank=st.integers(1, 4), wheels=st.integers(4, 6), seed=st.integers(0, 2**16))

@@ -128,6 +128,15 @@ def test_mecanum_wheels_give_the_matrix_of_the_textbooks() -> None:
     np.testing.assert_allclose(inverse_kinematic_matrix(wheels), textbook * [-1, 1, -1, 1], atol=1e-16)
 
 
+@given(wheels=many_wheels, angle=st.floats(-3, 3))
+def test_a_robot_with_its_wheels_turned_about_its_centre_drives_in_the_turned_direction(
+    wheels: tuple[Wheel, ...], angle: float
+) -> None:
+    turned = tuple(wheel.model_copy(update={"angle": wheel.angle + angle}) for wheel in wheels)
+    rotation = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
+    np.testing.assert_allclose(wheel_equations(turned) @ rotation, wheel_equations(wheels), rtol=1e-9, atol=1e-10)
+
+
 @given(wheels=many_wheels, turn=st.floats(-3, 3))
 def test_a_pure_turn_needs_lever_arm_over_radius_of_every_wheel(wheels: tuple[Wheel, ...], turn: float) -> None:
     rates = wheel_equations(wheels) @ [0.0, 0.0, turn]
