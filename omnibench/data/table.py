@@ -58,9 +58,12 @@ class Table:
         return values
 
     def stack(self, columns: Sequence[str]) -> Array | None:
-        """Optional columns as (rows, n), or None when one is not there."""
-        if not all(column in self.frame.columns for column in columns):
+        """Optional columns as (rows, n), or None when none is there. DataError when only some are."""
+        missing = [column for column in columns if column not in self.frame.columns]
+        if len(missing) == len(columns):
             return None
+        if missing:
+            raise DataError(f"{self.file}: column {missing[0]!r} is missing; give all of {', '.join(columns)} or none")
         return np.column_stack([self.numbers(column) for column in columns])
 
 

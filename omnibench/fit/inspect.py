@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from omnibench.config import Model
-from omnibench.data.dataset import SPLITS, Dataset
+from omnibench.data.dataset import SPLITS, Dataset, Split
 from omnibench.fit.span import DrivenSpan, direction_in_words, driven_span
 
 # Below this share of the strongest direction of wheel rates a motion is called hardly driven.
@@ -83,8 +83,8 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
     )
 
 
-def _content(dataset: Dataset, split: str) -> SplitContent:
-    group = dataset.split("train" if split == "train" else "validation")
+def _content(dataset: Dataset, split: Split) -> SplitContent:
+    group = dataset.split(split)
     commands = [t.command for t in group if t.command is not None]
     counts = [commands.count(command) for command in sorted(set(commands))] or [1]
     return SplitContent(

@@ -75,7 +75,7 @@ def complaint(folder: Path, **changes: Any) -> str:
         ({"integration": "eular"}, ["integration: Input should be 'euler' or 'arc' (given: 'eular')"]),
         (
             {"calibrators": ["closed_from"]},
-            ["calibrators.0: unknown calibrator 'closed_from'; did you mean 'closed_form'? known: closed_form, crs, "],
+            ["calibrators.0: unknown calibrator 'closed_from'; did you mean 'closed_form'? known: closed_form, "],
         ),
         (
             {"calibrators": ["crs", {"name": "closed_form", "options": {"tolerence": 1}}]},

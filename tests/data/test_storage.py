@@ -155,6 +155,12 @@ REFUSED: dict[str, tuple[Change, str, str]] = {
     "a pose column is missing": (rename("poses", "theta", "thetaa"), "poses.{x}: ", "did you mean 'thetaa'?"),
     "the ids are missing": (drop_column("poses", "trajectory"), "poses.{x}: ", "column 'trajectory' is missing"),
     "the split is missing": (drop_column("trajectories", "split"), "trajectories.{x}: ", "column 'split' is missing"),
+    "one of the wheel angles is missing": (
+        drop_column("wheels", "phi_b"),
+        "wheels.{x}: ",
+        "column 'phi_b' is missing; give all of phi_a, phi_b, phi_c or none",
+    ),
+    "one of the covariances is missing": (drop_column("poses", "cov_yy"), "poses.{x}: ", "column 'cov_yy' is missing"),
     "a rate is NaN": (set_cell("wheels", 6, "omega_c", math.nan), "wheels.{x}, row 6: ", "omega_c is nan"),
     "a rate is infinite": (set_cell("wheels", 2, "omega_a", math.inf), "wheels.{x}, row 2: ", "omega_a is inf"),
     "a rate is empty": (set_cell("wheels", 3, "omega_b", None), "wheels.{x}, row 3: ", "omega_b is missing"),
@@ -448,7 +454,6 @@ def test_a_folder_that_cannot_be_made_is_refused_in_one_line(tmp_path: Path) -> 
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 @pytest.mark.parametrize("fmt", FORMATS)
 def test_a_folder_without_permission_is_refused_in_one_line(
     good: dict[Format, Path], tmp_path: Path, fmt: Format
@@ -456,6 +461,8 @@ def test_a_folder_without_permission_is_refused_in_one_line(
     folder = tmp_path / "dataset"
     shutil.copytree(good["csv"], folder)
     folder.chmod(0o555)
+    if os.access(folder, os.W_OK):
+        pytest.skip("whoever runs the tests may write anywhere")
     with pytest.raises(DataError, match="cannot be written"):
         save_dataset(everything_known(), folder, fmt)
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from omnibench.fit.sum_of_norms import SumOfNormsProgram
 
 _MOST_HALVINGS = 30
+_FLAT = 1e-6  # of the matrix: a step this small that leads nowhere is the solver's last digits, not a way down
 _NO_ERROR = 1e-10  # m, rad: next to rounding, where a program finds no direction
 
 
@@ -64,7 +65,9 @@ class ClosedForm(Calibrator):
             before = problem.matrix(vector)
             vector, cost, descended = _descend(problem, vector, cost, step)
             if not descended:
-                return Solution(vector, f"no part of the step lowers the cost after {count} cone programs")
+                wanted = float(np.abs(step).max())
+                reason = f"no part of the last step ({wanted:.1e}) lowers the cost after {count} cone programs"
+                return Solution(vector, reason, converged=wanted < _FLAT * float(np.ptp(problem.matrix(vector))))
             moved = float(np.abs(problem.matrix(vector) - before).max())
             if moved < self.options.tolerance:
                 return Solution(vector, f"step below {self.options.tolerance:g} after {count} cone programs")
