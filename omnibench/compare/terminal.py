@@ -159,22 +159,33 @@ def _cost_table(title: str, entries: Iterable[EntryStatistics], split: Split) ->
 
 
 def _error_table(title: str, entries: Iterable[EntryStatistics]) -> Table:
-    """Mean errors of the final pose and how the entries compare, on the validation split if there is one."""
-    headings = ("position", "heading", "cost against best", "95 % interval")
+    """Mean errors of the final pose on both splits, and how the entries compare."""
+    headings = (
+        "training: position",
+        "heading",
+        "validation: position",
+        "heading",
+        "cost against best",
+        "95 % interval",
+    )
     table = _new_table(title, ["M^-1"], headings)
     for entry in entries:
         if entry.typical is None:
             table.add_row(entry.label, "no answer")
             continue
         record = entry.typical.record
-        position, heading = record.validation_position_m, record.validation_heading_rad
-        if position is None or heading is None:
-            position, heading = record.train_position_m, record.train_heading_rad
-        assert position is not None  # a run with an answer has errors on its training data
-        assert heading is not None
-        errors = [f"{1000 * position:.1f} mm", f"{math.degrees(heading):.2f} deg"]
+        errors = (
+            *_error_cells(record.train_position_m, record.train_heading_rad),
+            *_error_cells(record.validation_position_m, record.validation_heading_rad),
+        )
         table.add_row(entry.label, *errors, *_against_best(entry), style="bold" if entry.is_best else None)
     return table
+
+
+def _error_cells(position: float | None, heading: float | None) -> tuple[str, str]:
+    if position is None or heading is None:
+        return "", ""
+    return f"{1000 * position:.1f} mm", f"{math.degrees(heading):.2f} deg"
 
 
 def _search_table(result: ComparisonResult) -> Table:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import pty
 import re
@@ -59,14 +60,20 @@ def test_the_tables_of_costs_agree_with_the_summary(result: ComparisonResult, sp
 def test_the_final_errors_are_in_millimetres_and_degrees(result: ComparisonResult) -> None:
     found = table(printed(result), "Final errors: flower (simulated data)")
     (run,) = (run for run in summary(result.output)["runs"] if run["label"] == "closed_form")
-    assert found["closed_form"][0] == f"{1000 * run['validation_position_m']:.1f} mm"
-    assert found["closed_form"][1].endswith(" deg")
-    assert found["closed_form"][2] == "best"
+    expected = [
+        text
+        for split in ("train", "validation")
+        for text in (
+            f"{1000 * run[f'{split}_position_m']:.1f} mm",
+            f"{math.degrees(run[f'{split}_heading_rad']):.2f} deg",
+        )
+    ]
+    assert found["closed_form"] == [*expected, "best"]
 
 
 def test_a_practically_equal_entry_is_marked(result: ComparisonResult) -> None:
     found = table(printed(result), "Final errors: flower")
-    assert found["again"][2] == "= +0.00000"
+    assert found["again"][4] == "= +0.00000"
     assert found["theoretical"][2].startswith("+")
 
 
