@@ -160,25 +160,19 @@ def _cost_table(title: str, entries: Iterable[EntryStatistics], split: Split) ->
 
 def _error_table(title: str, entries: Iterable[EntryStatistics]) -> Table:
     """Mean errors of the final pose on both splits, and how the entries compare."""
-    headings = (
-        "training: position",
-        "heading",
-        "validation: position",
-        "heading",
-        "cost against best",
-        "95 % interval",
-    )
-    table = _new_table(title, ["M^-1"], headings)
+    errors = ("training: position", "heading", "validation: position", "heading")
+    table = _new_table(title, ["M^-1"], [*errors, "cost against best", "95 % interval"])
     for entry in entries:
         if entry.typical is None:
             table.add_row(entry.label, "no answer")
             continue
         record = entry.typical.record
-        errors = (
+        cells = (
             *_error_cells(record.train_position_m, record.train_heading_rad),
             *_error_cells(record.validation_position_m, record.validation_heading_rad),
+            *_against_best(entry),
         )
-        table.add_row(entry.label, *errors, *_against_best(entry), style="bold" if entry.is_best else None)
+        table.add_row(entry.label, *cells, style="bold" if entry.is_best else None)
     return table
 
 
