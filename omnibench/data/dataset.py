@@ -119,7 +119,7 @@ def make_dataset(
 ) -> Dataset:
     """A data set with unwrapped headings and with warnings about values that cannot be right.
 
-    DataError when there is no trajectory or two have the same id.
+    DataError when there is no trajectory, two have the same id, or an array has not the shape that Trajectory says.
     """
     raw = tuple(trajectories)
     if not raw:
@@ -129,13 +129,14 @@ def make_dataset(
         if trajectory.id in seen:
             raise DataError(f"data set {name}: trajectory {trajectory.id} is there twice; give each its own id")
         seen.add(trajectory.id)
+        _check_shapes(name, robot, trajectory)
     logs = [trajectory.log(trajectory.pose_times) for trajectory in raw]
     headings, doubts = unwrap(robot, logs, [trajectory.poses[:, 2] for trajectory in raw])
     warnings = implausible(robot, logs, [trajectory.poses for trajectory in raw])
     if doubts and not warnings:
         shown = ", ".join(raw[index].id for index in doubts[:5])
         warnings = [f"headings of {len(doubts)} trajectories may be unwrapped wrongly (reference too sparse): {shown}"]
-    warnings += _late_references(raw)
+    warnings += _late_references(raw) + _other_periods(raw, sample_period)
     unwrapped = (
         replace(trajectory, poses=np.column_stack([trajectory.poses[:, :2], heading]))
         for trajectory, heading in zip(raw, headings, strict=True)
@@ -143,6 +144,26 @@ def make_dataset(
     return Dataset(
         name, robot, sample_period, tuple(unwrapped), description, source, licence, simulated, tuple(warnings)
     )
+
+
+def _other_periods(trajectories: Sequence[Trajectory], sample_period: float) -> list[str]:
+    """A sample period that the stamps contradict; jitter and gaps do not move their median."""
+    periods = np.concatenate([np.diff(trajectory.times, prepend=0.0) for trajectory in trajectories])
+    median = float(np.median(periods))
+    if 0.5 < median / sample_period < 2:
+        return []
+    return [f"sample_period is {sample_period:g} s, but the wheel samples come every {median:g} s (the median)"]
+
+
+def _check_shapes(name: str, robot: Robot, trajectory: Trajectory) -> None:
+    samples, poses = trajectory.times.shape, trajectory.pose_times.shape
+    expected: dict[str, tuple[int, ...]] = {"rates": (*samples, len(robot.wheels)), "poses": (*poses, 3)}
+    expected |= {"angles": expected["rates"], "targets": expected["rates"], "pose_covariances": (*poses, 3, 3)}
+    for item, shape in expected.items():
+        array = getattr(trajectory, item)
+        if len(samples) != 1 or len(poses) != 1 or (array is not None and array.shape != shape):
+            found = None if array is None else array.shape
+            raise DataError(f"data set {name}: trajectory {trajectory.id}: {item} has shape {found}, expected {shape}")
 
 
 def _late_references(trajectories: Sequence[Trajectory]) -> list[str]:

@@ -82,6 +82,9 @@ def read_table(folder: Path, name: str, required: Sequence[str]) -> Table:
             frame = pl.read_csv(file, infer_schema_length=None, schema_overrides=_TEXTS)
     except (pl.exceptions.PolarsError, OSError) as error:
         raise DataError(f"{file}: cannot be read: {error}") from None
+    twice = [column for column in frame.columns if "_duplicated_" in column and file.suffix == ".csv"]
+    if twice:  # polars' name for the second of two
+        raise DataError(f"{file}: column {twice[0].partition('_duplicated_')[0]!r} is there twice; remove one")
     for column in required:
         if column not in frame.columns:
             known = ", ".join(frame.columns)

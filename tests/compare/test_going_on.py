@@ -55,7 +55,7 @@ def started(config: Path, output: Path) -> subprocess.Popen[str]:
         start_new_session=True,
     )
     assert process.stderr is not None
-    assert process.stderr.readline().startswith("[1/4] flower theoretical")
+    assert process.stderr.readline().startswith("[1/4] flower ")
     return process
 
 
@@ -105,8 +105,8 @@ def test_going_on_keeps_what_had_ended_and_gives_what_an_uninterrupted_compariso
     stopped: Stopped, tmp_path: Path
 ) -> None:
     run = compared(stopped.config, stopped.output)
-    assert "theoretical seed 1: converged, cost 0.138732, 1 evaluations, 0.0 s, kept from an earlier run" in run.stderr
-    assert run.stderr.count("kept from an earlier run") == 1
+    (line,) = (line for line in run.stderr.splitlines() if "kept from an earlier run" in line)
+    assert "theoretical seed 1: converged, cost 0.138732, 1 evaluations, " in line
     after = files_of(stopped.output)
     kept = {name: content for name, content in stopped.files.items() if name.startswith("runs/")}
     assert kept == {name: after[name] for name in kept}

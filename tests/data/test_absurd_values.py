@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from commands import flower
 
 from omnibench.config import validate
+from omnibench.data.dataset import make_dataset
 from omnibench.data.simulate.config import FlowerConfig
 from omnibench.data.simulate.flower import simulate_dataset
 from omnibench.data.storage import load_dataset, save_dataset
@@ -58,3 +60,28 @@ def test_a_column_of_lists_is_refused(folder: Path) -> None:
     table.with_columns(pl.concat_list("trajectory").alias("trajectory")).write_parquet(folder / "wheels.parquet")
     with pytest.raises(DataError, match=r"wheels.parquet: column 'trajectory' holds List"):
         load_dataset(folder)
+
+
+def test_a_csv_column_that_is_there_twice_is_refused(folder: Path) -> None:
+    save_dataset(load_dataset(folder), folder, "csv")
+    lines = (folder / "poses.csv").read_text().splitlines()
+    doubled = [f"{line},{line.split(',')[2]}" for line in lines]
+    (folder / "poses.csv").write_text("\n".join(doubled) + "\n")
+    with pytest.raises(DataError, match=r"poses.csv: column 'x' is there twice"):
+        load_dataset(folder)
+
+
+def test_a_sample_period_that_the_stamps_contradict_is_told(folder: Path) -> None:
+    dataset = load_dataset(folder)
+    assert dataset.warnings == ()
+    again = make_dataset("d", dataset.robot, 100 * dataset.sample_period, dataset.trajectories)
+    assert any(warning.startswith("sample_period is") for warning in again.warnings)
+
+
+@pytest.mark.parametrize("item", ["rates", "poses", "targets", "times"])
+def test_an_array_of_another_shape_is_refused_with_its_trajectory(folder: Path, item: str) -> None:
+    dataset = load_dataset(folder)
+    first, *others = dataset.trajectories
+    spoiled = replace(first, **{item: getattr(first, item)[:, None]})
+    with pytest.raises(DataError, match=f"trajectory {first.id}: .* has shape .*, expected"):
+        make_dataset("d", dataset.robot, dataset.sample_period, [spoiled, *others])
