@@ -48,8 +48,8 @@ def test_nothing_is_below_the_exact_optimum_in_the_same_box(paper: dict[str, dic
     assert -1e-9 <= paper["crs"]["gap"] < 1e-5
 
 
-def test_the_exact_optimum_takes_less_than_a_second(paper: dict[str, dict[str, Any]]) -> None:
-    assert paper["closed_form"]["seconds"] < 1.0
+def test_the_exact_optimum_takes_a_handful_of_evaluations(paper: dict[str, dict[str, Any]]) -> None:
+    assert paper["closed_form"]["evaluations"] <= 10  # times are measured in tests/benchmarks
     assert paper["closed_form"]["outcome"] == "converged"
 
 
