@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+from commands import Command, Prepared, commands_of_this_process, prepare
 from hypothesis import settings
 
 from omnibench import registry
@@ -24,3 +26,16 @@ def registries_as_before() -> Iterator[None]:
         each._entries = kept
     registry._loaded.clear()
     registry._loaded.update(loaded)
+
+
+@pytest.fixture
+def command(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
+    """Commands, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return commands_of_this_process(capfd, monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
+    """What commands need to work on: a config, a data set, a calibration."""
+    return prepare(tmp_path_factory.mktemp("prepared"))

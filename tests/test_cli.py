@@ -20,8 +20,6 @@ from commands import (
     Prepared,
     Printed,
     assert_refused,
-    commands_of_this_process,
-    prepare,
     write_config,
     write_plugin,
 )
@@ -31,18 +29,6 @@ from omnibench.robot.calibration import read_calibration
 from omnibench.robot.published import published_matrix
 
 pytestmark = pytest.mark.usefixtures("registries_as_before")
-
-
-@pytest.fixture
-def command(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
-    """Commands, in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    return commands_of_this_process(capfd, monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
-    return prepare(tmp_path_factory.mktemp("prepared"))
 
 
 def document(printed: Printed) -> Any:

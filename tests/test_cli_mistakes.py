@@ -15,26 +15,12 @@ from commands import (
     Command,
     Prepared,
     assert_refused,
-    commands_of_this_process,
     omnibench,
-    prepare,
 )
 
 from omnibench.data.storage import load_dataset
 
 pytestmark = pytest.mark.usefixtures("registries_as_before")
-
-
-@pytest.fixture
-def command(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
-    """Commands, in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    return commands_of_this_process(capfd, monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
-    return prepare(tmp_path_factory.mktemp("prepared"))
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,10 @@ import numpy as np
 import plotly.graph_objects as go
 
 from omnibench.compare.results import EntryStatistics, ScoredRun
-from omnibench.compare.view import SPLIT_NAMES, THEORETICAL_LOOK, DatasetView, Look, positions_and_headings
+from omnibench.compare.view import SPLIT_NAMES, THEORETICAL_LOOK, DatasetView, Look
 from omnibench.compare.wording import position_unit
 from omnibench.data.dataset import Split, Trajectory
+from omnibench.fit.evaluate import positions_and_headings
 from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem, Paragraph
 from omnibench.report.numbers import fixed
 from omnibench.report.style import INK, plot, text

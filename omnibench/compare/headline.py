@@ -6,7 +6,7 @@ import numpy as np
 
 from omnibench.compare.results import EntryStatistics
 from omnibench.compare.tables import on_bounds
-from omnibench.compare.view import SPLIT_NAMES, THEORETICAL_NAME, DatasetView, positions_and_headings
+from omnibench.compare.view import SPLIT_NAMES, THEORETICAL_NAME, DatasetView
 from omnibench.compare.wording import (
     cost,
     cost_decimals,
@@ -15,6 +15,7 @@ from omnibench.compare.wording import (
     improvement_in_words,
     position_unit,
 )
+from omnibench.fit.evaluate import positions_and_headings
 from omnibench.report.blocks import Block, Callout, Fact, Facts, Paragraph
 from omnibench.report.numbers import fixed, listing, percent, plural, span
 

@@ -126,11 +126,3 @@ class ComparisonResult:
     statistics: tuple[EntryStatistics, ...]
     environment: Environment
     warnings: tuple[str, ...]
-
-    def baseline(self, dataset: str) -> Array:
-        """The design matrix (3, N) of a data set's robot."""
-        return self.datasets[dataset].robot.inverse_kinematic_matrix
-
-    def typical_runs(self, dataset: str) -> list[ScoredRun]:
-        """The typical run of every entry that has an answer, in the config's order."""
-        return [s.typical for s in self.statistics if s.dataset == dataset and s.typical is not None]

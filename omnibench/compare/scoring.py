@@ -13,6 +13,7 @@ from omnibench.data.dataset import Dataset, Split, Trajectory
 from omnibench.errors import PluginError
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error
 from omnibench.fit.cost import Cost
+from omnibench.fit.evaluate import positions_and_headings
 from omnibench.fit.parameterisation import Box, FittedParameter, fitted_parameters, make_bounds
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import matrix_rows
@@ -77,12 +78,12 @@ def score(
 
 def position_error(errors: Array) -> float:
     """Mean distance of final errors (Z, 3), m."""
-    return float(np.linalg.norm(errors[:, :2], axis=1).mean())
+    return float(positions_and_headings(errors)[0].mean())
 
 
 def heading_error(errors: Array) -> float:
     """Mean absolute heading of final errors (Z, 3), rad."""
-    return float(np.abs(errors[:, 2]).mean())
+    return float(positions_and_headings(errors)[1].mean())
 
 
 def _score_one(run: PlannedRun, result: RunResult, scorers: Mapping[tuple[str, Split], SplitScorer]) -> ScoredRun:

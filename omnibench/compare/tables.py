@@ -11,7 +11,6 @@ from omnibench.compare.view import (
     THEORETICAL_NAME,
     DatasetView,
     is_bounded,
-    positions_and_headings,
 )
 from omnibench.compare.wording import (
     cost,
@@ -22,6 +21,7 @@ from omnibench.compare.wording import (
     position_unit,
 )
 from omnibench.data.dataset import Split
+from omnibench.fit.evaluate import positions_and_headings
 from omnibench.registry import costs
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.numbers import (

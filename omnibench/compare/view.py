@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import PlannedRun, make_plan
 from omnibench.compare.results import ComparisonResult, EntryStatistics, ScoredRun
 from omnibench.compare.statistics import entry_statistics
 from omnibench.data.dataset import Dataset, Split
+from omnibench.fit.evaluate import final_errors
 from omnibench.fit.parameterisation import GeometryLimits
 from omnibench.registry import calibrators
 from omnibench.report.blocks import Dash, LegendItem
@@ -98,7 +97,7 @@ class DatasetView:
     @property
     def reference_entry(self) -> tuple[EntryStatistics, ScoredRun] | None:
         """The entry that matrices are compared with: the exact optimum, else the best calibration."""
-        exact = [pair for pair in self.calibrated if pair[0].calibrator == "closed_form"]
+        exact = [pair for pair in self.calibrated if calibrators.entry(pair[0].calibrator).cls.exact]
         best = [pair for pair in self.calibrated if pair[0].is_best]
         return next(iter(exact + best + self.calibrated), None)
 
@@ -136,15 +135,11 @@ def views(result: ComparisonResult) -> list[DatasetView]:
     return [_view(result, name, looks, plan) for name in result.datasets]
 
 
-def positions_and_headings(errors: Array) -> tuple[Array, Array]:
-    """Distances (Z,) in m and absolute heading errors (Z,) in rad of final pose errors (Z, 3)."""
-    return np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2])
-
-
 def _view(result: ComparisonResult, name: str, looks: Mapping[str, Look], plan: Sequence[PlannedRun]) -> DatasetView:
     dataset = result.datasets[name]
     splits: tuple[Split, ...] = ("train", "validation")
     present = [split for split in splits if dataset.split(split)]
+    design = OdometryModel.of_design(dataset.robot, result.config.integration)
     runs = tuple(run for run in result.runs if run.record.dataset == name)
     return DatasetView(
         name=name,
@@ -155,7 +150,7 @@ def _view(result: ComparisonResult, name: str, looks: Mapping[str, Look], plan: 
         looks=looks,
         boxes={run.label: _searched(run) for run in plan if run.dataset_name == name},
         theoretical=_theoretical(result, runs[0]) if runs else None,
-        design_errors={split: _design_errors(result, dataset, split) for split in present},
+        design_errors={split: final_errors(design, dataset.split(split)) for split in present},
     )
 
 
@@ -183,14 +178,6 @@ def _theoretical(result: ComparisonResult, run: ScoredRun) -> EntryStatistics:
     )
     (statistics,) = entry_statistics([design], result.config.bootstrap)
     return statistics
-
-
-def _design_errors(result: ComparisonResult, dataset: Dataset, split: Split) -> Array:
-    trajectories = dataset.split(split)
-    model = OdometryModel.of_design(dataset.robot, result.config.integration)
-    odometry = np.concatenate(model.poses([trajectory.final_log for trajectory in trajectories]))
-    errors: Array = odometry - np.array([trajectory.final_pose for trajectory in trajectories])
-    return errors
 
 
 def _looks(result: ComparisonResult) -> dict[str, Look]:

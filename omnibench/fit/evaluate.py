@@ -12,6 +12,7 @@ from omnibench.data.dataset import SPLITS, Dataset, Trajectory
 from omnibench.errors import DataError
 from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration
+from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 
 
@@ -55,11 +56,21 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
     )
 
 
+def final_errors(model: OdometryModel, trajectories: Sequence[Trajectory]) -> Array:
+    """Odometry minus reference (Z, 3) at the last reference pose of each trajectory, m, m, rad."""
+    ends = np.concatenate(model.poses([trajectory.final_log for trajectory in trajectories]))
+    return ends - np.array([trajectory.final_pose for trajectory in trajectories])
+
+
+def positions_and_headings(errors: Array) -> tuple[Array, Array]:
+    """Distances (Z,) in m and absolute heading errors (Z,) in rad of final pose errors (Z, 3)."""
+    return np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2])
+
+
 def split_errors(model: OdometryModel, trajectories: Sequence[Trajectory]) -> SplitErrors:
     """Errors of a model on some trajectories."""
-    ends = np.concatenate(model.poses([trajectory.final_log for trajectory in trajectories]))
-    errors = ends - np.array([trajectory.final_pose for trajectory in trajectories])
-    positions, headings = np.linalg.norm(errors[:, :2], axis=1), np.abs(errors[:, 2])
+    errors = final_errors(model, trajectories)
+    positions, headings = positions_and_headings(errors)
     cost = costs.create("final_pose").combine(errors[None], np.arange(len(errors)))
     return SplitErrors(
         trajectories=len(trajectories),
