@@ -1,17 +1,21 @@
 """omnibench: compare, run and extend odometry calibrations of robots on omnidirectional wheels."""
 
-from omnibench.compare.plan import read_compare_config
-from omnibench.compare.run import run_comparison
-from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.importer import import_dataset
-from omnibench.data.simulate.flower import simulate_dataset
-from omnibench.data.storage import load_dataset, save_dataset
-from omnibench.errors import OmnibenchError
-from omnibench.fit.calibrate import calibrate
-from omnibench.fit.evaluate import evaluate
-from omnibench.fit.inspect import inspect_dataset
-from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
-from omnibench.robot.export import export_calibration
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from omnibench.compare.plan import read_compare_config
+    from omnibench.compare.run import run_comparison
+    from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+    from omnibench.data.importer import import_dataset
+    from omnibench.data.simulate.flower import simulate_dataset
+    from omnibench.data.storage import load_dataset, save_dataset
+    from omnibench.errors import OmnibenchError
+    from omnibench.fit.calibrate import calibrate
+    from omnibench.fit.evaluate import evaluate
+    from omnibench.fit.inspect import inspect_dataset
+    from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
+    from omnibench.robot.export import export_calibration
 
 __all__ = [
     "Calibration",
@@ -32,3 +36,30 @@ __all__ = [
     "simulate_dataset",
     "write_calibration",
 ]
+
+# Imported when first asked for: the command line starts at once, and Ctrl-C finds it listening.
+_HOMES = {
+    "compare.plan": ("read_compare_config",),
+    "compare.run": ("run_comparison",),
+    "data.dataset": ("Dataset", "Trajectory", "make_dataset"),
+    "data.importer": ("import_dataset",),
+    "data.simulate.flower": ("simulate_dataset",),
+    "data.storage": ("load_dataset", "save_dataset"),
+    "errors": ("OmnibenchError",),
+    "fit.calibrate": ("calibrate",),
+    "fit.evaluate": ("evaluate",),
+    "fit.inspect": ("inspect_dataset",),
+    "robot.calibration": ("Calibration", "read_calibration", "write_calibration"),
+    "robot.export": ("export_calibration",),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f"omnibench.{module}"), name)
+    raise AttributeError(f"module 'omnibench' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

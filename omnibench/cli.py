@@ -372,7 +372,3 @@ def _named_paths(data: list[str] | None) -> dict[str, Path]:
             raise ConfigError(f"--data {item}: no such file or folder")
         paths[name] = Path(location)
     return paths
-
-
-if __name__ == "__main__":
-    main()

@@ -21,7 +21,7 @@ from omnibench.compare.run import run_comparison
 ROOT = Path(__file__).resolve().parents[1]
 CONFIGS = ROOT / "configs"
 RECORDINGS = ROOT.parent / "shared" / "data"
-COMMAND = (sys.executable, "-m", "omnibench.cli")
+COMMAND = (sys.executable, "-m", "omnibench")
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
 
 # What every plug-in file of the tests begins with.

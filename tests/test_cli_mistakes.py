@@ -140,7 +140,7 @@ def test_nothing_typed_shows_the_help(command: Command) -> None:
 
 
 def test_a_reader_that_has_gone_is_no_error(prepared: Prepared) -> None:
-    shell = f"{COMMAND[0]} -m omnibench.cli inspect {prepared.data} --json | true; exit ${{PIPESTATUS[0]}}"
+    shell = f"{COMMAND[0]} -m omnibench inspect {prepared.data} --json | true; exit ${{PIPESTATUS[0]}}"
     run = subprocess.run(
         ["bash", "-c", shell], env=ENVIRONMENT, capture_output=True, text=True, timeout=60, check=False
     )

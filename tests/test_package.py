@@ -1,0 +1,48 @@
+"""The package as it is imported and started."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+import omnibench
+
+
+@pytest.mark.parametrize("name", omnibench.__all__)
+def test_a_public_name_is_found_in_its_module(name: str) -> None:
+    found = getattr(omnibench, name)
+    assert found.__name__ == name
+    assert found.__module__.startswith("omnibench.")
+
+
+def test_a_name_that_is_not_public_is_missed_by_its_name() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
+        _ = omnibench.calibrat  # type: ignore[attr-defined]
+
+
+# Stands for Ctrl-C while a package that takes long is still being imported.
+INTERRUPTED = """
+import sys
+
+class Impatient:
+    def find_spec(self, name, path=None, target=None):
+        if name == "typer":
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Impatient())
+from omnibench.__main__ import main
+main()
+"""
+
+
+def test_ctrl_c_during_the_first_imports_is_one_line() -> None:
+    run = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=60, check=False)
+    assert (run.returncode, run.stdout, run.stderr) == (130, "", "interrupted\n")
+
+
+def test_importing_the_package_loads_no_heavy_library() -> None:
+    program = "import sys, omnibench; print(sorted({'numpy', 'polars', 'plotly', 'cvxpy'} & set(sys.modules)))"
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    assert run.stdout == "[]\n"
