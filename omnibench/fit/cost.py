@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from omnibench.data.dataset import Trajectory
 from omnibench.registry import Options, costs
 from omnibench.robot.kinematics import Array
-from omnibench.robot.odometry import Integration, OdometryBatch
+from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
 
 
 class Cost(ABC):
@@ -37,11 +37,13 @@ class Cost(ABC):
         own = (errors[None, trajectory == index] for index in range(int(trajectory[-1]) + 1))
         return np.array([self.combine(part, np.zeros(part.shape[1], dtype=np.intp))[0] for part in own])
 
+    def logs(self, trajectories: Sequence[Trajectory]) -> list[WheelLog]:
+        """The wheel logs of the trajectories with this cost's stamps."""
+        return [t.final_log if self.stamps == "final" else t.reference_log for t in trajectories]
+
     def batch(self, trajectories: Sequence[Trajectory], integration: Integration) -> OdometryBatch:
         """The odometry of the trajectories at this cost's stamps."""
-        return OdometryBatch(
-            [t.final_log if self.stamps == "final" else t.reference_log for t in trajectories], integration
-        )
+        return OdometryBatch(self.logs(trajectories), integration)
 
     def reference(self, trajectories: Sequence[Trajectory]) -> Array:
         """The reference poses (S, 3) at this cost's stamps."""
@@ -66,7 +68,12 @@ class SumOfNorms(Cost):
 
     def norms(self, errors: Array) -> Array:
         """Norms (..., S) of pose errors (..., S, 3)."""
-        return np.sqrt(np.square(errors) @ np.square(self.weights))
+        seen = [(axis, weight) for axis, weight in enumerate(self.weights) if weight]
+        squares = sum(
+            np.square(errors[..., axis] if weight == 1 else weight * errors[..., axis]) for axis, weight in seen
+        )
+        norms: Array = np.sqrt(squares)
+        return norms
 
     def shares(self, trajectory: NDArray[np.intp]) -> Array:
         """Share (S,) of each stamp in the cost; they sum to one."""

@@ -15,6 +15,7 @@ from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.cost import Cost, SumOfNorms
+from omnibench.fit.evaluator import ElementBox, PoseEvaluator, make_evaluator
 from omnibench.fit.parameterisation import (
     Box,
     GeometryLimits,
@@ -23,11 +24,13 @@ from omnibench.fit.parameterisation import (
     ParameterisationName,
     WheelGeometry,
 )
-from omnibench.fit.span import driven_span
+from omnibench.fit.span import Unidentified, directions_kept, driven_span
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration
 
 _PROGRESS_PERIOD = 0.1  # s
+# From so many evaluations on the fast evaluator is worth the time that it takes to build.
+_WORTH_BUILDING = 50
 
 
 class Budget(Model):
@@ -89,7 +92,9 @@ class CalibrationProblem:
         self.box = bounds.name
         self.names = parameterisation.names
         self.odometry = cost.batch(self.trajectories, integration)
-        self.reference = _frozen(cost.reference(self.trajectories))
+        self.reference = _frozen(
+            np.ascontiguousarray(cost.reference(self.trajectories).T)
+        ).T  # components apart, as poses have them
         self.start = _frozen(parameterisation.start)
         matters = self._matters()
         self.lower = _frozen(np.where(matters, bounds.lower, self.start))
@@ -99,6 +104,8 @@ class CalibrationProblem:
         self.best_vector = self.start
         self.best_cost = np.inf
         self.history: list[Improvement] = []
+        self._evaluator: PoseEvaluator | None = None
+        self._evaluator_tried = False
         self._watch = watch
         self._began = time.perf_counter()
         self._shown = 0.0
@@ -112,6 +119,11 @@ class CalibrationProblem:
     def remaining(self) -> int:
         """Evaluations that the budget still allows."""
         return self.budget.evaluations - self.evaluations
+
+    @property
+    def is_fast(self) -> bool:
+        """Whether ``cost`` uses the fast evaluator by now."""
+        return self._evaluator is not None
 
     @property
     def seconds(self) -> float:
@@ -130,17 +142,30 @@ class CalibrationProblem:
         self._check_budget()
         asked = len(candidates)
         candidates = candidates[: self.remaining]
-        values = self.values(candidates)
+        if self.evaluations + len(candidates) >= _WORTH_BUILDING and not self._evaluator_tried:
+            self.build_evaluator()
+        values = self._fast_values(candidates) if self._evaluator else self.values(candidates)
         self._record(candidates, values)
         if len(candidates) < asked:
             self._check_budget()
         return values
 
     def values(self, candidates: Array) -> Array:
-        """Costs (P,) of candidates (P, n) without counting: for the verdict on a run, not for a search."""
+        """Costs (P,) of candidates (P, n), uncounted and by direct integration: for the verdict on a run."""
         with np.errstate(all="ignore"):
-            errors = self.odometry.poses(self.parameterisation.matrices(candidates)) - self.reference
-            return self.objective.combine(errors, self.odometry.trajectory)
+            return self._combined(self.odometry.poses(self.parameterisation.matrices(candidates)))
+
+    def build_evaluator(self) -> PoseEvaluator | None:
+        """The fast evaluator that ``cost`` uses from now on; None where direct integration is the faster way.
+
+        ``cost`` builds it by itself when a search asks for many candidates. Both ways give the same costs to 1e-11.
+        """
+        if not self._evaluator_tried:
+            self._evaluator_tried = True
+            box = ElementBox.of(self.parameterisation, self.lower, self.upper)
+            logs = self.objective.logs(self.trajectories)
+            self._evaluator = make_evaluator(self.odometry, logs, self.integration, box)
+        return self._evaluator
 
     def to_unit(self, vectors: Array) -> Array:
         """Vectors (P, n) as points (P, free) of the unit cube over the free elements; never outside it."""
@@ -151,10 +176,11 @@ class CalibrationProblem:
     def from_unit(self, points: Array) -> Array:
         """Vectors (P, n) of points (P, free) of the unit cube; never outside the box."""
         points = np.atleast_2d(points)
-        vectors = np.tile(self.start, (len(points), 1))
-        span = (self.upper - self.lower)[self.free]
-        vectors[:, self.free] = self.lower[self.free] + points * span
-        return np.clip(vectors, self.lower, self.upper)
+        vectors = np.empty((len(points), self.size))
+        vectors[:] = self.start
+        low, high = self.lower[self.free], self.upper[self.free]
+        vectors[:, self.free] = np.minimum(np.maximum(low + points * (high - low), low), high)
+        return vectors
 
     def inside(self, vectors: Array) -> NDArray[np.bool_]:
         """Which vectors (P, n) lie in the box, up to rounding: (P,) of bool."""
@@ -177,6 +203,23 @@ class CalibrationProblem:
         """The inverse kinematic matrix (3, N) of one vector (n,)."""
         return self.parameterisation.matrices(vector[None])[0]
 
+    def _fast_values(self, candidates: Array) -> Array:
+        """Costs (P,) by the evaluator in its box, and by direct integration outside it."""
+        assert self._evaluator is not None  # cost asks only then
+        with np.errstate(all="ignore"):
+            matrices = self.parameterisation.matrices(candidates)
+            covered = self._evaluator.covers(matrices)
+            if covered.all():
+                return self._combined(self._evaluator.poses(matrices))
+            values = np.empty(len(candidates))
+            values[covered] = self._combined(self._evaluator.poses(matrices[covered]))
+            values[~covered] = self._combined(self.odometry.poses(matrices[~covered]))
+            return values
+
+    def _combined(self, poses: Array) -> Array:
+        poses -= self.reference
+        return self.objective.combine(poses, self.odometry.trajectory)
+
     def _matters(self) -> NDArray[np.bool_]:
         """Which elements (n,) the cost depends on: a cost of headings alone sees row 3 of the matrix only."""
         cost = self.objective
@@ -194,16 +237,21 @@ class CalibrationProblem:
             raise BudgetSpent("time", f"time budget of {self.budget.seconds:g} s spent")
 
     def _record(self, candidates: Array, values: Array) -> None:
+        self._note_improvements(candidates, values)
+        self.evaluations += len(candidates)
+        if self._watch and self.seconds - self._shown > _PROGRESS_PERIOD:
+            self._shown = self.seconds
+            self._watch(self.evaluations, self.best_cost)
+
+    def _note_improvements(self, candidates: Array, values: Array) -> None:
+        if not (values < self.best_cost).any():
+            return
         eligible = np.where(np.isfinite(values) & self.inside(candidates), values, np.inf)
         running = np.minimum.accumulate(np.concatenate([[self.best_cost], eligible]))
         for index in np.flatnonzero(running[1:] < running[:-1]):
             self.best_cost = float(eligible[index])
             self.best_vector = _frozen(candidates[index])
             self.history.append(Improvement(self.evaluations + int(index) + 1, self.seconds, self.best_cost))
-        self.evaluations += len(candidates)
-        if self._watch and self.seconds - self._shown > _PROGRESS_PERIOD:
-            self._shown = self.seconds
-            self._watch(self.evaluations, self.best_cost)
 
 
 def training_split(dataset: Dataset) -> tuple[Trajectory, ...]:
@@ -223,11 +271,17 @@ def make_parameterisation(
     *,
     box: Box = "row",
     limits: GeometryLimits | None = None,
+    unidentified: Unidentified = "keep",
 ) -> Parameterisation:
-    """The parameterisation called ``name``. ConfigError when its box excludes the start."""
+    """The parameterisation called ``name``. ConfigError when its box excludes the start.
+
+    unidentified: what becomes of the directions of wheel rates that the trajectories drive so little that slip alone
+    may have done it. Matrix elements keep the design values there, or (fit) are fitted to what there is. The geometry
+    cannot keep values along a direction, and fits them.
+    """
     if name == "geometry":
         return WheelGeometry(robot, limits)
-    return MatrixElements(robot, box, driven_span(trajectories).null)
+    return MatrixElements(robot, box, directions_kept(robot, driven_span(trajectories), unidentified))
 
 
 def _frozen(array: NDArray[Any]) -> NDArray[Any]:

@@ -116,11 +116,12 @@ def _pseudo_inverse(equations: Array) -> Array:
 
 
 def _eq_3(r: Array, R: Array, d: Array) -> Array:
-    ra, rb, rc = np.moveaxis(r, -1, 0)
-    Ra, Rb, Rc = np.moveaxis(R, -1, 0)
+    ra, rb, rc = (r[..., wheel] for wheel in range(3))
+    Ra, Rb, Rc = (R[..., wheel] for wheel in range(3))
     sin_bc, sin_ac, sin_ab = (np.sin(d[..., i] - d[..., j]) for i, j in ((1, 2), (0, 2), (0, 1)))
-    ca, cb, cc = np.moveaxis(np.cos(d), -1, 0)
-    sa, sb, sc = np.moveaxis(np.sin(d), -1, 0)
+    cosine, sine = np.cos(d), np.sin(d)
+    ca, cb, cc = (cosine[..., wheel] for wheel in range(3))
+    sa, sb, sc = (sine[..., wheel] for wheel in range(3))
     rows = [
         [ra * (Rb * cc - Rc * cb), -rb * (Ra * cc - Rc * ca), rc * (Ra * cb - Rb * ca)],
         [ra * (Rb * sc - Rc * sb), -rb * (Ra * sc - Rc * sa), rc * (Ra * sb - Rb * sa)],

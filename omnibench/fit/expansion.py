@@ -1,0 +1,130 @@
+"""Chebyshev expansion of sums of exponentials exp(i m3.c) over a box of row 3, with a proven bound of its error.
+
+With m3 = centre + reach * d and d in [-1, 1]^N, each exponential is exp(i centre.c) times a product over the wheels of
+(Jacobi-Anger)
+
+    exp(i z d) = J_0(z) + 2 sum_n i^n J_n(z) T_n(d),        z = reach_j c_j.
+
+Terms of total degree above D are left out. From |J_n(z)| <= |z/2|^n / n! they sum to at most
+2^N sum_{n > D} (zeta/2)^n / n!, zeta = sum_j |z_j|.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from math import comb, factorial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.robot.kinematics import Array
+
+_MOST_TERMS = 3000
+_LARGEST_ANGLE = 4.0  # rad; beyond it the power series of J_n loses digits
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Products of Chebyshev polynomials of total degree ``degree`` or less.
+
+    orders (n, N): the order in each wheel. A wheel whose element has no width has order 0 throughout.
+    """
+
+    degree: int
+    orders: NDArray[np.intp]
+
+    @classmethod
+    def make(cls, degree: int, free: NDArray[np.bool_]) -> Basis:
+        """All products of total degree ``degree`` or less in the free wheels (N,)."""
+        ranges = (range(degree + 1) if wheel else range(1) for wheel in free)
+        return cls(degree, np.array([orders for orders in product(*ranges) if sum(orders) <= degree], dtype=np.intp))
+
+    def values(self, places: Array) -> Array:
+        """The products (n, P) at places (P, N) in [-1, 1]."""
+        angle = np.arccos(np.clip(places.T, -1.0, 1.0))
+        polynomials = np.cos(angle[:, None, :] * np.arange(self.degree + 1)[:, None])  # (N, D + 1, P)
+        first, *others = self.orders.T
+        values: Array = polynomials[0][first]
+        for wheel, orders in enumerate(others, 1):
+            values *= polynomials[wheel][orders]
+        return values
+
+    def coefficients(self, angles: Array) -> Array:
+        """Coefficients (n, M) of exp(i sum_j z_j d_j) for z = angles (M, N), each to be times i^(total degree)."""
+        factors = _bessel(angles.T, self.degree)  # (N, D + 1, M)
+        first, *others = self.orders.T
+        values: Array = factors[0][first]
+        for wheel, orders in enumerate(others, 1):
+            values *= factors[wheel][orders]
+        return values
+
+    @property
+    def quarter_turns(self) -> NDArray[np.intp]:
+        """Total degree (n,) modulo 4: the power of i that belongs to each term."""
+        turns: NDArray[np.intp] = self.orders.sum(axis=1) % 4
+        return turns
+
+
+def degree_for(
+    zeta: Array, steps: Array, firsts: NDArray[np.intp], tolerance: float, wheels: int
+) -> tuple[int | None, float]:
+    """The degree that expands every path to ``tolerance``, and the bound of what it leaves out (m).
+
+    zeta (M,): angles in all of each exponential, rad. steps (M,): the lengths that they multiply, m. firsts (Z,):
+    where each path begins. The degree is None where too many terms would be needed.
+    """
+    if zeta.max(initial=0.0) > _LARGEST_ANGLE:
+        return None, 0.0
+    half, power = zeta / 2, steps * truncation_factor(zeta, wheels)
+    degree = -1
+    while True:
+        degree += 1
+        if comb(degree + wheels, wheels) > _MOST_TERMS:
+            return None, 0.0
+        power = power * half / (degree + 1)
+        left_out = float(np.add.reduceat(power, firsts).max())
+        if left_out <= tolerance:
+            return degree, left_out
+
+
+def truncation_factor(zeta: Array, wheels: int) -> Array:
+    """What (zeta/2)^(D + 1) / (D + 1)! is to be multiplied with for the bound of the terms above degree D.
+
+    sum_{n > D} x^n / n! is at most x^(D + 1) / (D + 1)! * exp(x).
+    """
+    factor: Array = 2.0**wheels * np.exp(zeta / 2)
+    return factor
+
+
+def _bessel(angles: Array, degree: int) -> Array:
+    """J_0, 2 J_1, ..., 2 J_degree at angles (N, M): (N, degree + 1, M).
+
+    With J_n(z) = (z/2)^n j_n(z) the downward recurrence j_{n-1} = n j_n - (z/2)^2 j_{n+1} is stable and free of
+    divisions; it starts from the power series of the two highest orders.
+    """
+    half = angles / 2
+    square = half * half
+    scaled: Array = np.empty((len(angles), degree + 2, angles.shape[1]))
+    for order in (degree + 1, degree):
+        scaled[:, order] = _power_series(order, square)
+    for order in range(degree, 0, -1):
+        scaled[:, order - 1] = order * scaled[:, order] - square * scaled[:, order + 1]
+    power = 2 * half
+    for order in range(1, degree + 1):
+        scaled[:, order] *= power
+        power = power * half
+    return scaled[:, : degree + 1]
+
+
+def _power_series(order: int, square: Array) -> Array:
+    """sum_m (-square)^m / (m! (order + m)!), to rounding."""
+    largest = float(square.max(initial=0.0))
+    terms = 1
+    while largest**terms / (factorial(terms) * factorial(order + terms)) * factorial(order) > 1e-17:
+        terms += 1
+    total = np.full(square.shape, 1.0 / (factorial(terms) * factorial(order + terms)))
+    for m in range(terms - 1, -1, -1):
+        total *= -square
+        total += 1.0 / (factorial(m) * factorial(order + m))
+    return total
