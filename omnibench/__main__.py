@@ -1,17 +1,69 @@
-"""``omnibench`` and ``python -m omnibench``: the command line, with Ctrl-C heard from the first import on."""
+"""``omnibench`` and ``python -m omnibench``: every user's mistake is one line on standard error and exit code 2.
+
+Ctrl-C is heard from the first import on, so that nothing is imported before ``main``.
+"""
 
 import sys
+from typing import Any, NoReturn
 
 
 def main() -> None:
     """Run the command line."""
     try:
-        from omnibench.cli import main as command_line
+        from omnibench.cli import app
 
-        command_line()
+        _run(app)
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)  # noqa: T201 (nothing is loaded yet that could tell it)
-        sys.exit(130)
+        _fail("interrupted", 130)
+
+
+def _run(app: Any) -> None:
+    from io import TextIOWrapper
+
+    import typer
+
+    from omnibench.errors import Interrupted, OmnibenchError
+
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without a letter shows another, and no traceback
+    command = typer.main.get_command(app)
+    usage_error: Any = typer.BadParameter.__mro__[1]  # click's UsageError, wherever this Typer keeps it
+    try:
+        code = command.main(prog_name="omnibench", standalone_mode=False)
+    except usage_error as error:
+        if type(error).__name__ == "NoArgsIsHelpError":  # nothing was typed: the message is the whole help
+            _fail(error.format_message())
+        _fail(_usage(error))
+    except Interrupted as error:
+        _fail(str(error), 130)
+    except OmnibenchError as error:
+        _fail(f"error: {error}")
+    except typer.Abort:
+        _fail("interrupted", 130)
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of our output has gone: nothing more to say
+        sys.exit(1)
+    except MemoryError:
+        _fail("error: this needs more memory than there is; make the data or the budget smaller")
+    except OSError as error:  # a disk or a terminal that refuses where nobody expected it
+        _fail(f"error: {error.filename or 'output'}: {error.strerror or error}")
+    else:
+        if code == 130:  # Typer's newer versions turn Ctrl-C into this
+            _fail("interrupted", 130)
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+def _usage(error: Any) -> str:
+    message = " ".join(error.format_message().split()).replace("Value error, ", "")
+    context = error.ctx
+    command = context.command_path if context else "omnibench"
+    return f"error: {message} (see {command} --help)"
+
+
+def _fail(message: str, code: int = 2) -> NoReturn:
+    print(message, file=sys.stderr)  # noqa: T201 (the one place where errors are told)
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The command line: parse, call, print. A user's mistake is one line on standard error and exit code 2."""
+"""The commands: parse, call, print. What a mistake ends in is __main__'s."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import redirect_stdout
-from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn
+from typing import Annotated, Any, Literal
 
 import typer
 from pydantic import BaseModel
 
 from omnibench import terminal
 from omnibench.config import parse_yaml, to_json
-from omnibench.errors import ConfigError, Interrupted, OmnibenchError
+from omnibench.errors import ConfigError
 from omnibench.registry import PluginFailure, calibrators, costs, importers, load_plugins
 
 app = typer.Typer(
@@ -287,50 +286,6 @@ def plugin_check(
     typer.echo(", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
     if report.failures:
         raise typer.Exit(1)
-
-
-def main() -> None:
-    """Entry point: every user's mistake ends in one line and exit code 2."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal without a letter shows another, and no traceback
-    command = typer.main.get_command(app)
-    usage_error: Any = typer.BadParameter.__mro__[1]  # click's UsageError, wherever this Typer keeps it
-    try:
-        code = command.main(prog_name="omnibench", standalone_mode=False)
-    except usage_error as error:
-        if type(error).__name__ == "NoArgsIsHelpError":  # nothing was typed: the message is the whole help
-            _fail(error.format_message())
-        _fail(_usage(error))
-    except Interrupted as error:
-        _fail(str(error), 130)
-    except OmnibenchError as error:
-        _fail(f"error: {error}")
-    except (KeyboardInterrupt, typer.Abort):
-        _fail("interrupted", 130)
-    except BrokenPipeError:
-        sys.stderr.close()  # the reader of our output has gone: nothing more to say
-        sys.exit(1)
-    except MemoryError:
-        _fail("error: this needs more memory than there is; make the data or the budget smaller")
-    except OSError as error:  # a disk or a terminal that refuses where nobody expected it
-        _fail(f"error: {error.filename or 'output'}: {error.strerror or error}")
-    else:
-        if code == 130:  # Typer's newer versions turn Ctrl-C into this
-            _fail("interrupted", 130)
-        sys.exit(code if isinstance(code, int) else 0)
-
-
-def _usage(error: Any) -> str:
-    message = " ".join(error.format_message().split()).replace("Value error, ", "")
-    context = error.ctx
-    command = context.command_path if context else "omnibench"
-    return f"error: {message} (see {command} --help)"
-
-
-def _fail(message: str, code: int = 2) -> NoReturn:
-    print(message, file=sys.stderr)  # noqa: T201 (the one place where errors are told)
-    sys.exit(code)
 
 
 def _load(folders: list[Path] | None) -> list[PluginFailure]:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import pytest
 import yaml
 
-from omnibench import cli
+from omnibench.__main__ import main
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.results import ComparisonResult
 from omnibench.compare.run import run_comparison
@@ -153,7 +153,7 @@ def commands_of_this_process(capfd: pytest.CaptureFixture[str], monkeypatch: pyt
     def command(*arguments: object) -> Printed:
         monkeypatch.setattr(sys, "argv", ["omnibench", *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
-            cli.main()
+            main()
         printed = capfd.readouterr()
         assert "Traceback" not in printed.err
         return Printed(int(ended.value.code or 0), printed.out, printed.err)

@@ -184,4 +184,4 @@ def test_progress_tells_evaluations_and_the_best_cost(tmp_path: Path) -> None:
     counts, bests = zip(*notes.moves, strict=True)
     assert list(counts) == sorted(counts)
     assert list(bests) == sorted(bests, reverse=True)
-    assert bests[-1] >= (result.runs[0].record.train_cost or 0.0)
+    assert bests[-1] >= (result.runs[0].record.train_cost or 0.0) - 1e-11  # the verdict is by direct integration

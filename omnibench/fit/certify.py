@@ -1,0 +1,156 @@
+"""The proven optimum: how much better than a calibration any matrix of a box could be.
+
+Branch and bound on row 3 of the matrix: the box with the lowest bound (lower_bound.py) is cut in two until no box can
+hold a matrix that is better than the best known one by more than the wanted gap. What is proven holds at any time.
+"""
+
+from __future__ import annotations
+
+import heapq
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from omnibench.config import Model
+from omnibench.data.dataset import Dataset
+from omnibench.errors import DataError
+from omnibench.fit.lower_bound import LowerBounds, Node
+from omnibench.fit.parameterisation import Box
+from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
+from omnibench.registry import costs
+from omnibench.robot.calibration import Calibration
+from omnibench.robot.kinematics import Array
+from omnibench.threads import one_thread
+
+Watch = Callable[["Proof"], None]
+_NO_ERROR = 1e-9  # m, rad: below it a cost is rounding, and no share of it can be proven
+
+
+@dataclass(frozen=True, eq=False)
+class Proof:
+    """No matrix of the box costs less than ``lower_bound``.
+
+    best_cost, best_vector (n,): the best matrix that is known. boxes: looked at. finished: False when time ran out.
+    """
+
+    lower_bound: float
+    best_cost: float
+    best_vector: Array
+    boxes: int
+    seconds: float
+    finished: bool
+
+
+class Certificate(Model):
+    """How far a calibration's cost can be from the optimum: ``gap`` = 1 - lower_bound / cost.
+
+    cost: on the training split. lower_bound: of every matrix in the box.
+    """
+
+    cost: float
+    lower_bound: float
+    gap: float
+    box: str
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class CertifiedCalibration:
+    """A certificate, how it was proven, and whether the calibration lies in the box that it speaks of."""
+
+    certificate: Certificate
+    proof: Proof
+    cost_name: str
+    dataset: Dataset
+    inside: bool
+    held: tuple[str, ...]
+
+
+def certify_optimum(
+    calibration: Calibration,
+    dataset: Dataset,
+    *,
+    box: Box | None = None,
+    gap: float = 1e-3,
+    seconds: float = 60.0,
+    watch: Watch | None = None,
+) -> CertifiedCalibration:
+    """Prove how much better than a calibration any matrix of the box could be, on a data set's training split.
+
+    The cost and the integration are the calibration's. ``box``: default the one that it was searched in, or ``row``.
+    gap: stop when the best known matrix is proven to be this close to the optimum. seconds: or after this time.
+    Raises DataError when the wheels differ or the training split is empty, ConfigError for a cost that is no sum of
+    norms.
+    """
+    if calibration.robot.wheel_names != dataset.robot.wheel_names:
+        ours, theirs = ", ".join(calibration.robot.wheel_names), ", ".join(dataset.robot.wheel_names)
+        raise DataError(f"the calibration is for wheels {ours}, the data set {dataset.name} has {theirs}")
+    provenance = calibration.provenance
+    searched = provenance.box if provenance else ""
+    chosen: Box = box or ("paper" if searched == "paper" else "row")
+    training = training_split(dataset)
+    problem = CalibrationProblem(
+        dataset.robot,
+        training,
+        costs.create(provenance.cost if provenance else "final_pose"),
+        make_parameterisation("matrix", dataset.robot, training, box=chosen),
+        integration=calibration.integration,
+        budget=Budget(),
+        seed=0,
+    )
+    vector = calibration.matrix_array.ravel()
+    cost = float(problem.values(vector[None])[0])
+    inside = bool(problem.inside(vector[None])[0])
+    proof = prove(problem, vector if inside else problem.start, gap=gap, seconds=seconds, watch=watch)
+    return CertifiedCalibration(
+        Certificate(
+            cost=cost,
+            lower_bound=proof.lower_bound,
+            gap=proven_gap(cost, proof.lower_bound),
+            box=problem.box,
+            seconds=proof.seconds,
+        ),
+        proof,
+        problem.objective.name,
+        dataset,
+        inside,
+        problem.held,
+    )
+
+
+def proven_gap(cost: float, lower_bound: float) -> float:
+    """What share of a cost could be saved at most; negative for a cost below the bound (of a matrix not in the box)."""
+    return 1 - lower_bound / cost if cost > 0 else 0.0
+
+
+def prove(
+    problem: CalibrationProblem, known: Array, *, gap: float = 1e-3, seconds: float = 60.0, watch: Watch | None = None
+) -> Proof:
+    """A lower bound of the cost over the problem's box, within ``gap`` of the best cost known unless time runs out.
+
+    known (n,): a good vector in the box. ConfigError when the problem has no such bound (see LowerBounds).
+    """
+    began = time.perf_counter()
+    with one_thread():
+        bounds = LowerBounds(problem)
+        looked_at = 1
+        best_cost, best_vector = float(problem.values(known[None])[0]), known
+        root = bounds.root(known)
+        boxes: list[tuple[float, int, Node]] = [(root.bound, 0, root)]
+        while True:
+            lowest, _, node = boxes[0]
+            proven = min(lowest, best_cost)
+            spent = time.perf_counter() - began
+            finished = proven >= (1 - gap) * best_cost or best_cost < _NO_ERROR or not node.looseness.any()
+            proof = Proof(proven, best_cost, best_vector, looked_at, spent, finished)
+            if watch:
+                watch(proof)
+            if finished or spent > seconds:
+                return proof
+            heapq.heappop(boxes)
+            for part in bounds.split(node):
+                vector = bounds.vector(part.good)
+                if problem.inside(vector[None])[0] and (found := float(problem.values(vector[None])[0])) < best_cost:
+                    best_cost, best_vector = found, vector
+                heapq.heappush(boxes, (part.bound, looked_at, part))  # the number, as nodes cannot be compared
+                looked_at += 1
