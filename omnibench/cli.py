@@ -152,6 +152,36 @@ def evaluate(
 
 
 @app.command()
+def certify(
+    calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
+    dataset: Annotated[Path, typer.Argument(help="A data set folder.")],
+    box: Annotated[
+        Literal["paper", "row"] | None,
+        typer.Option(help="paper: +-10 % of each element; row: wider. Default: the box it was searched in, or row."),
+    ] = None,
+    gap: Annotated[float, typer.Option(min=1e-9, max=0.999, help="Stop when this share of the cost is left.")] = 1e-3,
+    seconds: Annotated[float, typer.Option(min=0.0, help="Or after this time; what is proven by then holds.")] = 60.0,
+    as_json: Json = False,
+) -> None:
+    """Prove how much better than a calibration any matrix of the box could be, on the training split."""
+    from omnibench.data.storage import load_dataset
+    from omnibench.fit.certify import certify_optimum
+    from omnibench.robot.calibration import read_calibration
+
+    recordings = load_dataset(dataset)
+    with terminal.ProofLine() as watch:
+        certified = certify_optimum(
+            read_calibration(calibration), recordings, box=box, gap=gap, seconds=seconds, watch=watch
+        )
+    _warn(recordings.warnings)
+    if not certified.inside:
+        _warn([f"the calibration is outside the box {certified.certificate.box!r}, of which the bound speaks"])
+    if as_json:
+        return _print_json(certified.certificate)
+    return terminal.print_certificate(terminal.make_console(), certified)
+
+
+@app.command()
 def simulate(
     config: Annotated[Path, typer.Argument(help="A comparison config with a simulated data set.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="The data set folder to write.")],

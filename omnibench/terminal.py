@@ -11,6 +11,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from omnibench.fit.calibrate import CalibrationRun
+from omnibench.fit.certify import CertifiedCalibration, Proof
 from omnibench.fit.evaluate import Evaluation
 from omnibench.fit.inspect import Inspection
 from omnibench.fit.parameterisation import FittedParameter
@@ -51,6 +52,53 @@ class EvaluationsBar:
 
     def __call__(self, evaluations: int, best: float) -> None:
         self._progress.update(self._task, completed=evaluations, note=f"{evaluations} evaluations, best {best:.6f}")
+
+
+class ProofLine:
+    """How far a proof has come, on a terminal."""
+
+    def __init__(self) -> None:
+        console = make_console(error=True)
+        self._progress = Progress(
+            TextColumn("proving"),
+            TextColumn("{task.fields[note]}"),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._progress.add_task("", total=None, note="")
+
+    def __enter__(self) -> ProofLine:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def __call__(self, proof: Proof) -> None:
+        note = f"{proof.boxes} parts of the box, bound {proof.lower_bound:.6f}, best {proof.best_cost:.6f}"
+        self._progress.update(self._task, note=note)
+
+
+def print_certificate(console: Console, certified: CertifiedCalibration) -> None:
+    """What is proven of a calibration, in words."""
+    certificate, proof = certified.certificate, certified.proof
+    kind = "simulated data" if certified.dataset.simulated else "recorded data"
+    console.print(f"{certified.dataset.name} ({kind}), training split, cost {certified.cost_name}", soft_wrap=True)
+    console.print(f"cost of the calibration      {certificate.cost:.9f}")
+    if proof.best_cost < certificate.cost:
+        console.print(f"best matrix seen in the box  {proof.best_cost:.9f}")
+    console.print(f"proven lower bound           {certificate.lower_bound:.9f}")
+    console.print(
+        f"No matrix in the box {certificate.box!r} costs less than that: whatever the optimiser, there is at most "
+        f"{max(certificate.gap, 0.0):.3%} to gain on this calibration.",
+        soft_wrap=True,
+    )
+    if certified.held:
+        console.print(f"The box holds {', '.join(certified.held)} at the design value.", soft_wrap=True)
+    ended = "" if proof.finished else "; the time was up: with more (--seconds) the bound may rise"
+    console.print(f"{proof.boxes} parts of the box looked at in {certificate.seconds:.1f} s{ended}", soft_wrap=True)
 
 
 def print_calibration(console: Console, run: CalibrationRun) -> None:

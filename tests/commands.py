@@ -106,6 +106,7 @@ def small(**changes: Any) -> dict[str, Any]:
         "calibrators": ["theoretical", "closed_form", search()],
         "workers": 2,
         "bootstrap": {"resamples": 200},
+        "certificate": None,
         **changes,
     }
 

@@ -66,6 +66,13 @@ class Bootstrap(Model):
     seed: int = Field(0, ge=0)
 
 
+class CertificateChoice(Model):
+    """How far the optimum of each box is proven, by ``closed_form`` or anything else."""
+
+    gap: float = Field(1e-3, gt=0, lt=1, description="share of the lowest cost that may stay unproven")
+    seconds: float = Field(10.0, gt=0, description="time for each box; what is proven by then is reported")
+
+
 class PublishedResult(Model):
     """A result from the literature, shown beside ours and said to be on other data."""
 
@@ -93,6 +100,7 @@ class CompareConfig(Model):
     plugins: tuple[Path, ...] = Field((), description="folders of plug-ins; relative to the config file")
     workers: int | None = Field(None, gt=0, description="processes; default: the processors")
     bootstrap: Bootstrap = Bootstrap()
+    certificate: CertificateChoice | None = Field(CertificateChoice(), description="null: prove nothing")
     published_results: tuple[PublishedResult, ...] = ()
 
     @field_validator("calibrators", mode="before", json_schema_input_type=tuple[str | CalibratorEntry, ...])

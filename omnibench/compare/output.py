@@ -95,6 +95,7 @@ def summary(result: ComparisonResult) -> dict[str, Any]:
         "budget": result.config.budget.model_dump(),
         "runs": [run.record.model_dump(mode="json") for run in result.runs],
         "statistics": [_statistics_row(entry) for entry in result.statistics],
+        "certificates": [certificate.model_dump() for certificate in result.certificates],
         "warnings": list(result.warnings),
         "environment": result.environment.model_dump(),
     }

@@ -13,7 +13,14 @@ from omnibench.compare.matrices import matrix_blocks
 from omnibench.compare.path_figures import path_grid
 from omnibench.compare.results import ComparisonResult
 from omnibench.compare.search_figures import search_blocks
-from omnibench.compare.tables import cost_in_words, cost_table, entry_table, final_error_table, run_table
+from omnibench.compare.tables import (
+    certificate_table,
+    cost_in_words,
+    cost_table,
+    entry_table,
+    final_error_table,
+    run_table,
+)
 from omnibench.compare.view import SPLIT_NAMES, DatasetView, views
 from omnibench.compare.wording import cost, cost_decimals, improvement_in_words, level_in_words
 from omnibench.config import to_yaml
@@ -101,10 +108,15 @@ def _parts(result: ComparisonResult, view: DatasetView, prefix: str) -> tuple[Se
         ),
         Section(f"{prefix}paths", "Paths", (path_grid(view),)),
         Section(f"{prefix}searches", "Searches", search_blocks(view)),
-        Section(f"{prefix}outcomes", "Outcomes", (entry_table(view), runs)),
+        Section(f"{prefix}outcomes", "Outcomes", (entry_table(view), *_proofs(result, view), runs)),
         Section(f"{prefix}matrices", "Matrices", matrix_blocks(view)),
         Section(f"{prefix}data", "Data", _data_blocks(result, view)),
     )
+
+
+def _proofs(result: ComparisonResult, view: DatasetView) -> tuple[Block, ...]:
+    own = [certificate for certificate in result.certificates if certificate.dataset == view.name]
+    return (certificate_table(own),) if own else ()
 
 
 def _badges(view: DatasetView) -> tuple[Badge, ...]:

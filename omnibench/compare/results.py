@@ -49,6 +49,24 @@ class RunRecord(Model):
     held: tuple[str, ...]  # elements that keep their start value: the box or the cost leaves no choice
     gap: float | None  # train_cost / exact optimum in the box ``gap_box`` - 1
     gap_box: str | None
+    proven_gap: float | None  # the share of train_cost that any matrix of the box could save at most
+
+
+class BoxCertificate(Model):
+    """No matrix of a box has a training cost below ``lower_bound``.
+
+    best_cost: the lowest one known. gap: 1 - lower_bound / best_cost. parts: of the box that were looked at. finished:
+    False when the config's seconds came before its gap.
+    """
+
+    dataset: str
+    box: str
+    lower_bound: float
+    best_cost: float
+    gap: float
+    parts: int
+    seconds: float
+    finished: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +129,7 @@ class EntryStatistics:
     practically_equal: bool | None
     is_best: bool
     gap_median: float | None
+    proven_gap_median: float | None
     evaluations_median: float | None
     seconds_median: float | None
 
@@ -124,5 +143,6 @@ class ComparisonResult:
     datasets: dict[str, Dataset]
     runs: tuple[ScoredRun, ...]
     statistics: tuple[EntryStatistics, ...]
+    certificates: tuple[BoxCertificate, ...]
     environment: Environment
     warnings: tuple[str, ...]

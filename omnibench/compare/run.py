@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from omnibench.compare.certificates import certify
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.execute import Progress, execute
 from omnibench.compare.output import prepare_output, write_results
@@ -49,13 +50,14 @@ def run_comparison(
     store = RunStore(folder / "runs")
     with _resumable(plan, store, folder):
         results = execute(plan, store, progress or Silent(), config.workers or os.cpu_count() or 1)
-        runs = score(plan, results, datasets)
+        runs, certificates = certify(plan, score(plan, results, datasets))
         result = ComparisonResult(
             config=config,
             output=folder,
             datasets=datasets,
             runs=runs,
             statistics=entry_statistics(runs, config.bootstrap),
+            certificates=certificates,
             environment=environment(),
             warnings=tuple(_warnings(failures, datasets, runs)),
         )

@@ -125,6 +125,7 @@ def _score_one(run: PlannedRun, result: RunResult, scorers: Mapping[tuple[str, S
         held=result.held,
         gap=None,
         gap_box=None,
+        proven_gap=None,
     )
     return ScoredRun(
         record=record,
@@ -162,20 +163,26 @@ def _with_gap(run: PlannedRun, scored: ScoredRun, exact: Sequence[tuple[PlannedR
     cost, matrix = scored.record.train_cost, scored.matrix
     if cost is None or matrix is None:
         return scored
-    elsewhere = run.parameterisation == "geometry" or run.box == UNBOUNDED
     for other, optimum in exact:
         if other.dataset_name != run.dataset_name or optimum.record.train_cost is None:
             continue
-        if _contains(other, matrix) if elsewhere else _box(other) == _box(run):
+        if box_contains(other, matrix) if has_no_box(run) else box_of(other) == box_of(run):
             gap = cost / optimum.record.train_cost - 1
             return replace(scored, record=scored.record.model_copy(update={"gap": gap, "gap_box": other.box}))
     return scored
 
 
-def _box(run: PlannedRun) -> Box:
+def has_no_box(run: PlannedRun) -> bool:
+    """Whether a run's matrix was not searched in a box of matrix elements: a geometry, or an answer that is given."""
+    return run.parameterisation == "geometry" or run.box == UNBOUNDED
+
+
+def box_of(run: PlannedRun) -> Box:
+    """The box of a run that has one."""
     return run.entry.box or run.config.box
 
 
-def _contains(run: PlannedRun, matrix: Array) -> bool:
-    bounds = make_bounds(run.dataset.robot, _box(run))
+def box_contains(run: PlannedRun, matrix: Array) -> bool:
+    """Whether a matrix (3, N) lies in the box of a run that has one."""
+    bounds = make_bounds(run.dataset.robot, box_of(run))
     return bool(((matrix.ravel() >= bounds.lower) & (matrix.ravel() <= bounds.upper)).all())

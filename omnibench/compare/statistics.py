@@ -60,6 +60,7 @@ def _statistics(
     record = group[0].record
     costs = [run.record.train_cost for run in group if run.record.train_cost is not None]
     gaps = [run.record.gap for run in group if run.record.gap is not None]
+    proven = [run.record.proven_gap for run in group if run.record.proven_gap is not None]
     train = None if typical is None else typical.train_costs
     validation = None if typical is None else typical.validation_costs
     difference, equal = None, None
@@ -84,6 +85,7 @@ def _statistics(
         practically_equal=equal,
         is_best=typical is not None and typical is best,
         gap_median=float(np.median(gaps)) if gaps else None,
+        proven_gap_median=float(np.median(proven)) if proven else None,
         evaluations_median=float(np.median([run.record.evaluations for run in group])),
         seconds_median=float(np.median([run.record.seconds for run in group])),
     )

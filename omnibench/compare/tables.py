@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from omnibench.compare.results import EntryStatistics, Interval, RunRecord
+from omnibench.compare.results import BoxCertificate, EntryStatistics, Interval, RunRecord
 from omnibench.compare.view import (
     SPLIT_NAMES,
     THEORETICAL_LOOK,
@@ -113,7 +115,7 @@ def entry_table(view: DatasetView) -> Table:
                     entry_cell(view, entry),
                     Cell(f"{entry.answers} of {entry.runs}"),
                     Cell(fixed(entry.train_median, digits), _spread(entry)),
-                    Cell(gap(entry.gap_median)),
+                    Cell(gap(entry.gap_median), proven(entry.proven_gap_median)),
                     Cell(count(entry.evaluations_median), seconds(entry.seconds_median)),
                     _difference(entry),
                     _verdict(view, entry),
@@ -134,7 +136,8 @@ def entry_table(view: DatasetView) -> Table:
         ),
         rows=tuple(rows),
         note="Spread: interquartile range over seeds. Gap: training cost relative to the exact optimum in the same box "
-        f"(closed_form), minus one; {NOTHING} where that is not known. Difference: paired over trajectories, with its "
+        f"(closed_form), minus one; {NOTHING} where that is not known. Proven: what any optimiser could still save of "
+        "the cost in that box, at most. Difference: paired over trajectories, with its "
         "95 % bootstrap interval. Practically equal: that interval contains zero, or the difference is below a tenth "
         "of the standard error of the best entry's cost. Best: the lowest training cost of the entries that are "
         f"practically equal to the one of lowest {SPLIT_NAMES[view.scored]} cost.{_held_in_words(view)}",
@@ -182,6 +185,40 @@ def gap(value: float | None) -> str:
     if value is not None and abs(value) < 5e-13:
         return "0"
     return significant(value, 2)
+
+
+def proven(value: float | None) -> str:
+    """What share of a cost could be saved at most, as a note; nothing where nothing is proven."""
+    return "" if value is None else f"proven: at most {percent(max(value, 0.0), 2)} to gain"
+
+
+def certificate_table(certificates: Sequence[BoxCertificate]) -> Table:
+    """The boxes whose optimum is bounded by proof."""
+    rows = [
+        Row(
+            (
+                Cell(certificate.box),
+                Cell(significant(certificate.best_cost, 6)),
+                Cell(significant(certificate.lower_bound, 6)),
+                Cell(percent(certificate.gap, 2), "" if certificate.finished else "time was up"),
+                Cell(count(certificate.parts), seconds(certificate.seconds)),
+            )
+        )
+        for certificate in certificates
+    ]
+    return Table(
+        caption="What no optimiser can beat",
+        columns=(
+            Column("Box", numeric=False),
+            Column("Lowest CF training found"),
+            Column("No matrix of the box is below"),
+            Column("Left to gain, at most"),
+            Column("Parts of the box, time"),
+        ),
+        rows=tuple(rows),
+        note="Proven by branch and bound on row 3 of the matrix, with rounding counted in: whichever search is used, "
+        "and however long it runs, the training cost cannot fall below the bound while the matrix stays in the box.",
+    )
 
 
 def _cost_row(view: DatasetView, entry: EntryStatistics, split: Split, before: str) -> Row:
@@ -266,7 +303,7 @@ def _run_row(view: DatasetView, record: RunRecord) -> Row:
         Cell(record.outcome.value, record.reason),
         Cell(fixed(record.train_cost, 6)),
         Cell(fixed(record.validation_cost, 6)),
-        Cell(gap(record.gap)),
+        Cell(gap(record.gap), proven(record.proven_gap)),
         Cell(count(record.evaluations), seconds(record.seconds)),
         Cell(", ".join(on_bounds(record)) if answered and on_bounds(record) else NOTHING),
     )

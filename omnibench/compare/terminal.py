@@ -118,7 +118,7 @@ def print_result(console: Console, result: ComparisonResult) -> None:
             console.print(f"no answer: {title}: {record.outcome}: {record.reason}", soft_wrap=True)
     console.print(
         "intervals: 95 % bootstrap over trajectories;  = : practically equal to the best;  gap: above the "
-        "exact optimum in the same box",
+        "exact optimum in the same box;  proven: what any optimiser could still save of the cost there, at most",
         soft_wrap=True,
     )
 
@@ -183,7 +183,7 @@ def _error_cells(position: float | None, heading: float | None) -> tuple[str, st
 
 
 def _search_table(result: ComparisonResult) -> Table:
-    headings = ("runs", "evaluations", "time", "gap", "on a bound")
+    headings = ("runs", "evaluations", "time", "gap", "proven", "on a bound")
     several = len(result.datasets) > 1
     table = _new_table("How each was found", [*(["data set"] * several), "M^-1", "box", "outcome"], headings)
     for entry in result.statistics:
@@ -198,6 +198,7 @@ def _search_table(result: ComparisonResult) -> Table:
             f"{entry.evaluations_median:.0f}" if entry.evaluations_median is not None else "",
             f"{entry.seconds_median:.2f} s" if entry.seconds_median is not None else "",
             f"{entry.gap_median:.1e}" if entry.gap_median is not None else "",
+            f"{max(entry.proven_gap_median, 0.0):.2%}" if entry.proven_gap_median is not None else "",
             _on_bounds(entry),
         )
     return table

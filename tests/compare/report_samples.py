@@ -9,6 +9,7 @@ from typing import Any
 
 from report_page import Page
 
+from omnibench.compare.certificates import certify
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
 from omnibench.compare.report import write_report
@@ -55,6 +56,7 @@ def config(**changes: Any) -> CompareConfig:
             "budget": {"evaluations": 2000},
             "calibrators": ["theoretical", "closed_form", {"name": "random_search", "options": {"candidates": 1000}}],
             "seeds": [1, 2],
+            "certificate": {"gap": 0.05, "seconds": 5},
             **changes,
         }
     )
@@ -64,13 +66,14 @@ def run(chosen: CompareConfig, datasets: Mapping[str, Dataset] | None = None) ->
     """The comparison of a config, in this process; ``datasets`` in place of the config's own."""
     loaded = dict(datasets or load_datasets(chosen))
     plan = make_plan(chosen, loaded)
-    scored = score(plan, [solve(planned) for planned in plan], loaded)
+    scored, certificates = certify(plan, score(plan, [solve(planned) for planned in plan], loaded))
     return ComparisonResult(
         config=chosen,
         output=Path("results"),
         datasets=loaded,
         runs=scored,
         statistics=entry_statistics(scored, chosen.bootstrap),
+        certificates=certificates,
         environment=environment(),
         warnings=(),
     )

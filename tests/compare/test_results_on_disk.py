@@ -52,6 +52,7 @@ FURTHER = {
     "held": list,
     "gap": float,
     "gap_box": str,
+    "proven_gap": (float, type(None)),
 }
 
 
@@ -68,7 +69,7 @@ def test_the_summary_has_the_documented_keys(output: Path) -> None:
     assert (found["dataset"], found["cost"], found["name"]) == ("flower", "final_pose", "small")
     assert {*found} == {
         *("name", "dataset", "simulated", "cost", "integration", "budget", "runs", "statistics", "warnings"),
-        "environment",
+        *("environment", "certificates"),
     }
     assert [(run["label"], run["seed"]) for run in found["runs"]] == [
         ("theoretical", 1),
@@ -93,7 +94,7 @@ def test_a_run_without_validation_data_says_null(tmp_path: Path) -> None:
     del data["validation"]
     compared_here(tmp_path / "out", datasets={"flower": {"simulate": data}})
     for run in summary(tmp_path / "out")["runs"]:
-        missing = {name for name, value in run.items() if value is None and name != "parameters"}
+        missing = {name for name, value in run.items() if value is None and name not in ("parameters", "proven_gap")}
         assert missing == {name for name in run if "validation" in name}
 
 

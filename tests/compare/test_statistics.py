@@ -57,6 +57,7 @@ def scored(
         held=(),
         gap=gap,
         gap_box=None,
+        proven_gap=None,
     )
     return ScoredRun(record, (), None, train, None, validation, design, None if validation is None else design)
 
