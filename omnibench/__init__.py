@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from omnibench.compare.design import design_experiment
     from omnibench.compare.plan import read_compare_config
     from omnibench.compare.run import run_comparison
     from omnibench.data.dataset import Dataset, Trajectory, make_dataset
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
     from omnibench.data.storage import load_dataset, save_dataset
     from omnibench.errors import OmnibenchError
     from omnibench.fit.calibrate import calibrate
+    from omnibench.fit.certify import certify_optimum
     from omnibench.fit.evaluate import evaluate
     from omnibench.fit.inspect import inspect_dataset
     from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
@@ -23,6 +25,8 @@ __all__ = [
     "OmnibenchError",
     "Trajectory",
     "calibrate",
+    "certify_optimum",
+    "design_experiment",
     "evaluate",
     "export_calibration",
     "import_dataset",
@@ -39,6 +43,7 @@ __all__ = [
 
 # Imported when first asked for: the command line starts at once, and Ctrl-C finds it listening.
 _HOMES = {
+    "compare.design": ("design_experiment",),
     "compare.plan": ("read_compare_config",),
     "compare.run": ("run_comparison",),
     "data.dataset": ("Dataset", "Trajectory", "make_dataset"),
@@ -47,6 +52,7 @@ _HOMES = {
     "data.storage": ("load_dataset", "save_dataset"),
     "errors": ("OmnibenchError",),
     "fit.calibrate": ("calibrate",),
+    "fit.certify": ("certify_optimum",),
     "fit.evaluate": ("evaluate",),
     "fit.inspect": ("inspect_dataset",),
     "robot.calibration": ("Calibration", "read_calibration", "write_calibration"),

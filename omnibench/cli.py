@@ -85,7 +85,11 @@ def calibrate(
     seed: Annotated[int, typer.Option(min=0)] = 1,
     evaluations: Annotated[int, typer.Option(min=1, help="Budget.")] = 60_000,
     seconds: Annotated[float, typer.Option(min=0.001, help="Budget.")] = 600.0,
-    intervals: Annotated[bool, typer.Option("--intervals", help="95 % bootstrap intervals (closed_form).")] = False,
+    intervals: Annotated[bool, typer.Option("--intervals", help="Also bootstrap intervals (closed_form).")] = False,
+    unidentified: Annotated[
+        Literal["keep", "fit"],
+        typer.Option(help="Motions that the data hardly drive: keep the design values, or fit them to slip and noise."),
+    ] = "keep",
     settings: Settings = None,
     plugins: Plugins = None,
     as_json: Json = False,
@@ -114,12 +118,13 @@ def calibrate(
             budget=Budget(evaluations=evaluations, seconds=seconds),
             seed=seed,
             intervals=intervals,
+            unidentified=unidentified,
             watch=watch,
         )
     calibration, result = run.calibration, run.result
     if output is not None:
         write_calibration(calibration, output)
-    _warn(recordings.warnings)
+    _warn([*recordings.warnings, *run.warnings])
     if result.at_bounds:
         _warn([f"{', '.join(result.at_bounds)} lie on a bound of the box {box!r}; a wider box may fit better"])
     if result.held:
@@ -179,6 +184,46 @@ def certify(
     if as_json:
         return _print_json(certified.certificate)
     return terminal.print_certificate(terminal.make_console(), certified)
+
+
+@app.command()
+def design(
+    source: Annotated[
+        Path, typer.Argument(metavar="DATASET|CONFIG", help="A data set folder, or a comparison's or design's YAML.")
+    ],
+    use: Annotated[
+        Literal["trajectory", "final"], typer.Option(help="Reference poses that a calibration is made from.")
+    ] = "trajectory",
+    per: Annotated[Literal["run", "second", "metre"], typer.Option(help="What is to be spared.")] = "run",
+    runs: Annotated[int | None, typer.Option(min=1, help="Choose so many. Default: within 1 % of the optimum.")] = None,
+    repetitions: Annotated[int | None, typer.Option(min=1, help="How often a command may be chosen.")] = None,
+    dataset: Annotated[str | None, typer.Option(help="Which data set, if the config has several.")] = None,
+    integration: Annotated[
+        Literal["euler", "arc"] | None, typer.Option(help="Default: the config's, or arc for a data set.")
+    ] = None,
+    output: Annotated[Path | None, typer.Option("--output", help="Folder for report.html and design.json.")] = None,
+    plugins: Plugins = None,
+    as_json: Json = False,
+) -> None:
+    """Which commands are worth driving: the runs that shrink the covariance of the matrix most."""
+    from omnibench.compare.design import design_experiment
+    from omnibench.compare.design_report import write_design_report
+    from omnibench.compare.design_terminal import print_design
+    from omnibench.files import write_text
+
+    _load(plugins)
+    found = design_experiment(
+        source, use=use, per=per, runs=runs, repetitions=repetitions, dataset=dataset, integration=integration
+    )
+    if output is not None:
+        write_text(output / "design.json", to_json(found) + "\n")
+        write_design_report(found, output / "report.html")
+    if as_json:
+        return _print_json(found)
+    print_design(terminal.make_console(), found)
+    if output is not None:
+        typer.echo(f"report: {output / 'report.html'}")
+    return None
 
 
 @app.command()
@@ -279,11 +324,15 @@ def list_(plugins: Plugins = None, as_json: Json = False) -> None:
 
 
 @app.command()
-def schema() -> None:
+def schema(
+    kind: Annotated[Literal["compare", "design"], typer.Argument(help="Configs of which command.")] = "compare",
+) -> None:
     """JSON schema of the configs, for editors."""
     from omnibench.compare.config import CompareConfig
+    from omnibench.compare.design_config import DesignConfig
 
-    _print_json(CompareConfig.model_json_schema(by_alias=True))
+    config: type[BaseModel] = CompareConfig if kind == "compare" else DesignConfig
+    _print_json(config.model_json_schema(by_alias=True))
 
 
 @plugin_app.command("new")

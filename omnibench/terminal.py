@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from omnibench.fit.bootstrap import ElementIntervals
 from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.certify import CertifiedCalibration, Proof
 from omnibench.fit.evaluate import Evaluation
+from omnibench.fit.identifiability import ROWS, Identifiability
 from omnibench.fit.inspect import Inspection
-from omnibench.fit.parameterisation import FittedParameter
+from omnibench.fit.parameterisation import WheelGeometry
+from omnibench.fit.physical import ParameterEstimate
 from omnibench.registry import REGISTRIES, Entry, PluginFailure
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Robot
 
 _PIPED_WIDTH = 160
 
@@ -115,31 +120,53 @@ def print_calibration(console: Console, run: CalibrationRun) -> None:
     for row_number, ((label, unit), row, start) in enumerate(rows):
         cells = [f"{value:+.7f} ({_deviation(value, first)})" for value, first in zip(row, start, strict=True)]
         table.add_row(f"{label} ({unit})", *cells)
-        if run.intervals is not None:
-            bounds = zip(run.intervals.low[row_number], run.intervals.high[row_number], strict=True)
-            table.add_row("  95 %", *(f"{low:+.7f} .. {high:+.7f}" for low, high in bounds), style="dim")
+        for label, intervals in _intervals(run):
+            bounds = zip(intervals.low[row_number], intervals.high[row_number], strict=True)
+            table.add_row(f"  {label}", *(f"{low:+.7f} .. {high:+.7f}" for low, high in bounds), style="dim")
     console.print(table)
-    if run.parameters is not None:
-        _print_parameters(console, run.parameters)
+    if run.uncertainty is not None and run.uncertainty.parameters is not None:
+        _print_parameters(console, calibration.robot, run.uncertainty.parameters)
+    if run.uncertainty is not None:
+        console.print(f"95 % intervals: {run.uncertainty.source}", soft_wrap=True)
+        console.print(f"noise of the reference: {_noise_in_words(run.uncertainty.noise)}", soft_wrap=True)
     console.print(
         f"{result.outcome}: {result.reason}; {result.evaluations} evaluations, {result.seconds:.2f} s",
         soft_wrap=True,
     )
 
 
-def _print_parameters(console: Console, parameters: Sequence[FittedParameter]) -> None:
+def _intervals(run: CalibrationRun) -> Iterator[tuple[str, ElementIntervals]]:
+    if run.uncertainty is not None:
+        yield "95 %", run.uncertainty.intervals
+    if run.intervals is not None:
+        yield "95 %, bootstrap", run.intervals
+
+
+def _noise_in_words(noise: Noise) -> str:
+    """Positions and headings apart, without what is zero."""
+    kinds = (("white", ""), ("walk", "/sqrt s"), ("bias of a run", ""))
+    position = (noise.pose_position, noise.walk_position, noise.bias_position)
+    heading = (noise.pose_heading, noise.walk_heading, noise.bias_heading)
+    parts = [
+        ", ".join(f"{kind} {factor * value:.2g} {unit}{per}" for (kind, per), value in zip(kinds, values, strict=True))
+        for values, factor, unit in ((position, 1000.0, "mm"), (heading, math.degrees(1.0), "deg"))
+    ]
+    return "; ".join(parts)
+
+
+def _print_parameters(console: Console, robot: Robot, parameters: Sequence[ParameterEstimate]) -> None:
     table = Table(title="physical parameters", title_justify="left")
-    for heading in ("parameter", "design", "fitted", "deviation"):
+    for heading in ("parameter", "design", "fitted", "deviation", "95 %"):
         table.add_column(heading, justify="left" if heading == "parameter" else "right")
-    for parameter in parameters:
-        angle = parameter.unit == "rad"
-        shown = [math.degrees(value) if angle else value for value in (parameter.design, parameter.value)]
-        deviation = parameter.deviation_percent
-        table.add_row(
-            parameter.name,
-            *(f"{value:.3f} deg" if angle else f"{value:.5f} m" for value in shown),
-            "design 0" if deviation is None else f"{deviation:+.2f} %",
-        )
+    design = WheelGeometry(robot).start
+    for parameter, start in zip(parameters, design, strict=True):
+        factor, form = (math.degrees(1.0), "{:.3f} deg") if parameter.unit == "rad" else (1.0, "{:.5f} m")
+        shown = [form.format(factor * value) for value in (start, parameter.value)]
+        deviation = "design 0" if not start else f"{100 * (parameter.value / start - 1):+.2f} %"
+        interval = "not told by these data"
+        if parameter.low is not None and parameter.high is not None:
+            interval = f"{form.format(factor * parameter.low)} .. {form.format(factor * parameter.high)}"
+        table.add_row(parameter.name, *shown, deviation, interval)
     console.print(table)
 
 
@@ -201,8 +228,22 @@ def print_inspection(console: Console, found: Inspection) -> None:
     console.print(table)
     shares = ", ".join(f"{share:.2g}" for share in found.driven_shares)
     console.print(f"directions of wheel rates driven: {found.driven_directions} of {len(found.wheels)} ({shares})")
+    _print_identifiability(console, found.identifiability)
     for finding in found.findings:
         console.print(f"- {finding}", soft_wrap=True)
+
+
+def _print_identifiability(console: Console, told: Identifiability) -> None:
+    table = Table(title="what a calibration can tell, +- % of the row's largest element", title_justify="left")
+    for heading in ("wheel rates along", "which is", "driven", *(f"row {row}" for row in ROWS)):
+        table.add_column(heading, justify="left" if heading in ("wheel rates along", "which is") else "right")
+    for each in told.directions:
+        deviations = ["open"] * len(ROWS)
+        if each.state == "driven" and each.deviations is not None:
+            deviations = [f"{100 * value:.2g} %" for value in each.deviations]
+        table.add_row(each.direction, each.motion or "slip of the wheels", f"{100 * each.share:.3g} %", *deviations)
+    console.print(table)
+    console.print(f"noise: {told.noise_source}", soft_wrap=True)
 
 
 def print_registries(console: Console) -> None:

@@ -261,3 +261,58 @@ def test_a_plugin_that_breaks_the_contract_fails_its_check_with_exit_code_1(comm
     printed = command("plugin", "check", tmp_path / "outside.py")
     assert printed.returncode == 1
     assert "failed  calibrator outside: bounds are kept" in printed.stdout
+
+
+def test_certify_prints_the_documented_document(command: Command, prepared: Prepared) -> None:
+    found = document(command("certify", prepared.calibration, prepared.data, "--gap", 0.05, "--seconds", 30, "--json"))
+    assert [*found] == ["cost", "lower_bound", "gap", "box", "seconds"]
+    assert 0 < found["lower_bound"] <= found["cost"]
+    assert found["gap"] == pytest.approx(1 - found["lower_bound"] / found["cost"])
+    assert found["box"] == "row"
+
+
+def test_certify_says_in_words_what_is_proven(command: Command, prepared: Prepared) -> None:
+    printed = command("certify", prepared.calibration, prepared.data, "--seconds", 0.01)
+    assert "(simulated data), training split, cost final_pose" in printed.stdout
+    assert "No matrix in the box 'row' costs less than that" in printed.stdout
+    assert "the time was up" in printed.stdout
+
+
+def test_design_prints_one_document_and_writes_its_report(command: Command, tmp_path: Path) -> None:
+    config = write_config(tmp_path)
+    found = document(command("design", config, "--output", tmp_path / "out", "--json"))
+    assert json.loads((tmp_path / "out" / "design.json").read_text(encoding="utf-8")) == found
+    assert found["sets"][0]["step"]["efficiency"] > 0.99
+    assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
+
+
+def test_a_calibration_comes_with_its_noise_and_covariance(prepared: Prepared) -> None:
+    calibration = read_calibration(prepared.calibration)
+    assert calibration.noise is not None
+    assert calibration.covariance is not None
+    deviations = np.sqrt(np.diag(calibration.covariance))
+    assert (deviations > 0).all()
+    assert (deviations < 0.05).all()
+
+
+def test_a_motion_that_was_hardly_driven_keeps_the_design_unless_it_is_to_be_fitted(
+    command: Command, tmp_path: Path
+) -> None:
+    recordings = RECORDINGS / "robotino"
+    if not recordings.is_dir():
+        pytest.skip(f"{recordings} is not there")
+    data = tmp_path / "data"
+    plugins = CONFIGS.parent / "plugins"
+    assert command("import", "robotino", recordings, "-o", data, "--plugins", plugins).returncode == 0
+    told = command("inspect", data).stdout
+    assert "turning on the spot" in told
+    assert "cannot be identified" in told
+    turned = {}
+    for choice in ("keep", "fit"):
+        file = tmp_path / f"{choice}.yaml"
+        printed = command("calibrate", data, "-o", file, "--unidentified", choice)
+        assert "do not identify" in printed.stderr
+        calibration = read_calibration(file)
+        turned[choice] = (calibration.matrix_array - calibration.robot.inverse_kinematic_matrix).sum(axis=1)
+    assert np.abs(turned["keep"]).max() < 1e-9
+    assert np.abs(turned["fit"]).max() > 1e-4

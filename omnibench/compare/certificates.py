@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from omnibench.compare.plan import PlannedRun
+from omnibench.compare.problem import make_problem
 from omnibench.compare.results import BoxCertificate, ScoredRun
 from omnibench.compare.scoring import box_contains, box_of, has_no_box
 from omnibench.fit.certify import prove, proven_gap
 from omnibench.fit.cost import SumOfNorms
-from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
-from omnibench.registry import costs
 
 
 def certify(
@@ -39,24 +38,14 @@ def certify(
 
 def _proof(run: PlannedRun, answers: Sequence[np.ndarray]) -> list[BoxCertificate]:
     """The lower bound over a run's box, if its cost has one; the better the known answers, the sooner."""
-    config = run.config
-    cost = costs.create(config.cost.name, config.cost.options)
-    if not isinstance(cost, SumOfNorms) or config.certificate is None:
+    choice = run.config.certificate
+    problem = make_problem(run.config, run.entry, run.dataset.robot, run.dataset.split("train"), "matrix")
+    if choice is None or not isinstance(problem.objective, SumOfNorms):
         return []
-    training = run.dataset.split("train")
-    problem = CalibrationProblem(
-        run.dataset.robot,
-        training,
-        cost,
-        make_parameterisation("matrix", run.dataset.robot, training, box=box_of(run)),
-        integration=config.integration,
-        budget=Budget(),
-        seed=0,
-    )
     known = np.stack([problem.start, *answers])
     inside = known[problem.inside(known)]
     best = inside[int(np.nanargmin(problem.values(inside)))]
-    proof = prove(problem, best, gap=config.certificate.gap, seconds=config.certificate.seconds)
+    proof = prove(problem, best, gap=choice.gap, seconds=choice.seconds)
     return [
         BoxCertificate(
             dataset=run.dataset_name,

@@ -11,6 +11,7 @@ from omnibench.config import Model
 from omnibench.data.simulate.config import FlowerConfig
 from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
 from omnibench.fit.problem import Budget
+from omnibench.fit.span import Unidentified
 from omnibench.robot.odometry import Integration
 
 
@@ -94,6 +95,9 @@ class CompareConfig(Model):
     cost: CostChoice = CostChoice()
     integration: Integration = "arc"
     box: Box = "row"
+    unidentified: Unidentified = Field(
+        "keep", description="motions that the data hardly drive: keep the design values, or fit them to slip and noise"
+    )
     budget: Budget = Budget()
     seeds: tuple[int, ...] = Field((1,), min_length=1, description="one run of every search for each")
     calibrators: tuple[CalibratorEntry, ...] = Field(min_length=1)

@@ -19,12 +19,12 @@ from typing import Any, Protocol
 
 from omnibench.compare.config import CalibratorEntry, CompareConfig
 from omnibench.compare.plan import PlannedRun, load_calibrators
+from omnibench.compare.problem import make_problem
 from omnibench.compare.store import RunStore, StoredRun
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error, run_calibrator
 from omnibench.fit.parameterisation import ParameterisationName
-from omnibench.fit.problem import CalibrationProblem, make_parameterisation
-from omnibench.registry import calibrators, costs
+from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Robot
 
 # A run that does not look at its budget is ended this long after its seconds are spent.
@@ -197,21 +197,10 @@ def _end_with_parent() -> None:
 
 
 def _solve(job: _Job, watch: Callable[[int, float], None]) -> RunResult:
-    config, entry = job.config, job.entry
-    load_calibrators(config)
-    calibrator = calibrators.create(entry.name, entry.options)
-    cost = costs.create(config.cost.name, config.cost.options)
-    box = entry.box or config.box
-    searched = make_parameterisation(job.parameterisation, job.robot, job.trajectories, box=box, limits=entry.limits)
-    problem = CalibrationProblem(
-        job.robot,
-        job.trajectories,
-        cost,
-        searched,
-        integration=config.integration,
-        budget=config.budget,
-        seed=job.seed,
-        watch=watch,
+    load_calibrators(job.config)
+    calibrator = calibrators.create(job.entry.name, job.entry.options)
+    problem = make_problem(
+        job.config, job.entry, job.robot, job.trajectories, job.parameterisation, seed=job.seed, watch=watch
     )
     return run_calibrator(calibrator, problem)
 

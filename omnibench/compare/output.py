@@ -18,7 +18,7 @@ from omnibench.config import read_yaml, to_json, to_yaml
 from omnibench.data.dataset import Dataset
 from omnibench.errors import DataError
 from omnibench.files import remove, write_table, write_text
-from omnibench.robot.calibration import Calibration, Provenance, Row, write_calibration
+from omnibench.robot.calibration import Calibration, Provenance, Row, covariance_rows, write_calibration
 
 # The first line of config.yaml tells a folder of results from a folder that happens to hold such a file.
 _MARK = "# The effective config of a comparison; the results beside it were made with it."
@@ -111,6 +111,8 @@ def calibration_of(run: ScoredRun, result: ComparisonResult) -> Calibration:
         sample_period=dataset.sample_period,
         matrix=run.record.matrix,
         integration=result.config.integration,
+        noise=run.uncertainty.noise if run.uncertainty else None,
+        covariance=covariance_rows(run.uncertainty.covariance) if run.uncertainty else None,
         provenance=Provenance(
             dataset=dataset.name,
             dataset_hash=dataset.hash,

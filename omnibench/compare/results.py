@@ -15,6 +15,7 @@ from omnibench.environment import Environment
 from omnibench.fit.calibrator import Outcome
 from omnibench.fit.parameterisation import FittedParameter, ParameterisationName
 from omnibench.fit.problem import Improvement
+from omnibench.fit.uncertainty import Uncertainty
 from omnibench.robot.calibration import Row
 from omnibench.robot.kinematics import Array
 
@@ -86,6 +87,7 @@ class ScoredRun:
     validation_costs: Array | None
     theoretical_train_costs: Array
     theoretical_validation_costs: Array | None
+    uncertainty: Uncertainty | None = None
 
     @property
     def matrix(self) -> Array | None:

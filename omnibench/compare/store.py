@@ -10,7 +10,7 @@ from omnibench.config import Model
 from omnibench.files import write_text
 from omnibench.fit.calibrator import Outcome, RunResult
 from omnibench.fit.problem import Improvement
-from omnibench.robot.calibration import matrix_rows
+from omnibench.robot.calibration import Noise, matrix_rows
 from omnibench.robot.kinematics import Array
 
 
@@ -27,6 +27,9 @@ class StoredRun(Model):
     history: tuple[tuple[int, float, float], ...]
     at_bounds: tuple[str, ...]
     held: tuple[str, ...]
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    noise: Noise | None = None
+    degrees_of_freedom: int | None = None
 
     @classmethod
     def of(cls, result: RunResult) -> StoredRun:
@@ -42,6 +45,9 @@ class StoredRun(Model):
             history=tuple((step.evaluations, step.seconds, step.cost) for step in result.history),
             at_bounds=result.at_bounds,
             held=result.held,
+            covariance=None if result.covariance is None else tuple(map(tuple, result.covariance.tolist())),
+            noise=result.noise,
+            degrees_of_freedom=result.degrees_of_freedom,
         )
 
     def result(self) -> RunResult:
@@ -57,6 +63,9 @@ class StoredRun(Model):
             history=tuple(Improvement(*row) for row in self.history),
             at_bounds=self.at_bounds,
             held=self.held,
+            covariance=_array(self.covariance),
+            noise=self.noise,
+            degrees_of_freedom=self.degrees_of_freedom,
         )
 
 

@@ -20,8 +20,11 @@ from omnibench.fit.parameterisation import (
     fitted_parameters,
 )
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
+from omnibench.fit.span import Unidentified
+from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
+from omnibench.fit.unidentified import warnings_of_calibration
 from omnibench.registry import calibrators, costs
-from omnibench.robot.calibration import Calibration, Provenance, matrix_rows
+from omnibench.robot.calibration import Calibration, Provenance, covariance_rows, matrix_rows
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 
@@ -30,13 +33,17 @@ from omnibench.robot.odometry import Integration
 class CalibrationRun:
     """A calibration, how it was found and, where asked for, 95 % intervals of its elements.
 
-    parameters: radius, distance and angle of each wheel, where these were searched.
+    parameters: radius, distance and angle of each wheel, where these were searched. uncertainty: covariance of the
+    elements and of the physical parameters; None where warnings say why there is none. warnings: what of the
+    calibration does not rest on the data, one sentence each.
     """
 
     calibration: Calibration
     result: RunResult
     intervals: ElementIntervals | None
     parameters: tuple[FittedParameter, ...] | None
+    uncertainty: Uncertainty | None
+    warnings: tuple[str, ...]
 
 
 def calibrate(
@@ -52,11 +59,14 @@ def calibrate(
     budget: Budget | None = None,
     seed: int = 1,
     intervals: bool = False,
+    unidentified: Unidentified = "keep",
     watch: Callable[[int, float], None] | None = None,
 ) -> CalibrationRun:
     """Fit the odometry model of a data set's training split.
 
     intervals: also draw bootstrap intervals about the optimum (closed_form only).
+    unidentified: what becomes of motions that the data drive so little that slip alone may have done it: the design
+    values are kept there, or they are fitted (see make_parameterisation). The run's warnings name them.
 
     Raises UnknownNameError or ConfigError for wrong arguments, DataError for an empty training split, and ConfigError
     when the calibrator gives no answer.
@@ -67,7 +77,12 @@ def calibrate(
     objective: Cost = costs.create(cost)
     training = training_split(dataset)
     searched = make_parameterisation(
-        parameterisation or chosen.parameterisation, dataset.robot, training, box=box, limits=limits
+        parameterisation or chosen.parameterisation,
+        dataset.robot,
+        training,
+        box=box,
+        limits=limits,
+        unidentified=unidentified,
     )
     problem = CalibrationProblem(
         dataset.robot,
@@ -84,12 +99,16 @@ def calibrate(
         raise ConfigError(f"calibrator {calibrator!r} gave no answer ({result.outcome}): {result.reason}")
     validation = dataset.split("validation")
     model = OdometryModel(dataset.robot, result.matrix, integration)
+    uncertainty, doubts = _uncertainty(problem, result, chosen)
+    warnings = warnings_of_calibration(dataset.robot, training, searched.name, unidentified)
     calibration = Calibration(
         name=f"{dataset.name} {calibrator}",
         robot=dataset.robot,
         sample_period=dataset.sample_period,
         matrix=matrix_rows(result.matrix),
         integration=integration,
+        noise=uncertainty.noise if uncertainty else None,
+        covariance=covariance_rows(uncertainty.covariance) if uncertainty else None,
         provenance=Provenance(
             dataset=dataset.name,
             dataset_hash=dataset.hash,
@@ -109,7 +128,19 @@ def calibrate(
     drawn = bootstrap_intervals(problem, result.vector, rng=problem.rng) if intervals else None
     geometry = problem.parameterisation.name == "geometry"
     parameters = fitted_parameters(dataset.robot, result.vector) if geometry else None
-    return CalibrationRun(calibration, result, drawn, parameters)
+    return CalibrationRun(calibration, result, drawn, parameters, uncertainty, (*warnings, *doubts))
+
+
+def _uncertainty(
+    problem: CalibrationProblem, result: RunResult, calibrator: Calibrator
+) -> tuple[Uncertainty | None, tuple[str, ...]]:
+    """The uncertainty of an answer, or why it has none; no word of that where nothing was fitted."""
+    if not calibrator.bounded:
+        return None, ()
+    try:
+        return uncertainty_of(problem, result), ()
+    except NoCovarianceError as error:
+        return None, (str(error),)
 
 
 def _cost(objective: Cost, model: OdometryModel, trajectories: Sequence[Trajectory]) -> float:

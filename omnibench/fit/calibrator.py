@@ -14,6 +14,7 @@ from omnibench.errors import OmnibenchError, PluginError, one_line
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
 from omnibench.registry import AnyOptions, Options, PluginFailure, calibrators
+from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
 
@@ -32,11 +33,16 @@ class Solution:
     """A calibrator's answer: the vector (n,) and why it stopped there.
 
     converged: False when a limit of the calibrator's own (generations, programs) came before its stopping rule.
+    covariance (n, n) of the vector, degrees_of_freedom of its variances, and noise of the reference poses: of calibrators
+    that estimate them.
     """
 
     vector: Array
     reason: str
     converged: bool = True
+    covariance: Array | None = None
+    noise: Noise | None = None
+    degrees_of_freedom: int | None = None
 
 
 class Calibrator(ABC):
@@ -71,7 +77,10 @@ calibrators.contract = Calibrator
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """How one calibrator did on one problem. ``vector``, ``matrix`` and ``cost`` are None unless there is an answer."""
+    """How one calibrator did on one problem. ``vector``, ``matrix`` and ``cost`` are None unless there is an answer.
+
+    covariance (n, n) of the vector, its degrees_of_freedom and noise: of calibrators that estimate them.
+    """
 
     outcome: Outcome
     reason: str
@@ -83,11 +92,15 @@ class RunResult:
     history: tuple[Improvement, ...]
     at_bounds: tuple[str, ...] = ()
     held: tuple[str, ...] = ()
+    covariance: Array | None = None
+    noise: Noise | None = None
+    degrees_of_freedom: int | None = None
 
 
 def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunResult:
     """Run a calibrator to its end, whatever that is."""
     answer: Any = None
+    solution: Solution | None = None
     try:
         solution = calibrator.calibrate(problem)
         if not isinstance(solution, Solution):
@@ -124,6 +137,9 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
         history=tuple(problem.history),
         at_bounds=problem.at_bounds(vector) if vector is not None and calibrator.bounded else (),
         held=problem.held if calibrator.bounded else (),
+        covariance=solution.covariance if solution is not None and vector is not None else None,
+        noise=solution.noise if solution is not None and vector is not None else None,
+        degrees_of_freedom=solution.degrees_of_freedom if solution is not None and vector is not None else None,
     )
 
 

@@ -68,12 +68,11 @@ class SumOfNorms(Cost):
 
     def norms(self, errors: Array) -> Array:
         """Norms (..., S) of pose errors (..., S, 3)."""
-        seen = [(axis, weight) for axis, weight in enumerate(self.weights) if weight]
-        squares = sum(
-            np.square(errors[..., axis] if weight == 1 else weight * errors[..., axis]) for axis, weight in seen
-        )
-        norms: Array = np.sqrt(squares)
-        return norms
+        squares = np.zeros(errors.shape[:-1])
+        for axis, weight in enumerate(self.weights):
+            if weight:
+                squares += np.square(errors[..., axis] if weight == 1 else weight * errors[..., axis])
+        return np.sqrt(squares, out=squares)
 
     def shares(self, trajectory: NDArray[np.intp]) -> Array:
         """Share (S,) of each stamp in the cost; they sum to one."""

@@ -6,10 +6,8 @@ import numpy as np
 
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Split
-from omnibench.fit.span import DrivenSpan, direction_in_words, driven_span
-
-# Below this share of the strongest direction of wheel rates a motion is called hardly driven.
-_WEAK_SHARE = 0.2
+from omnibench.fit.identifiability import Identifiability, identifiability
+from omnibench.fit.span import direction_in_words, driven_span
 
 
 class SplitContent(Model):
@@ -26,7 +24,10 @@ class SplitContent(Model):
 
 
 class Inspection(Model):
-    """A data set in numbers. Periods in s; shares are of the most driven direction of wheel rates."""
+    """A data set in numbers. Periods in s; shares are of the most driven direction of wheel rates.
+
+    identifiability: what the training runs (all runs, if none is marked so) can tell of the robot.
+    """
 
     dataset: str
     description: str
@@ -47,16 +48,19 @@ class Inspection(Model):
     driven_directions: int
     driven_shares: tuple[float, ...]
     undriven: tuple[str, ...]
+    identifiability: Identifiability
     findings: tuple[str, ...]
     warnings: tuple[str, ...]
 
 
 def inspect_dataset(dataset: Dataset) -> Inspection:
-    """Count, measure, and look for directions of wheel rates that the training runs do not drive, or hardly."""
+    """Count, measure, and predict what the training runs can tell of the robot, and what they leave open."""
     trajectories = dataset.trajectories
     periods = np.concatenate([np.diff(t.times, prepend=0.0) for t in trajectories])
     pose_periods = np.concatenate([np.diff(t.pose_times) for t in trajectories])
-    span = driven_span(dataset.split("train") or trajectories)
+    training = dataset.split("train") or trajectories
+    span = driven_span(training)
+    told = identifiability(dataset.robot, training)
     undriven = tuple(direction_in_words(direction, dataset.robot.wheel_names) for direction in span.null)
     return Inspection(
         dataset=dataset.name,
@@ -78,7 +82,8 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
         driven_directions=len(span.driven),
         driven_shares=tuple(span.shares.tolist()),
         undriven=undriven,
-        findings=tuple(_findings(dataset, span)),
+        identifiability=told,
+        findings=tuple(_findings(dataset, told)),
         warnings=dataset.warnings,
     )
 
@@ -99,23 +104,8 @@ def _content(dataset: Dataset, split: Split) -> SplitContent:
     )
 
 
-def _findings(dataset: Dataset, span: DrivenSpan) -> list[str]:
-    findings = []
-    names = dataset.robot.wheel_names
-    for direction in span.null:
-        alone = len(names) == 4 and len(span.null) == 1
-        expected = ", as for any robot on four wheels that does not slip" if alone else ""
-        findings.append(
-            f"no run drives the wheels along {direction_in_words(direction, names)}{expected}: the matrix is not "
-            "determined along it, and calibration keeps the design values there"
-        )
-    for direction, share in zip(span.driven, span.shares, strict=False):
-        if share < _WEAK_SHARE:
-            words = direction_in_words(direction, names)
-            findings.append(
-                f"the runs hardly drive the wheels along {words} ({100 * share:.1f} % of the strongest): what the "
-                "matrix says of that motion rests on slips and noise; drive it on purpose"
-            )
+def _findings(dataset: Dataset, told: Identifiability) -> list[str]:
+    findings = list(told.sentences)
     if not dataset.split("train"):
         findings.append("no trajectory is marked train: nothing can be calibrated")
     if not dataset.split("validation"):

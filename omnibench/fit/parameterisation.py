@@ -74,8 +74,8 @@ class Parameterisation(Protocol):
 class MatrixElements:
     """The elements of the matrix row by row, Eq. (4) and (5): the paper's non-parametric way.
 
-    ``null`` (q, N): orthonormal directions of wheel rates that the data do not drive; along them the start values
-    are kept.
+    ``null`` (q, N): orthonormal directions of wheel rates that the data do not drive, or too little to identify; along
+    them the start values are kept.
     """
 
     robot: Robot

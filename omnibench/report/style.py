@@ -98,7 +98,7 @@ def logarithmic(figure: go.Figure, axis: Literal["x", "y"], low: float, high: fl
     if decades < 2:
         steps = (1, 1.5, 2, 3, 4, 6, 8) if decades < 1 else (1, 2, 5)
         ticks = [step * 10.0**exponent for exponent in exponents for step in steps]
-        labels = [f"{tick:.2g}" for tick in ticks]
+        labels = [f"{tick:.6g}" for tick in ticks]
     else:
         stride = math.ceil(decades / 7)
         ticks = [10.0**exponent for exponent in exponents if exponent % stride == 0]

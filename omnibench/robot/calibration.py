@@ -107,6 +107,11 @@ def matrix_rows(matrix: Array) -> tuple[Row, Row, Row]:
     return first, second, third
 
 
+def covariance_rows(covariance: Array) -> tuple[Row, ...]:
+    """A covariance (n, n) as the rows that documents hold."""
+    return tuple(tuple(float(value) for value in row) for row in covariance)
+
+
 def read_calibration(path: Path | str) -> Calibration:
     """Read and check a calibration file. DataError names the file and what is wrong."""
     path = Path(path)

@@ -12,6 +12,7 @@ from report_page import Page
 from omnibench.compare.certificates import certify
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
+from omnibench.compare.problem import make_problem
 from omnibench.compare.report import write_report
 from omnibench.compare.results import ComparisonResult, EntryStatistics
 from omnibench.compare.scoring import score
@@ -19,8 +20,7 @@ from omnibench.compare.statistics import entry_statistics
 from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
 from omnibench.fit.calibrator import RunResult, run_calibrator
-from omnibench.fit.problem import CalibrationProblem, make_parameterisation
-from omnibench.registry import calibrators, costs
+from omnibench.registry import calibrators
 
 APR02 = {
     "name": "APR-02",
@@ -81,22 +81,9 @@ def run(chosen: CompareConfig, datasets: Mapping[str, Dataset] | None = None) ->
 
 def solve(planned: PlannedRun) -> RunResult:
     """One planned run, in this process."""
-    chosen, dataset = planned.config, planned.dataset
-    training = dataset.split("train")
-    problem = CalibrationProblem(
-        dataset.robot,
-        training,
-        costs.create(chosen.cost.name, chosen.cost.options),
-        make_parameterisation(
-            planned.parameterisation,
-            dataset.robot,
-            training,
-            box=planned.entry.box or chosen.box,
-            limits=planned.entry.limits,
-        ),
-        integration=chosen.integration,
-        budget=chosen.budget,
-        seed=planned.seed,
+    dataset = planned.dataset
+    problem = make_problem(
+        planned.config, planned.entry, dataset.robot, dataset.split("train"), planned.parameterisation, planned.seed
     )
     return run_calibrator(calibrators.create(planned.entry.name, planned.entry.options), problem)
 

@@ -126,7 +126,8 @@ def without_seconds(output: Path) -> list[dict[str, Any]]:
 
 def test_ctrl_c_before_the_first_run_ends_in_one_line(tmp_path: Path) -> None:
     config = write_config(tmp_path, calibrators=SEARCHES)
-    program = "import os, signal, sys, threading; sys.argv[0] = 'omnibench'; from omnibench.__main__ import main; import omnibench.cli; "
+    program = "import os, signal, sys, threading; sys.argv[0] = 'omnibench'; "
+    program += "from omnibench.__main__ import main; import omnibench.cli; "
     program += "threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start(); main()"
     run = subprocess.run(
         [COMMAND[0], "-c", program, "compare", str(config), "--output", str(tmp_path / "out")],

@@ -44,6 +44,9 @@ def complaint(folder: Path, **changes: Any) -> str:
     return str(failure.value)
 
 
+COMPARISONS = [path for path in sorted(CONFIGS.glob("*.yaml")) if "calibrators:" in path.read_text(encoding="utf-8")]
+
+
 @pytest.mark.parametrize(
     ("changes", "parts"),
     [
@@ -161,7 +164,7 @@ def schema() -> dict[str, Any]:
     return document
 
 
-@pytest.mark.parametrize("config", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("config", COMPARISONS, ids=lambda path: path.stem)
 def test_a_config_that_we_ship_keeps_to_the_schema_that_editors_get(config: Path, schema: dict[str, Any]) -> None:
     jsonschema.Draft202012Validator.check_schema(schema)
     jsonschema.validate(yaml.safe_load(config.read_text()), schema, jsonschema.Draft202012Validator)
@@ -174,7 +177,7 @@ def test_the_schema_refuses_what_reading_refuses(mistake: dict[str, Any], schema
         jsonschema.validate(small(**mistake), schema)
 
 
-@pytest.mark.parametrize("config", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("config", COMPARISONS, ids=lambda path: path.stem)
 def test_a_config_that_we_ship_is_read_with_all_its_calibrators(config: Path) -> None:
     chosen = read_compare_config(config)
     assert load_calibrators(chosen) == []

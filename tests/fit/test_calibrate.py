@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fit_samples import noisy_trajectories
+from motions import RING, driven
 
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.environment import package_versions
@@ -127,6 +128,47 @@ def test_intervals_are_drawn_on_demand(dataset: Dataset) -> None:
     intervals = calibrate(dataset, intervals=True).intervals
     assert intervals is not None
     assert (intervals.low <= intervals.high).all()
+
+
+def test_noise_and_covariance_are_written_with_the_calibration(dataset: Dataset) -> None:
+    run = calibrate(dataset)
+    assert run.uncertainty is not None
+    assert run.calibration.noise == run.uncertainty.noise
+    np.testing.assert_array_equal(run.calibration.covariance, run.uncertainty.covariance)
+    assert run.warnings == ()
+
+
+def test_a_matrix_that_was_not_fitted_has_no_covariance_and_needs_no_word_of_it(dataset: Dataset) -> None:
+    run = calibrate(dataset, "theoretical")
+    assert (run.uncertainty, run.calibration.noise, run.calibration.covariance, run.warnings) == (None, None, None, ())
+
+
+def test_a_search_that_stops_far_from_the_minimum_has_no_covariance_and_says_why(dataset: Dataset) -> None:
+    run = calibrate(dataset, "random_search", options={"candidates": 20})
+    assert run.uncertainty is None
+    assert run.warnings[0].startswith("no covariance: the answer is ")
+    assert run.warnings[0].endswith(" standard deviations or more from a better one")
+
+
+@pytest.mark.parametrize("calibrator", ["closed_form", "crs"])
+def test_what_the_data_do_not_identify_is_kept_and_told(calibrator: str) -> None:
+    runs = driven(RING, slip=0.02)
+    run = calibrate(make_dataset("straight", ROBOT, 0.1, runs), calibrator)
+    change = run.calibration.matrix_array - ROBOT.inverse_kinematic_matrix
+    np.testing.assert_allclose(change.sum(axis=1), 0, atol=1e-15)
+    assert run.warnings[0].endswith("kept at the design values")
+
+
+def test_told_to_fit_it_calibration_fits_it_and_says_what_that_rests_on() -> None:
+    run = calibrate(make_dataset("straight", ROBOT, 0.1, driven(RING, slip=0.02)), unidentified="fit")
+    change = run.calibration.matrix_array - ROBOT.inverse_kinematic_matrix
+    assert np.abs(change.sum(axis=1)).max() > 1e-4
+    assert run.warnings[0].endswith("what was fitted there rests on slip and noise")
+
+
+def test_a_searched_geometry_cannot_keep_it_and_says_so() -> None:
+    run = calibrate(make_dataset("straight", ROBOT, 0.1, driven(RING, slip=0.02)), "parametric")
+    assert "the geometry cannot keep design values there" in run.warnings[0]
 
 
 def test_progress_is_shown(dataset: Dataset) -> None:

@@ -112,7 +112,10 @@ def test_straight_runs_of_three_wheels_leave_the_common_turn() -> None:
     straight = [run for index, run in enumerate(commanded()) if index % 3 == 1]
     inspection = inspect_dataset(dataset(straight))
     assert inspection.undriven == ("a + b + c",)
-    assert inspection.findings[0].startswith("no run drives the wheels along a + b + c: ")
+    assert inspection.findings[0] == (
+        "no run drives the wheels along a + b + c (turning on the spot): the matrix is not determined along it, "
+        "and calibration keeps the design values there; record turns, on the spot or while driving"
+    )
 
 
 @pytest.mark.parametrize(
@@ -149,7 +152,26 @@ def test_a_real_recording_of_hours_is_inspected() -> None:
     assert inspection.findings == ()
 
 
-def test_a_motion_that_is_hardly_driven_is_told_with_its_share() -> None:
-    runs = [replace(run, rates=run.rates - 0.95 * run.rates.mean(axis=1, keepdims=True)) for run in commanded()]
-    findings = inspect_dataset(dataset(runs)).findings
-    assert any(finding.startswith("the runs hardly drive the wheels along a + b + c (") for finding in findings)
+@pytest.mark.parametrize(
+    ("left", "beginning"),
+    [(0.05, "these recordings hardly turn the robot: they drive"), (0.25, "the runs drive")],
+)
+def test_a_motion_that_is_hardly_driven_is_told_with_its_share(left: float, beginning: str) -> None:
+    runs = [replace(run, rates=run.rates - (1 - left) * run.rates.mean(axis=1, keepdims=True)) for run in commanded()]
+    inspection = inspect_dataset(dataset(runs))
+    turning = next(each for each in inspection.identifiability.directions if each.motion == "turning on the spot")
+    finding = inspection.findings[0]
+    assert finding.startswith(f"{beginning} the wheels along a + b + c (turning on the spot) with ")
+    assert f" {100 * turning.share:.1f} % of the strongest motion" in finding
+
+
+def test_what_can_be_told_is_part_of_the_json_document(found: Inspection) -> None:
+    document = found.model_dump(mode="json")["identifiability"]
+    assert [each["state"] for each in document["directions"]] == ["driven"] * 3
+    assert len(document["parameters"]) == 9
+    assert document["sentences"] == []
+
+
+def test_without_training_runs_all_runs_are_judged() -> None:
+    runs = [replace(run, split="validation") for run in commanded()]
+    assert len(inspect_dataset(dataset(runs)).identifiability.directions) == 3

@@ -7,10 +7,18 @@ import pytest
 from fit_samples import noisy_trajectories
 from hypothesis import given
 from hypothesis import strategies as st
+from motions import FLOWER, RING, driven
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
-from omnibench.fit.span import direction_in_words, driven_span
+from omnibench.fit.span import (
+    aligned,
+    direction_in_words,
+    directions_kept,
+    driven_span,
+    motion_in_words,
+    unidentified_directions,
+)
 from omnibench.robot.kinematics import Array, wheel_equations
 from omnibench.testing.synthetic import synthetic_robot
 
@@ -93,3 +101,79 @@ def test_hundreds_of_thousands_of_poses_are_no_burden() -> None:
 def test_no_trajectories_are_refused() -> None:
     with pytest.raises(DataError, match="no trajectories"):
         driven_span([])
+
+
+ROBOT = synthetic_robot()
+TURN = np.ones(3) / np.sqrt(3)
+
+
+def test_what_is_driven_with_less_than_a_tenth_is_weak() -> None:
+    span = driven_span([run_at(np.array([4.0, 0, 0])), run_at(np.array([0, 0.41, 0])), run_at(np.array([0, 0, 0.39]))])
+    assert (len(span.driven), len(span.strong), len(span.weak), len(span.null)) == (3, 2, 1, 0)
+    np.testing.assert_allclose(np.abs(span.weak), [[0, 0, 1]], atol=1e-12)
+    assert [span.state(direction) for direction in np.eye(3)] == ["driven", "driven", "weak"]
+
+
+def test_the_share_of_a_direction_between_two_is_between_theirs() -> None:
+    span = driven_span([run_at(np.array([4.0, 0, 0])), run_at(np.array([0, 2.0, 0]))])
+    between = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
+    assert span.share(between) == pytest.approx(np.sqrt((1 + 0.25) / 2))
+
+
+def test_translation_with_slip_keeps_the_turn_of_the_design_exactly() -> None:
+    kept = directions_kept(ROBOT, driven_span(driven(RING, slip=0.02)), "keep")
+    np.testing.assert_allclose(kept, TURN[None], atol=1e-15)
+
+
+def test_told_to_fit_only_what_is_not_driven_is_kept() -> None:
+    assert directions_kept(ROBOT, driven_span(driven(RING, slip=0.02)), "fit").shape == (0, 3)
+    assert directions_kept(ROBOT, driven_span(driven(RING)), "fit").shape == (1, 3)
+
+
+@pytest.mark.parametrize("wheels", [3, 4])
+def test_nothing_changes_where_every_direction_is_driven(wheels: int) -> None:
+    span = driven_span(driven(FLOWER, wheels=wheels))
+    np.testing.assert_array_equal(directions_kept(synthetic_robot(wheels), span, "keep"), span.null)
+
+
+@given(size=st.integers(1, 4), seed=st.integers(0, 2**16))
+def test_aligned_directions_are_orthonormal_and_stay_close_to_their_span(size: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    space = np.linalg.qr(rng.normal(size=(4, 4)))[0][:size]
+    turned = aligned(space, synthetic_robot(4))
+    np.testing.assert_allclose(turned @ turned.T, np.eye(size), atol=1e-9)
+    assert np.linalg.norm(turned @ space.T @ space - turned, axis=1).max() < 0.25
+
+
+def test_a_span_that_holds_motions_is_named_by_them() -> None:
+    robot = synthetic_robot(4)
+    rng = np.random.default_rng(0)
+    mixed = np.linalg.qr(rng.normal(size=(4, 4)))[0]
+    first, *others, last = (motion_in_words(direction, robot) for direction in aligned(mixed, robot))
+    assert (first, set(others), last) == ("turning on the spot", {"moving along x", "moving along y"}, "")
+
+
+@pytest.mark.parametrize(
+    ("twist", "words"),
+    [
+        ((0.0, 0.0, -0.3), "turning on the spot"),
+        ((-0.2, 0.0, 0.0), "moving along x"),
+        ((0.0, 0.2, 0.0), "moving along y"),
+        ((0.2, -0.2, 0.0), "moving at 135 deg"),
+        ((0.2, 0.0, 1.0), "moving along x while turning"),
+    ],
+)
+def test_a_direction_is_told_by_what_the_designed_robot_does(twist: tuple[float, float, float], words: str) -> None:
+    rates = wheel_equations(ROBOT.wheels) @ np.array(twist)
+    assert motion_in_words(rates / np.linalg.norm(rates), ROBOT) == words
+
+
+def test_what_is_not_identified_is_named_the_same_on_any_slip() -> None:
+    names = {
+        tuple(
+            direction_in_words(direction, ROBOT.wheel_names)
+            for direction in unidentified_directions(ROBOT, driven_span(driven(RING, slip=0.02, seed=seed)))
+        )
+        for seed in range(5)
+    }
+    assert names == {("a + b + c",)}

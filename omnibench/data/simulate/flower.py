@@ -11,7 +11,7 @@ import numpy as np
 
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Split, Trajectory, make_dataset
-from omnibench.data.simulate.config import EncoderNoise, FlowerConfig, Session, Truth
+from omnibench.data.simulate.config import Commands, EncoderNoise, FlowerConfig, Session, Truth
 from omnibench.robot.calibration import Row, matrix_rows
 from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrices, wheel_equations
 from omnibench.robot.model import OdometryModel
@@ -101,8 +101,12 @@ def true_matrix(truth: Truth, robot: Robot) -> Array:
 
 
 def commands_of(config: FlowerConfig) -> list[Command]:
-    """The commands, in the config's order; the direction of a turn on the spot has no meaning and is 0."""
-    chosen = config.commands
+    """The commands of a config, in its order."""
+    return grid_of(config.commands)
+
+
+def grid_of(chosen: Commands) -> list[Command]:
+    """Every direction with every rate of turn, at each speed; the direction of a turn on the spot is 0."""
     return [
         Command(speed, math.radians(direction), turn_rate)
         for speed, turn_rate in product(chosen.speeds, chosen.turn_rates)
@@ -163,12 +167,9 @@ def _drive(
 ) -> _Run:
     """One run: the robot's own matrix turns the command into wheel rates, its true one into motion."""
     duration = session.distance / command.speed if command.speed else config.commands.turn_duration
-    samples = max(1, round(duration / config.sample_period))
-    times: Array = config.sample_period * np.arange(1, samples + 1)
-    targets = np.tile(wheel_equations(config.robot.wheels) @ command.twist, (samples, 1))
+    times, pose_times = stamps_of_run(duration, config.sample_period, config.pose_period)
+    targets = np.tile(wheel_equations(config.robot.wheels) @ command.twist, (len(times), 1))
     rates = targets + config.noise.encoder * rng.standard_normal(targets.shape)
-    between = config.pose_period * np.arange(1, math.ceil(times[-1] / config.pose_period))
-    pose_times: Array = np.concatenate([[0.0], between[between < times[-1] - 1e-9], times[-1:]])
     (poses,) = model.poses([WheelLog(times, targets, np.zeros(3), pose_times)])
     return _Run(
         times=times,
@@ -178,6 +179,14 @@ def _drive(
         pose_times=pose_times,
         poses=poses + session.noise_scale * _reference_noise(config.noise, pose_times, rng),
     )
+
+
+def stamps_of_run(duration: float, sample_period: float, pose_period: float) -> tuple[Array, Array]:
+    """Ends of the wheel samples (F,) and stamps of the reference poses (K,), the first at 0, the last at the end; s."""
+    samples = max(1, round(duration / sample_period))
+    times: Array = sample_period * np.arange(1, samples + 1)
+    between = pose_period * np.arange(1, math.ceil(times[-1] / pose_period))
+    return times, np.concatenate([[0.0], between[between < times[-1] - 1e-9], times[-1:]])
 
 
 def _reference_noise(noise: EncoderNoise, times: Array, rng: np.random.Generator) -> Array:

@@ -1,0 +1,259 @@
+"""D-optimal designs: how often to drive each of some candidate runs so that the covariance becomes smallest.
+
+A run of candidate c tells the Fisher information F_c (p, p) of the parameters and costs t_c (1 to count runs, or s, m).
+n_c runs of each tell M = sum_c n_c F_c, and the criterion is det(M)^(1/p) / sum_c n_c t_c, information for its cost.
+Over shares w_c = n_c t_c / sum n_c t_c, which need not be whole runs, its logarithm is concave, and by Kiefer and
+Wolfowitz (1960) no design at all has more than
+
+    det(M(w))^(1/p) * max_c tr(M(w)^-1 F_c / t_c) / p,      M(w) = sum_c w_c F_c / t_c,
+
+whatever w: for the eigenvalues of M(w)^-1 M the geometric mean is at most the arithmetic one. See Fedorov, Theory of
+Optimal Experiments (1972), and Silvey, Titterington and Torsney, Commun. Stat. A7:1379 (1978) for the algorithm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.robot.kinematics import Array
+
+Counts = NDArray[np.intp]
+
+# Stands for what is not known at all yet, so that the first few runs can be chosen by the same rule; as a share of the
+# information of an average candidate. If it were much smaller, rounding would decide between designs that leave
+# something open.
+_RIDGE = 1e-6
+# A direction with less than this share of what a run of an average candidate tells is not identified: its standard
+# deviation is a hundred times as large.
+_NULL_SHARE = 1e-4
+# Gains of the logarithm of the determinant below this are rounding, and could go round in circles.
+_NO_GAIN = 1e-6
+_BLOCK = 256  # pairs whose exchange is tried at once
+# What comes this close to the bound is not improved further.
+_NEAR = 1e-4
+_STARTS = 120  # for the exchange of a run; of n runs, where a start matters less, one n-th of it
+
+
+class Candidates:
+    """Runs that a design may choose from, in coordinates where their information per cost is the identity on average.
+
+    information (C, p, p): of a run of each, in any coordinates: no design depends on them. costs (C,): > 0. most: how
+    many runs of one candidate an exact design may have. ValueError when all together leave a direction open.
+    """
+
+    def __init__(self, information: Array, costs: Array | None = None, most: int | None = None) -> None:
+        self.costs = np.ones(len(information)) if costs is None else np.asarray(costs, dtype=float)
+        self.most = most
+        mean = (information / self.costs[:, None, None]).mean(axis=0)
+        # Scaled to a unit diagonal first: metres and radians may lie orders apart.
+        scale = 1 / np.sqrt(np.maximum(np.diagonal(mean), np.finfo(float).tiny))
+        values, vectors = np.linalg.eigh(mean * scale * scale[:, None])
+        if not (np.isfinite(values).all() and values[0] > 1e-9 * values[-1]):
+            raise ValueError("the candidates together leave a direction of the parameters open")
+        self.basis: Array = scale[:, None] * vectors / np.sqrt(values)
+        standard = self.basis.T @ information @ self.basis
+        self.information: Array = (standard + np.swapaxes(standard, 1, 2)) / 2
+        self._log_scale = -2 * float(np.linalg.slogdet(self.basis)[1])
+
+    def __len__(self) -> int:
+        return len(self.costs)
+
+    @property
+    def parameters(self) -> int:
+        return self.information.shape[1]
+
+    def sum(self, counts: Array | Counts) -> Array:
+        """The information (p, p) of so many runs of each, in the standard coordinates."""
+        return np.tensordot(counts, self.information, 1)
+
+    def cost(self, counts: Array | Counts) -> float:
+        """What so many runs of each cost in all."""
+        return float(counts @ self.costs)
+
+    def root(self, counts: Array | Counts) -> float:
+        """det(M)^(1/p) in the coordinates of the information given; 0 when a direction is open."""
+        sign, log_determinant = np.linalg.slogdet(self.sum(counts))
+        return float(np.exp((log_determinant + self._log_scale) / self.parameters)) if sign > 0 else 0.0
+
+    def criterion(self, counts: Array | Counts) -> float:
+        """det(M)^(1/p) per cost: what a design is to make large."""
+        return self.root(counts) / self.cost(counts)
+
+    def score(self, counts: Array | Counts) -> float:
+        """What a search makes large: the logarithm of the criterion in standard coordinates.
+
+        A little information in every direction is added, so that designs which leave something open can be compared.
+        """
+        return float(_log_determinants(self.sum(counts)[None])[0] - self.parameters * np.log(self.cost(counts)))
+
+    def identifies(self, counts: Array | Counts) -> bool:
+        """Whether so many runs leave no direction open."""
+        share = np.linalg.eigvalsh(self.sum(counts))[0] / self.cost(counts)
+        return bool(share > _NULL_SHARE)
+
+    def covariance(self, counts: Array | Counts) -> Array:
+        """The covariance (p, p) of the parameters in the coordinates of the information given."""
+        return self.basis @ np.linalg.inv(self.sum(counts)) @ self.basis.T
+
+
+@dataclass(frozen=True, eq=False)
+class ContinuousDesign:
+    """The optimum over shares (C,) of the cost. No design at all has a criterion above ``bound``.
+
+    gap: bound / criterion - 1, how far from the optimum the shares can be at most.
+    """
+
+    shares: Array
+    criterion: float
+    bound: float
+    gap: float
+    iterations: int
+
+
+def continuous_optimum(candidates: Candidates, gap: float = 1e-5, iterations: int = 20_000) -> ContinuousDesign:
+    """Shares within ``gap`` of the optimum by the multiplicative algorithm, or after so many iterations.
+
+    Every share is multiplied by tr(M^-1 F_c / t_c) / p, which never lowers the criterion. The bound holds wherever it
+    ends.
+    """
+    per_cost = candidates.information / candidates.costs[:, None, None]
+    flat = per_cost.reshape(len(candidates), -1)
+    shares = np.full(len(candidates), 1 / len(candidates))
+    for iteration in range(1, iterations + 1):
+        moment = np.tensordot(shares, per_cost, 1)
+        gains = flat @ np.linalg.inv(moment).ravel() / candidates.parameters
+        excess = float(gains.max()) - 1
+        if excess <= gap or iteration == iterations:
+            break
+        shares = shares * gains
+        shares /= shares.sum()
+    criterion = candidates.criterion(shares / candidates.costs)
+    return ContinuousDesign(shares, criterion, criterion * (1 + max(excess, 0.0)), max(excess, 0.0), iteration)
+
+
+def exact_designs(candidates: Candidates, optimum: ContinuousDesign, most: int) -> Iterator[Counts]:
+    """Good designs of 1, 2, ..., ``most`` runs: counts (C,).
+
+    Each is the best of several, all exchanged: the one before it with the run added that gains most, the optimum's
+    shares rounded and, while runs are few and a start matters, shares drawn about these; one that comes within 0.01 %
+    of the bound is good enough. Ends early when no candidate may be driven more often.
+    """
+    enough = (1 - _NEAR) * optimum.bound
+    counts: Counts = np.zeros(len(candidates), dtype=np.intp)
+    for runs in range(1, most + 1):
+        free = _free(candidates, counts)
+        if len(free) == 0:
+            return
+        added = candidates.sum(counts) + candidates.information[free]
+        costs = candidates.cost(counts) + candidates.costs[free]
+        best = free[np.argmax(_log_determinants(added) - candidates.parameters * np.log(costs))]
+        counts = counts.copy()
+        counts[best] += 1
+        counts = exchanged(candidates, counts, enough)
+        for shares in _shares_about(optimum.shares, _STARTS // runs):
+            if candidates.criterion(counts) >= enough:
+                break
+            other = rounded(candidates, shares, runs, enough)
+            counts = max(counts, other, key=candidates.score)
+        yield counts
+
+
+def _shares_about(shares: Array, draws: int) -> Iterator[Array]:
+    """The shares (C,) themselves and some at random about them, always the same."""
+    yield shares
+    rng = np.random.default_rng(draws)
+    for _ in range(draws):
+        yield shares * rng.exponential(size=len(shares))
+
+
+def rounded(candidates: Candidates, shares: Array, runs: int, enough: float = math.inf) -> Counts:
+    """A design of so many runs near the shares (C,) of a continuous one, exchanged: counts (C,).
+
+    Whole runs by the largest remainders. ValueError when the candidates may not be driven that often.
+    """
+    limit = runs if candidates.most is None else candidates.most
+    if limit * len(candidates) < runs:
+        raise ValueError(f"{len(candidates)} candidates, each driven at most {limit} times, make no {runs} runs")
+    wanted = shares / candidates.costs
+    wanted = runs * wanted / wanted.sum()
+    counts: Counts = np.minimum(np.floor(wanted + 1e-9).astype(np.intp), limit)
+    while (missing := runs - int(counts.sum())) > 0:
+        short = np.where(counts < limit, wanted - counts, -np.inf)
+        counts[np.argsort(-short, kind="stable")[: min(missing, int((counts < limit).sum()))]] += 1
+    return exchanged(candidates, counts, enough)
+
+
+def equal_design(candidates: Candidates, optimum: ContinuousDesign, target: float) -> Counts | None:
+    """A small design whose det(M)^(1/p) is ``target`` at least: counts (C,); None when no number of runs allowed is.
+
+    By cost none can have less than target / optimum.bound. Where all cost the same the search starts from there.
+    """
+    least = target / optimum.bound  # cost
+    runs_per_cost = float((optimum.shares / candidates.costs).sum())
+    runs = max(1, math.ceil(least / candidates.costs.max()), math.floor(0.9 * least * runs_per_cost))
+    limit = math.inf if candidates.most is None else candidates.most * len(candidates)
+    while runs <= limit:
+        counts = rounded(candidates, optimum.shares, runs, (1 - _NEAR) * optimum.bound)
+        if candidates.root(counts) < target:
+            counts = exchanged(candidates, counts)
+        if candidates.root(counts) >= target:
+            return counts
+        runs += 1
+    return None
+
+
+def exchanged(candidates: Candidates, counts: Counts, enough: float = math.inf) -> Counts:
+    """A design after Fedorov's exchange: a good swap of one run for another, again and again, until none gains.
+
+    The score never falls. The result is a local optimum, which no single swap improves, or reaches ``enough``.
+    """
+    counts = counts.copy()
+    while candidates.criterion(counts) < enough and (swap := _good_swap(candidates, counts)) is not None:
+        given, taken = swap
+        counts[given] -= 1
+        counts[taken] += 1
+    return counts
+
+
+def _good_swap(candidates: Candidates, counts: Counts) -> tuple[int, int] | None:
+    """The pair (driven, other) whose swap gains most among the promising ones; None when no swap at all gains.
+
+    log det is concave, so that its slope tells how much a swap can gain at most: pairs that cannot gain are not tried,
+    and others block by block from the most promising on.
+    """
+    moment, cost = candidates.sum(counts), candidates.cost(counts)
+    identity = np.eye(candidates.parameters)
+    slopes = candidates.information.reshape(len(candidates), -1) @ np.linalg.inv(moment + _RIDGE * identity).ravel()
+    given, taken = np.flatnonzero(counts), _free(candidates, counts)
+    dearer = np.log((cost - candidates.costs[given, None] + candidates.costs[taken]) / cost) * candidates.parameters
+    most = slopes[taken] - slopes[given, None] - dearer
+    most[given[:, None] == taken] = -np.inf
+    rows, columns = np.nonzero(most > _NO_GAIN)
+    order = np.argsort(-most[rows, columns], kind="stable")
+    rows, columns = rows[order], columns[order]
+    now = _log_determinants(moment[None])[0]
+    for first in range(0, len(rows), _BLOCK):
+        row, column = rows[first : first + _BLOCK], columns[first : first + _BLOCK]
+        swapped = moment - candidates.information[given[row]] + candidates.information[taken[column]]
+        gains = _log_determinants(swapped) - now - dearer[row, column]
+        best = int(np.argmax(gains))
+        if gains[best] > _NO_GAIN:
+            return int(given[row[best]]), int(taken[column[best]])
+    return None
+
+
+def _free(candidates: Candidates, counts: Counts) -> Counts:
+    """The candidates (m,) that may be driven once more."""
+    limit = candidates.most
+    return np.arange(len(candidates)) if limit is None else np.flatnonzero(counts < limit)
+
+
+def _log_determinants(moments: Array) -> Array:
+    """log det of information matrices (m, p, p) in standard coordinates, the ridge added."""
+    signs, values = np.linalg.slogdet(moments + _RIDGE * np.eye(moments.shape[-1]))
+    return np.where(signs > 0, values, -np.inf)

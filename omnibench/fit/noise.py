@@ -1,0 +1,158 @@
+"""The noise of reference poses: whitening of residuals, and variance components from repetitions.
+
+The errors of one run at its stamps t_i > 0, of x and y alike and of the heading apart, have the covariance
+
+    white^2 I + walk^2 min(t_i, t_j) + bias^2 1 1^T.
+
+Of (r_1, r_2 - r_1, r_3 - r_2, ...) it is tridiagonal, so that all that follows takes a time proportional to K.
+A shift of the start pose is a bias, exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.linalg import cholesky_banded
+from scipy.linalg.lapack import dtbtrs
+from scipy.optimize import minimize
+
+from omnibench.data.dataset import Trajectory
+from omnibench.errors import DataError
+from omnibench.fit.repetitions import Difference, differences_between_repetitions
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Array
+
+# White noise, m or rad, that stands in where there is neither white noise nor walk and the covariance is singular.
+LEAST_WHITE = 1e-9
+# Components as shares of the residuals' size, on a logarithmic scale.
+_LOGARITHMS = (np.log(1e-4), np.log(1e2))
+_NO_LOSS = 1e-3  # of twice the logarithm of the likelihood
+_COORDINATES = (("position", slice(0, 2)), ("heading", slice(2, 3)))
+
+
+class Whitener:
+    """Turns the pose residuals of one run into independent ones of unit variance, exactly, in O(K).
+
+    stamps (K,): s, > 0, increasing; the start pose at t = 0 is not among them. log_determinant: of the covariance of
+    all 3K residuals. Without white noise and walk the covariance is singular: white noise of 1e-9 (m, rad) stands in.
+    """
+
+    log_determinant: float
+
+    def __init__(self, noise: Noise, stamps: Array) -> None:
+        stamps = np.asarray(stamps, dtype=float)
+        if stamps.ndim != 1 or len(stamps) == 0 or not (np.diff(stamps, prepend=0.0) > 0).all():
+            raise ValueError("stamps must be increasing and > 0")
+        self._position = _Factor(noise.pose_position, noise.walk_position, noise.bias_position, stamps)
+        self._heading = _Factor(noise.pose_heading, noise.walk_heading, noise.bias_heading, stamps)
+        self.log_determinant = 2 * self._position.log_determinant + self._heading.log_determinant
+
+    def __call__(self, residuals: Array) -> Array:
+        """Whitened residuals, or derivatives of residuals: (K, 3) or (K, 3, n) to the same shape."""
+        return np.concatenate([self._position(residuals[:, :2]), self._heading(residuals[:, 2:])], axis=1)
+
+
+class _Factor:
+    """The Cholesky factor of one coordinate's covariance, as a lower bidiagonal matrix of the differences."""
+
+    def __init__(self, white: float, walk: float, bias: float, stamps: Array) -> None:
+        steps = np.diff(stamps, prepend=0.0)
+        if white**2 + (walk**2 * steps[1:]).min(initial=np.inf if bias else walk**2 * steps[0]) < LEAST_WHITE**2:
+            white = LEAST_WHITE
+        bands = np.empty((2, len(stamps)))
+        bands[0] = 2 * white**2 + walk**2 * steps
+        bands[0, 0] += bias**2 - white**2
+        bands[1] = -(white**2)
+        self._factor = cholesky_banded(bands, lower=True, check_finite=False)
+        self.log_determinant = float(2 * np.log(self._factor[0]).sum())
+
+    def __call__(self, residuals: Array) -> Array:
+        """Whitened residuals (K, ...)."""
+        differences = np.diff(residuals, axis=0, prepend=np.zeros((1, *residuals.shape[1:])))
+        whitened, _ = dtbtrs(self._factor, differences.reshape(len(residuals), -1), uplo="L")
+        return whitened.reshape(residuals.shape)
+
+
+@dataclass(frozen=True)
+class NoiseEstimate:
+    """A noise model and where it comes from.
+
+    degrees_of_freedom: independent differences between runs, or the runs themselves where none is repeated.
+    """
+
+    noise: Noise
+    source: Literal["repetitions", "within runs"]
+    degrees_of_freedom: int
+    description: str
+
+
+def estimate_noise(trajectories: Sequence[Trajectory], residuals: Sequence[Array]) -> NoiseEstimate:
+    """Variance components by restricted maximum likelihood from the differences between repetitions of a command.
+
+    residuals: for every trajectory (K, 3) at its pose_times[1:], odometry minus reference, m, m, rad, of any decent
+    fit: what the model gets wrong of a command drops out of the differences. Repetitions are runs of one command
+    within a session (within a split if no session repeats a command). Runs whose stamps differ are compared at the
+    nearest ones, without interpolation, which would take away white noise. Without repetitions the residuals
+    themselves are taken for noise, and the estimate says so. DataError without trajectories.
+    """
+    differences = differences_between_repetitions(trajectories, residuals)
+    if not differences.each:
+        raise DataError("no trajectory has a reference pose after its start; the noise cannot be estimated")
+    return NoiseEstimate(
+        _components(differences.each), differences.source, len(differences.each), differences.description
+    )
+
+
+def _components(differences: Sequence[Difference]) -> Noise:
+    """The noise model that makes the differences most likely, position and heading each by itself."""
+    groups: dict[bytes, tuple[Array, list[Array]]] = {}
+    for each in differences:
+        groups.setdefault(each.stamps.tobytes(), (each.stamps, []))[1].append(each.values)
+    found: dict[str, float] = {}
+    for name, columns in _COORDINATES:
+        samples = [
+            (stamps, np.stack(values, axis=-1)[:, columns].reshape(len(stamps), -1))
+            for stamps, values in groups.values()
+        ]
+        for kind, component in zip(("pose", "walk", "bias"), _most_likely(samples), strict=True):
+            found[f"{kind}_{name}"] = component
+    return Noise(**found)
+
+
+def _most_likely(groups: list[tuple[Array, Array]]) -> tuple[float, float, float]:
+    """White noise, walk and bias for which samples (K, n) at stamps (K,) are most likely."""
+    count = sum(values.size for _, values in groups)
+    size = float(np.sqrt(sum(np.square(values).sum() for _, values in groups) / count))
+    if size < LEAST_WHITE:
+        return 0.0, 0.0, 0.0
+    longest = max(float(stamps[-1]) for stamps, _ in groups)
+    units = size * np.array([1.0, longest**-0.5, 1.0])
+
+    def surprise(components: Array) -> float:
+        total = 0.0
+        for stamps, values in groups:
+            factor = _Factor(*components, stamps)
+            total += values.shape[1] * factor.log_determinant + float(np.square(factor(values)).sum())
+        return total / count
+
+    # The likelihood may have a hill for each component that could dominate.
+    tries = [
+        minimize(
+            lambda logarithms: surprise(units * np.exp(logarithms)),
+            start,
+            method="L-BFGS-B",
+            bounds=[_LOGARITHMS] * 3,
+            options={"eps": 1e-5, "ftol": 1e-10},
+        )
+        for start in np.log(0.1 + 0.6 * np.eye(3))
+    ]
+    best = units * np.exp(min(tries, key=lambda each: float(each.fun)).x)
+    for index in np.argsort(best / units):  # on a logarithmic scale none is ever zero
+        without = np.where(np.arange(3) == index, 0.0, best)
+        if count * (surprise(without) - surprise(best)) < _NO_LOSS:
+            best = without
+    white, walk, bias = best
+    return float(white), float(walk), float(bias)
