@@ -136,8 +136,8 @@ def entry_table(view: DatasetView) -> Table:
         ),
         rows=tuple(rows),
         note="Spread: interquartile range over seeds. Gap: training cost relative to the exact optimum in the same box "
-        f"(closed_form), minus one; {NOTHING} where that is not known. Proven: what any optimiser could still save of "
-        "the cost in that box, at most. Difference: paired over trajectories, with its "
+        f"(closed_form), minus one; {NOTHING} where that is not known. Proven: what share of the "
+        "cost any optimiser could still save in that box, at most. Difference: paired over trajectories, with its "
         "95 % bootstrap interval. Practically equal: that interval contains zero, or the difference is below a tenth "
         "of the standard error of the best entry's cost. Best: the lowest training cost of the entries that are "
         f"practically equal to the one of lowest {SPLIT_NAMES[view.scored]} cost.{_held_in_words(view)}",
@@ -189,7 +189,7 @@ def gap(value: float | None) -> str:
 
 def proven(value: float | None) -> str:
     """What share of a cost could be saved at most, as a note; nothing where nothing is proven."""
-    return "" if value is None else f"proven: at most {percent(max(value, 0.0), 2)} to gain"
+    return "" if value is None else f"proven: ≤ {percent(max(value, 0.0), 2)}"
 
 
 def certificate_table(certificates: Sequence[BoxCertificate]) -> Table:

@@ -60,7 +60,7 @@ def test_the_report_tells_what_is_proven(tmp_path: Path) -> None:
     found = run(config())
     text = page(found, tmp_path).text
     assert "What no optimiser can beat" in text
-    assert "proven: at most" in text
+    assert "proven: ≤" in text
 
 
 def test_nothing_is_proven_where_nobody_asks(tmp_path: Path) -> None:
