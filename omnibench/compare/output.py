@@ -105,14 +105,15 @@ def calibration_of(run: ScoredRun, result: ComparisonResult) -> Calibration:
     """The calibration file of a run with an answer."""
     dataset: Dataset = result.datasets[run.record.dataset]
     assert run.record.matrix is not None  # only runs with an answer are written
+    uncertainty = result.uncertainties.get((run.record.dataset, run.record.label))
     return Calibration(
         name=f"{run.record.dataset} {run.record.label}",
         robot=dataset.robot,
         sample_period=dataset.sample_period,
         matrix=run.record.matrix,
         integration=result.config.integration,
-        noise=run.uncertainty.noise if run.uncertainty else None,
-        covariance=covariance_rows(run.uncertainty.covariance) if run.uncertainty else None,
+        noise=uncertainty.noise if uncertainty else None,
+        covariance=covariance_rows(uncertainty.covariance) if uncertainty else None,
         provenance=Provenance(
             dataset=dataset.name,
             dataset_hash=dataset.hash,

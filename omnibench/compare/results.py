@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -87,7 +88,6 @@ class ScoredRun:
     validation_costs: Array | None
     theoretical_train_costs: Array
     theoretical_validation_costs: Array | None
-    uncertainty: Uncertainty | None = None
 
     @property
     def matrix(self) -> Array | None:
@@ -138,7 +138,7 @@ class EntryStatistics:
 
 @dataclass(frozen=True, eq=False)
 class ComparisonResult:
-    """Everything that the report shows."""
+    """Everything that the report shows. uncertainties: of the entries' typical runs, by data set and label."""
 
     config: CompareConfig
     output: Path
@@ -146,5 +146,6 @@ class ComparisonResult:
     runs: tuple[ScoredRun, ...]
     statistics: tuple[EntryStatistics, ...]
     certificates: tuple[BoxCertificate, ...]
+    uncertainties: Mapping[tuple[str, str], Uncertainty]
     environment: Environment
     warnings: tuple[str, ...]

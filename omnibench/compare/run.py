@@ -17,6 +17,7 @@ from omnibench.compare.results import ComparisonResult, ScoredRun
 from omnibench.compare.scoring import score
 from omnibench.compare.statistics import entry_statistics, is_mean
 from omnibench.compare.store import RunStore
+from omnibench.compare.uncertainties import typical_uncertainties
 from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
 from omnibench.errors import ConfigError, Interrupted, UnknownNameError
@@ -51,13 +52,15 @@ def run_comparison(
     with _resumable(plan, store, folder):
         results = execute(plan, store, progress or Silent(), config.workers or os.cpu_count() or 1)
         runs, certificates = certify(plan, score(plan, results, datasets))
+        statistics = entry_statistics(runs, config.bootstrap)
         result = ComparisonResult(
             config=config,
             output=folder,
             datasets=datasets,
             runs=runs,
-            statistics=entry_statistics(runs, config.bootstrap),
+            statistics=statistics,
             certificates=certificates,
+            uncertainties=typical_uncertainties(plan, results, runs, statistics),
             environment=environment(),
             warnings=tuple(_warnings(failures, datasets, runs)),
         )

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from omnibench.compare.plan import UNBOUNDED, PlannedRun
-from omnibench.compare.problem import make_problem
 from omnibench.compare.results import RunRecord, ScoredRun
 from omnibench.data.dataset import Dataset, Split, Trajectory
 from omnibench.errors import PluginError
@@ -16,7 +15,6 @@ from omnibench.fit.calibrator import Outcome, RunResult, describe_error
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.fit.parameterisation import Box, FittedParameter, fitted_parameters, make_bounds
-from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import matrix_rows
 from omnibench.robot.kinematics import Array
@@ -138,20 +136,7 @@ def _score_one(run: PlannedRun, result: RunResult, scorers: Mapping[tuple[str, S
         validation_costs=None if matrix is None or validation is None else validation.costs(matrix),
         theoretical_train_costs=train.costs(design),
         theoretical_validation_costs=None if validation is None else validation.costs(design),
-        uncertainty=_uncertainty(run, result),
     )
-
-
-def _uncertainty(run: PlannedRun, result: RunResult) -> Uncertainty | None:
-    """How sure a run's answer is; None where it is no minimum, or nothing was fitted."""
-    if result.matrix is None or run.box == UNBOUNDED:
-        return None
-    training = run.dataset.split("train")
-    problem = make_problem(run.config, run.entry, run.dataset.robot, training, run.parameterisation)
-    try:
-        return uncertainty_of(problem, result)
-    except NoCovarianceError:
-        return None
 
 
 def _improvement(cost: float | None, theoretical: float | None) -> float | None:

@@ -296,11 +296,12 @@ def _least_sum_of_norms(
     errors = residuals + jacobian @ point
     weights = 1 / np.maximum(np.linalg.norm(errors, axis=1), 1e-300)
     fixed, moving = residuals + jacobian[:, :, ~free] @ point[~free], jacobian[:, :, free]
+    columns = moving.reshape(-1, moving.shape[2])
     for step in range(_STEPS if free.any() else 0):
         lengths = np.linalg.norm(errors, axis=1)
         weights = 1 / np.hypot(lengths, 1e-12 + lengths.mean() * 10.0 ** -min(1 + step / 2, _SMOOTHING))
-        normal = np.einsum("s,sci,scj->ij", shares * weights, moving, moving, optimize=True)
-        target = np.einsum("s,sci,sc->i", shares * weights, moving, fixed, optimize=True)
+        weighted = columns * np.repeat(shares * weights, fixed.shape[1])[:, None]
+        normal, target = weighted.T @ columns, weighted.T @ fixed.ravel()
         scale = 1 / np.sqrt(np.diag(normal))
         factor = np.linalg.cholesky(normal * np.outer(scale, scale) + _RIDGE * np.eye(len(scale))).T
         wanted = -np.linalg.solve(factor.T, scale * target)

@@ -74,6 +74,7 @@ def run(chosen: CompareConfig, datasets: Mapping[str, Dataset] | None = None) ->
         runs=scored,
         statistics=entry_statistics(scored, chosen.bootstrap),
         certificates=certificates,
+        uncertainties={},
         environment=environment(),
         warnings=(),
     )
