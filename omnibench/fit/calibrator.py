@@ -33,7 +33,7 @@ class Solution:
     """A calibrator's answer: the vector (n,) and why it stopped there.
 
     converged: False when a limit of the calibrator's own (generations, programs) came before its stopping rule.
-    covariance (n, n) of the vector, degrees_of_freedom of its variances, and noise of the reference poses: of calibrators
+    covariance (n, n) of the vector, degrees_of_freedom of its variances, noise of the reference poses: of calibrators
     that estimate them.
     """
 

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.linalg import cholesky_banded
-from scipy.linalg.lapack import dtbtrs
+from scipy.linalg.lapack import dpbtrf, dtbtrs
 from scipy.optimize import minimize
 
 from omnibench.data.dataset import Trajectory
@@ -46,34 +45,50 @@ class Whitener:
         stamps = np.asarray(stamps, dtype=float)
         if stamps.ndim != 1 or len(stamps) == 0 or not (np.diff(stamps, prepend=0.0) > 0).all():
             raise ValueError("stamps must be increasing and > 0")
-        self._position = _Factor(noise.pose_position, noise.walk_position, noise.bias_position, stamps)
-        self._heading = _Factor(noise.pose_heading, noise.walk_heading, noise.bias_heading, stamps)
+        steps = np.diff(stamps, prepend=0.0)
+        self._position = _Factor(noise.pose_position, noise.walk_position, noise.bias_position, steps)
+        self._heading = _Factor(noise.pose_heading, noise.walk_heading, noise.bias_heading, steps)
         self.log_determinant = 2 * self._position.log_determinant + self._heading.log_determinant
 
     def __call__(self, residuals: Array) -> Array:
         """Whitened residuals, or derivatives of residuals: (K, 3) or (K, 3, n) to the same shape."""
-        return np.concatenate([self._position(residuals[:, :2]), self._heading(residuals[:, 2:])], axis=1)
+        differences = _differences(residuals)
+        split = 2 * differences.shape[1] // 3
+        white = [self._position.whiten(differences[:, :split]), self._heading.whiten(differences[:, split:])]
+        return np.concatenate(white, axis=1).reshape(residuals.shape)
 
 
 class _Factor:
-    """The Cholesky factor of one coordinate's covariance, as a lower bidiagonal matrix of the differences."""
+    """The Cholesky factor of one coordinate's covariance, as a lower bidiagonal matrix of the differences.
 
-    def __init__(self, white: float, walk: float, bias: float, stamps: Array) -> None:
-        steps = np.diff(stamps, prepend=0.0)
-        if white**2 + (walk**2 * steps[1:]).min(initial=np.inf if bias else walk**2 * steps[0]) < LEAST_WHITE**2:
+    steps (K,): s from each stamp to the next, the first from t = 0.
+    """
+
+    def __init__(self, white: float, walk: float, bias: float, steps: Array) -> None:
+        least = steps[1:].min(initial=np.inf) if bias else steps.min()
+        if white**2 + walk**2 * least < LEAST_WHITE**2:
             white = LEAST_WHITE
-        bands = np.empty((2, len(stamps)))
+        bands = np.empty((2, len(steps)), order="F")
         bands[0] = 2 * white**2 + walk**2 * steps
         bands[0, 0] += bias**2 - white**2
         bands[1] = -(white**2)
-        self._factor = cholesky_banded(bands, lower=True, check_finite=False)
+        self._factor, failed = dpbtrf(bands, lower=1, overwrite_ab=1)
+        if failed:
+            raise ValueError("noise or stamps are not finite")
         self.log_determinant = float(2 * np.log(self._factor[0]).sum())
 
-    def __call__(self, residuals: Array) -> Array:
-        """Whitened residuals (K, ...)."""
-        differences = np.diff(residuals, axis=0, prepend=np.zeros((1, *residuals.shape[1:])))
-        whitened, _ = dtbtrs(self._factor, differences.reshape(len(residuals), -1), uplo="L")
-        return whitened.reshape(residuals.shape)
+    def whiten(self, differences: Array) -> Array:
+        """Independent values (K, n) of differences (K, n) between successive residuals, the first from 0."""
+        whitened, _ = dtbtrs(self._factor, differences, uplo="L")
+        return whitened
+
+
+def _differences(residuals: Array) -> Array:
+    """Differences (K, n) of residuals (K, ...) from one stamp to the next, the first from 0."""
+    flat = residuals.reshape(len(residuals), -1)
+    differences = flat.copy()
+    differences[1:] -= flat[:-1]
+    return differences
 
 
 @dataclass(frozen=True)
@@ -89,24 +104,27 @@ class NoiseEstimate:
     description: str
 
 
-def estimate_noise(trajectories: Sequence[Trajectory], residuals: Sequence[Array]) -> NoiseEstimate:
+def estimate_noise(
+    trajectories: Sequence[Trajectory], residuals: Sequence[Array], near: Noise | None = None
+) -> NoiseEstimate:
     """Variance components by restricted maximum likelihood from the differences between repetitions of a command.
 
     residuals: for every trajectory (K, 3) at its pose_times[1:], odometry minus reference, m, m, rad, of any decent
     fit: what the model gets wrong of a command drops out of the differences. Repetitions are runs of one command
     within a session (within a split if no session repeats a command). Runs whose stamps differ are compared at the
     nearest ones, without interpolation, which would take away white noise. Without repetitions the residuals
-    themselves are taken for noise, and the estimate says so. DataError without trajectories.
+    themselves are taken for noise, and the estimate says so. near: an earlier estimate, from which to search; without
+    one the search begins in several places. DataError without trajectories.
     """
     differences = differences_between_repetitions(trajectories, residuals)
     if not differences.each:
         raise DataError("no trajectory has a reference pose after its start; the noise cannot be estimated")
     return NoiseEstimate(
-        _components(differences.each), differences.source, len(differences.each), differences.description
+        _components(differences.each, near), differences.source, len(differences.each), differences.description
     )
 
 
-def _components(differences: Sequence[Difference]) -> Noise:
+def _components(differences: Sequence[Difference], near: Noise | None) -> Noise:
     """The noise model that makes the differences most likely, position and heading each by itself."""
     groups: dict[bytes, tuple[Array, list[Array]]] = {}
     for each in differences:
@@ -117,13 +135,14 @@ def _components(differences: Sequence[Difference]) -> Noise:
             (stamps, np.stack(values, axis=-1)[:, columns].reshape(len(stamps), -1))
             for stamps, values in groups.values()
         ]
-        for kind, component in zip(("pose", "walk", "bias"), _most_likely(samples), strict=True):
-            found[f"{kind}_{name}"] = component
+        names = [f"{kind}_{name}" for kind in ("pose", "walk", "bias")]
+        start = None if near is None else np.array([getattr(near, each) for each in names])
+        found |= dict(zip(names, _most_likely(samples, start), strict=True))
     return Noise(**found)
 
 
-def _most_likely(groups: list[tuple[Array, Array]]) -> tuple[float, float, float]:
-    """White noise, walk and bias for which samples (K, n) at stamps (K,) are most likely."""
+def _most_likely(groups: list[tuple[Array, Array]], near: Array | None) -> tuple[float, float, float]:
+    """White noise, walk and bias for which samples (K, n) at stamps (K,) are most likely; near (3,): where to begin."""
     count = sum(values.size for _, values in groups)
     size = float(np.sqrt(sum(np.square(values).sum() for _, values in groups) / count))
     if size < LEAST_WHITE:
@@ -131,23 +150,29 @@ def _most_likely(groups: list[tuple[Array, Array]]) -> tuple[float, float, float
     longest = max(float(stamps[-1]) for stamps, _ in groups)
     units = size * np.array([1.0, longest**-0.5, 1.0])
 
+    prepared = [(np.diff(stamps, prepend=0.0), np.asfortranarray(_differences(values))) for stamps, values in groups]
+
     def surprise(components: Array) -> float:
+        white, walk, bias = components
         total = 0.0
-        for stamps, values in groups:
-            factor = _Factor(*components, stamps)
-            total += values.shape[1] * factor.log_determinant + float(np.square(factor(values)).sum())
+        for steps, differences in prepared:
+            factor = _Factor(white, walk, bias, steps)
+            total += differences.shape[1] * factor.log_determinant + float(np.square(factor.whiten(differences)).sum())
         return total / count
 
-    # The likelihood may have a hill for each component that could dominate.
+    if near is not None and near.any():
+        starts = np.log(np.clip(near / units, 0.05, 50.0))[None]
+    else:  # the likelihood may have a hill for each component that could dominate
+        starts = np.log(0.1 + 0.6 * np.eye(3))
     tries = [
         minimize(
             lambda logarithms: surprise(units * np.exp(logarithms)),
             start,
             method="L-BFGS-B",
             bounds=[_LOGARITHMS] * 3,
-            options={"eps": 1e-5, "ftol": 1e-10},
+            options={"eps": 1e-5, "ftol": 1e-9},
         )
-        for start in np.log(0.1 + 0.6 * np.eye(3))
+        for start in starts
     ]
     best = units * np.exp(min(tries, key=lambda each: float(each.fun)).x)
     for index in np.argsort(best / units):  # on a logarithmic scale none is ever zero

@@ -102,12 +102,13 @@ def _polished(groups: list[tuple[Array, Array]], noise: Noise, deviation: float)
         values = [float(value) for value in start * np.exp(logarithms)]
         return Noise(**dict(zip(_NAMES, values[:6], strict=True))), values[6]
 
+    count = sum(everything[..., 0].size for _, everything in groups)
     answer = minimize(
-        lambda logarithms: _surprise(groups, *described(logarithms)) / len(groups),
+        lambda logarithms: _surprise(groups, *described(logarithms)) / count,
         np.zeros(7),
         method="L-BFGS-B",
         bounds=[(-5.0, 5.0)] * 7,
-        options={"eps": 1e-5, "ftol": 1e-9, "maxiter": 60},
+        options={"eps": 1e-5, "ftol": 1e-9},
     )
     found, deviation = described(answer.x)
     return found, deviation, _surprise(groups, found, deviation)

@@ -21,18 +21,17 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
-from scipy import stats
+from pydantic import Field, model_validator
 
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.cost import SumOfNorms
+from omnibench.fit.cost_weights import cost_weightings
 from omnibench.fit.gauss_newton import Descent, descend
-from omnibench.fit.noise import LEAST_WHITE, NoiseEstimate, estimate_noise
+from omnibench.fit.noise import NoiseEstimate, estimate_noise
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.fit.sandwich import Pulls, Sandwich, sandwich
 from omnibench.fit.start_noise import separate_start_noise
-from omnibench.fit.trajectory_fit import OFFSET, SLOPE, TURN, Estimate, Linearisation, TrajectoryFit, Weighting
+from omnibench.fit.trajectory_covariance import FitCovariance
+from omnibench.fit.trajectory_fit import OFFSET, SLOPE, TURN, Estimate, TrajectoryFit
 from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
@@ -40,8 +39,7 @@ from omnibench.robot.kinematics import Array
 # Before anything is known of the noise: 1 cm or 0.01 rad, and as much again in a second.
 _FIRST = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.01, walk_heading=0.01)
 _MOST_ROUNDS = 10
-# The model counts as wrong where chance exceeds the scatter of the runs once in a thousand times.
-_CHANCE = 0.001
+_STILL = 0.1  # standard errors: what the noise moves the vector by no longer matters
 
 
 class TrajectoryMLOptions(Options):
@@ -60,6 +58,12 @@ class TrajectoryMLOptions(Options):
         "auto", description="from the noise, from the scatter of the runs, or the latter only where the model misfits"
     )
     tolerance: float = Field(1e-3, gt=0, description="largest last step, standard errors")
+
+    @model_validator(mode="after")
+    def _covariance_belongs_to_weights(self) -> TrajectoryMLOptions:
+        if self.covariance == "model" and self.weights == "cost":
+            raise ValueError("covariance: model is that of noise weights; with weights: cost use robust")
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,68 +103,77 @@ class TrajectoryML(Calibrator):
         found = self.estimate(problem)
         state = "settled" if found.settled else "not settled"
         reason = f"{state} after {found.rounds} rounds of noise and fit; covariance from {found.description}"
-        return Solution(found.vector, reason, found.settled, found.covariance, found.noise.noise)
+        return Solution(
+            found.vector, reason, found.settled, found.covariance, found.noise.noise, found.degrees_of_freedom
+        )
 
     def estimate(self, problem: CalibrationProblem) -> TrajectoryEstimate:
         """The estimate with all that belongs to it."""
         fit = TrajectoryFit(problem.trajectories, problem.parameterisation, problem.integration)
         begin = Estimate(problem.start, np.zeros((len(fit.trajectories), 3)))
         now = descend(problem, fit, begin, fit.whiteners(_FIRST), self._deviations(0.0), 0.1)
-        for rounds in range(1, _MOST_ROUNDS + 1):
-            before = now.estimate.vector
-            noise, start_heading = self._noise(fit, now.estimate)
-            deviations = self._deviations(start_heading)
-            held = Estimate(before, np.where(deviations > 0, now.estimate.nuisances, 0.0))
-            now = descend(problem, fit, held, fit.whiteners(noise.noise), deviations, self.options.tolerance)
-            moved = now.estimate.vector - before
-            settled = float(moved @ now.linear.information.sum(axis=0) @ moved) < 0.01
-            if settled and now.settled:
-                break
-        return self._judged(problem, fit, now, noise, start_heading, rounds)
+        found: _Noise | None = None
+        rounds, settled = 0, False
+        while not settled and rounds < _MOST_ROUNDS:
+            before, earlier = now.estimate, found
+            found = self._noise(fit, before, earlier)
+            deviations = self._deviations(found.start_heading)
+            held = Estimate(before.vector, np.where(deviations > 0, before.nuisances, 0.0))
+            now = descend(problem, fit, held, fit.whiteners(found.estimate.noise), deviations, self.options.tolerance)
+            moved = now.estimate.vector - before.vector
+            still = float(moved @ now.linear.information.sum(axis=0) @ moved) < _STILL**2
+            settled = now.settled and (still or (earlier is not None and found.is_near(earlier)))
+            rounds += 1
+        assert found is not None  # there is at least one round
+        return self._judged(problem, fit, now, found, rounds, settled)
 
     def _judged(
         self,
         problem: CalibrationProblem,
         fit: TrajectoryFit,
         now: Descent,
-        noise: NoiseEstimate,
-        start_heading: float,
+        found: _Noise,
         rounds: int,
+        settled: bool,
     ) -> TrajectoryEstimate:
         """The likeliest estimate, or another where it misfits, with its covariance."""
-        options = self.options
+        options, noise = self.options, found.estimate
         corrections = _start_corrections(fit, now.estimate, noise.noise)
-        spread = _spread(problem, fit, now.linear)
-        lack = spread.words if spread is not None and spread.lack_of_fit else ""
-        by_cost = options.weights == "cost" or bool(lack and options.weights == "auto" and options.covariance != "model")
+        covariance = FitCovariance(problem, now.linear, fit.trajectories)
+        misfit = covariance.scatter.words if covariance.lack_of_fit and covariance.scatter else ""
+        by_cost = options.weights == "cost" or (
+            options.weights == "auto" and bool(misfit) and options.covariance != "model"
+        )
         if by_cost:
-            weightings = _cost_weightings(problem, fit, now.estimate)
+            weightings = cost_weightings(problem.objective, fit.trajectories, fit.residuals(now.estimate))
             now = descend(problem, fit, now.estimate, weightings, np.zeros(3), options.tolerance)
-            spread = _spread(problem, fit, now.linear)
-        model = _inverse(problem, now.linear)
-        covariance, freedom, words = model, noise.degrees_of_freedom, f"the noise model: {noise.description}"
-        if by_cost and spread is None:
-            raise DataError("too few runs for the covariance of a fit that is weighted by the cost; use weights: noise")
-        if spread is not None and options.covariance != "model":
-            scatter = _full(problem, spread.covariance)
-            if by_cost or options.covariance == "robust" or _wider_than(model, scatter, spread.degrees_of_freedom):
-                covariance, freedom, words = scatter, spread.degrees_of_freedom, spread.words
-        if lack and by_cost:
-            words += "; so the squared pose errors of the cost are minimised, not those that the noise weights"
+            covariance = FitCovariance(problem, now.linear, fit.trajectories)
+        matrix, freedom, words = self._covariance(covariance, noise, by_cost)
         return TrajectoryEstimate(
             vector=now.estimate.vector,
-            covariance=covariance,
+            covariance=matrix,
             degrees_of_freedom=freedom,
             noise=noise,
-            start_heading=start_heading,
+            start_heading=found.start_heading,
             start_corrections=corrections,
             clocks=now.estimate.nuisances[:, [OFFSET, SLOPE]],
             trajectories=tuple(run.id for run in fit.trajectories),
-            misfit=lack,
+            misfit=misfit,
             description=words,
             rounds=rounds,
-            settled=now.settled,
+            settled=settled and now.settled,
         )
+
+    def _covariance(self, covariance: FitCovariance, noise: NoiseEstimate, by_cost: bool) -> tuple[Array, int, str]:
+        """The covariance (n, n), its degrees of freedom and what it rests on."""
+        asked, scatter = self.options.covariance, covariance.scatter
+        robust = by_cost or asked == "robust" or (asked == "auto" and covariance.scatter_is_wider)
+        if not robust:
+            return covariance.model, noise.degrees_of_freedom, f"the noise model ({noise.description})"
+        if scatter is None:
+            raise DataError("too few runs for a covariance from their scatter; use covariance: model, weights: noise")
+        words = f"{scatter.words}; weighted by the cost" if by_cost else scatter.words
+        return scatter.covariance, scatter.degrees_of_freedom, words
 
     def _deviations(self, start_heading: float) -> Array:
         """Expected sizes (3,) of the nuisances; 0 for those that are none."""
@@ -168,45 +181,34 @@ class TrajectoryML(Calibrator):
         offset = 0.0 if clock == "none" else self.options.clock_offset
         return np.array([start_heading, offset, self.options.clock_slope if clock == "offset_and_slope" else 0.0])
 
-    def _noise(self, fit: TrajectoryFit, estimate: Estimate) -> tuple[NoiseEstimate, float]:
+    def _noise(self, fit: TrajectoryFit, estimate: Estimate, earlier: _Noise | None) -> _Noise:
         """The noise and the deviation of the start headings, by the residuals of an estimate."""
         straight = estimate.nuisances.copy()
         straight[:, TURN] = 0.0
         estimate = Estimate(estimate.vector, straight)
         residuals = fit.residuals(estimate)
-        found = estimate_noise(fit.trajectories, residuals)
+        near = None if earlier is None else earlier.estimate.noise
+        found = estimate_noise(fit.trajectories, residuals, near)
         if self.options.start == "exact":
-            return found, 0.0
+            return _Noise(found, 0.0)
         apart = separate_start_noise(fit.trajectories, residuals, fit.turning(estimate), found.noise)
         least = apart.noise.pose_heading if self.options.start == "noisy" else 0.0
-        return replace(found, noise=apart.noise), max(apart.start_heading, least)
+        return _Noise(replace(found, noise=apart.noise), max(apart.start_heading, least))
 
 
-def _cost_weightings(problem: CalibrationProblem, fit: TrajectoryFit, estimate: Estimate) -> list[Weighting]:
-    """Pose errors at the stamps of the problem's cost, weighted as it does, each run the same, of unit size."""
-    cost = problem.objective
-    scale = np.array(cost.weights if isinstance(cost, SumOfNorms) else (1.0, 1.0, 1.0))
-    chosen: list[Weighting] = [
-        _Errors(scale / np.sqrt(1 if cost.stamps == "final" else len(run.pose_times) - 1), cost.stamps == "final")
-        for run in fit.trajectories
-    ]
-    residuals = fit.residuals(estimate)
-    squares = sum(float(np.square(weigh(own)).sum()) for weigh, own in zip(chosen, residuals, strict=True))
-    size = max(np.sqrt(squares / len(chosen)), LEAST_WHITE)
-    return [_Errors(weigh.scale / size, weigh.final) for weigh in chosen if isinstance(weigh, _Errors)]
+@dataclass(frozen=True)
+class _Noise:
+    """The noise of the reference, and the standard deviation of the start headings, rad."""
 
+    estimate: NoiseEstimate
+    start_heading: float
 
-@dataclass(frozen=True, eq=False)
-class _Errors:
-    """Residuals of a run times ``scale`` (3,): those of all poses, or of the last alone."""
-
-    scale: Array
-    final: bool
-
-    def __call__(self, residuals: Array) -> Array:
-        chosen = residuals[-1:] if self.final else residuals
-        weighted: Array = chosen * self.scale.reshape(3, *([1] * (residuals.ndim - 2)))
-        return weighted
+    def is_near(self, other: _Noise) -> bool:
+        """Whether no component differs by more than 1 % of the largest of its kind."""
+        ours, theirs = (
+            np.array([*each.estimate.noise.model_dump().values(), each.start_heading]) for each in (self, other)
+        )
+        return bool((np.abs(ours - theirs) <= 0.01 * np.maximum(ours, theirs).max()).all())
 
 
 def _start_corrections(fit: TrajectoryFit, estimate: Estimate, noise: Noise) -> Array:
@@ -219,35 +221,3 @@ def _start_corrections(fit: TrajectoryFit, estimate: Estimate, noise: Noise) -> 
             ones, residuals = weigh(np.ones_like(own))[:, :2], weigh(own)[:, :2]
             found[row, :2] = -(ones * residuals).sum(axis=0) / (noise.bias_position**-2 + np.square(ones).sum(axis=0))
     return found
-
-
-def _spread(problem: CalibrationProblem, fit: TrajectoryFit, linear: Linearisation) -> Sandwich | None:
-    """The covariance (free, free) from the scatter of the runs, in widths of the box; None for too few runs."""
-    free, unit = problem.free, (problem.upper - problem.lower)[problem.free]
-    scores = linear.scores[:, free] * unit
-    information = linear.information[:, free][:, :, free] * np.outer(unit, unit)
-    try:
-        return sandwich(Pulls(scores, information, fit.trajectories, np.zeros(len(unit))))
-    except DataError:
-        return None
-
-
-def _inverse(problem: CalibrationProblem, linear: Linearisation) -> Array:
-    """The covariance (n, n) that the noise means; zero where held, and along what the data do not tell at all."""
-    free, unit = problem.free, (problem.upper - problem.lower)[problem.free]
-    information = linear.information.sum(axis=0)[np.ix_(free, free)] * np.outer(unit, unit)
-    return _full(problem, np.linalg.pinv(information, rcond=1e-12, hermitian=True))
-
-
-def _full(problem: CalibrationProblem, covariance: Array) -> Array:
-    """A covariance (free, free) in widths of the box as one (n, n) of the vector."""
-    free, unit = problem.free, (problem.upper - problem.lower)[problem.free]
-    whole = np.zeros((problem.size, problem.size))
-    whole[np.ix_(free, free)] = covariance * np.outer(unit, unit)
-    return whole
-
-
-def _wider_than(model: Array, scatter: Array, freedom: int) -> bool:
-    """Whether a covariance from scatter is wider, by more than chance, than that of the noise model."""
-    values, directions = np.linalg.eigh(model / np.sqrt(np.outer(*[np.maximum(np.diag(model), 1e-300)] * 2)))
-    raise NotImplementedError

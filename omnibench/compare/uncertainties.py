@@ -1,0 +1,32 @@
+"""How sure the answers of a comparison are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from omnibench.compare.plan import UNBOUNDED, PlannedRun
+from omnibench.compare.problem import make_problem
+from omnibench.compare.results import EntryStatistics, ScoredRun
+from omnibench.fit.calibrator import RunResult
+from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
+
+
+def typical_uncertainties(
+    plan: Sequence[PlannedRun],
+    results: Sequence[RunResult],
+    scored: Sequence[ScoredRun],
+    statistics: Sequence[EntryStatistics],
+) -> dict[tuple[str, str], Uncertainty]:
+    """The uncertainty of every entry's typical run, by data set and label; none where it is no minimum."""
+    typical = [entry.typical for entry in statistics]
+    found = {}
+    for run, result, done in zip(plan, results, scored, strict=True):
+        if run.box == UNBOUNDED or not any(done is one for one in typical):
+            continue
+        training = run.dataset.split("train")
+        problem = make_problem(run.config, run.entry, run.dataset.robot, training, run.parameterisation)
+        try:
+            found[run.dataset_name, run.label] = uncertainty_of(problem, result)
+        except NoCovarianceError:
+            continue
+    return found
