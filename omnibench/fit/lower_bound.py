@@ -296,7 +296,7 @@ def _least_sum_of_norms(
     errors = residuals + jacobian @ point
     weights = 1 / np.maximum(np.linalg.norm(errors, axis=1), 1e-300)
     fixed, moving = residuals + jacobian[:, :, ~free] @ point[~free], jacobian[:, :, free]
-    columns = moving.reshape(-1, moving.shape[2])
+    columns = moving.reshape(fixed.size, moving.shape[2])
     for step in range(_STEPS if free.any() else 0):
         lengths = np.linalg.norm(errors, axis=1)
         weights = 1 / np.hypot(lengths, 1e-12 + lengths.mean() * 10.0 ** -min(1 + step / 2, _SMOOTHING))

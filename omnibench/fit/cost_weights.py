@@ -1,0 +1,43 @@
+"""Weighting the pose errors of runs as a cost does, in squares: what a fit minimises when no matrix fits the runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from omnibench.data.dataset import Trajectory
+from omnibench.fit.cost import Cost, SumOfNorms
+from omnibench.fit.noise import LEAST_WHITE
+from omnibench.robot.kinematics import Array
+
+
+@dataclass(frozen=True, eq=False)
+class CostWeighting:
+    """Pose residuals of a run times ``scale`` (3,): of all poses, or of the last alone."""
+
+    scale: Array
+    last_alone: bool
+
+    def __call__(self, residuals: Array) -> Array:
+        """Weighted residuals (k, 3) or derivatives (k, 3, n)."""
+        chosen = residuals[-1:] if self.last_alone else residuals
+        weighted: Array = chosen * self.scale.reshape(3, *([1] * (residuals.ndim - 2)))
+        return weighted
+
+
+def cost_weightings(cost: Cost, trajectories: Sequence[Trajectory], residuals: Sequence[Array]) -> list[CostWeighting]:
+    """The weighting of every run: at the cost's stamps, each run counting the same, of unit mean square over the runs.
+
+    A cost that is no sum of norms has no weights of its own: m and rad count alike.
+    """
+    weights = np.array(cost.weights if isinstance(cost, SumOfNorms) else (1.0, 1.0, 1.0))
+    last_alone = cost.stamps == "final"
+    raw = [
+        CostWeighting(weights / np.sqrt(1 if last_alone else len(run.pose_times) - 1), last_alone)
+        for run in trajectories
+    ]
+    squares = [float(np.square(weigh(own)).sum()) for weigh, own in zip(raw, residuals, strict=True)]
+    size = max(float(np.sqrt(np.mean(squares))), LEAST_WHITE)
+    return [CostWeighting(weigh.scale / size, last_alone) for weigh in raw]
