@@ -65,8 +65,8 @@ class _Factor:
     """
 
     def __init__(self, white: float, walk: float, bias: float, steps: Array) -> None:
-        least = steps[1:].min(initial=np.inf) if bias else steps.min()
-        if white**2 + walk**2 * least < LEAST_WHITE**2:
+        walked = walk**2 * (steps[1:] if bias else steps)
+        if white**2 + walked.min(initial=np.inf) < LEAST_WHITE**2:
             white = LEAST_WHITE
         bands = np.empty((2, len(steps)), order="F")
         bands[0] = 2 * white**2 + walk**2 * steps
@@ -170,7 +170,7 @@ def _most_likely(groups: list[tuple[Array, Array]], near: Array | None) -> tuple
             start,
             method="L-BFGS-B",
             bounds=[_LOGARITHMS] * 3,
-            options={"eps": 1e-5, "ftol": 1e-9},
+            options={"eps": 1e-5, "ftol": 1e-8},
         )
         for start in starts
     ]

@@ -108,7 +108,7 @@ def _polished(groups: list[tuple[Array, Array]], noise: Noise, deviation: float)
         np.zeros(7),
         method="L-BFGS-B",
         bounds=[(-5.0, 5.0)] * 7,
-        options={"eps": 1e-5, "ftol": 1e-9},
+        options={"eps": 1e-5, "ftol": 1e-10},
     )
     found, deviation = described(answer.x)
     return found, deviation, _surprise(groups, found, deviation)

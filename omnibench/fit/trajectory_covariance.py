@@ -14,9 +14,10 @@ from omnibench.fit.sandwich import Pulls, Sandwich, sandwich
 from omnibench.fit.trajectory_fit import Linearisation
 from omnibench.robot.kinematics import Array
 
-# The scatter counts as wider than the noise means where chance exceeds it once in a thousand times.
+# Scatter counts as more than noise where chance exceeds it once in a thousand times.
 _CHANCE = 0.001
 _RANK = 1e-12
+_TOLD = 1e-3  # of what a command tells most sharply: what it tells by encoder noise alone is less
 
 
 class FitCovariance:
@@ -35,6 +36,8 @@ class FitCovariance:
         values, vectors = np.linalg.eigh(information.sum(axis=0))
         known = values > _RANK * values.max(initial=0.0)
         self._roots, self._directions = np.sqrt(values[known]), vectors[:, known]
+        turn = self._directions / self._roots  # to numbers whose covariance, by the model, is the unit matrix
+        self._fit_test = _fit_test(scores @ turn, turn.T @ information @ turn, trajectories)
         self._scatter: Sandwich | None = None
         if known.any():
             try:
@@ -55,14 +58,21 @@ class FitCovariance:
 
     @property
     def lack_of_fit(self) -> bool:
-        """Whether commands or sessions scatter more than their repetitions explain."""
-        return self._scatter is not None and self._scatter.lack_of_fit
+        """Whether commands scatter more than their repetitions explain, by the likelihood as well as by the sandwich.
+
+        The likelihood's is an F test on what every command by itself says of the vector, each direction in units of
+        its noise, so that the noise's size does not matter.
+        """
+        return self._scatter is not None and self._scatter.lack_of_fit and self._fit_test < _CHANCE
 
     @property
     def scatter_is_wider(self) -> bool:
-        """Whether the runs scatter more than the noise means, by more than chance."""
-        if self._scatter is None:
-            return False
+        """Whether the runs scatter more than the noise means, by more than chance.
+
+        Scatter between commands counts only where the likelihood's test bears it out.
+        """
+        if self._scatter is None or self._scatter.lack_of_fit:
+            return self.lack_of_fit
         whitened = self._directions * self._roots
         values = np.linalg.eigvalsh(whitened.T @ self._scatter.covariance @ whitened)
         total = float(values.sum())
@@ -73,3 +83,29 @@ class FitCovariance:
         whole = np.zeros((self._size, self._size))
         whole[np.ix_(self._free, self._free)] = covariance * np.outer(self._unit, self._unit)
         return whole
+
+
+def _fit_test(scores: Array, information: Array, trajectories: Sequence[Trajectory]) -> float:
+    """The chance that commands differ from one vector as much as they do; 1 where no repetitions show the noise.
+
+    scores (Z, k) and information (Z, k, k) of the runs, summed up to 0 and the unit matrix.
+    """
+    groups: dict[tuple[str | None, ...], list[int]] = {}
+    for index, run in enumerate(trajectories):
+        key = (run.session, run.command) if run.command is not None else (run.session, None, run.id)
+        groups.setdefault(key, []).append(index)
+    between, within, between_freedom, within_freedom = 0.0, 0.0, -scores.shape[1], 0
+    for members in groups.values():
+        values, vectors = np.linalg.eigh(information[members].sum(axis=0))
+        told = values > _TOLD * values.max(initial=0.0)
+        own, rank = scores[members] @ vectors[:, told], int(told.sum())
+        common = float((own.sum(axis=0) ** 2 / values[told]).sum())
+        between, between_freedom = between + common, between_freedom + rank
+        if len(members) > 1:
+            each = vectors[:, told].T @ information[members] @ vectors[:, told]
+            within += sum(float(s @ np.linalg.lstsq(m, s)[0]) for s, m in zip(own, each, strict=True)) - common
+            within_freedom += (len(members) - 1) * rank
+    if between_freedom <= 0 or within_freedom <= 0 or within <= 0:
+        return 1.0
+    ratio = (between / between_freedom) / (within / within_freedom)
+    return float(stats.f.sf(ratio, between_freedom, within_freedom))
