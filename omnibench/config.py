@@ -51,6 +51,13 @@ _Loader.add_implicit_resolver(
 )
 
 
+class _Dumper(yaml.SafeDumper):
+    """Quotes what the loader would otherwise take for a number."""
+
+
+_Dumper.yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
+
+
 def read_yaml(path: Path) -> Any:
     """The content of a YAML file; ConfigError in one line when it cannot be read."""
     try:
@@ -149,7 +156,7 @@ def to_yaml(document: BaseModel | Mapping[str, Any]) -> str:
     data = document.model_dump(mode="json", by_alias=True) if isinstance(document, BaseModel) else dict(document)
     # A JSON round trip drops types that YAML would tag (tuples, NumPy numbers).
     plain = json.loads(json.dumps(data))
-    return yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+    return yaml.dump(plain, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
 
 
 def to_json(document: BaseModel | Mapping[str, Any]) -> str:

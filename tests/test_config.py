@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import Field, model_validator
 
@@ -200,6 +200,7 @@ def test_floats_come_back_to_the_last_bit(values: list[float]) -> None:
     assert validated(Numbers, Numbers(values=tuple(values))).values == tuple(values)
 
 
+@example(text="0E0")
 @given(st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc"))))
 def test_texts_come_back_as_they_were(text: str) -> None:
     class Words(Model):

@@ -83,7 +83,7 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     freedom: int | None
     if result.covariance is not None:
         found, freedom = result.covariance, None
-        source = "the calibrator's own: the likelihood under its noise model"
+        source = "the calibrator's own (see its reason)"
     else:
         found, freedom, source = _by_scatter(problem, result)
     covariance = slopes @ found @ slopes.T
