@@ -48,8 +48,10 @@ def design_experiment(
     for name, number in (("runs", runs), ("repetitions", repetitions)):
         if number is not None and not 1 <= number <= _MOST_RUNS:
             raise ConfigError(f"{name}: must be from 1 to {_MOST_RUNS} (given: {number})")
-    pool = source if isinstance(source, CandidatePool) else None
-    pool = pool or read_candidates(source, dataset=dataset, integration=integration)  # type: ignore[arg-type]
+    if isinstance(source, CandidatePool):
+        pool = source
+    else:
+        pool = read_candidates(source, dataset=dataset, integration=integration)
     problem = DesignProblem(pool, use, per, repetitions)
     sets = tuple(_design_of_set(problem, name, runs) for name in pool.sets)
     return Design(

@@ -28,7 +28,7 @@ def main() -> None:
     ((name, source),) = config.datasets.items()
     dataset = load_source(name, source)
     training = dataset.split("train")
-    for chosen in sys.argv[1:] or ["closed_form", "crs", "parametric", "genetic"]:
+    for chosen in sys.argv[1:] or ["closed_form", "crs", "genetic", "isres", "parametric"]:
         calibrator = calibrators.create(chosen)
         problem = CalibrationProblem(
             dataset.robot,
