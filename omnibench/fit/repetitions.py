@@ -1,8 +1,8 @@
-"""Differences between repetitions of a command: combinations of runs that hold noise and nothing of the model."""
+"""Repetitions of a command, and their differences: combinations of runs that hold noise and nothing of the model."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -39,23 +39,21 @@ def differences_between_repetitions(
 ) -> Differences:
     """Independent differences of residuals (K, 3), given at every trajectory's pose_times[1:].
 
-    Repetitions are runs of one command within a session; within a split, if no session repeats a command. Where none
-    is repeated, the residuals themselves stand for the differences.
+    Where no command is repeated, the residuals themselves stand for the differences.
     """
     companions = residuals if companions is None else companions
     runs = [
         (run.pose_times[1:], np.stack([own, other], axis=-1))
         for run, own, other in zip(trajectories, residuals, companions, strict=True)
     ]
-    for within in ("session", "split"):
-        groups = _repetitions(trajectories, within)
-        found = tuple(each for members in groups for each in _contrasts([runs[index] for index in members]))
-        if found:
-            words = (
-                f"{len(found)} independent differences between repetitions ({sum(map(len, groups))} runs of "
-                f"{len(groups)} commands, each within one {within})"
-            )
-            return Differences(found, "repetitions", words)
+    repeated = repetitions_of_commands(trajectories)
+    measured = [[runs[index] for index in members if len(runs[index][0])] for members in repeated.groups]
+    if found := tuple(each for members in measured for each in _contrasts(members)):
+        words = (
+            f"{len(found)} independent differences between repetitions ({repeated.description}, each within one "
+            f"{repeated.within})"
+        )
+        return Differences(found, "repetitions", words)
     found = tuple(Difference(stamps, values[..., 0], values[..., 1]) for stamps, values in runs if len(stamps))
     words = (
         f"the residuals within {len(found)} runs: no command is repeated, so what the model cannot express counts as "
@@ -64,14 +62,34 @@ def differences_between_repetitions(
     return Differences(found, "within runs", words)
 
 
-def _repetitions(trajectories: Sequence[Trajectory], within: str) -> list[list[int]]:
-    """Indices of the runs of each command that is driven more than once within a split, and session if so asked."""
-    groups: dict[tuple[str | None, ...], list[int]] = {}
-    for index, run in enumerate(trajectories):
-        if run.command is not None and len(run.pose_times) > 1:
-            session = run.session if within == "session" else None
-            groups.setdefault((run.split, session, run.command), []).append(index)
-    return [members for members in groups.values() if len(members) > 1]
+@dataclass(frozen=True)
+class Repetitions:
+    """Indices of the runs of every command that is driven more than once, within one session or one split."""
+
+    groups: tuple[tuple[int, ...], ...]
+    within: Literal["session", "split"]
+
+    @property
+    def description(self) -> str:
+        return f"{sum(map(len, self.groups))} runs of {len(self.groups)} commands"
+
+
+def repetitions_of_commands(trajectories: Sequence[Trajectory]) -> Repetitions:
+    """The repetitions within sessions; if no session repeats a command, those within splits. Runs need a command."""
+    for within in ("session", "split"):
+        keys = [(run.split, run.session if within == "session" else None, run.command) for run in trajectories]
+        repeated = [each for each in grouped(keys) if len(each) > 1 and trajectories[each[0]].command is not None]
+        if repeated:
+            return Repetitions(tuple(repeated), within)
+    return Repetitions((), "split")
+
+
+def grouped(keys: Sequence[Hashable]) -> list[tuple[int, ...]]:
+    """Indices of equal keys, in the order in which the keys first come."""
+    groups: dict[Hashable, list[int]] = {}
+    for index, key in enumerate(keys):
+        groups.setdefault(key, []).append(index)
+    return [tuple(members) for members in groups.values()]
 
 
 def _contrasts(runs: list[tuple[Array, Array]]) -> Iterator[Difference]:

@@ -11,6 +11,7 @@ from scipy import stats
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.cost import SumOfNorms
+from omnibench.fit.repetitions import grouped, repetitions_of_commands
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
 
@@ -108,14 +109,15 @@ def sandwich(pulls: Pulls) -> Sandwich:
     free_runs = count - max(1, -(-size // 3))  # a run has three numbers
     if free_runs < 1:
         raise DataError(f"runs are too few ({count}) for the scatter of {size} fitted numbers")
-    groups = repetitions(runs)
+    repeated = repetitions_of_commands(runs)
+    groups = repeated.groups
     if not groups:
         spread = _between([(index,) for index in range(count)], pulls, bread)
         words = f"the scatter between {count} runs: no command is repeated, so what the model cannot express counts too"
         return Sandwich(bread @ spread @ bread, free_runs, words)
     within = _within(groups, pulls, bread)
     freedom = sum(len(group) - 1 for group in groups)
-    spread, clusters, words = within, None, _of_repetitions(groups)
+    spread, clusters, words = within, None, f"the scatter between repetitions ({repeated.description})"
     largest = 1.0
     for name, members in _clusterings(runs):
         between = _between(members, pulls, bread)
@@ -132,35 +134,14 @@ def sandwich(pulls: Pulls) -> Sandwich:
     return Sandwich(bread @ spread @ bread, freedom if clusters is None else len(clusters) - 1, words, lack)
 
 
-def repetitions(runs: Sequence[Trajectory]) -> list[tuple[int, ...]]:
-    """Indices of the runs of each command that is driven more than once within a session (or, if none is, at all)."""
-    for within_session in (True, False):
-        groups = _grouped([(run.session if within_session else None, run.command) for run in runs])
-        repeated = [group for group in groups if len(group) > 1 and runs[group[0]].command is not None]
-        if repeated:
-            return repeated
-    return []
-
-
-def _of_repetitions(groups: Sequence[tuple[int, ...]]) -> str:
-    return f"the scatter between repetitions ({sum(map(len, groups))} runs of {len(groups)} commands)"
-
-
 def _clusterings(runs: Sequence[Trajectory]) -> list[tuple[str, list[tuple[int, ...]]]]:
     """Ways to put runs together that may have more in common than the model says, with enough clusters to judge."""
     ways: list[tuple[str, list[Hashable]]] = [
         ("command", [run.command if run.command is not None else ("run", run.id) for run in runs]),
         ("session", [run.session if run.session is not None else ("run", run.id) for run in runs]),
     ]
-    found = [(name, _grouped(keys)) for name, keys in ways]
+    found = [(name, grouped(keys)) for name, keys in ways]
     return [(name, members) for name, members in found if len(members) >= _FEWEST_CLUSTERS]
-
-
-def _grouped(keys: Sequence[Hashable]) -> list[tuple[int, ...]]:
-    groups: dict[Hashable, list[int]] = {}
-    for index, key in enumerate(keys):
-        groups.setdefault(key, []).append(index)
-    return [tuple(members) for members in groups.values()]
 
 
 def _within(groups: Sequence[tuple[int, ...]], pulls: Pulls, bread: Array) -> Array:

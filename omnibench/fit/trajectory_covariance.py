@@ -10,6 +10,7 @@ from scipy import stats
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.problem import CalibrationProblem
+from omnibench.fit.repetitions import grouped
 from omnibench.fit.sandwich import Pulls, Sandwich, sandwich
 from omnibench.fit.trajectory_fit import Linearisation
 from omnibench.robot.kinematics import Array
@@ -37,7 +38,7 @@ class FitCovariance:
         known = values > _RANK * values.max(initial=0.0)
         self._roots, self._directions = np.sqrt(values[known]), vectors[:, known]
         turn = self._directions / self._roots  # to numbers whose covariance, by the model, is the unit matrix
-        self._fit_test = _fit_test(scores @ turn, turn.T @ information @ turn, trajectories)
+        self._chance_of_misfit = _chance_of_misfit(scores @ turn, turn.T @ information @ turn, trajectories)
         self._scatter: Sandwich | None = None
         if known.any():
             try:
@@ -63,7 +64,7 @@ class FitCovariance:
         The likelihood's is an F test on what every command by itself says of the vector, each direction in units of
         its noise, so that the noise's size does not matter.
         """
-        return self._scatter is not None and self._scatter.lack_of_fit and self._fit_test < _CHANCE
+        return self._scatter is not None and self._scatter.lack_of_fit and self._chance_of_misfit < _CHANCE
 
     @property
     def scatter_is_wider(self) -> bool:
@@ -85,17 +86,14 @@ class FitCovariance:
         return whole
 
 
-def _fit_test(scores: Array, information: Array, trajectories: Sequence[Trajectory]) -> float:
+def _chance_of_misfit(scores: Array, information: Array, trajectories: Sequence[Trajectory]) -> float:
     """The chance that commands differ from one vector as much as they do; 1 where no repetitions show the noise.
 
     scores (Z, k) and information (Z, k, k) of the runs, summed up to 0 and the unit matrix.
     """
-    groups: dict[tuple[str | None, ...], list[int]] = {}
-    for index, run in enumerate(trajectories):
-        key = (run.session, run.command) if run.command is not None else (run.session, None, run.id)
-        groups.setdefault(key, []).append(index)
+    groups = grouped([(run.session, run.command, run.id if run.command is None else None) for run in trajectories])
     between, within, between_freedom, within_freedom = 0.0, 0.0, -scores.shape[1], 0
-    for members in groups.values():
+    for members in map(list, groups):
         values, vectors = np.linalg.eigh(information[members].sum(axis=0))
         told = values > _TOLD * values.max(initial=0.0)
         own, rank = scores[members] @ vectors[:, told], int(told.sum())

@@ -11,7 +11,9 @@ from fit_samples import make_problem, noisy_trajectories
 from omnibench.data.dataset import Trajectory
 from omnibench.data.simulate.config import FlowerConfig
 from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
+from omnibench.fit.calibrators.trajectory_ml import TrajectoryML, TrajectoryMLOptions
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Array
@@ -126,6 +128,73 @@ def test_start_poses_that_are_off_are_taken_for_nuisances() -> None:
 
     runs = [with_start_off(run) for run in problem.trajectories]
     assert np.abs(misses(solved(changed(problem, runs)))).max() < 4
+
+
+def test_how_far_start_headings_are_off_is_measured() -> None:
+    problem = flower(pose_position=0.002, pose_heading=0.002)
+    rng = np.random.default_rng(4)
+    runs = []
+    for run in problem.trajectories:
+        poses = run.poses.copy()
+        poses[0, 2] += 0.03 * rng.standard_normal()
+        runs.append(replace(run, poses=poses))
+    estimate = TrajectoryML(TrajectoryMLOptions()).estimate(changed(problem, runs))
+    assert estimate.start_heading == pytest.approx(0.03, rel=0.45)  # three standard deviations with 24 differences
+    assert TrajectoryML(TrajectoryMLOptions()).estimate(problem).start_heading < 0.003
+
+
+def bent(problem: CalibrationProblem) -> CalibrationProblem:
+    """The problem with references that no matrix explains: commands to the left and the right differ in length."""
+    runs = []
+    for run in problem.trajectories:
+        assert run.alpha is not None
+        poses = run.poses.copy()
+        poses[:, :2] *= 1 + 0.05 * np.sin(3 * run.alpha + 1)
+        runs.append(replace(run, poses=poses))
+    return changed(problem, runs)
+
+
+def test_where_no_matrix_fits_the_cost_weighs_and_the_intervals_are_those_of_the_scatter() -> None:
+    problem = bent(flower())
+    found, by_noise = solved(problem), solved(problem, weights="noise", covariance="model")
+    assert "weighted by the cost" in found.reason
+    assert "the noise model" in by_noise.reason
+    assert found.cost is not None
+    assert by_noise.cost is not None
+    assert found.cost < by_noise.cost
+    assert found.covariance is not None
+    assert by_noise.covariance is not None
+    assert np.trace(found.covariance) > 2 * np.trace(by_noise.covariance)
+
+
+def test_where_a_matrix_fits_the_noise_weighs() -> None:
+    assert "the noise model" in solved(flower()).reason
+
+
+def test_intervals_of_the_scatter_can_be_asked_for() -> None:
+    problem = flower()
+    scatter, model = solved(problem, covariance="robust"), solved(problem)
+    assert "the scatter between repetitions (36 runs of 12 commands)" in scatter.reason
+    assert scatter.vector == pytest.approx(model.vector)
+    assert scatter.covariance is not None
+    assert model.covariance is not None
+    # The same variances but for chance; each is known from 24 differences.
+    ratios = np.diag(scatter.covariance) / np.diag(model.covariance)
+    assert np.exp(np.abs(np.log(ratios)).max()) < 3
+
+
+def test_a_covariance_of_the_noise_does_not_go_with_weights_of_the_cost() -> None:
+    with pytest.raises(ConfigError, match="use robust"):
+        calibrators.create("trajectory_ml", {"covariance": "model", "weights": "cost"})
+
+
+def test_too_few_runs_for_their_scatter_are_refused_with_the_way_out() -> None:
+    problem = flower()
+    result = run_calibrator(
+        calibrators.create("trajectory_ml", {"covariance": "robust"}), changed(problem, list(problem.trajectories[:3]))
+    )
+    assert result.outcome is Outcome.FAILED
+    assert "too few runs for a covariance from their scatter; use covariance: model" in result.reason
 
 
 def test_the_box_is_kept() -> None:
