@@ -9,7 +9,10 @@ from pathlib import Path
 
 from omnibench.config import Model
 
-_PACKAGES = ("omnibench", "numpy", "scipy", "nlopt", "cvxpy", "clarabel", "cma", "polars", "pydantic")
+_PACKAGES = (
+    *("omnibench", "numpy", "scipy", "nlopt", "cvxpy", "clarabel", "cma", "polars", "pydantic"),
+    *("eclipse-zenoh", "filterpy", "rosbags"),
+)
 
 
 class Environment(Model):

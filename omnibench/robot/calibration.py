@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from omnibench.config import Model, read_yaml, to_yaml, validate
+from omnibench.config import Model, parse_yaml, read_yaml, to_yaml, validate
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import write_text
 from omnibench.registry import effects
@@ -114,17 +114,27 @@ def covariance_rows(covariance: Array) -> tuple[Row, ...]:
 
 def read_calibration(path: Path | str) -> Calibration:
     """Read and check a calibration file. DataError names the file and what is wrong."""
-    path = Path(path)
     try:
-        content = read_yaml(path)
-        found = content.get("format") if isinstance(content, dict) else None
-        if found != FORMAT:
-            raise DataError(f"{path}: format is {found!r}, expected {FORMAT!r}; is this a calibration file?")
-        calibration = validate(Calibration, content, str(path))
-        for term in calibration.effects:
-            effects.entry(term.name, str(path))
+        return _checked(read_yaml(Path(path)), str(path))
     except ConfigError as error:
         raise DataError(str(error)) from None
+
+
+def parse_calibration(text: str, where: str) -> Calibration:
+    """A calibration file's text, checked. DataError, with ``where`` in front, says what is wrong."""
+    try:
+        return _checked(parse_yaml(text, where), where)
+    except ConfigError as error:
+        raise DataError(str(error)) from None
+
+
+def _checked(content: Any, where: str) -> Calibration:
+    found = content.get("format") if isinstance(content, dict) else None
+    if found != FORMAT:
+        raise DataError(f"{where}: format is {found!r}, expected {FORMAT!r}; is this a calibration file?")
+    calibration = validate(Calibration, content, where)
+    for term in calibration.effects:
+        effects.entry(term.name, where)
     return calibration
 
 

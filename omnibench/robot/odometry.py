@@ -11,6 +11,7 @@ s = sin(h)/h with h = m3.a(k)/2. For a given row 3 positions are linear in rows 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -176,22 +177,40 @@ class OdometryBatch:
 
 
 class OdometryStream:
-    """The same odometry, one sample at a time: ``step`` moves ``pose`` (3,) in m, m, rad."""
+    """The same odometry, one sample at a time: ``step`` moves ``pose`` (3,) in m, m, rad.
+
+    moved (3,): what the last step drove, in the robot's frame: m, m, rad.
+    """
 
     def __init__(self, matrix: Array, integration: Integration, start: Array | None = None) -> None:
         self.matrix = matrix
         self.integration: Integration = integration
         self.pose = np.zeros(3) if start is None else np.array(start, dtype=float)
+        self.moved = np.zeros(3)
 
     def step(self, rates: Array, duration: float) -> Array:
         """Advance by one sample of mean wheel rates (N,) rad/s over ``duration`` s; the new pose."""
-        moved_x, moved_y, turned = self.matrix @ np.asarray(rates) * duration
-        direction, stretch = self.pose[2], 1.0
-        if self.integration == "arc":
-            direction, stretch = direction + turned / 2, float(_sinc(turned / 2))
-        path = (moved_x + 1j * moved_y) * stretch * np.exp(1j * direction)
-        self.pose = self.pose + np.array([path.real, path.imag, turned])
+        return self.drive(np.asarray(rates) * duration)
+
+    def drive(self, angles: Array) -> Array:
+        """Advance by one sample in which the wheels turned by ``angles`` (N,) rad; the new pose."""
+        self.moved = self.matrix @ angles
+        self.pose = advance(self.pose, self.moved, self.integration)
         return self.pose
+
+
+def advance(pose: Array, moved: Array, integration: Integration) -> Array:
+    """The pose (3,) after a motion (3,) in the robot's frame, m, m, rad: Eq. (1), (2), or the arc of constant twist."""
+    x, y, heading = pose.tolist()
+    moved_x, moved_y, turned = moved.tolist()
+    direction = heading
+    if integration == "arc":
+        half_turn = turned / 2
+        direction += half_turn
+        stretch = math.sin(half_turn) / half_turn if half_turn else 1.0
+        moved_x, moved_y = moved_x * stretch, moved_y * stretch
+    cosine, sine = math.cos(direction), math.sin(direction)
+    return np.array([x + moved_x * cosine - moved_y * sine, y + moved_x * sine + moved_y * cosine, heading + turned])
 
 
 def _locate(log: WheelLog) -> tuple[NDArray[np.intp], Array]:

@@ -1,0 +1,1 @@
+"""The live runtime: wheel samples in, calibrated odometry out, over Zenoh."""

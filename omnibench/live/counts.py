@@ -1,0 +1,44 @@
+"""What a robot's inputs brought, counted: everything that was taken, refused or put right."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+
+@dataclass(slots=True)
+class Counts:
+    """Counters since the start, in the order in which diagnostics show them."""
+
+    samples: int = 0  # wheel samples taken
+    missing: int = 0  # wheel samples that never came, by the stamps of those that did
+    duplicates: int = 0  # the same stamp again
+    late: int = 0  # out of order: a newer one had been taken
+    gaps: int = 0  # longer than max_gap
+    clock_jumps: int = 0  # the stamps went on somewhere else
+    bad_stamps: int = 0  # a stamp far away, which the next ones did not confirm
+    wraps: int = 0  # angles that started again after a turn of the counter
+    counter_restarts: int = 0  # angles that started again at random
+    not_finite: int = 0  # NaN or infinity among what the wheels say
+    too_fast: int = 0  # beyond max_rate
+    wrong_joints: int = 0  # a wheel is not among the names, or has neither angle nor rate
+    undecodable: int = 0  # wheel messages that are no sensor_msgs/JointState
+    poses: int = 0  # SLAM poses that were fused
+    pose_rejected: int = 0  # by the gate
+    pose_too_late: int = 0  # older than the history
+    pose_ahead: int = 0  # stamps in the future
+    pose_duplicates: int = 0
+    pose_invalid: int = 0  # not finite, no covariance, wrong frame
+    pose_undecodable: int = 0  # not a geometry_msgs/PoseWithCovarianceStamped
+    reacquired: int = 0  # times that the filter gave up its pose for that of SLAM
+    swaps: int = 0  # calibrations taken
+    swaps_refused: int = 0
+    failures: int = 0  # errors of omnibench itself while it took a message; each is logged
+
+    def as_dict(self) -> dict[str, int]:
+        """Names and values."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
+    def anomalies(self) -> dict[str, int]:
+        """What is not as it should be, and how often."""
+        usual = ("samples", "poses", "swaps", "wraps")
+        return {name: value for name, value in self.as_dict().items() if value and name not in usual}

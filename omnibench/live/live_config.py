@@ -1,0 +1,108 @@
+"""What a config says of a node: its robots, how they are fused, where messages go, and how Zenoh is reached."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from omnibench.config import Model, read_model
+from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.live.arrivals import ReplayConfig
+from omnibench.live.fusion import FusionSettings
+from omnibench.live.session_config import SessionConfig
+from omnibench.live.topics import Profile
+from omnibench.live.tracker import Frames
+from omnibench.live.wheels import WheelSettings
+
+FusionChoice = Literal["none", "ekf"] | FusionSettings
+
+
+class RobotConfig(Model):
+    """One robot of a node."""
+
+    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", description="begins its topics: <name>/odom")
+    calibration: Path = Field(description="calibration file")
+    wheels: WheelSettings = WheelSettings()
+    fusion: FusionChoice | None = Field(None, description="default: the node's")
+    frames: Frames | None = Field(None, description="default: map, odom, base_link; of several robots <name>/odom, ...")
+
+
+class ReplaySource(ReplayConfig):
+    """What ``--replay`` plays unless it names something else, and how."""
+
+    dataset: Path | None = Field(None, description="a data set folder, or a comparison's config with a simulated one")
+    robot: str | None = Field(None, description="whose messages are played; default: the first robot")
+
+
+class LiveConfig(Model):
+    """A node."""
+
+    name: str = Field("omnibench", pattern=r"^[A-Za-z][A-Za-z0-9_]*$", description="the node's name in the ROS graph")
+    description: str = ""
+    robots: tuple[RobotConfig, ...] = Field((), description="may be empty for a router")
+    fusion: FusionChoice = Field("none", description="of SLAM poses: none, ekf, or its settings")
+    stale_after: float = Field(0.5, gt=0, allow_inf_nan=False, description="no wheel sample for so long is told, s")
+    profile: Profile = Field("plain", description="plain: plain Zenoh and the DDS bridge; rmw, humble: rmw_zenoh")
+    domain: int = Field(0, ge=0, le=232, description="ROS_DOMAIN_ID, for rmw and humble")
+    zenoh: SessionConfig = SessionConfig()
+    state: Path | None = Field(None, description="folder in which pose and calibration outlive the node")
+    record: Path | None = Field(None, description="MCAP file to record to")
+    foxglove: bool | int = Field(False, description="serve Foxglove's WebSocket on loopback; a number is the port")
+    replay: ReplaySource = ReplaySource()
+
+    @model_validator(mode="after")
+    def _robots_differ(self) -> LiveConfig:
+        names = [robot.name for robot in self.robots]
+        if len(set(names)) < len(names):
+            raise ValueError(f"robots: names must differ: {', '.join(names)}")
+        if not names and self.zenoh.mode != "router":
+            raise ValueError(
+                "robots: none is given; without robots a node can only be a router (zenoh: {mode: router})"
+            )
+        return self
+
+    def fusion_of(self, robot: RobotConfig) -> FusionSettings | None:
+        """How a robot's SLAM poses are fused, if they are."""
+        chosen = self.fusion if robot.fusion is None else robot.fusion
+        if isinstance(chosen, FusionSettings):
+            return chosen
+        return FusionSettings() if chosen == "ekf" else None
+
+    def frames_of(self, robot: RobotConfig) -> Frames:
+        """A robot's frames: tf is everybody's, so that those of several robots carry their names."""
+        if robot.frames is not None:
+            return robot.frames
+        if len(self.robots) == 1:
+            return Frames()
+        return Frames(odom=f"{robot.name}/odom", base=f"{robot.name}/base_link")
+
+
+def read_live_config(path: Path | str) -> LiveConfig:
+    """Read a node's config; paths in it start from its folder. ConfigError in one line."""
+    path = Path(path)
+    config = read_model(LiveConfig, path)
+    folder = path.resolve().parent
+
+    def there(value: Path | None) -> Path | None:
+        return None if value is None else folder / value
+
+    changes: dict[str, Any] = {
+        "robots": tuple(each.model_copy(update={"calibration": folder / each.calibration}) for each in config.robots),
+        "zenoh": config.zenoh.relative_to(folder),
+        "state": there(config.state),
+        "record": there(config.record),
+        "replay": config.replay.model_copy(update={"dataset": there(config.replay.dataset)}),
+    }
+    return config.model_copy(update=changes)
+
+
+def robot_called(config: LiveConfig, name: str | None) -> RobotConfig:
+    """The robot of that name, or the first one. UnknownNameError, or ConfigError when there is none."""
+    if not config.robots:
+        raise ConfigError("the config has no robot")
+    for robot in config.robots:
+        if name in (None, robot.name):
+            return robot
+    raise UnknownNameError("robot", str(name), [robot.name for robot in config.robots])

@@ -1,0 +1,316 @@
+"""ROS 2's messages as typed objects of the plane, to and from CDR (rosbags does the serialising).
+
+Poses are (x, y, heading) in m, m, rad; twists (vx, vy, w) in m/s, m/s, rad/s in the child frame; stamps are ns.
+Covariances of the plane (3, 3) take their places in ROS 2's 6 x 6; the variances of z, roll and pitch there are 1e-9,
+so that the whole can be inverted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Generic, TypeVar
+
+import numpy as np
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+
+from omnibench.errors import DataError
+from omnibench.robot.kinematics import Array
+
+STORE: Final = get_typestore(Stores.ROS2_JAZZY)
+
+_FLAT = np.array([0, 1, 5, 6, 7, 11, 30, 31, 35])  # the plane's nine places in the 36
+_ELSEWHERE = np.zeros(36)
+_ELSEWHERE[[14, 21, 28]] = 1e-9
+_SECOND = 1_000_000_000
+_LARGEST_TILT = math.radians(10.0)
+
+
+class MessageError(DataError):
+    """A message that cannot be what its topic says."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointState:
+    """sensor_msgs/JointState. names (N,); positions (N,) rad and velocities (N,) rad/s, where the sender gives them."""
+
+    stamp: int
+    names: tuple[str, ...]
+    positions: Array | None = None
+    velocities: Array | None = None
+    frame: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseEstimate:
+    """geometry_msgs/PoseWithCovarianceStamped. pose (3,), covariance (3, 3)."""
+
+    stamp: int
+    frame: str
+    pose: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """nav_msgs/Odometry: pose (3,) of ``child_frame`` in ``frame``, twist (3,) in ``child_frame``, and covariances."""
+
+    stamp: int
+    frame: str
+    child_frame: str
+    pose: Array
+    pose_covariance: Array
+    twist: Array
+    twist_covariance: Array
+
+    @property
+    def seconds(self) -> float:
+        """The stamp in s."""
+        return self.stamp / _SECOND
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transform:
+    """One transform of a tf2_msgs/TFMessage: pose (3,) of ``child_frame`` in ``frame``."""
+
+    stamp: int
+    frame: str
+    child_frame: str
+    pose: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnostic:
+    """One status of a diagnostic_msgs/DiagnosticArray. level: 0 ok, 1 warn, 2 error, 3 stale."""
+
+    name: str
+    level: int
+    message: str
+    hardware: str
+    values: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnostics:
+    """diagnostic_msgs/DiagnosticArray."""
+
+    stamp: int
+    statuses: tuple[Diagnostic, ...]
+
+
+M = TypeVar("M")
+
+
+@dataclass(frozen=True)
+class MessageType(Generic[M]):
+    """A ROS 2 message type and how it becomes one of the classes above.
+
+    name: as in ROS 2, sensor_msgs/msg/JointState.
+    """
+
+    name: str
+    _to_ros: Callable[[M], Any]
+    _from_ros: Callable[[Any], M]
+
+    @property
+    def hash(self) -> str:
+        """Its type hash (REP-2011), RIHS01_..."""
+        return STORE.hash_rihs01(self.name)
+
+    @property
+    def definition(self) -> str:
+        """Its definition and those of the types within it in one text, as recordings and Foxglove want it (ros2msg)."""
+        return STORE.generate_msgdef(self.name, ros_version=2)[0]
+
+    def encode(self, message: M) -> bytes:
+        """The message in CDR, little-endian, with its header of four bytes."""
+        return bytes(STORE.serialize_cdr(self._to_ros(message), self.name))
+
+    def decode(self, payload: bytes) -> M:
+        """The message in a payload. MessageError says what is wrong of one that is not of this type."""
+        return self._from_ros(self.parse(payload))
+
+    def parse(self, payload: bytes) -> Any:
+        """The message in a payload as rosbags' object, whatever its values. MessageError: it is not of this type."""
+        try:
+            return STORE.deserialize_cdr(payload, self.name)  # which sees to it that nothing is left over
+        except (SerdeError, UnicodeError, ValueError, OverflowError, MemoryError) as error:
+            raise MessageError(f"not a {self.name} of {len(payload)} bytes: {error}") from None
+
+
+def _ros(name: str) -> Any:
+    return STORE.types[name]
+
+
+_Header, _Time = _ros("std_msgs/msg/Header"), _ros("builtin_interfaces/msg/Time")
+_Point, _Vector, _Quaternion = (_ros(f"geometry_msgs/msg/{name}") for name in ("Point", "Vector3", "Quaternion"))
+_Pose, _PoseCovariance = _ros("geometry_msgs/msg/Pose"), _ros("geometry_msgs/msg/PoseWithCovariance")
+_Twist, _TwistCovariance = _ros("geometry_msgs/msg/Twist"), _ros("geometry_msgs/msg/TwistWithCovariance")
+_Transform, _TransformStamped = _ros("geometry_msgs/msg/Transform"), _ros("geometry_msgs/msg/TransformStamped")
+_Status, _KeyValue = _ros("diagnostic_msgs/msg/DiagnosticStatus"), _ros("diagnostic_msgs/msg/KeyValue")
+_NOTHING = np.zeros(0)
+_STILL = _Vector(0.0, 0.0, 0.0)
+
+
+def _header(stamp: int, frame: str) -> Any:
+    return _Header(_Time(stamp // _SECOND, stamp % _SECOND), frame)
+
+
+def _stamp(header: Any) -> int:
+    return int(header.stamp.sec) * _SECOND + int(header.stamp.nanosec)
+
+
+def _quaternion(heading: float) -> Any:
+    return _Quaternion(0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
+
+
+def _heading(quaternion: Any) -> float:
+    """The yaw of a quaternion of length 1, of a body that stands upright."""
+    x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    if not abs(length - 1) < 0.01:
+        raise MessageError(f"its quaternion has length {length:.3g}, expected 1")
+    upright = 1 - 2 * (x * x + y * y) / length**2
+    if not upright > math.cos(_LARGEST_TILT):
+        raise MessageError(f"its pose is tilted by {math.degrees(math.acos(max(upright, -1.0))):.0f} degrees")
+    return math.atan2(2 * (w * z + x * y), length**2 - 2 * (y * y + z * z))
+
+
+def _covariance_36(covariance: Array) -> Array:
+    full = _ELSEWHERE.copy()
+    full[_FLAT] = np.ravel(covariance)
+    return full
+
+
+def _plane_pose(pose: Any) -> Array:
+    return np.array([pose.position.x, pose.position.y, _heading(pose.orientation)])
+
+
+def _plane_covariance(covariance: Array) -> Array:
+    return np.asarray(covariance[_FLAT], dtype=float).reshape(3, 3)
+
+
+def _ros_pose(pose: Array) -> Any:
+    x, y, heading = pose.tolist()
+    return _Pose(_Point(x, y, 0.0), _quaternion(heading))
+
+
+def _joint_state_to_ros(message: JointState) -> Any:
+    positions = _NOTHING if message.positions is None else np.ascontiguousarray(message.positions, dtype=float)
+    velocities = _NOTHING if message.velocities is None else np.ascontiguousarray(message.velocities, dtype=float)
+    return _ros("sensor_msgs/msg/JointState")(
+        _header(message.stamp, message.frame), list(message.names), positions, velocities, _NOTHING
+    )
+
+
+def _joint_state_from_ros(content: Any) -> JointState:
+    names = tuple(content.name)
+    for what, values in (("positions", content.position), ("velocities", content.velocity)):
+        if len(values) not in (0, len(names)):
+            raise MessageError(f"it has {len(names)} names and {len(values)} {what}")
+    return JointState(
+        _stamp(content.header),
+        names,
+        content.position if len(content.position) else None,
+        content.velocity if len(content.velocity) else None,
+        content.header.frame_id,
+    )
+
+
+def _pose_to_ros(message: PoseEstimate) -> Any:
+    return _ros("geometry_msgs/msg/PoseWithCovarianceStamped")(
+        _header(message.stamp, message.frame),
+        _PoseCovariance(_ros_pose(message.pose), _covariance_36(message.covariance)),
+    )
+
+
+def _pose_from_ros(content: Any) -> PoseEstimate:
+    return PoseEstimate(
+        _stamp(content.header),
+        content.header.frame_id,
+        _plane_pose(content.pose.pose),
+        _plane_covariance(content.pose.covariance),
+    )
+
+
+def _odometry_to_ros(message: Odometry) -> Any:
+    vx, vy, w = message.twist.tolist()
+    return _ros("nav_msgs/msg/Odometry")(
+        _header(message.stamp, message.frame),
+        message.child_frame,
+        _PoseCovariance(_ros_pose(message.pose), _covariance_36(message.pose_covariance)),
+        _TwistCovariance(_Twist(_Vector(vx, vy, 0.0), _Vector(0.0, 0.0, w)), _covariance_36(message.twist_covariance)),
+    )
+
+
+def _odometry_from_ros(content: Any) -> Odometry:
+    twist = content.twist.twist
+    return Odometry(
+        _stamp(content.header),
+        content.header.frame_id,
+        content.child_frame_id,
+        _plane_pose(content.pose.pose),
+        _plane_covariance(content.pose.covariance),
+        np.array([twist.linear.x, twist.linear.y, twist.angular.z]),
+        _plane_covariance(content.twist.covariance),
+    )
+
+
+def _transforms_to_ros(transforms: Sequence[Transform]) -> Any:
+    return _ros("tf2_msgs/msg/TFMessage")(
+        [
+            _TransformStamped(
+                _header(each.stamp, each.frame),
+                each.child_frame,
+                _Transform(_Vector(float(each.pose[0]), float(each.pose[1]), 0.0), _quaternion(float(each.pose[2]))),
+            )
+            for each in transforms
+        ]
+    )
+
+
+def _transforms_from_ros(content: Any) -> tuple[Transform, ...]:
+    return tuple(
+        Transform(
+            _stamp(each.header),
+            each.header.frame_id,
+            each.child_frame_id,
+            np.array([each.transform.translation.x, each.transform.translation.y, _heading(each.transform.rotation)]),
+        )
+        for each in content.transforms
+    )
+
+
+def _diagnostics_to_ros(message: Diagnostics) -> Any:
+    statuses = [
+        _Status(each.level, each.name, each.message, each.hardware, [_KeyValue(*pair) for pair in each.values])
+        for each in message.statuses
+    ]
+    return _ros("diagnostic_msgs/msg/DiagnosticArray")(_header(message.stamp, ""), statuses)
+
+
+def _diagnostics_from_ros(content: Any) -> Diagnostics:
+    statuses = tuple(
+        Diagnostic(
+            each.name,
+            int(each.level),
+            each.message,
+            each.hardware_id,
+            tuple((pair.key, pair.value) for pair in each.values),
+        )
+        for each in content.status
+    )
+    return Diagnostics(_stamp(content.header), statuses)
+
+
+JOINT_STATE: Final = MessageType[JointState]("sensor_msgs/msg/JointState", _joint_state_to_ros, _joint_state_from_ros)
+POSE_ESTIMATE: Final = MessageType[PoseEstimate](
+    "geometry_msgs/msg/PoseWithCovarianceStamped", _pose_to_ros, _pose_from_ros
+)
+ODOMETRY: Final = MessageType[Odometry]("nav_msgs/msg/Odometry", _odometry_to_ros, _odometry_from_ros)
+TRANSFORMS: Final = MessageType[Sequence[Transform]]("tf2_msgs/msg/TFMessage", _transforms_to_ros, _transforms_from_ros)
+DIAGNOSTICS: Final = MessageType[Diagnostics](
+    "diagnostic_msgs/msg/DiagnosticArray", _diagnostics_to_ros, _diagnostics_from_ros
+)

@@ -1,0 +1,366 @@
+"""One robot: messages in, odometry out. No network here; a lock lets messages and questions come from any thread."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from omnibench.config import Model
+from omnibench.errors import DataError
+from omnibench.live.counts import Counts
+from omnibench.live.fusion import Fusion, FusionSettings, Outcome
+from omnibench.live.health import FusionHealth, Health, Status, SwapRecord
+from omnibench.live.memory import RobotMemory, SavedState
+from omnibench.live.messages import JOINT_STATE, POSE_ESTIMATE, MessageError, Odometry, Transform
+from omnibench.live.odometry import UNKNOWN_NOISE, LiveOdometry, Motion
+from omnibench.live.stamps import PublishedStamps
+from omnibench.live.timeline import Entry, Fix, Timeline
+from omnibench.live.wheels import WheelInput, WheelSettings, WheelStep
+from omnibench.robot.calibration import Calibration
+from omnibench.robot.kinematics import Array
+
+_HISTORY = 5.0  # s of odometry without fusion
+_SAVING = 0.1  # s between states written
+_OTHER_ROBOT = 0.5  # of a row's largest element; no calibration moves a matrix so far from its design
+_SECOND = 1e9  # ns
+
+
+class Frames(Model):
+    """Names of the coordinate frames (REP-105)."""
+
+    map: str = "map"
+    odom: str = "odom"
+    base: str = "base_link"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Update:
+    """What is published of one wheel sample."""
+
+    odometry: Odometry
+    filtered: Odometry | None
+    transforms: tuple[Transform, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseAt:
+    """Where the robot was at ``stamp`` (ns); in_map: pose (3,) and covariance (3, 3)."""
+
+    stamp: int
+    odometry: Array
+    in_map: tuple[Array, Array] | None
+
+
+class RobotTracker:
+    """The state of one robot.
+
+    stale_after: s without wheel samples after which the stream counts as stale. fusion: None for odometry alone.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        calibration: Calibration,
+        *,
+        wheels: WheelSettings | None = None,
+        fusion: FusionSettings | None = None,
+        frames: Frames | None = None,
+        stale_after: float = 0.5,
+        memory: RobotMemory | None = None,
+    ) -> None:
+        self.name = name
+        self.calibration = calibration
+        self.counts = Counts()
+        self._frames = frames or Frames()
+        self._stale_after = stale_after
+        self._settings = fusion
+        self._memory = memory
+        self._lock = threading.RLock()
+        self._wheels = WheelInput(
+            calibration.robot.wheel_names, wheels or WheelSettings(), calibration.sample_period, self.counts
+        )
+        self._odometry = LiveOdometry(calibration, fusion.standstill if fusion else 1.0)
+        self._timeline = Timeline(fusion.history if fusion else _HISTORY)
+        self._fusion = Fusion(fusion, self._timeline, self.counts) if fusion else None
+        self._stamps = PublishedStamps()
+        self._arrival: float | None = None  # of the last wheel sample
+        self._began: float | None = None
+        self._pose_arrival: float | None = None
+        self._outcome: Outcome | None = None
+        self._rejected_in_a_row = 0
+        self._last_refusal = ""
+        self._last_swap: SwapRecord | None = None
+        self._saved = -np.inf
+        self._counted = (time.monotonic(), 0)
+        self._rate = 0.0
+
+    def take_wheels(self, payload: bytes, arrival: float) -> list[Update]:
+        """Take a sensor_msgs/JointState; what is to be published. arrival: s, monotonic."""
+        with self._lock:
+            try:
+                message = JOINT_STATE.decode(payload)
+            except MessageError as error:
+                self.counts.undecodable += 1
+                self._last_refusal = str(error)
+                return []
+            self._wheels.last_refusal = ""
+            steps = self._wheels.take(message, arrival)
+            self._last_refusal = self._wheels.last_refusal or self._last_refusal
+            if not steps:
+                return []
+            self._arrival = arrival
+            updates = [self._drive(step) for step in steps]
+            if arrival - self._saved >= _SAVING:
+                self._save()
+            return updates
+
+    def take_pose(self, payload: bytes, arrival: float) -> Outcome | None:
+        """Take a geometry_msgs/PoseWithCovarianceStamped; what became of it, None when it is invalid."""
+        with self._lock:
+            if self._fusion is None:
+                return None
+            try:
+                fix = self._fix(payload)
+            except MessageError as error:
+                self._last_refusal = str(error)
+                return None
+            self._outcome = self._fusion.correct(fix)
+            self._rejected_in_a_row = self._rejected_in_a_row + 1 if self._outcome == "rejected" else 0
+            if self._outcome in ("fused", "located", "reacquired", "waiting"):
+                self._pose_arrival = arrival
+            return self._outcome
+
+    def swap(self, calibration: Calibration) -> None:
+        """Go on with another calibration from the next sample on. DataError: it is not this robot's."""
+        with self._lock:
+            try:
+                self._check(calibration)
+            except DataError as error:
+                self.counts.swaps_refused += 1
+                self._last_swap = SwapRecord(accepted=False, name=calibration.name, reason=str(error), at=time.time())
+                raise
+            self._odometry.swap(calibration)
+            self.calibration = calibration
+            self.counts.swaps += 1
+            self._last_swap = SwapRecord(accepted=True, name=calibration.name, reason="runs", at=time.time())
+            self._save()
+
+    def refuse_swap(self, reason: str) -> None:
+        """A calibration was sent that is none."""
+        with self._lock:
+            self.counts.swaps_refused += 1
+            self._last_swap = SwapRecord(accepted=False, name=None, reason=reason, at=time.time())
+
+    def set_pose(self, pose: Array, covariance: Array) -> None:
+        """The robot is at ``pose`` (3,) of the map, now. DataError without fusion: odometry itself never jumps."""
+        with self._lock:
+            fusion = self._fusing("set_pose")
+            if self._timeline.entries:
+                fusion.set_pose(pose, covariance)
+            else:
+                fusion.begin(pose, covariance)
+
+    def reset(self) -> None:
+        """Forget where the robot is in the map; odometry goes on."""
+        with self._lock:
+            fusion = self._fusing("reset")
+            if self._timeline.entries:
+                fusion.reset()
+            else:
+                fusion.begin(np.zeros(3), None)
+
+    def pose_at(self, stamp: int | None = None) -> PoseAt:
+        """Where the robot was at a time (ns; default: of the last sample). DataError outside of what is remembered."""
+        with self._lock:
+            if not self._timeline.entries:
+                raise DataError(f"robot {self.name!r} has sent no wheel sample yet")
+            chosen = self._timeline.newest if stamp is None else stamp
+            odometry = self._timeline.odometry_at(chosen)
+            if odometry is None:
+                oldest, newest = self._timeline.oldest / _SECOND, self._timeline.newest / _SECOND
+                raise DataError(f"at: {chosen / _SECOND:.6f} s is not within {oldest:.6f} to {newest:.6f} s")
+            return PoseAt(chosen, odometry, self._fusion.at(chosen) if self._fusion else None)
+
+    def health(self, now: float) -> Health:
+        """How the stream is. now: s, monotonic."""
+        with self._lock:
+            self._measure_rate(now)
+            age = None if self._arrival is None else now - self._arrival
+            status, message = self._status(now, age)
+            covariance = self._odometry.grown(age) if status == "stale" and age is not None else None
+            if covariance is None:
+                covariance = self._odometry.covariance
+            elif self._fusion is not None:
+                covariance = covariance - self._odometry.covariance
+            if self._fusion is not None:
+                covariance = self._fusion.covariance + (covariance if status == "stale" else 0.0)
+            return Health(
+                robot=self.name,
+                status=status,
+                message=message,
+                calibration=self.calibration.name,
+                simulated=self.calibration.provenance is not None and self.calibration.provenance.simulated,
+                rate_hz=self._rate,
+                age_s=age,
+                last_stamp=self._timeline.newest / _SECOND if self._timeline.entries else None,
+                position_sigma_m=float(np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2)),
+                heading_sigma_rad=float(np.sqrt(covariance[2, 2])),
+                fusion=self._fusion_health(now),
+                counts=self.counts.as_dict(),
+                last_refusal=self._last_refusal,
+                last_swap=self._last_swap,
+            )
+
+    def close(self) -> None:
+        """Write down where the robot is."""
+        with self._lock:
+            self._save()
+            if self._memory is not None:
+                self._memory.close()
+                self._memory = None
+
+    def resume(self, saved: SavedState, now: float, wall: float) -> None:
+        """Go on where another node stopped. now, wall: monotonic and unix time, s."""
+        with self._lock:
+            wheels = len(self.calibration.robot.wheels)
+            positions = None if saved.positions is None else np.array(saved.positions)
+            if positions is not None and len(positions) != wheels:
+                raise DataError(
+                    f"the state of robot {self.name!r} is of a robot with {len(positions)} wheels; remove it"
+                )
+            self._wheels.resume(saved.stamp, positions, now - (wall - saved.wall))
+            covariance = np.reshape(saved.covariance, (3, 3))
+            self._odometry.resume(np.array(saved.pose), covariance)
+            if self._fusion is not None and saved.map_pose is not None and saved.map_covariance is not None:
+                self._fusion.begin(np.array(saved.map_pose), np.reshape(saved.map_covariance, (3, 3)))
+            self._stamps.unique(saved.stamp)
+            self._add(Motion(saved.stamp, 0.0, np.zeros(3), self.calibration.integration, 0.0, 0.0))
+
+    def _drive(self, step: WheelStep) -> Update:
+        motion = self._odometry.step(step)
+        if motion.restarted and self._timeline.entries:
+            # the motion is taken as if it ended at the new time; what came before has no time any more
+            self._timeline.restart(motion.stamp - round(motion.duration * _SECOND))
+            if self._fusion is not None:
+                self._fusion.restart()
+        self._add(motion)
+        return self._update(motion.stamp)
+
+    def _add(self, motion: Motion) -> None:
+        pose = self._odometry.pose
+        if self._fusion is None:
+            self._timeline.append(Entry(motion.stamp, motion, pose, pose, np.zeros((3, 3))))
+            return
+        self._timeline.append(Entry(motion.stamp, motion, pose, *self._fusion.predict(motion)))
+        self._fusion.take_waiting()
+
+    def _update(self, stamp: int) -> Update:
+        stamp = self._stamps.unique(stamp)
+        frames, twist = self._frames, self._odometry.twist
+        pose, twist_covariance = self._odometry.pose, self._odometry.twist_covariance
+        odometry = Odometry(stamp, frames.odom, frames.base, pose, self._odometry.covariance, twist, twist_covariance)
+        to_base = Transform(stamp, frames.odom, frames.base, pose)
+        if self._fusion is None:
+            return Update(odometry, None, (to_base,))
+        fused = self._fusion.pose
+        filtered = Odometry(stamp, frames.map, frames.base, fused, self._fusion.covariance, twist, twist_covariance)
+        to_odom = Transform(stamp, frames.map, frames.odom, correction(fused, pose))
+        return Update(odometry, filtered, (to_odom, to_base))
+
+    def _fix(self, payload: bytes) -> Fix:
+        try:
+            message = POSE_ESTIMATE.decode(payload)
+        except MessageError:
+            self.counts.pose_undecodable += 1
+            raise
+        try:
+            if message.frame not in ("", self._frames.map):
+                raise MessageError(f"the pose is in frame {message.frame!r}, not in {self._frames.map!r}")
+            if not np.isfinite(message.pose).all() or not np.isfinite(message.covariance).all():
+                raise MessageError("the pose or its covariance is not finite")
+            covariance = message.covariance if message.covariance.any() else self._usual_covariance()
+            if not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance)[0] <= 0:
+                raise MessageError("the pose's covariance is not positive definite")
+        except MessageError:
+            self.counts.pose_invalid += 1
+            raise
+        return Fix(message.stamp, message.pose, covariance)
+
+    def _usual_covariance(self) -> Array:
+        """Of a pose that comes without: white noise and bias of the reference, as the calibration knows them."""
+        noise = self.calibration.noise or UNKNOWN_NOISE
+        position = noise.pose_position**2 + noise.bias_position**2 or UNKNOWN_NOISE.pose_position**2
+        heading = noise.pose_heading**2 + noise.bias_heading**2 or UNKNOWN_NOISE.pose_heading**2
+        return np.diag([position, position, heading])
+
+    def _check(self, calibration: Calibration) -> None:
+        running = self.calibration.robot.wheel_names
+        if calibration.robot.wheel_names != running:
+            found = ", ".join(calibration.robot.wheel_names)
+            raise DataError(f"calibration {calibration.name!r} has wheels {found}; this robot has {', '.join(running)}")
+        design = calibration.robot.inverse_kinematic_matrix
+        off = np.abs(calibration.matrix_array - design).max(axis=1) / np.abs(design).max(axis=1)
+        if off.max() > _OTHER_ROBOT:
+            raise DataError(
+                f"row {int(off.argmax()) + 1} of the matrix is {off.max():.0%} off the design of its robot "
+                f"{calibration.robot.name!r}; is it another robot's, or in other units?"
+            )
+
+    def _fusing(self, what: str) -> Fusion:
+        if self._fusion is None:
+            raise DataError(f"{what}: robot {self.name!r} runs without fusion, and odom itself never jumps")
+        return self._fusion
+
+    def _status(self, now: float, age: float | None) -> tuple[Status, str]:
+        if age is None:
+            return "waiting", "no wheel sample yet"
+        if age > self._stale_after:
+            return "stale", f"no wheel sample for {age:.1f} s"
+        if self._settings is None or self._fusion is None:
+            return "ok", "odometry"
+        if not self._fusion.located:
+            return "degraded", "no pose of SLAM yet"
+        pose_age = None if self._pose_arrival is None else now - self._pose_arrival
+        if pose_age is None or pose_age > self._settings.stale_after:
+            return "degraded", "no pose of SLAM" + ("" if pose_age is None else f" for {pose_age:.1f} s")
+        return "ok", "odometry and SLAM"
+
+    def _fusion_health(self, now: float) -> FusionHealth | None:
+        if self._fusion is None:
+            return None
+        return FusionHealth(
+            located=self._fusion.located,
+            pose_age_s=None if self._pose_arrival is None else now - self._pose_arrival,
+            last_outcome=self._outcome,
+            rejected_in_a_row=self._rejected_in_a_row,
+        )
+
+    def _measure_rate(self, now: float) -> None:
+        since, samples = self._counted
+        if now - since >= 0.9:
+            self._rate = (self.counts.samples - samples) / (now - since)
+            self._counted = now, self.counts.samples
+
+    def _save(self) -> None:
+        last = self._wheels.last_sample
+        if self._memory is None or last is None or self._arrival is None:
+            return
+        self._saved = self._arrival
+        stamp, positions = last
+        fused = None
+        if self._fusion is not None and self._fusion.located:
+            fused = self._fusion.pose, self._fusion.covariance
+        wall = time.time() - (time.monotonic() - self._arrival)
+        self._memory.save(stamp, wall, positions, (self._odometry.pose, self._odometry.covariance), fused)
+
+
+def correction(in_map: Array, in_odom: Array) -> Array:
+    """The pose (3,) of frame odom in frame map, from the robot's pose in both."""
+    turned = in_map[2] - in_odom[2]
+    cosine, sine = np.cos(turned), np.sin(turned)
+    x = in_map[0] - (cosine * in_odom[0] - sine * in_odom[1])
+    y = in_map[1] - (sine * in_odom[0] + cosine * in_odom[1])
+    return np.array([x, y, turned])

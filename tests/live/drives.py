@@ -1,0 +1,93 @@
+"""A small robot with a calibration, and the messages that it sends while it drives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from omnibench.live.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
+from omnibench.live.odometry import Motion
+from omnibench.robot.calibration import Calibration, Noise, covariance_rows, matrix_rows
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import Integration, WheelLog
+from omnibench.testing.synthetic import synthetic_robot, true_robot
+
+ORIGIN = 1_800_000_000_000_000_000  # ns
+SECOND = 1_000_000_000
+PERIOD = 0.01  # s
+NOISE = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.003, walk_heading=0.003)
+EXACT = np.diag([1e-4, 1e-4, 1e-4])
+
+
+def calibration(
+    *, scale: float = 1.0, integration: Integration = "arc", wheels: int = 3, deviation: float | None = 1e-4
+) -> Calibration:
+    """A calibration of the synthetic robot; scale: of its matrix. deviation: of every element."""
+    robot = synthetic_robot(4 if wheels == 4 else 3)
+    matrix = scale * true_robot(robot).inverse_kinematic_matrix
+    return Calibration(
+        name=f"synthetic {scale:g}",
+        robot=robot,
+        sample_period=PERIOD,
+        matrix=matrix_rows(matrix),
+        integration=integration,
+        noise=NOISE,
+        covariance=None if deviation is None else covariance_rows(deviation**2 * np.eye(3 * wheels)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """times (F,) s; angles (F + 1, N) rad at 0 and at times; stamps (F + 1,) ns."""
+
+    times: Array
+    angles: Array
+    calibration: Calibration
+
+    @property
+    def stamps(self) -> list[int]:
+        return [ORIGIN, *(ORIGIN + np.round(self.times * SECOND).astype(int)).tolist()]
+
+    @property
+    def poses(self) -> Array:
+        """Batch odometry at 0 and at times, (F + 1, 3)."""
+        durations = np.diff(self.times, prepend=0.0)
+        rates = np.diff(self.angles, axis=0) / durations[:, None]
+        log = WheelLog(self.times, rates, np.zeros(3), np.concatenate([[0.0], self.times]))
+        return self.calibration.model.poses([log])[0]
+
+    def samples(self) -> list[JointState]:
+        """Every wheel message, positions and rates."""
+        durations = np.diff(self.times, prepend=0.0)
+        rates = np.vstack([np.zeros(self.angles.shape[1]), np.diff(self.angles, axis=0) / durations[:, None]])
+        names = self.calibration.robot.wheel_names
+        return [
+            JointState(stamp, names, position, rate)
+            for stamp, position, rate in zip(self.stamps, self.angles, rates, strict=True)
+        ]
+
+    def payloads(self) -> list[bytes]:
+        return [JOINT_STATE.encode(sample) for sample in self.samples()]
+
+
+def drive(seconds: float = 2.0, *, seed: int = 1, using: Calibration | None = None, period: float = PERIOD) -> Drive:
+    """A lively drive: wheel rates that wander by some rad/s."""
+    chosen = using or calibration()
+    rng = np.random.default_rng(seed)
+    count = round(seconds / period)
+    times = period * np.arange(1, count + 1)
+    phase = rng.uniform(0, 6, (len(chosen.robot.wheels), 1))
+    rates = 1.5 * np.sin(0.8 * times + phase) + 0.7 + 0.2 * rng.standard_normal((len(phase), count))
+    angles = np.vstack([np.zeros(len(phase)), np.cumsum(period * rates.T, axis=0)])
+    return Drive(times, angles + rng.uniform(-3, 3, len(phase)), chosen)
+
+
+def slam(stamp: int, pose: Array, covariance: Array = EXACT, frame: str = "map") -> bytes:
+    """A pose of SLAM as it comes over the wire."""
+    return POSE_ESTIMATE.encode(PoseEstimate(stamp, frame, np.asarray(pose, dtype=float), covariance))
+
+
+def motion(stamp: int, moved: Array, duration: float = PERIOD, variance: float = 1e-6) -> Motion:
+    """A motion of the robot's own frame."""
+    return Motion(stamp, duration, np.asarray(moved, dtype=float), "arc", variance, variance)
