@@ -6,6 +6,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import redirect_stdout
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,8 +14,9 @@ import typer
 from pydantic import BaseModel
 
 from omnibench import terminal
-from omnibench.config import parse_yaml, to_json
+from omnibench.config import parse_settings, to_json
 from omnibench.errors import ConfigError
+from omnibench.live_cli import live_app
 from omnibench.registry import PluginFailure, calibrators, costs, importers, load_plugins
 
 app = typer.Typer(
@@ -27,6 +29,7 @@ app = typer.Typer(
 )
 plugin_app = typer.Typer(help="Write a plug-in, or check one.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(plugin_app, name="plugin")
+app.add_typer(live_app)
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
 Plugins = Annotated[
@@ -110,7 +113,7 @@ def calibrate(
         run = fit(
             recordings,
             calibrator,
-            options=_parsed(settings),
+            options=parse_settings(settings),
             cost=cost,
             parameterisation=parameterisation,
             box=box,
@@ -272,7 +275,7 @@ def import_(
 
     _load(plugins)
     importers.entry(importer, "import")
-    dataset = import_dataset(importer, source, _parsed(settings))
+    dataset = import_dataset(importer, source, parse_settings(settings))
     save_dataset(dataset, output, table_format)
     _warn(dataset.warnings)
     typer.echo(f"{len(dataset.trajectories)} trajectories: {output}")
@@ -323,15 +326,20 @@ def list_(plugins: Plugins = None, as_json: Json = False) -> None:
     return terminal.print_registries(terminal.make_console())
 
 
+_CONFIGS = {
+    "compare": ("omnibench.compare.config", "CompareConfig"),
+    "design": ("omnibench.compare.design_config", "DesignConfig"),
+    "live": ("omnibench.live.live_config", "LiveConfig"),
+}
+
+
 @app.command()
 def schema(
-    kind: Annotated[Literal["compare", "design"], typer.Argument(help="Configs of which command.")] = "compare",
+    kind: Annotated[Literal["compare", "design", "live"], typer.Argument(help="Configs of which command.")] = "compare",
 ) -> None:
     """JSON schema of the configs, for editors."""
-    from omnibench.compare.config import CompareConfig
-    from omnibench.compare.design_config import DesignConfig
-
-    config: type[BaseModel] = CompareConfig if kind == "compare" else DesignConfig
+    module, name = _CONFIGS[kind]
+    config: type[BaseModel] = getattr(import_module(module), name)
     _print_json(config.model_json_schema(by_alias=True))
 
 
@@ -382,17 +390,6 @@ def _warn(messages: Iterable[str]) -> None:
 
 def _print_json(document: Mapping[str, Any] | BaseModel) -> None:
     typer.echo(to_json(document))
-
-
-def _parsed(settings: list[str] | None) -> dict[str, Any]:
-    """``key=value`` pairs, values in YAML."""
-    options: dict[str, Any] = {}
-    for setting in settings or []:
-        key, equals, value = setting.partition("=")
-        if not equals or not key:
-            raise ConfigError(f"--set {setting}: expected KEY=VALUE")
-        options[key] = parse_yaml(value, f"--set {setting}")
-    return options
 
 
 def _named_paths(data: list[str] | None) -> dict[str, Path]:

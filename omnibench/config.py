@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -79,6 +79,17 @@ def parse_yaml(text: str, where: str) -> Any:
         raise ConfigError(f"{where}: not valid YAML: {error}") from None
     except RecursionError:
         raise ConfigError(f"{where}: not valid YAML: nested too deeply") from None
+
+
+def parse_settings(settings: Iterable[str] | None) -> dict[str, Any]:
+    """``KEY=VALUE`` pairs of a command line, values in YAML. ConfigError names the pair."""
+    options: dict[str, Any] = {}
+    for setting in settings or ():
+        key, equals, value = setting.partition("=")
+        if not equals or not key:
+            raise ConfigError(f"--set {setting}: expected KEY=VALUE")
+        options[key] = parse_yaml(value, f"--set {setting}")
+    return options
 
 
 def read_model(model: type[M], path: Path) -> M:

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from omnibench.data.delimited import read_text, row_error
+from omnibench.data.planar import planar_headings
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
 FIELDS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
-_LARGEST_TILT = np.radians(20)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +41,13 @@ def read_tum(file: Path) -> PoseTrack:
     if not rows:
         raise DataError(f"{file}: it has no poses; a row is {' '.join(FIELDS)}")
     table = np.array(rows)
-    _check(file, table, lines)
-    qx, qy, qz, qw = (table[:, 4:] / np.linalg.norm(table[:, 4:], axis=1, keepdims=True)).T
-    yaw = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy**2 + qz**2))
-    return PoseTrack(table[:, 0], np.column_stack([table[:, 1], table[:, 2], yaw]))
+    _check_times(file, table[:, 0], lines)
+    orientations = planar_headings(table[:, 4:])
+    bad = np.flatnonzero(orientations.flawed)
+    if len(bad):
+        row = int(bad[0])
+        raise row_error(file, row, lines[row], orientations.flaw(row))
+    return PoseTrack(table[:, 0], np.column_stack([table[:, 1], table[:, 2], orientations.headings]))
 
 
 def _numbers(file: Path, row: int, line: int, fields: list[str]) -> list[float]:
@@ -62,26 +65,9 @@ def _numbers(file: Path, row: int, line: int, fields: list[str]) -> list[float]:
     return numbers
 
 
-def _check(file: Path, table: Array, lines: list[int]) -> None:
-    times, quaternions = table[:, 0], table[:, 4:]
+def _check_times(file: Path, times: Array, lines: list[int]) -> None:
     back = np.flatnonzero(np.diff(times) <= 0)
     if len(back):
         row = int(back[0]) + 1
         what = "is repeated" if times[row] == times[row - 1] else "goes backwards"
         raise row_error(file, row, lines[row], f"timestamp {what}: {times[row]:.10g} after {times[row - 1]:.10g}")
-    lengths = np.linalg.norm(quaternions, axis=1)
-    bad = np.flatnonzero(np.abs(lengths - 1) > 0.01)
-    if len(bad):
-        row = int(bad[0])
-        raise row_error(file, row, lines[row], f"quaternion has length {lengths[row]:.3g}, expected 1")
-    upright = 1 - 2 * (quaternions[:, 0] ** 2 + quaternions[:, 1] ** 2)  # z axis of the body along z of the world
-    tilt = np.arccos(np.clip(upright, -1, 1))
-    bad = np.flatnonzero(tilt > _LARGEST_TILT)
-    if len(bad):
-        row = int(bad[0])
-        raise row_error(
-            file,
-            row,
-            lines[row],
-            f"pose is tilted by {np.degrees(tilt[row]):.0f} degrees; give poses of the robot's body (z up)",
-        )

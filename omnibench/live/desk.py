@@ -7,10 +7,10 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 import zenoh
@@ -107,7 +107,7 @@ class Desk:
 
     def _reply(self, query: zenoh.Query, key: str, name: str, service: str) -> None:
         payload = b"" if query.payload is None else query.payload.to_bytes()
-        parameters = {key: value for key, value in query.parameters}  # noqa: C416 (no mapping)
+        parameters = dict(cast(Iterable[tuple[str, str]], query.parameters))
         try:
             answer = self._serve(name, service, payload, parameters)
         except OmnibenchError as error:

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from omnibench.config import Model, read_model
+from omnibench.config import Model, read_model, read_yaml, validate
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.live.arrivals import ReplayConfig
 from omnibench.live.fusion import FusionSettings
@@ -96,6 +96,33 @@ def read_live_config(path: Path | str) -> LiveConfig:
         "replay": config.replay.model_copy(update={"dataset": there(config.replay.dataset)}),
     }
     return config.model_copy(update=changes)
+
+
+class ClientConfig(Model):
+    """How a program reaches a node: what ``--config`` of listen, replay and record holds."""
+
+    zenoh: SessionConfig = SessionConfig(mode="client")
+    profile: Profile = "plain"
+    domain: int = Field(0, ge=0, le=232)
+
+
+def read_client_config(path: Path | str) -> ClientConfig:
+    """Read how a node is reached: a client's config, or the node's own. ConfigError in one line."""
+    path = Path(path)
+    content = read_yaml(path)
+    if isinstance(content, dict) and "robots" in content:
+        node = read_live_config(path)
+        return ClientConfig(zenoh=client_session(node.zenoh), profile=node.profile, domain=node.domain)
+    config = validate(ClientConfig, content, str(path))
+    return config.model_copy(update={"zenoh": config.zenoh.relative_to(path.resolve().parent)})
+
+
+def client_session(node: SessionConfig) -> SessionConfig:
+    """How a client on the same machine reaches a node with these settings, as the same user."""
+    if node.mode == "client":
+        return node
+    here = [each.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for each in node.listening]
+    return SessionConfig(mode="client", connect=tuple(here) or node.connecting, user=node.user, tls=node.tls)
 
 
 def robot_called(config: LiveConfig, name: str | None) -> RobotConfig:

@@ -13,6 +13,7 @@ import zenoh
 
 from omnibench.environment import package_versions
 from omnibench.live.desk import Desk
+from omnibench.live.health import Health
 from omnibench.live.live_config import LiveConfig, RobotConfig
 from omnibench.live.memory import RobotMemory
 from omnibench.live.service import RobotService
@@ -66,7 +67,7 @@ class LiveNode:
         for service in self._services:
             service.close()
         self._desk.close()
-        self.session.close()  # type: ignore[no-untyped-call]
+        self.session.close()
         gc.unfreeze()
 
     def __enter__(self) -> LiveNode:
@@ -74,6 +75,10 @@ class LiveNode:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def health(self, robot: str) -> Health:
+        """How a robot's stream is, now."""
+        return self.trackers[robot].health(time.monotonic())
 
     def _tracker(self, robot: RobotConfig) -> RobotTracker:
         memory = self._memories.get(robot.name)

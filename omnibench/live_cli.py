@@ -1,0 +1,248 @@
+"""The commands of the live runtime: parse, call, print."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from omnibench.errors import ConfigError
+from omnibench.live_terminal import ReplayBar, print_demonstration, print_played
+from omnibench.terminal import make_console
+
+if TYPE_CHECKING:
+    from omnibench.live.live_config import ClientConfig, LiveConfig
+    from omnibench.live.node import LiveNode
+
+live_app = typer.Typer()
+
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="YAML with zenoh, profile and domain; or the node's own config.")
+]
+Connect = Annotated[str | None, typer.Option("--connect", help="Endpoint of a node, as tcp/127.0.0.1:7447.")]
+ProfileOption = Annotated[Literal["plain", "rmw", "humble"] | None, typer.Option(help="How topics are keys.")]
+Seconds = Annotated[float | None, typer.Option(min=0.0, help="Stop after so long. Default: on Ctrl-C.")]
+
+
+@live_app.command()
+def live(
+    config: Annotated[Path, typer.Argument(help="A node in YAML.")],
+    dataset: Annotated[
+        Path | None,
+        typer.Argument(help="With --replay: a data set, or a config with a simulated one. Default: the config's."),
+    ] = None,
+    replay: Annotated[bool, typer.Option("--replay", help="Play a recording to the node; then judge and end.")] = False,
+    speed: Annotated[str | None, typer.Option(help="Of the replay: 1, 10, max. Default: the config's.")] = None,
+    foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve Foxglove's WebSocket on loopback.")] = False,
+    seconds: Seconds = None,
+) -> None:
+    """Run the node: wheel samples in, calibrated odometry out, over Zenoh."""
+    from omnibench.live.live_config import read_live_config
+
+    if replay and config.is_dir() and dataset is not None:  # --replay DATASET before CONFIG
+        config, dataset = dataset, config
+    chosen = read_live_config(config)
+    if foxglove and not chosen.foxglove:
+        chosen = chosen.model_copy(update={"foxglove": True})
+    if not replay:
+        if dataset is not None or speed is not None:
+            raise ConfigError(f"{dataset or '--speed'}: is for a replay; say --replay, too")
+        return _run(chosen, seconds)
+    return _replay_to_node(chosen, dataset, speed, config)
+
+
+@live_app.command()
+def replay(
+    dataset: Annotated[Path, typer.Argument(help="A data set, or a config with a simulated one.")],
+    robot: Annotated[str, typer.Option(help="As whom it is played.")] = "robot",
+    speed: Annotated[str, typer.Option(help="1: as it was; 10: ten times as fast; max.")] = "1",
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="As under replay in a node's config.")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Whose noise model says how sure the SLAM poses are.")
+    ] = None,
+    config: ConfigOption = None,
+    connect: Connect = None,
+    profile: ProfileOption = None,
+) -> None:
+    """Play a recording onto Zenoh, as the robot and its SLAM would."""
+    from omnibench.config import parse_settings, validate
+    from omnibench.live.arrivals import ReplayConfig
+    from omnibench.live.chain import chain_recording
+    from omnibench.live.recording import load_recording
+    from omnibench.live.replay import Player
+    from omnibench.live.stopping import stop_on_signals
+    from omnibench.live.topics import GraphNode
+    from omnibench.robot.calibration import read_calibration
+
+    chosen = validate(ReplayConfig, {"speed": _speed(speed), **parse_settings(settings)}, "replay")
+    noise = None if calibration is None else read_calibration(calibration).noise
+    recording = load_recording(dataset)
+    chain = chain_recording(recording, pause=chosen.pause, split=chosen.split)
+    with _client(config, connect, profile, "replay") as (session, keys), stop_on_signals() as stop:
+        player = Player(GraphNode(session, keys, "replay"), robot, chain, chosen, noise=noise)
+        with ReplayBar(f"{recording.dataset.name} as {robot}") as bar:
+            report = player.play(stop, bar)
+    print_played(make_console(), report, recording.dataset.simulated)
+    if not report.complete:
+        raise typer.Exit(130)
+
+
+@live_app.command()
+def listen(
+    robot: Annotated[str | None, typer.Argument(help="Default: all that are there.")] = None,
+    config: ConfigOption = None,
+    connect: Connect = None,
+    profile: ProfileOption = None,
+    seconds: Seconds = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document a line, once a second.")] = False,
+) -> None:
+    """Show a robot's odometry live: pose, rate, age, health."""
+    from omnibench.live.listen import listen as show
+    from omnibench.live.stopping import stop_on_signals
+
+    with _client(config, connect, profile, "listen") as (session, keys), stop_on_signals() as stop:
+        show(robot, session, keys, make_console(), stop, seconds, as_json)
+
+
+@live_app.command()
+def record(
+    robots: Annotated[list[str], typer.Argument(metavar="ROBOT...|CONFIG", help="Whose topics.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The MCAP file to write.")],
+    config: ConfigOption = None,
+    connect: Connect = None,
+    profile: ProfileOption = None,
+    seconds: Seconds = None,
+    topics: Annotated[list[str] | None, typer.Option("--topic", help="Only this; may be repeated.")] = None,
+) -> None:
+    """Record live topics into MCAP, which Foxglove and rosbags open."""
+    from omnibench.live.live_config import read_live_config
+    from omnibench.live.record import record as write
+    from omnibench.live.stopping import stop_on_signals
+    from omnibench.live.topics import TOPICS
+
+    if len(robots) == 1 and robots[0].endswith((".yaml", ".yml")):
+        config = Path(robots[0]) if config is None else config
+        robots = [each.name for each in read_live_config(robots[0]).robots]
+    with _client(config, connect, profile, "record") as (session, keys), stop_on_signals() as stop:
+        write(session, keys, robots, output, make_console(), stop, seconds=seconds, topics=topics or tuple(TOPICS))
+
+
+@live_app.command()
+def keys(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where they go.")],
+    names: Annotated[list[str] | None, typer.Argument(help="One certificate each. Default: node, client.")] = None,
+    hosts: Annotated[list[str] | None, typer.Option("--host", help="Where the node runs; may be repeated.")] = None,
+    days: Annotated[int, typer.Option(min=1, help="How long they are valid.")] = 365,
+    users: Annotated[bool, typer.Option("--users", help="Passwords, too, and users.txt for the node.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there, the CA too.")] = False,
+) -> None:
+    """Make a test CA and certificates for mTLS."""
+    from omnibench.live.keys import make_keys
+
+    chosen = names or ["node", "client"]
+    for file in make_keys(folder, chosen, hosts=hosts or (), days=days, users=users, overwrite=overwrite):
+        typer.echo(f"written: {file}")
+
+
+def _run(config: LiveConfig, seconds: float | None) -> None:
+    from omnibench.live.node import LiveNode
+    from omnibench.live.stopping import stop_on_signals
+
+    _log()
+    with stop_on_signals() as stop, LiveNode(config) as node, _extras(config, node):
+        log = logging.getLogger("omnibench.live")
+        for robot in config.robots:
+            fused = "fused with SLAM" if config.fusion_of(robot) else "without fusion"
+            log.info("%s: %r runs, %s", robot.name, node.trackers[robot.name].calibration.name, fused)
+        verb = "listens on" if config.zenoh.listening else "is connected to"
+        place = ", ".join(config.zenoh.listening or config.zenoh.connecting)
+        log.info("node %s %s %s; Ctrl-C ends it", config.name, verb, place)
+        for endpoint in config.zenoh.unprotected:
+            log.warning("%s: anybody on the network may connect; give users_file, or tls with mutual: true", endpoint)
+        stop.wait(seconds)
+
+
+def _replay_to_node(config: LiveConfig, dataset: Path | None, speed: str | None, file: Path) -> None:
+    from omnibench.config import validate
+    from omnibench.live.arrivals import ReplayConfig
+    from omnibench.live.demonstration import demonstrate
+    from omnibench.live.recording import load_recording
+    from omnibench.live.stopping import stop_on_signals
+
+    source = dataset or config.replay.dataset
+    if source is None:
+        raise ConfigError(f"{file}: replay.dataset names no recording; say --replay DATASET")
+    if speed is not None:
+        checked = validate(ReplayConfig, {"speed": _speed(speed)}, "--speed")
+        changed = config.replay.model_copy(update={"speed": checked.speed})
+        config = config.model_copy(update={"replay": changed})
+    recording = load_recording(source)
+    _log(logging.WARNING)
+    with ExitStack() as extras, stop_on_signals() as stop, ReplayBar(recording.dataset.name) as bar:
+        shown = demonstrate(
+            config, recording, stop, bar, attach=lambda node: extras.enter_context(_extras(config, node))
+        )
+    print_demonstration(make_console(), shown)
+    if not shown.report.complete:
+        raise typer.Exit(130)
+
+
+@contextmanager
+def _extras(config: LiveConfig, node: LiveNode) -> Iterator[None]:
+    """The recorder and the Foxglove server that a node's config asks for."""
+    from omnibench.live.foxglove import PORT, FoxgloveServer
+    from omnibench.live.recorder import Recorder
+
+    names = [robot.name for robot in config.robots]
+    log = logging.getLogger("omnibench.live")
+    with ExitStack() as stack:
+        if config.foxglove is not False:
+            port = PORT if config.foxglove is True else config.foxglove
+            server = stack.enter_context(FoxgloveServer(port=port))
+            server.forward(node.session, node.keys, names)
+            log.warning("Foxglove: open ws://127.0.0.1:%d", port)
+        if config.record is not None:
+            stack.enter_context(Recorder(node.session, node.keys, names, config.record, on_failure=log.error))
+            log.warning("recording to %s", config.record)
+        yield
+
+
+@contextmanager
+def _client(file: Path | None, connect: str | None, profile: Any, purpose: str) -> Iterator[tuple[Any, Any]]:
+    """A client's session, and the keys of the profile."""
+    from omnibench.live.live_config import ClientConfig, read_client_config
+    from omnibench.live.session import open_session
+    from omnibench.live.topics import KeySpace
+
+    chosen: ClientConfig = ClientConfig() if file is None else read_client_config(file)
+    if connect is not None:
+        chosen = chosen.model_copy(update={"zenoh": chosen.zenoh.model_copy(update={"connect": (connect,)})})
+    session = open_session(chosen.zenoh, purpose)
+    try:
+        yield session, KeySpace(profile or chosen.profile, chosen.domain)
+    finally:
+        session.close()
+
+
+def _speed(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _log(level: int = logging.INFO) -> None:
+    """What the node has to say, on standard error."""
+    log = logging.getLogger("omnibench.live")
+    log.setLevel(level)
+    if not log.handlers:
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
+        log.addHandler(handler)

@@ -1,0 +1,106 @@
+"""Nodes for tests: in this process, or as the command that a user runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+import zenoh
+from commands import COMMAND, ENVIRONMENT
+from drives import calibration
+from sessions import free_port, raw_session
+
+from omnibench.config import to_yaml
+from omnibench.live.live_config import LiveConfig, read_live_config
+from omnibench.live.messages import JOINT_STATE, JointState
+from omnibench.live.node import LiveNode
+from omnibench.robot.calibration import Calibration, write_calibration
+
+
+def write_node(folder: Path, *robots: str, port: int | None = None, **changes: Any) -> Path:
+    """A node's config: robots of the synthetic kind, fusion on, on a free port."""
+    write_calibration(calibration(), folder / "calibration.yaml")
+    config = {
+        "robots": [{"name": name, "calibration": "calibration.yaml"} for name in robots],
+        "fusion": "ekf",
+        "zenoh": {"listen": f"tcp/127.0.0.1:{port or free_port()}"},
+        **changes,
+    }
+    file = folder / "node.yaml"
+    file.write_text(yaml.safe_dump(config), encoding="utf-8")
+    return file
+
+
+def config_of(folder: Path, *robots: str, **changes: Any) -> LiveConfig:
+    """The same, read."""
+    return read_live_config(write_node(folder, *(robots or ("apr",)), **changes))
+
+
+@contextmanager
+def running(config: LiveConfig) -> Iterator[tuple[LiveNode, zenoh.Session]]:
+    """A node and a client of it."""
+    with LiveNode(config) as node:
+        (endpoint,) = config.zenoh.listening
+        session = raw_session("client", connect=[endpoint])
+        try:
+            yield node, session
+        finally:
+            session.close()
+
+
+class Command:
+    """``omnibench`` as a process, with what it says on standard error."""
+
+    def __init__(self, *arguments: object, cwd: Path | None = None) -> None:
+        self.process = subprocess.Popen(
+            [*COMMAND, *map(str, arguments)],
+            cwd=cwd,
+            env=ENVIRONMENT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def kill(self) -> None:
+        """As when the machine fails: no farewell."""
+        self.process.kill()
+        self.process.communicate(timeout=20)
+
+    def stop(self, number: int = signal.SIGINT) -> tuple[str, str]:
+        """End it as a user does; what it printed."""
+        if self.process.poll() is None:
+            os.kill(self.process.pid, number)
+        out, err = self.process.communicate(timeout=20)
+        return out, err
+
+    def __enter__(self) -> Command:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.process.poll() is None:
+            self.kill()
+
+
+def asked(session: zenoh.Session, selector: str, payload: str | bytes | None = None) -> Any:
+    """The one answer to a query: its JSON, with ``error`` in it when it was refused."""
+    (reply,) = list(session.get(selector, payload=payload, timeout=10.0))
+    answer = reply.ok if reply.ok is not None else reply.err
+    assert answer is not None
+    return json.loads(answer.payload.to_bytes())
+
+
+def sent(publisher: zenoh.Publisher, samples: list[JointState]) -> None:
+    for sample in samples:
+        publisher.put(JOINT_STATE.encode(sample))
+
+
+def as_text(chosen: Calibration) -> str:
+    """A calibration file's content."""
+    return to_yaml(chosen)

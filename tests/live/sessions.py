@@ -1,0 +1,68 @@
+"""Real Zenoh sessions on loopback for tests, and waiting for what they bring about."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import zenoh
+
+
+def free_port() -> int:
+    """A TCP port of 127.0.0.1 that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def raw_session(mode: str, *, listen: Sequence[str] = (), connect: Sequence[str] = ()) -> zenoh.Session:
+    """A session by zenoh's own settings, without scouting."""
+    config = zenoh.Config()
+    config.insert_json5("mode", json.dumps(mode))
+    config.insert_json5("listen/endpoints", json.dumps(list(listen)))
+    config.insert_json5("connect/endpoints", json.dumps(list(connect)))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("scouting/gossip/enabled", "false")
+    config.insert_json5("scouting/delay", "0")  # or a router waits 0.5 s for nobody
+    return zenoh.open(config)
+
+
+@dataclass
+class Loopback:
+    """A router on a free port, and clients of it; ``close`` closes all."""
+
+    port: int
+    router: zenoh.Session
+    _clients: list[zenoh.Session] = field(default_factory=list)
+
+    @property
+    def address(self) -> str:
+        return f"tcp/127.0.0.1:{self.port}"
+
+    def client(self) -> zenoh.Session:
+        """Another session, connected to the router."""
+        session = raw_session("client", connect=[self.address])
+        self._clients.append(session)
+        return session
+
+    def close(self) -> None:
+        for session in (*self._clients, self.router):
+            if not session.is_closed():
+                session.close()
+
+
+def open_loopback() -> Loopback:
+    """A router on a free port."""
+    port = free_port()
+    return Loopback(port, raw_session("router", listen=[f"tcp/127.0.0.1:{port}"]))
+
+
+def until(condition: Callable[[], object], what: str, seconds: float = 10.0) -> None:
+    """Wait until ``condition`` holds; the test fails, saying ``what`` was waited for, when it does not in time."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {seconds} s in vain for {what}"
+        time.sleep(0.005)

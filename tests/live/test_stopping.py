@@ -1,0 +1,53 @@
+"""Ending what runs until it is told to stop."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+
+import pytest
+
+from omnibench.live.stopping import stop_on_signals, ticks
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_sets_the_event(number: signal.Signals) -> None:
+    with stop_on_signals() as stop:
+        os.kill(os.getpid(), number)
+        assert stop.wait(5)
+
+
+def test_a_second_ctrl_c_interrupts() -> None:
+    with pytest.raises(KeyboardInterrupt), stop_on_signals() as stop:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop.wait(5)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(5)
+
+
+def test_signals_act_as_before_when_it_is_over() -> None:
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with stop_on_signals():
+        assert signal.getsignal(signal.SIGTERM) != before[1]
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_ticks_come_at_once_and_then_every_period_until_the_time_is_over() -> None:
+    began = time.monotonic()
+    passed = list(ticks(threading.Event(), 0.1, 0.35))
+    assert passed[0] == 0.0
+    assert len(passed) in (3, 4)  # fewer when the machine is busy
+    assert passed == sorted(passed)
+    assert 0.35 <= time.monotonic() - began < 1.0
+
+
+def test_ticks_end_when_told_to() -> None:
+    stop = threading.Event()
+    seen = []
+    for passed in ticks(stop, 0.01):
+        seen.append(passed)
+        if len(seen) == 3:
+            stop.set()
+    assert len(seen) == 3
