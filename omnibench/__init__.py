@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from omnibench.fit.certify import certify_optimum
     from omnibench.fit.evaluate import evaluate
     from omnibench.fit.inspect import inspect_dataset
+    from omnibench.live.subscriber import subscribe
     from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
     from omnibench.robot.export import export_calibration
 
@@ -38,6 +39,7 @@ __all__ = [
     "run_comparison",
     "save_dataset",
     "simulate_dataset",
+    "subscribe",
     "write_calibration",
 ]
 
@@ -55,6 +57,7 @@ _HOMES = {
     "fit.certify": ("certify_optimum",),
     "fit.evaluate": ("evaluate",),
     "fit.inspect": ("inspect_dataset",),
+    "live.subscriber": ("subscribe",),
     "robot.calibration": ("Calibration", "read_calibration", "write_calibration"),
     "robot.export": ("export_calibration",),
 }

@@ -75,12 +75,14 @@ def replay(
     from omnibench.config import parse_settings, validate
     from omnibench.live.arrivals import ReplayConfig
     from omnibench.live.chain import chain_recording
+    from omnibench.live.presence import checked_robot
     from omnibench.live.recording import load_recording
     from omnibench.live.replay import Player
     from omnibench.live.stopping import stop_on_signals
     from omnibench.live.topics import GraphNode
     from omnibench.robot.calibration import read_calibration
 
+    checked_robot(robot)
     chosen = validate(ReplayConfig, {"speed": _speed(speed), **parse_settings(settings)}, "replay")
     noise = None if calibration is None else read_calibration(calibration).noise
     recording = load_recording(dataset)
@@ -153,10 +155,11 @@ def keys(
 
 def _run(config: LiveConfig, seconds: float | None) -> None:
     from omnibench.live.node import LiveNode
+    from omnibench.live.refusals import log_refusals
     from omnibench.live.stopping import stop_on_signals
 
     _log()
-    with stop_on_signals() as stop, LiveNode(config) as node, _extras(config, node):
+    with stop_on_signals() as stop, log_refusals(config.zenoh), LiveNode(config) as node, _extras(config, node):
         log = logging.getLogger("omnibench.live")
         for robot in config.robots:
             fused = "fused with SLAM" if config.fusion_of(robot) else "without fusion"
@@ -164,8 +167,6 @@ def _run(config: LiveConfig, seconds: float | None) -> None:
         verb = "listens on" if config.zenoh.listening else "is connected to"
         place = ", ".join(config.zenoh.listening or config.zenoh.connecting)
         log.info("node %s %s %s; Ctrl-C ends it", config.name, verb, place)
-        for endpoint in config.zenoh.unprotected:
-            log.warning("%s: anybody on the network may connect; give users_file, or tls with mutual: true", endpoint)
         stop.wait(seconds)
 
 
@@ -174,6 +175,7 @@ def _replay_to_node(config: LiveConfig, dataset: Path | None, speed: str | None,
     from omnibench.live.arrivals import ReplayConfig
     from omnibench.live.demonstration import demonstrate
     from omnibench.live.recording import load_recording
+    from omnibench.live.refusals import log_refusals
     from omnibench.live.stopping import stop_on_signals
 
     source = dataset or config.replay.dataset
@@ -185,10 +187,8 @@ def _replay_to_node(config: LiveConfig, dataset: Path | None, speed: str | None,
         config = config.model_copy(update={"replay": changed})
     recording = load_recording(source)
     _log(logging.WARNING)
-    with ExitStack() as extras, stop_on_signals() as stop, ReplayBar(recording.dataset.name) as bar:
-        shown = demonstrate(
-            config, recording, stop, bar, attach=lambda node: extras.enter_context(_extras(config, node))
-        )
+    with stop_on_signals() as stop, log_refusals(config.zenoh), ReplayBar(recording.dataset.name) as bar:
+        shown = demonstrate(config, recording, stop, bar, beside=lambda node: _extras(config, node))
     print_demonstration(make_console(), shown)
     if not shown.report.complete:
         raise typer.Exit(130)
@@ -198,7 +198,7 @@ def _replay_to_node(config: LiveConfig, dataset: Path | None, speed: str | None,
 def _extras(config: LiveConfig, node: LiveNode) -> Iterator[None]:
     """The recorder and the Foxglove server that a node's config asks for."""
     from omnibench.live.foxglove import PORT, FoxgloveServer
-    from omnibench.live.recorder import Recorder
+    from omnibench.live.recorder import Recorder, free_path
 
     names = [robot.name for robot in config.robots]
     log = logging.getLogger("omnibench.live")
@@ -209,21 +209,27 @@ def _extras(config: LiveConfig, node: LiveNode) -> Iterator[None]:
             server.forward(node.session, node.keys, names)
             log.warning("Foxglove: open ws://127.0.0.1:%d", port)
         if config.record is not None:
-            stack.enter_context(Recorder(node.session, node.keys, names, config.record, on_failure=log.error))
-            log.warning("recording to %s", config.record)
+            path = free_path(config.record)
+            stack.enter_context(Recorder(node.session, node.keys, names, path, on_failure=log.error))
+            log.warning("recording to %s", path)
         yield
 
 
 @contextmanager
 def _client(file: Path | None, connect: str | None, profile: Any, purpose: str) -> Iterator[tuple[Any, Any]]:
     """A client's session, and the keys of the profile."""
+    from omnibench.config import validate
     from omnibench.live.live_config import ClientConfig, read_client_config
     from omnibench.live.session import open_session
+    from omnibench.live.session_config import SessionConfig
     from omnibench.live.topics import KeySpace
 
     chosen: ClientConfig = ClientConfig() if file is None else read_client_config(file)
     if connect is not None:
-        chosen = chosen.model_copy(update={"zenoh": chosen.zenoh.model_copy(update={"connect": (connect,)})})
+        checked = validate(SessionConfig, {"mode": "client", "tls": chosen.zenoh.tls, "connect": connect}, "--connect")
+        chosen = chosen.model_copy(
+            update={"zenoh": chosen.zenoh.model_copy(update={"connect": checked.connect, "mode": "client"})}
+        )
     session = open_session(chosen.zenoh, purpose)
     try:
         yield session, KeySpace(profile or chosen.profile, chosen.domain)

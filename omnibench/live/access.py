@@ -20,8 +20,7 @@ _WRITE: Final = ("put", "delete", "declare_queryable", "reply", "liveliness_toke
 _READ: Final = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
 
 _ALIVE: Final = "omnibench/{}/alive"
-# calibration is not among them: a question with a payload swaps it
-_ANSWERS: Final = ("omnibench/{}/info", "omnibench/{}/health", "omnibench/{}/pose")
+_ANSWERS: Final = tuple("omnibench/{}/" + service for service in ("info", "calibration", "health", "pose"))
 _SERVICES: Final = "omnibench/{}/*"
 _ROS_GRAPH: Final = "@ros2_lv/**"  # rmw_zenoh's tokens: who is there, no data
 _ADVANCED: Final = "/@adv/**"  # below a key: what advanced publishers and subscribers say to each other
@@ -58,10 +57,17 @@ def rights_of(access: Access) -> Rights:
     }
 
 
-def access_control(access: Access, *, by_certificate: bool) -> dict[str, Any]:
-    """Zenoh's setting ``access_control``. by_certificate: names are certificates' common names, else users'."""
+def access_control(access: Access, *, by_certificate: bool, own_name: str | None = None) -> dict[str, Any]:
+    """Zenoh's setting ``access_control``.
+
+    by_certificate: names are certificates' common names, else users'. own_name: the router's own. Who can show it holds
+    the router's key or password, and may do all: other programs on the router's machine.
+    """
     property_name = "cert_common_names" if by_certificate else "usernames"
     rights = rights_of(access)
+    if own_name is not None:
+        everything = sorted(_with_advanced(["**", _ROS_GRAPH]))
+        rights[own_name] = {"write": everything, "read": everything}
     named = {key for granted in rights.values() for keys in granted.values() for key in keys if "@" in key}
     rules = [
         # Whoever is not named is somebody, too: else its refusals would not be logged.

@@ -11,6 +11,7 @@ from cryptography import x509
 from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
+from cryptography.x509.oid import NameOID
 
 from omnibench.errors import ConfigError
 from omnibench.live.session_config import Tls
@@ -31,6 +32,12 @@ def check_files(tls: Tls) -> None:
     )
     if ours != its:
         raise ConfigError(f"tls: {tls.key} is not the key of {tls.certificate}; give the two that belong together")
+
+
+def common_name(path: Path) -> str | None:
+    """The common name in a certificate, by which access rules call its holder. ConfigError as ``read_certificate``."""
+    names = read_certificate(path).subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(names[0].value) if names else None
 
 
 def read_certificate(path: Path) -> x509.Certificate:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,20 +92,19 @@ def demonstrate(
     recording: Recording,
     stop: threading.Event | None = None,
     watch: Callable[[Progress, Health], None] | None = None,
-    attach: Callable[[LiveNode], None] | None = None,
+    beside: Callable[[LiveNode], AbstractContextManager[None]] | None = None,
 ) -> Demonstration:
     """Run the node of ``config``, play ``recording`` to it as the config's ``replay`` says, and judge what comes out.
 
-    The node begins afresh. attach: called with the node before the first message. Errors as LiveNode's and Player's.
+    The node begins afresh. beside: what is open while it runs, a recorder for example. Errors as LiveNode's and
+    Player's.
     """
     stop = stop or threading.Event()
     robot = robot_called(config, config.replay.robot)
     chain = chain_recording(recording, pause=config.replay.pause, split=config.replay.split)
-    with LiveNode(config, remember=False) as node:
+    with LiveNode(config, remember=False) as node, beside(node) if beside else nullcontext():
         tracker = node.trackers[robot.name]
-        if attach is not None:
-            attach(node)
-        guarded = config.zenoh.users_file is not None or config.zenoh.access is not None
+        guarded = config.zenoh.users_file is not None and config.zenoh.user is None
         session = node.session if guarded else open_session(client_session(config.zenoh), "replay")
         try:
             odometry = _Collector(session, robot.name, "odom", config)

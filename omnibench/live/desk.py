@@ -26,7 +26,7 @@ from omnibench.robot.kinematics import Array
 
 LOG = logging.getLogger("omnibench.live")
 _READING: Final = ("info", "calibration", "health", "pose")
-_ORDERS: Final = ("set_pose", "reset")
+_ORDERS: Final = ("set_pose", "reset", "swap")
 _NANOSECONDS = 10**14  # numbers of ``at`` from here on are ns; as s they would lie three million years ahead
 _LONGEST = 1 << 20  # bytes of a calibration
 
@@ -124,7 +124,11 @@ class Desk:
         if service == "pose":
             return _pose_answer(tracker, parameters)
         if service == "calibration":
-            return self._swap(name, payload) if payload else tracker.calibration
+            if payload:  # a right to read it must not be one to swap it
+                raise ConfigError(f"omnibench/{name}/calibration: put it there, or ask omnibench/{name}/swap with it")
+            return tracker.calibration
+        if service == "swap":
+            return self._swap(name, payload)
         if service == "set_pose":
             order = _order(payload, parameters)
             deviations = np.array([order.position_sigma, order.position_sigma, order.heading_sigma])
@@ -136,7 +140,7 @@ class Desk:
         return {"robot": name, "done": "reset"}
 
     def _take_calibration(self, name: str, sample: zenoh.Sample) -> None:
-        """A calibration that was put: there is nobody to answer, so health and log tell what became of it."""
+        """A calibration that was put: there is nobody to answer (unlike ``swap``), so health and log tell."""
         if sample.kind != zenoh.SampleKind.PUT:
             return
         try:

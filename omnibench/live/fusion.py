@@ -161,14 +161,13 @@ class Fusion:
     def _replace(self, index: int, fix: Fix) -> None:
         """Believe a pose alone: what other poses said of the time around it and after is forgotten."""
         for entry in self._timeline.entries[index:]:
-            entry.fixes = []
+            entry.fixes = ()
         self._insert(index, Fix(fix.stamp, fix.pose, fix.covariance, absolute=True))
 
     def _insert(self, index: int, fix: Fix) -> None:
         """Put a pose where it belongs and take what came after it again."""
         entry = self._timeline.entries[index]
-        entry.fixes.append(fix)
-        entry.fixes.sort(key=lambda each: each.stamp)
+        entry.fixes = tuple(sorted((*entry.fixes, fix), key=lambda each: each.stamp))
         if index == 0:  # nothing is known of the motion up to the oldest entry: it is corrected as it stands
             self._apply(fix)
             entry.pose, entry.covariance = self._filter.pose, self._filter.covariance

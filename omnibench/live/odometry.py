@@ -58,10 +58,9 @@ class LiveOdometry:
 
     def __init__(self, calibration: Calibration, standstill: float = 0.01) -> None:
         self._standstill = standstill
-        self._walked = np.zeros((3, 3))
+        self._walked = _Walked()
         self._stream = calibration.model.stream()
         self.twist: Array = np.zeros(3)
-        self._rates: Array = np.zeros(len(calibration.robot.wheels))
         self._duration = calibration.sample_period
         self._use(calibration)
 
@@ -74,28 +73,30 @@ class LiveOdometry:
     def covariance(self) -> Array:
         """Of the pose, (3, 3)."""
         if self._elements is None:
-            return self._walked.copy()
-        slopes = self._slopes.reshape(3, -1)
-        return self._walked + slopes @ self._elements @ slopes.T
+            return self._walked.covariance
+        slopes = self._slopes.jacobian
+        return self._walked.covariance + slopes @ self._elements @ slopes.T
 
     @property
     def twist_covariance(self) -> Array:
         """Of the twist, (3, 3), in the robot's frame."""
-        per_second = 1.0 / self._duration
-        diagonal = np.array([self._position_walk, self._position_walk, self._heading_walk]) * per_second
-        return np.diag(diagonal + self._matrix_variances())
+        position, heading = self._position_walk / self._duration, self._heading_walk / self._duration
+        along_x, along_y, turning = self._of_matrix
+        covariance = np.zeros((3, 3))
+        covariance[0, 0], covariance[1, 1] = position + along_x, position + along_y
+        covariance[2, 2] = heading + turning
+        return covariance
 
     def resume(self, pose: Array, covariance: Array) -> None:
         """Go on from a pose and covariance that another process reached."""
         self._stream.pose = np.array(pose, dtype=float)
-        self._walked = np.array(covariance, dtype=float)
-        self._slopes[:] = 0.0
+        self._walked.set(covariance)
+        self._slopes.clear()
 
     def swap(self, calibration: Calibration) -> None:
         """Go on with another calibration from the same pose; what is uncertain by now stays uncertain."""
-        pose, walked = self.pose, self.covariance
-        self._stream = calibration.model.stream(pose)
-        self._walked = np.array(walked)
+        self._walked.set(self.covariance)
+        self._stream = calibration.model.stream(self.pose)
         self._use(calibration)
 
     def _use(self, calibration: Calibration) -> None:
@@ -109,7 +110,8 @@ class LiveOdometry:
             self._elements = np.array(calibration.covariance)[: 3 * wheels, : 3 * wheels]
             by_row = self._elements.reshape(3, wheels, 3, wheels)
             self._blocks = np.stack([by_row[row, :, row] for row in range(3)])
-        self._slopes = np.zeros((3, 3, wheels))  # of the pose on the matrix's elements
+        self._slopes = _Slopes(wheels, calibration.integration)
+        self._of_matrix = [0.0, 0.0, 0.0]  # variances of the twist by the matrix's uncertainty
 
     def step(self, step: WheelStep) -> Motion:
         """Take a wheel step; the motion that it made."""
@@ -117,11 +119,12 @@ class LiveOdometry:
         self._stream.drive(step.angles)
         moved = self._stream.moved
         if step.duration > 0:
-            self._rates = step.angles / step.duration
+            rates = step.angles / step.duration
             self.twist = moved / step.duration
             self._duration = step.duration
+            self._of_matrix = ((self._blocks @ rates) @ rates).tolist()
         position, heading = self._variances(step, moved)
-        self._spread(self._stream.pose - before, step.angles, position, heading)
+        self._spread(before, step.angles, position, heading)
         return Motion(
             step.stamp, step.duration, moved, self._stream.integration, *self._of_filter(step, position, heading)
         )
@@ -139,7 +142,7 @@ class LiveOdometry:
 
     def _variances(self, step: WheelStep, moved: Array) -> tuple[float, float]:
         """What the step's noise adds to the variances of position and heading."""
-        still = np.abs(step.angles).max() <= _STILL * step.duration
+        still = max(map(abs, step.angles.tolist())) <= _STILL * step.duration
         share = self._standstill if still and not step.blind else 1.0
         position, heading = share * self._position_walk * step.duration, share * self._heading_walk * step.duration
         if step.blind:
@@ -154,35 +157,83 @@ class LiveOdometry:
 
     def _of_filter(self, step: WheelStep, position: float, heading: float) -> tuple[float, float, bool]:
         """The same for a filter that has no memory: an error of the matrix looks like noise to it."""
-        along_x, along_y, turning = (self._matrix_variances() * (_CORRELATION * step.duration)).tolist()
-        return position + (along_x + along_y) / 2, heading + turning, step.restarted
+        along_x, along_y, turning = self._of_matrix
+        time = _CORRELATION * step.duration
+        return position + time * (along_x + along_y) / 2, heading + time * turning, step.restarted
 
-    def _matrix_variances(self) -> Array:
-        """Variances (3,) of the twist by the matrix's uncertainty."""
-        return (self._blocks @ self._rates) @ self._rates
+    def _spread(self, before: Array, angles: Array, position: float, heading: float) -> None:
+        """Carry the covariance along the step from the pose ``before``, and add the step's own variances."""
+        x, y, start = before.tolist()
+        to_x, to_y, end = self._stream.pose.tolist()
+        self._walked.carry(to_x - x, to_y - y)
+        self._walked.add(position, heading)
+        if self._elements is not None:
+            self._slopes.add(angles, to_x - x, to_y - y, start, end)
 
-    def _spread(self, path: Array, angles: Array, position: float, heading: float) -> None:
-        """Carry the covariance along a path (3,) in the world's frame."""
-        across, along = -float(path[1]), float(path[0])
-        walked = self._walked
-        walked[0] += across * walked[2]
-        walked[1] += along * walked[2]
-        walked[:, 0] += across * walked[:, 2]
-        walked[:, 1] += along * walked[:, 2]
-        walked[0, 0] += position
-        walked[1, 1] += position
-        walked[2, 2] += heading
-        if self._elements is None:
-            return
-        slopes, half = self._slopes, angles / 2 if self._stream.integration == "arc" else 0.0
-        direction = self._stream.pose[2] - (path[2] / 2 if self._stream.integration == "arc" else path[2])
-        cosine, sine = math.cos(direction), math.sin(direction)
-        slopes[0] += across * slopes[2]
-        slopes[1] += along * slopes[2]
-        slopes[0, 0] += cosine * angles
-        slopes[0, 1] -= sine * angles
-        slopes[1, 0] += sine * angles
-        slopes[1, 1] += cosine * angles
-        slopes[0, 2] += across * half
-        slopes[1, 2] += along * half
-        slopes[2, 2] += angles
+
+class _Walked:
+    """A covariance (3, 3) of a pose, by its six numbers: in Python's own floats it is three times as fast."""
+
+    def __init__(self) -> None:
+        self._xx = self._xy = self._yy = self._xt = self._yt = self._tt = 0.0
+
+    @property
+    def covariance(self) -> Array:
+        return np.array(
+            [[self._xx, self._xy, self._xt], [self._xy, self._yy, self._yt], [self._xt, self._yt, self._tt]]
+        )
+
+    def set(self, covariance: Array) -> None:
+        (self._xx, self._xy, self._xt), (_, self._yy, self._yt), (_, _, self._tt) = np.asarray(covariance).tolist()
+
+    def carry(self, along_x: float, along_y: float) -> None:
+        """F P F^T with the heading's error bending the path (m) in the world's frame."""
+        xt, yt, tt = self._xt, self._yt, self._tt
+        self._xx += along_y * (along_y * tt - 2 * xt)
+        self._xy += along_x * xt - along_y * yt - along_x * along_y * tt
+        self._yy += along_x * (along_x * tt + 2 * yt)
+        self._xt -= along_y * tt
+        self._yt += along_x * tt
+
+    def add(self, position: float, heading: float) -> None:
+        """White noise on each axis (m2) and the heading (rad2)."""
+        self._xx += position
+        self._yy += position
+        self._tt += heading
+
+
+class _Slopes:
+    """Derivatives of the pose with respect to the matrix, to first order in the turn of one step.
+
+    Rows of ``_sums`` (5, N): sums over the steps of a cos, a sin, the bends of x and y by row 3, and of a itself, with
+    a (N,) the angles of a step. All else of the derivatives is 0, or one of these again.
+    """
+
+    def __init__(self, wheels: int, integration: Integration) -> None:
+        self._arc = integration == "arc"
+        self._sums = np.zeros((5, wheels))
+        self._shares = np.zeros((5, 2))
+        self._angles = np.zeros((2, wheels))
+        self._jacobian = np.zeros((3, 3, wheels))
+
+    def clear(self) -> None:
+        self._sums[:] = 0.0
+
+    def add(self, angles: Array, along_x: float, along_y: float, start: float, end: float) -> None:
+        """Take a step: angles (N,) rad, path (m) in the world's frame, headings at its ends (rad)."""
+        direction, half = ((start + end) / 2, 0.5) if self._arc else (start, 0.0)
+        self._angles[0], self._angles[1] = angles, self._sums[4]
+        self._shares[:, 0] = (math.cos(direction), math.sin(direction), -half * along_y, half * along_x, 1.0)
+        self._shares[2, 1], self._shares[3, 1] = -along_y, along_x
+        self._sums += self._shares @ self._angles
+
+    @property
+    def jacobian(self) -> Array:
+        """Of (x, y, heading) on the elements row by row, (3, 3N)."""
+        cosine, sine, bend_x, bend_y, turned = self._sums
+        full = self._jacobian
+        full[0, 0] = full[1, 1] = cosine
+        full[1, 0] = sine
+        full[0, 1] = -sine
+        full[0, 2], full[1, 2], full[2, 2] = bend_x, bend_y, turned
+        return full.reshape(3, -1)

@@ -162,6 +162,13 @@ class Recorder:
         self.counts[arrival.name] += 1
 
 
+def free_path(path: Path) -> Path:
+    """``path``, or the same with the time in its name where that is there: a node that starts again records on."""
+    if not path.exists():
+        return path
+    return path.with_name(f"{path.stem}-{time.strftime('%Y%m%d-%H%M%S')}{path.suffix}")
+
+
 def _stamp(kind: MessageType[Any], payload: bytes) -> int | None:
     """The stamp in a payload's header, ns; None where it has none. MessageError: not of this type."""
     content = kind.parse(payload)

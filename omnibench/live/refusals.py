@@ -7,7 +7,6 @@ with all that it allows. So, while refusals are logged, descriptor 1 is a pipe, 
 from __future__ import annotations
 
 import fcntl
-import io
 import logging
 import os
 import re
@@ -16,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Final
+from typing import Final, TextIO
 
 import zenoh
 
@@ -44,8 +43,9 @@ _PIPE_SIZE: Final = 1 << 20
 _PAUSE: Final = 0.02  # s; many lines at a time cost less than one by one
 _QUIET: Final = 10.0  # s in which the same refusal is not told again
 _MOST: Final = 20  # refusals told in that time
+_MOST_KNOWN: Final = 10_000  # peers; a node runs for long
 
-_started = threading.Lock()
+_one_at_a_time = threading.Lock()
 
 
 @contextmanager
@@ -60,12 +60,15 @@ def log_refusals(config: SessionConfig) -> Iterator[Refusals]:
     if "RUST_LOG" in os.environ:
         zenoh.try_init_log_from_env()
         guarded = False
-    if not guarded:
+    if not guarded or sys.stdout is None or not _one_at_a_time.acquire(blocking=False):
         yield refusals
         return
-    with _started, _descriptor_1_read_by(refusals.take):
-        _start_log(_FILTER + (_ACCESS_FILTER if config.access is not None else ""))
-        yield refusals
+    try:
+        with _descriptor_1_read_by(refusals.take):
+            _start_log(_FILTER + (_ACCESS_FILTER if config.access is not None else ""))
+            yield refusals
+    finally:
+        _one_at_a_time.release()
 
 
 class Refusals:
@@ -101,7 +104,7 @@ class Refusals:
         if (decision := _DECISION.fullmatch(text)) is not None:
             self._decisions[thread] = decision
             if decision["subject"]:
-                self._names[decision["zid"]] = _identity(decision["subject"])
+                _remember(self._names, decision["zid"], _identity(decision["subject"]))
         elif text == "Msg intercepted!" and (decision := self._decisions.pop(thread, None)) is not None:
             # What was decided without a message being intercepted was only looked up beforehand.
             zid = decision["zid"]
@@ -110,9 +113,9 @@ class Refusals:
 
     def _take_handshake(self, thread: str, text: str) -> None:
         if (handshake := _HANDSHAKE.match(text)) is not None:
-            self._addresses[thread] = handshake["address"]
+            _remember(self._addresses, thread, handshake["address"])
         elif (accepted := _ACCEPTED.match(text)) is not None:
-            self._addresses[accepted["zid"]] = accepted["address"]
+            _remember(self._addresses, accepted["zid"], accepted["address"])
         elif "UsrPwd" in text:
             reason = next((meaning for sign, meaning in _REASONS if sign in text), text)
             self._refuse(f"{self._addresses.get(thread, 'a connection')}: {reason}")
@@ -131,6 +134,12 @@ class Refusals:
             return
         self._told[same] = now
         self._tell(one_line(f"refused: {text}" if refused else text))
+
+
+def _remember(known: dict[str, str], key: str, value: str) -> None:
+    known[key] = value
+    if len(known) > _MOST_KNOWN:
+        del known[next(iter(known))]
 
 
 def _identity(subject: str) -> str:
@@ -193,10 +202,10 @@ def _descriptor_1_read_by(take: Callable[[str], bool]) -> Iterator[None]:
         os.close(outside)
 
 
-def _is_descriptor_1(stream: io.TextIOBase | object) -> bool:
+def _is_descriptor_1(stream: TextIO) -> bool:
     try:
-        return stream.fileno() == 1  # type: ignore[union-attr]
-    except (OSError, AttributeError, ValueError):
+        return stream.fileno() == 1
+    except (OSError, ValueError):  # a stream without a file
         return False
 
 
@@ -213,8 +222,10 @@ def _read(reading: int, outside: int, take: Callable[[str], bool]) -> None:
                 LOG.exception("a line of Zenoh's log could not be read")
                 continue
             if not known:
-                os.write(outside, line + b"\n")
+                with suppress(OSError):  # nobody reads the program's output any more
+                    os.write(outside, line + b"\n")
         time.sleep(_PAUSE)
     os.close(reading)
     if rest:
-        os.write(outside, rest)
+        with suppress(OSError):
+            os.write(outside, rest)

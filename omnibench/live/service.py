@@ -8,6 +8,7 @@ import time
 
 import zenoh
 
+from omnibench.live.encoders import OdometryEncoder, TransformsEncoder
 from omnibench.live.health import Health, diagnostic
 from omnibench.live.messages import Diagnostics
 from omnibench.live.topics import GraphNode
@@ -28,6 +29,10 @@ class RobotService:
         self.tracker = tracker
         self._order = threading.Lock()  # wheel samples may come over several links: one after another goes out
         self._odometry = graph.publisher(name, "odom")
+        frames = tracker.frames
+        self._encode_odometry = OdometryEncoder(frames.odom, frames.base).encode
+        self._encode_filtered = OdometryEncoder(frames.map, frames.base).encode
+        self._encode_transforms = TransformsEncoder(((frames.map, frames.odom), (frames.odom, frames.base))).encode
         self._filtered = graph.publisher(name, "odometry/filtered") if fusing else None
         self._transforms = graph.publisher(name, "tf") if fusing else None
         self._diagnostics = graph.publisher(name, "diagnostics")
@@ -70,10 +75,10 @@ class RobotService:
             self._failed("pose", error)
 
     def _publish(self, update: Update) -> None:
-        self._odometry.put(update.odometry)
+        self._odometry.put_encoded(self._encode_odometry(update.odometry))
         if self._filtered is not None and self._transforms is not None and update.filtered is not None:
-            self._filtered.put(update.filtered)
-            self._transforms.put(update.transforms)
+            self._filtered.put_encoded(self._encode_filtered(update.filtered))
+            self._transforms.put_encoded(self._encode_transforms(update.transforms))
 
     def _failed(self, what: str, error: Exception) -> None:
         self.tracker.counts.failures += 1

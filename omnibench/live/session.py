@@ -15,9 +15,9 @@ import zenoh
 
 from omnibench.errors import ConfigError, nearest
 from omnibench.live.access import access_control
-from omnibench.live.certificates import check_files
+from omnibench.live.certificates import check_files, common_name
 from omnibench.live.diagnosis import why_not_connected, why_not_listening
-from omnibench.live.session_config import SessionConfig, Tls, User
+from omnibench.live.session_config import Access, SessionConfig, Tls, User
 
 LOG = logging.getLogger("omnibench.live")
 
@@ -100,8 +100,13 @@ def _settings(config: SessionConfig) -> Iterator[tuple[str, Any]]:
         check_files(config.tls)
         yield "transport/link/tls", _tls_settings(config.tls)
     if config.access is not None:
-        by_certificate = config.tls is not None and config.tls.mutual
-        yield "access_control", access_control(config.access, by_certificate=by_certificate)
+        yield "access_control", _access_settings(config.access, config)
+
+
+def _access_settings(access: Access, config: SessionConfig) -> Mapping[str, Any]:
+    if config.tls is not None and config.tls.mutual and config.tls.certificate is not None:
+        return access_control(access, by_certificate=True, own_name=common_name(config.tls.certificate))
+    return access_control(access, by_certificate=False, own_name=config.user.name if config.user else None)
 
 
 def _tls_settings(tls: Tls) -> Mapping[str, Any]:

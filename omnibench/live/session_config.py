@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import AfterValidator, Field, SecretStr, field_validator, model_validator
 
-from omnibench.config import Model
+from omnibench.config import Model, read_model
 
 Mode = Literal["router", "peer", "client"]
 
@@ -109,7 +109,7 @@ class AccessRule(Model):
 class Access(Model):
     """Who may do what at a router; all else is refused. A name is a certificate's common name or a user's.
 
-    The router's own session is not bound by it.
+    The router itself may do all, and so may whoever shows its own certificate, or is the user it names.
     """
 
     robots: dict[Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")], str] = Field(
@@ -219,3 +219,8 @@ class SessionConfig(Model):
                 update={name: folder / file for name, file in files.items() if file is not None}
             )
         return self.model_copy(update=changes)
+
+
+def read_session_config(path: Path) -> SessionConfig:
+    """A session's config from a file of its own; paths in it are relative to it. ConfigError in one line."""
+    return read_model(SessionConfig, path).relative_to(path.resolve().parent)

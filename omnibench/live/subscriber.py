@@ -69,7 +69,7 @@ def subscribe(
     own = None
     if session is None:
         if isinstance(connect, str):
-            connect = validate(SessionConfig, {"mode": "client", "connect": connect}, "connect")
+            connect = validate(SessionConfig, {"mode": "client", "connect": connect}, f"subscribing to {robot}")
         session = own = open_session(connect, f"subscribing to {robot}")
     return Subscription(session.declare_subscriber(key, channel), callback, own)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,7 +36,7 @@ class Entry:
     odometry: Array
     pose: Array
     covariance: Array
-    fixes: list[Fix] = field(default_factory=list)
+    fixes: tuple[Fix, ...] = ()
 
 
 class Timeline:
@@ -67,7 +67,7 @@ class Timeline:
     def restart(self, stamp: int) -> None:
         """Keep the newest entry alone, at another time: the clock jumped, or all before has no meaning any more."""
         newest = self.entries[-1]
-        newest.stamp, newest.fixes = stamp, []
+        newest.stamp, newest.fixes = stamp, ()
         self.entries, self._stamps = [newest], [stamp]
 
     def index(self, stamp: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from dataclasses import dataclass
@@ -74,7 +75,7 @@ class RobotTracker:
         self.name = name
         self.calibration = calibration
         self.counts = Counts()
-        self._frames = frames or Frames()
+        self.frames = frames or Frames()
         self._stale_after = stale_after
         self._settings = fusion
         self._memory = memory
@@ -259,7 +260,7 @@ class RobotTracker:
 
     def _update(self, stamp: int) -> Update:
         stamp = self._stamps.unique(stamp)
-        frames, twist = self._frames, self._odometry.twist
+        frames, twist = self.frames, self._odometry.twist
         pose, twist_covariance = self._odometry.pose, self._odometry.twist_covariance
         odometry = Odometry(stamp, frames.odom, frames.base, pose, self._odometry.covariance, twist, twist_covariance)
         to_base = Transform(stamp, frames.odom, frames.base, pose)
@@ -277,8 +278,8 @@ class RobotTracker:
             self.counts.pose_undecodable += 1
             raise
         try:
-            if message.frame not in ("", self._frames.map):
-                raise MessageError(f"the pose is in frame {message.frame!r}, not in {self._frames.map!r}")
+            if message.frame not in ("", self.frames.map):
+                raise MessageError(f"the pose is in frame {message.frame!r}, not in {self.frames.map!r}")
             if not np.isfinite(message.pose).all() or not np.isfinite(message.covariance).all():
                 raise MessageError("the pose or its covariance is not finite")
             covariance = message.covariance if message.covariance.any() else self._usual_covariance()
@@ -359,8 +360,8 @@ class RobotTracker:
 
 def correction(in_map: Array, in_odom: Array) -> Array:
     """The pose (3,) of frame odom in frame map, from the robot's pose in both."""
-    turned = in_map[2] - in_odom[2]
-    cosine, sine = np.cos(turned), np.sin(turned)
-    x = in_map[0] - (cosine * in_odom[0] - sine * in_odom[1])
-    y = in_map[1] - (sine * in_odom[0] + cosine * in_odom[1])
-    return np.array([x, y, turned])
+    map_x, map_y, map_heading = in_map.tolist()
+    x, y, heading = in_odom.tolist()
+    turned = map_heading - heading
+    cosine, sine = math.cos(turned), math.sin(turned)
+    return np.array([map_x - cosine * x + sine * y, map_y - sine * x - cosine * y, turned])

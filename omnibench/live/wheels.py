@@ -105,7 +105,8 @@ class WheelInput:
             self._counts.duplicates += 1
             return []
         if 0 < elapsed <= self._settings.max_gap:
-            self._drop_suspects()
+            if self._suspects:
+                self._drop_suspects()
             return [self._step(sample, elapsed)]
         if -_REORDERED <= elapsed < 0:
             self._counts.late += 1
@@ -116,8 +117,8 @@ class WheelInput:
         places = self._places.get(message.names)
         if places is None:
             places = self._find(message.names)
-        positions = None if message.positions is None else np.asarray(message.positions)[places]
-        velocities = None if message.velocities is None else np.asarray(message.velocities)[places]
+        positions = None if message.positions is None else message.positions.take(places)
+        velocities = None if message.velocities is None else message.velocities.take(places)
         if self._settings.use == "velocities" or (self._settings.use == "auto" and self._rates_only()):
             positions = None
         if positions is None and (velocities is None or self._settings.use == "positions"):
@@ -125,10 +126,10 @@ class WheelInput:
             raise MessageError(f"it has no {'positions' if self._settings.use != 'velocities' else 'velocities'}")
         used = velocities if positions is None else positions
         assert used is not None
-        if not np.isfinite(used).all():
+        if not all(map(math.isfinite, used.tolist())):
             self._counts.not_finite += 1
             raise MessageError(f"wheels say {used.tolist()}")
-        if velocities is not None and not (np.abs(velocities) <= self._settings.max_rate).all():
+        if velocities is not None and not all(abs(rate) <= self._settings.max_rate for rate in velocities.tolist()):
             if positions is None:
                 self._counts.too_fast += 1
                 raise MessageError(
@@ -186,11 +187,11 @@ class WheelInput:
             wrapped = angles - self._settings.wrap * np.round(angles / self._settings.wrap)
             self._counts.wraps += int((wrapped != angles).any())
             angles = wrapped
-        elif (np.abs(angles) > min(largest, math.pi)).any():
+        elif max(map(abs, angles.tolist())) > min(largest, math.pi):
             angles = self._unwrapped(angles, before, sample.positions)
-        strange = np.abs(angles) > largest
-        if not strange.any():
+        if max(map(abs, angles.tolist())) <= largest:
             return angles, True
+        strange = np.abs(angles) > largest
         self._counts.counter_restarts += 1
         rates = self._rates if sample.velocities is None else sample.velocities
         return np.where(strange, rates * min(elapsed, self._settings.max_gap), angles), False

@@ -13,10 +13,9 @@ from pathlib import Path
 
 import zenoh
 
-from omnibench.config import read_model
 from omnibench.live.refusals import log_refusals
 from omnibench.live.session import open_session
-from omnibench.live.session_config import SessionConfig
+from omnibench.live.session_config import read_session_config
 
 
 def say(line: str) -> None:
@@ -26,7 +25,7 @@ def say(line: str) -> None:
 
 def main(path: Path) -> None:
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    config = read_model(SessionConfig, path).relative_to(path.parent)
+    config = read_session_config(path)
     ended = threading.Event()
     threading.Thread(target=lambda: (sys.stdin.read(), ended.set()), daemon=True).start()
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import zenoh
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from samples import COVARIANCE, sample
@@ -125,12 +127,32 @@ def node(network: Loopback, profile: Profile) -> dict[str, Publisher[Any]]:
     return {topic: graph.publisher("apr02", topic) for topic in TOPICS}
 
 
+@contextmanager
+def samples_of(network: Loopback, publisher: Publisher[Any]) -> Iterator[Callable[[], zenoh.Sample]]:
+    """The next sample of a publisher, in another session, time after time; then nobody subscribes to it any more."""
+    with network.client().declare_subscriber(publisher.key) as subscriber:
+        until(lambda: publisher.matched, "the subscription")
+
+        def sample_that_comes() -> zenoh.Sample:
+            found: list[zenoh.Sample] = []
+
+            def comes() -> bool:
+                one = subscriber.try_recv()
+                found.extend([one] if one else [])
+                return bool(found)
+
+            until(comes, "a sample")
+            return found[0]
+
+        yield sample_that_comes
+    until(lambda: not publisher.matched, "the subscription to go")
+
+
 @pytest.mark.parametrize("topic", TOPICS)
 def test_rosbags_reads_what_comes_over_zenoh(network: Loopback, node: dict[str, Publisher[Any]], topic: str) -> None:
-    with network.client().declare_subscriber(node[topic].key) as subscriber:
-        until(lambda: node[topic].matched, "the subscription")
+    with samples_of(network, node[topic]) as next_sample:
         node[topic].put(sample(topic))
-        payload = subscriber.recv().payload.to_bytes()
+        payload = next_sample().payload.to_bytes()
     store = get_typestore(Stores.ROS2_HUMBLE)  # of the oldest ROS 2 that reads us
     assert read(topic, store.deserialize_cdr(payload, TOPICS[topic].name)) == EXPECTED[topic]
 
@@ -254,6 +276,7 @@ def test_another_ros_client_reads_the_content(
         assert came.wait(10)
     finally:
         subscriber.close()
+    until(lambda: not rmw_node[topic].matched, "the subscription to go")
     assert read(topic, contents[0]) == EXPECTED[topic]
 
 
@@ -262,12 +285,11 @@ def test_each_message_says_who_sent_it_when_and_which_one_it_is(
     network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str
 ) -> None:
     package = pytest.importorskip("zenoh_ros2_sdk.attachment", reason="zenoh-ros2-sdk is not installed")
-    with network.client().declare_subscriber(rmw_node[topic].key) as subscriber:
-        until(lambda: rmw_node[topic].matched, "the subscription")
+    with samples_of(network, rmw_node[topic]) as next_sample:
         attachments = []
         for _ in range(2):
             rmw_node[topic].put(sample(topic))
-            attachment = subscriber.recv().attachment
+            attachment = next_sample().attachment
             assert attachment is not None
             attachments.append(package.Attachment.from_bytes(attachment.to_bytes()))
     first, second = attachments

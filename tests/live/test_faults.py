@@ -140,7 +140,7 @@ def test_a_killed_node_goes_on_with_its_pose_and_calibration(tmp_path: Path) -> 
         heard = heard_odometry(session)
         wheels = wheels_of(session)
         poses = session.declare_publisher("apr/slam_pose")
-        assert asked(session, "omnibench/apr/calibration", as_text(other))["accepted"]
+        assert asked(session, "omnibench/apr/swap", as_text(other))["accepted"]
         sent(wheels, path.samples()[:150])
         until(lambda: len(heard) == 150, "odometry before")
         until(lambda: poses.matching_status.matching, "the node's subscription")

@@ -75,7 +75,7 @@ def test_a_message_comes_through_with_its_numbers(loopback: Loopback, server: Fo
     assert before <= stamp <= time.time_ns()
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(channel["schema"], channel["schemaName"]))  # by what the channel itself says
-    content = store.deserialize_cdr(message[13:], channel["schemaName"])
+    content: Any = store.deserialize_cdr(message[13:], channel["schemaName"])
     assert (content.pose.pose.position.x, content.pose.pose.position.y) == (1.28, -2.5)
     assert content.twist.twist.angular.z == 0.45
     np.testing.assert_array_equal(content.pose.covariance.reshape(6, 6)[:2, :2], COVARIANCE[:2, :2])

@@ -168,9 +168,10 @@ def test_the_pose_at_a_time_is_interpolated(driven: Any, form: str) -> None:
         ("set_pose", '{"x": 1}', "set_pose: key 'y' is missing (and 1 more)"),
         ("set_pose", '{"x": 1, "y": 2, "theta": 3, "z": 4}', "set_pose: unknown key 'z'"),
         ("set_pose", b"\xff\xfe", "the payload is not text"),
-        ("calibration", "format: something", "format is 'something', expected 'omnibench-calibration/1'"),
-        ("calibration", "{", "not valid YAML"),
-        ("calibration", b"\xff\xfe", "not a text in UTF-8"),
+        ("calibration", "format: something", "put it there, or ask omnibench/apr/swap"),
+        ("swap", "format: something", "format is 'something', expected 'omnibench-calibration/1'"),
+        ("swap", "{", "not valid YAML"),
+        ("swap", b"\xff\xfe", "not a text in UTF-8"),
     ],
 )
 def test_a_bad_order_is_refused_with_the_reason(driven: Any, selector: str, payload: Any, message: str) -> None:
@@ -224,7 +225,7 @@ def test_a_bad_calibration_that_is_put_is_refused_and_told_in_health(tmp_path: P
 @pytest.mark.parametrize("profile", ["rmw", "humble"])
 def test_ros_2_finds_topics_under_its_own_keys(tmp_path: Path, profile: str) -> None:
     path = drive(0.1)
-    with running(config_of(tmp_path, profile=profile, domain=7)) as (node, session):
+    with running(config_of(tmp_path, profile=profile, domain=7)) as (_, session):
         key = asked(session, "omnibench/apr/info")["topics"]["odom"]
         assert key.startswith("7/apr/odom/nav_msgs::msg::dds_::Odometry_/")
         heard: list[zenoh.Sample] = []
@@ -263,7 +264,7 @@ def test_a_missing_calibration_is_named(tmp_path: Path) -> None:
 
 def test_the_configs_of_the_project_are_valid() -> None:
     folder = Path(__file__).resolve().parents[2] / "configs"
-    for file in sorted(folder.glob("live*.yaml")):
+    for file in (folder / "live.yaml", folder / "live_fleet.yaml"):
         config: LiveConfig = read_live_config(file)
         for robot in config.robots:
             assert robot.calibration.is_file()

@@ -20,7 +20,7 @@ from omnibench.errors import ConfigError
 from omnibench.live.access import rights_of
 from omnibench.live.keys import make_keys
 from omnibench.live.refusals import Refusals
-from omnibench.live.session import open_session
+from omnibench.live.session import open_session, zenoh_config
 from omnibench.live.session_config import Access, SessionConfig, Tls, User
 
 MEMBERS = ("node", "apr02", "apr03", "viewer", "operator", "remote", "stranger")
@@ -170,6 +170,27 @@ class TestMutualTls:
         text = refusal(elsewhere)
         assert "nothing listens there" in text or "IP address mismatch" in text
 
+    def test_a_refused_peer_opens_but_nothing_of_it_passes(self, fleet: RouterProcess, keys: Path) -> None:
+        settings = zenoh_config(member(fleet, keys / "other", "apr02", ca=keys / "ca.pem"))
+        settings.insert_json5("mode", '"peer"')
+        settings.insert_json5("connect/timeout_ms", "-1")
+        with zenoh.open(settings) as session:
+            publisher = session.declare_publisher("apr02/joint_states")
+            for _ in range(20):
+                publisher.put(b"forged")
+                time.sleep(0.005)
+            fleet.until_told("refused: a connection: invalid peer certificate: UnknownIssuer")
+            assert not session.info.routers_zid()
+        assert fleet.got("apr02/joint_states") == 0
+
+    def test_a_router_that_is_refused_elsewhere_does_not_open(
+        self, fleet: RouterProcess, keys: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("omnibench.live.session._PATIENCE", 0.5)
+        refused = member(fleet, keys / "other", "apr02", ca=keys / "ca.pem")
+        upstream = SessionConfig(listen=(f"tls/127.0.0.1:{free_port()}",), connect=refused.connect, tls=refused.tls)
+        assert "our certificate is not from its authority" in refusal(upstream)
+
     def test_rightful_members_work_beside_intruders(self, fleet: RouterProcess, keys: Path) -> None:
         with open_session(member(fleet, keys, "apr02"), "apr02") as session:
             works(session, fleet)
@@ -240,13 +261,14 @@ class TestAccess:
     def test_a_certificate_without_rights_can_do_nothing(self, fleet: RouterProcess, keys: Path) -> None:
         with open_session(member(fleet, keys, "stranger"), "stranger") as session:
             heard: list[zenoh.Sample] = []
-            session.declare_subscriber("apr02/odom", heard.append, background=True)
+            subscriber = session.declare_subscriber("apr02/odom", heard.append)
             for _ in range(20):
                 session.put("apr02/joint_states", b"forged")
                 time.sleep(0.005)
             fleet.until_told("may not declare subscriber apr02/odom")
             fleet.until_told("may not write apr02/joint_states")
             assert not heard
+            subscriber.undeclare()
         assert fleet.got("apr02/joint_states") == 0
 
     def test_nodes_serve_operators_through_the_router(self, fleet: RouterProcess, keys: Path) -> None:
@@ -255,20 +277,30 @@ class TestAccess:
             open_session(member(fleet, keys, "operator"), "operator") as operator,
             open_session(member(fleet, keys, "viewer"), "viewer") as viewer,
         ):
-            for service in ("health", "set_pose"):
-                key = f"omnibench/apr07/{service}"
-                node.declare_queryable(key, lambda query: query.reply(str(query.key_expr), b"done"), background=True)
+            keys_served = [f"omnibench/apr07/{service}" for service in ("health", "set_pose")]
+            served = [
+                node.declare_queryable(key, lambda query, key=key: query.reply(key, b"done")) for key in keys_served
+            ]
             token = node.liveliness().declare_token("omnibench/apr07/alive")
-            assert answers(operator, "omnibench/apr07/set_pose") == [b"done"]
-            assert answers(viewer, "omnibench/apr07/health") == [b"done"]
-            assert answers(viewer, "omnibench/*/health") == [b"done"]
-            alive = [str(reply.ok.key_expr) for reply in viewer.liveliness().get("omnibench/*/alive") if reply.ok]
-            assert alive == ["omnibench/apr07/alive"]
+            for session, key in (
+                (operator, "omnibench/apr07/set_pose"),
+                (viewer, "omnibench/apr07/health"),
+                (viewer, "omnibench/*/health"),
+            ):
+                until(lambda session=session, key=key: answers(session, key) == [b"done"], f"an answer to {key}")
+            until(lambda: alive(viewer, "omnibench/*/alive") == ["omnibench/apr07/alive"], "the token")
             assert fleet.errors.read_text() == ""
             assert answers(viewer, "omnibench/apr07/set_pose") == []
             fleet.until_told("certificate 'viewer' at")
             assert fleet.told("may not ask omnibench/apr07/set_pose")
-            token.undeclare()
+            for each in (*served, token):
+                each.undeclare()
+
+    def test_who_holds_the_routers_own_key_may_do_all(self, fleet: RouterProcess, keys: Path) -> None:
+        with open_session(member(fleet, keys, "node"), "replay") as session:
+            for robot in ("apr02", "apr03"):
+                works(session, fleet, robot)
+        assert fleet.errors.read_text() == ""
 
     def test_only_operators_swap_calibrations(self, fleet: RouterProcess, keys: Path) -> None:
         with (
@@ -278,15 +310,21 @@ class TestAccess:
             open_session(member(fleet, keys, "apr02"), "robot") as robot,
         ):
             heard: list[bytes] = []
-            node.declare_subscriber(
-                "omnibench/apr07/calibration", lambda each: heard.append(bytes(each.payload)), background=True
+            subscriber = node.declare_subscriber(
+                "omnibench/apr07/calibration", lambda each: heard.append(bytes(each.payload))
             )
-            for session, what in ((viewer, b"viewer"), (robot, b"robot"), (operator, b"operator")):
-                session.put("omnibench/apr07/calibration", what)
-            until(lambda: heard, "the operator's calibration")
+
+            def again() -> bool:
+                operator.put("omnibench/apr07/calibration", b"operator")
+                return b"operator" in heard
+
+            until(again, "the operator's calibration")
+            for session in (viewer, robot):
+                session.put("omnibench/apr07/calibration", b"forged")
             fleet.until_told("certificate 'viewer' at")
             fleet.until_told("certificate 'apr02' at")
-            assert heard == [b"operator"]
+            assert set(heard) == {b"operator"}
+            subscriber.undeclare()
 
     def test_tokens_of_ros_nodes_pass(self, fleet: RouterProcess, keys: Path) -> None:
         key = "@ros2_lv/0/abc/0/1/MP/%/%/apr02/%apr02%joint_states/sensor_msgs::msg::dds_::JointState_/hash/qos"
@@ -295,8 +333,7 @@ class TestAccess:
             open_session(member(fleet, keys, "viewer"), "viewer") as viewer,
         ):
             token = robot.liveliness().declare_token(key)
-            found = [str(reply.ok.key_expr) for reply in viewer.liveliness().get("@ros2_lv/0/**") if reply.ok]
-            assert found == [key]
+            until(lambda: alive(viewer, "@ros2_lv/0/**") == [key], "the token")
             token.undeclare()
 
     def test_advanced_publishers_are_heard(self, fleet: RouterProcess, keys: Path) -> None:
@@ -350,6 +387,10 @@ def answers(session: zenoh.Session, key: str) -> list[bytes]:
     return [bytes(reply.ok.payload) for reply in replies if reply.ok is not None]
 
 
+def alive(session: zenoh.Session, key: str) -> list[str]:
+    return [str(reply.ok.key_expr) for reply in session.liveliness().get(key) if reply.ok is not None]
+
+
 class TestLog:
     def test_lines_that_are_not_zenohs_are_left_alone(self) -> None:
         told: list[str] = []
@@ -367,3 +408,35 @@ class TestLog:
         assert refusals.take(f"{head}: Msg intercepted!")
         assert told == ["refused: certificate 'apr02' at an unknown address: may not write apr03/odom"]
         assert refusals.count == 1
+
+    def test_the_programs_own_output_comes_out_as_it_was_written(self, keys: Path, tmp_path: Path) -> None:
+        config = tmp_path / "router.yaml"
+        config.write_text(json.dumps(mutual(keys)))
+        process = subprocess.run([sys.executable, "-c", _PROGRAM, str(config)], capture_output=True, check=True)
+        assert sorted(process.stdout.split(b"\n")) == [b"before", b"of a child", b"printed", b"unended"]
+        assert process.stderr == b""
+
+    @pytest.mark.parametrize(("variable", "logged"), [("off", False), ("zenoh_link_tls=warn", True)])
+    def test_rust_log_asks_for_zenohs_own_log(
+        self, keys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variable: str, logged: bool
+    ) -> None:
+        monkeypatch.setenv("RUST_LOG", variable)
+        with running(tmp_path / "router", mutual(keys)) as router:
+            refusal(member(router, keys / "other", "apr02", ca=keys / "ca.pem"))
+            until(lambda: not logged or "UnknownIssuer" in router.output.read_text(), "Zenoh's own log")
+            assert not router.told("UnknownIssuer")
+
+
+_PROGRAM = """
+import os, subprocess, sys
+from pathlib import Path
+from omnibench.live.refusals import log_refusals
+from omnibench.live.session import open_session
+from omnibench.live.session_config import read_session_config
+config = read_session_config(Path(sys.argv[1]))
+print("before")
+with log_refusals(config), open_session(config, "router"):
+    print("printed")
+    subprocess.run(["echo", "of a child"], check=True)
+print("unended", end="")
+"""

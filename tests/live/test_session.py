@@ -199,7 +199,7 @@ def test_a_frozen_subscriber_holds_up_nobody(address: str) -> None:
             if sent % 5 == 4:
                 time.sleep(0.001)
         until(lambda: len(samples) == count, "messages at the healthy subscriber")
-    assert sorted(durations)[int(0.99 * count)] < 0.5e-3  # s
+    assert max(durations) < 0.5  # s; blocking would take 5 s once, and then drop the frozen one
 
 
 class TestOneClearLine:

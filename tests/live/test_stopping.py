@@ -19,12 +19,17 @@ def test_a_signal_sets_the_event(number: signal.Signals) -> None:
         assert stop.wait(5)
 
 
-def test_a_second_ctrl_c_interrupts() -> None:
-    with pytest.raises(KeyboardInterrupt), stop_on_signals() as stop:
+def interrupted_twice() -> None:
+    with stop_on_signals() as stop:
         os.kill(os.getpid(), signal.SIGINT)
         assert stop.wait(5)
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(5)
+
+
+def test_a_second_ctrl_c_interrupts() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        interrupted_twice()
 
 
 def test_signals_act_as_before_when_it_is_over() -> None:

@@ -1,0 +1,189 @@
+"""The commands of the live runtime, as a user types them."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+import zenoh
+from commands import Command as InProcess
+from commands import assert_refused, flower, omnibench, prepare, write_config
+from nodes import Command, as_text, write_node
+from sessions import free_port, raw_session, until
+
+import omnibench as package
+from omnibench.data.storage import load_dataset
+from omnibench.robot.calibration import read_calibration
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated data set, its calibration, and a node's config for it."""
+    folder = tmp_path_factory.mktemp("live")
+    prepared = prepare(folder)
+    config = {
+        "robots": [{"name": "apr", "calibration": prepared.calibration.name}],
+        "fusion": "ekf",
+        "zenoh": {"listen": f"tcp/127.0.0.1:{free_port()}"},
+        "replay": {"dataset": prepared.config.name, "speed": "max"},
+    }
+    (folder / "node.yaml").write_text(yaml.safe_dump(config))
+    return folder
+
+
+def endpoint(config: Path) -> str:
+    return str(yaml.safe_load(config.read_text())["zenoh"]["listen"])
+
+
+def test_a_replay_to_a_node_is_one_command_and_shows_that_odom_is_the_batch_odometry(workplace: Path) -> None:
+    run = omnibench("live", workplace / "node.yaml", "--replay")
+    assert run.returncode == 0, run.stderr
+    assert "against the simulated truth" in run.stdout
+    difference = re.search(r"batch odometry: (\S+) \(m, rad\) at most; 0 messages of odom lost", run.stdout)
+    assert difference is not None, run.stdout
+    assert float(difference[1]) <= 1e-9
+    errors = [float(found) for found in re.findall(r"│ +([\d.]+) m │ +[\d.]+ deg", run.stdout)]
+    theoretical, calibrated, fused = errors
+    assert fused < 0.1 * theoretical
+    assert calibrated < theoretical
+
+
+def test_a_replay_can_name_another_recording(workplace: Path) -> None:
+    run = omnibench("live", workplace / "node.yaml", "--replay", workplace / "data")
+    assert run.returncode == 0, run.stderr
+    # a data set's folder has no truth beside it
+    assert "against the reference poses of the recording" in run.stdout
+    assert "simulated" in run.stdout
+
+
+def test_ctrl_c_ends_a_replay_with_what_it_has_shown(workplace: Path) -> None:
+    with Command("live", workplace / "node.yaml", "--replay", "--speed", "1") as demonstration:
+        time.sleep(4)
+        out, said = demonstration.stop(signal.SIGINT)
+    assert demonstration.process.returncode == 130
+    assert "stopped after" in out
+    assert "Traceback" not in said
+
+
+def test_a_recording_goes_out_and_comes_back_as_a_calibration_that_is_swapped_in(workplace: Path) -> None:
+    """record -> import -> calibrate -> swap, with the real commands."""
+    config, mcap = workplace / "node.yaml", workplace / "drive.mcap"
+    with Command("live", config) as node:
+        session = wait_for(endpoint(config))
+        with Command("record", config, "-o", mcap) as recorder:
+            until(mcap.exists, "the recorder", 20.0)
+            played = omnibench(
+                *("replay", workplace / "data", "--robot", "apr", "--speed", "20", "--connect", endpoint(config)),
+                *("--set", "pause=1.5", "--set", "slam={delay: 0.1, jitter: 0, period: 0.25}"),
+            )
+            assert played.returncode == 0, played.stderr
+            _, said = recorder.stop()
+        assert recorder.process.returncode == 0, said
+        imported = omnibench(
+            *("import", "rosbag", mcap, "-o", workplace / "back", "--set", f"robot={workplace / 'calibration.yaml'}")
+        )
+        assert imported.returncode == 0, imported.stderr
+        assert len(load_dataset(workplace / "back").trajectories) == 12
+        fitted = omnibench("calibrate", workplace / "back", "-o", workplace / "again.yaml")
+        assert fitted.returncode == 0, fitted.stderr
+        again = read_calibration(workplace / "again.yaml")
+        np.testing.assert_allclose(
+            again.matrix_array, read_calibration(workplace / "calibration.yaml").matrix_array, atol=0.004
+        )
+        session.put("omnibench/apr/calibration", as_text(again))
+        until(lambda: ask(session, "omnibench/apr/info")["calibration"] == again.name, "the swap")
+        session.close()
+        assert node.process.poll() is None
+
+
+def test_listen_prints_a_line_a_second_when_piped(workplace: Path) -> None:
+    config = workplace / "node.yaml"
+    with Command("live", config):
+        wait_for(endpoint(config)).close()
+        with Command("replay", workplace / "data", "--robot", "apr", "--connect", endpoint(config)):
+            run = omnibench("listen", "apr", "--config", config, "--seconds", "3", "--json")
+    assert run.returncode == 0, run.stderr
+    documents = [json.loads(line) for line in run.stdout.splitlines()]
+    assert 2 <= len(documents) <= 4
+    assert documents[-1]["robot"] == "apr"
+
+
+def test_a_subscription_is_three_lines_of_python(workplace: Path) -> None:
+    config = workplace / "node.yaml"
+    with Command("live", config):
+        wait_for(endpoint(config)).close()
+        with Command("replay", workplace / "data", "--robot", "apr", "--connect", endpoint(config)):
+            stamps = []
+            with package.subscribe("apr", connect=endpoint(config)) as odometry:
+                for message in odometry:
+                    stamps.append(message.stamp)
+                    if len(stamps) == 20:
+                        break
+    assert stamps == sorted(set(stamps))
+
+
+def test_keys_for_a_fleet_are_one_command(command: InProcess, tmp_path: Path) -> None:
+    made = command("keys", tmp_path / "keys", "node", "apr02")
+    assert made.returncode == 0, made.stderr
+    assert {file.name for file in (tmp_path / "keys").iterdir()} >= {"ca.pem", "node.pem", "node.key", "apr02.key"}
+    assert_refused(command("keys", tmp_path / "keys", "apr02"), "apr02.pem", "is there already")
+
+
+def test_the_schema_of_a_nodes_config_is_printed(command: InProcess) -> None:
+    printed = command("schema", "live")
+    assert "robots" in json.loads(printed.stdout)["properties"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (("live", "none.yaml"), ("none.yaml", "no such file")),
+        (("live", "node.yaml", "data"), ("data", "--replay")),
+        (("live", "node.yaml", "--speed", "2"), ("--replay",)),
+        (("live", "node.yaml", "--replay"), ("replay.dataset", "--replay DATASET")),
+        (("live", "node.yaml", "--replay", "nowhere"), ("nowhere", "no such file")),
+        (("live", "node.yaml", "--replay", "small.yaml", "--speed", "quick"), ("--speed", "quick")),
+        (("replay", "nowhere"), ("nowhere", "no such file")),
+        (("replay", "small.yaml", "--set", "sped=2"), ("unknown key 'sped'", "speed")),
+        (("replay", "small.yaml", "--robot", "a/b"), ("a/b",)),
+        (("listen", "apr", "--connect", "127.0.0.1:7447"), ("127.0.0.1:7447", "tcp/127.0.0.1:7447")),
+        (("listen", "apr", "--connect", "tcp/127.0.0.1:1"), ("tcp/127.0.0.1:1",)),
+        (("record", "apr", "-o", "x.mcap", "--connect", "tcp/127.0.0.1:1"), ("tcp/127.0.0.1:1",)),
+    ],
+)
+def test_a_mistake_is_one_line(
+    command: InProcess, tmp_path: Path, arguments: tuple[str, ...], parts: tuple[str, ...]
+) -> None:
+    write_node(tmp_path, "apr")
+    write_config(tmp_path, datasets={"flower": {"simulate": flower()}})
+    (tmp_path / "data").mkdir()
+    refused = command(*arguments)
+    assert_refused(refused, *parts)
+
+
+def wait_for(address: str) -> zenoh.Session:
+    """A client, once the node is up."""
+    found: list[zenoh.Session] = []
+
+    def connected() -> bool:
+        try:
+            found.append(raw_session("client", connect=[address]))
+        except zenoh.ZError:
+            return False
+        return True
+
+    until(connected, "a node", 20.0)
+    return found[0]
+
+
+def ask(session: zenoh.Session, key: str) -> dict[str, object]:
+    (reply,) = list(session.get(key, timeout=10.0))
+    assert reply.ok is not None
+    answer: dict[str, object] = json.loads(reply.ok.payload.to_bytes())
+    return answer
