@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from rich.console import Console
 
 from omnibench.errors import ConfigError
-from omnibench.live_terminal import ReplayBar, print_demonstration, print_played
+from omnibench.live_terminal import LogLines, ReplayBar, print_demonstration, print_played
 from omnibench.terminal import make_console
 
 if TYPE_CHECKING:
@@ -158,9 +158,13 @@ def _run(config: LiveConfig, seconds: float | None) -> None:
     from omnibench.live.refusals import log_refusals
     from omnibench.live.stopping import stop_on_signals
 
-    _log()
-    with stop_on_signals() as stop, log_refusals(config.zenoh), LiveNode(config) as node, _extras(config, node):
-        log = logging.getLogger("omnibench.live")
+    with (
+        _logging_to(make_console(error=True)) as log,
+        stop_on_signals() as stop,
+        log_refusals(config.zenoh),
+        LiveNode(config) as node,
+        _extras(config, node),
+    ):
         for robot in config.robots:
             fused = "fused with SLAM" if config.fusion_of(robot) else "without fusion"
             log.info("%s: %r runs, %s", robot.name, node.trackers[robot.name].calibration.name, fused)
@@ -186,8 +190,12 @@ def _replay_to_node(config: LiveConfig, dataset: Path | None, speed: str | None,
         changed = config.replay.model_copy(update={"speed": checked.speed})
         config = config.model_copy(update={"replay": changed})
     recording = load_recording(source)
-    _log(logging.WARNING)
-    with stop_on_signals() as stop, log_refusals(config.zenoh), ReplayBar(recording.dataset.name) as bar:
+    with (
+        ReplayBar(recording.dataset.name) as bar,
+        _logging_to(bar.console, logging.WARNING),
+        stop_on_signals() as stop,
+        log_refusals(config.zenoh),
+    ):
         shown = demonstrate(config, recording, stop, bar, beside=lambda node: _extras(config, node))
     print_demonstration(make_console(), shown)
     if not shown.report.complete:
@@ -244,11 +252,14 @@ def _speed(text: str) -> float | str:
         return text
 
 
-def _log(level: int = logging.INFO) -> None:
-    """What the node has to say, on standard error."""
+@contextmanager
+def _logging_to(console: Console, level: int = logging.INFO) -> Iterator[logging.Logger]:
+    """What the node has to say goes to ``console``."""
     log = logging.getLogger("omnibench.live")
+    lines = LogLines(console)
     log.setLevel(level)
-    if not log.handlers:
-        handler = logging.StreamHandler(sys.stderr)
-        handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
-        log.addHandler(handler)
+    log.addHandler(lines)
+    try:
+        yield log
+    finally:
+        log.removeHandler(lines)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import TYPE_CHECKING
 
@@ -18,21 +19,36 @@ if TYPE_CHECKING:
     from omnibench.live.replay import Progress as Played
 
 
+class LogLines(logging.Handler):
+    """What the node has to say, a line each, above whatever the console shows."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console = console
+        self.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            self._console.print(self.format(record), soft_wrap=True)
+        except Exception:  # a terminal that has gone must not stop the node
+            self.handleError(record)
+
+
 class ReplayBar:
     """How far a replay is, on a terminal; a line every ten seconds when piped."""
 
     _PERIOD = 10.0  # s
 
     def __init__(self, title: str) -> None:
-        self._console = make_console(error=True)
+        self.console = make_console(error=True)
         self._progress = Progress(
             TextColumn(title),
             BarColumn(),
             TextColumn("{task.fields[note]}"),
             TimeElapsedColumn(),
-            console=self._console,
+            console=self.console,
             transient=True,
-            disable=not self._console.is_terminal,
+            disable=not self.console.is_terminal,
         )
         self._task = self._progress.add_task("", total=None, note="")
         self._title = title
@@ -50,9 +66,9 @@ class ReplayBar:
         if health is not None:
             note += f", {health.rate_hz:.0f} samples/s, {health.counts['poses']} poses fused"
         self._progress.update(self._task, total=played.total, completed=played.done, note=note)
-        if not self._console.is_terminal and played.wall_seconds - self._told >= self._PERIOD:
+        if not self.console.is_terminal and played.wall_seconds - self._told >= self._PERIOD:
             self._told = played.wall_seconds
-            self._console.print(f"{self._title}: {played.done} of {played.total} messages, {note}")
+            self.console.print(f"{self._title}: {played.done} of {played.total} messages, {note}")
 
 
 def print_played(console: Console, report: PlayReport, simulated: bool) -> None:
