@@ -205,35 +205,24 @@ class _Walked:
 class _Slopes:
     """Derivatives of the pose with respect to the matrix, to first order in the turn of one step.
 
-    Rows of ``_sums`` (5, N): sums over the steps of a cos, a sin, the bends of x and y by row 3, and of a itself, with
-    a (N,) the angles of a step. All else of the derivatives is 0, or one of these again.
+    jacobian (3, 3N): of (x, y, heading) on the elements row by row.
     """
 
     def __init__(self, wheels: int, integration: Integration) -> None:
         self._arc = integration == "arc"
-        self._sums = np.zeros((5, wheels))
-        self._shares = np.zeros((5, 2))
-        self._angles = np.zeros((2, wheels))
-        self._jacobian = np.zeros((3, 3, wheels))
+        self.jacobian = np.zeros((3, 3 * wheels))
+        self._by_row = self.jacobian.reshape(3, 3, wheels)
 
     def clear(self) -> None:
-        self._sums[:] = 0.0
+        self.jacobian[:] = 0.0
 
     def add(self, angles: Array, along_x: float, along_y: float, start: float, end: float) -> None:
         """Take a step: angles (N,) rad, path (m) in the world's frame, headings at its ends (rad)."""
         direction, half = ((start + end) / 2, 0.5) if self._arc else (start, 0.0)
-        self._angles[0], self._angles[1] = angles, self._sums[4]
-        self._shares[:, 0] = (math.cos(direction), math.sin(direction), -half * along_y, half * along_x, 1.0)
-        self._shares[2, 1], self._shares[3, 1] = -along_y, along_x
-        self._sums += self._shares @ self._angles
-
-    @property
-    def jacobian(self) -> Array:
-        """Of (x, y, heading) on the elements row by row, (3, 3N)."""
-        cosine, sine, bend_x, bend_y, turned = self._sums
-        full = self._jacobian
-        full[0, 0] = full[1, 1] = cosine
-        full[1, 0] = sine
-        full[0, 1] = -sine
-        full[0, 2], full[1, 2], full[2, 2] = bend_x, bend_y, turned
-        return full.reshape(3, -1)
+        cosine, sine = math.cos(direction), math.sin(direction)
+        by_row = self._by_row
+        turned = by_row[2, 2]
+        by_row[0, 2] -= along_y * turned  # row 3 has bent the path so far, and bends this step by half of its own turn
+        by_row[1, 2] += along_x * turned
+        shares = ((cosine, -sine, -half * along_y), (sine, cosine, half * along_x), (0.0, 0.0, 1.0))
+        by_row += np.array(shares)[:, :, None] * angles

@@ -12,10 +12,11 @@ import numpy as np
 from omnibench.config import Model
 from omnibench.errors import DataError
 from omnibench.live.counts import Counts
+from omnibench.live.encoders import JointStateDecoder
 from omnibench.live.fusion import Fusion, FusionSettings, Outcome
 from omnibench.live.health import FusionHealth, Health, Status, SwapRecord
 from omnibench.live.memory import RobotMemory, SavedState
-from omnibench.live.messages import JOINT_STATE, POSE_ESTIMATE, MessageError, Odometry, Transform
+from omnibench.live.messages import POSE_ESTIMATE, MessageError, Odometry, Transform
 from omnibench.live.odometry import UNKNOWN_NOISE, LiveOdometry, Motion
 from omnibench.live.stamps import PublishedStamps
 from omnibench.live.timeline import Entry, Fix, Timeline
@@ -87,6 +88,7 @@ class RobotTracker:
         self._timeline = Timeline(fusion.history if fusion else _HISTORY)
         self._fusion = Fusion(fusion, self._timeline, self.counts) if fusion else None
         self._stamps = PublishedStamps()
+        self._decode = JointStateDecoder().decode
         self._arrival: float | None = None  # of the last wheel sample
         self._began: float | None = None
         self._pose_arrival: float | None = None
@@ -102,7 +104,7 @@ class RobotTracker:
         """Take a sensor_msgs/JointState; what is to be published. arrival: s, monotonic."""
         with self._lock:
             try:
-                message = JOINT_STATE.decode(payload)
+                message = self._decode(payload)
             except MessageError as error:
                 self.counts.undecodable += 1
                 self._last_refusal = str(error)
