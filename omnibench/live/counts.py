@@ -11,6 +11,7 @@ class Counts:
 
     samples: int = 0  # wheel samples taken
     missing: int = 0  # wheel samples that never came, by the stamps of those that did
+    irregular: int = 0  # periods off the mean by a quarter or more, missing samples aside
     duplicates: int = 0  # the same stamp again
     late: int = 0  # out of order: a newer one had been taken
     gaps: int = 0  # longer than max_gap

@@ -20,6 +20,7 @@ _SECOND = 1e9  # ns
 _TURN = 2 * math.pi
 _CONFIRMATION = 3  # stamps in a row that make a new time of a stamp that cannot be
 _REORDERED = 0.2  # s; what is late by less is out of order, never a clock that jumped back
+_IRREGULAR = 0.25  # of the mean period
 _SMOOTHING = 0.02  # share of a new period in the mean
 
 
@@ -159,8 +160,9 @@ class WheelInput:
         assert self._last is not None
         gap = elapsed > self._settings.max_gap
         if not gap and not restarted:
-            skipped = round(elapsed / self.period) - 1
-            self._counts.missing += max(skipped, 0)
+            periods = elapsed / self.period
+            self._counts.missing += max(round(periods) - 1, 0)
+            self._counts.irregular += abs(periods - max(round(periods), 1)) > _IRREGULAR
             self.period += _SMOOTHING * (min(elapsed, 3 * self.period) - self.period)
         blind = elapsed if gap or restarted else 0.0
         if sample.positions is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 import yaml
 import zenoh
 from commands import Command as InProcess
-from commands import assert_refused, flower, omnibench, prepare, write_config
+from commands import CONFIGS, assert_refused, flower, omnibench, prepare, write_config
 from nodes import Command, as_text, write_node
 from sessions import free_port, raw_session, until
 
@@ -133,6 +134,31 @@ def test_keys_for_a_fleet_are_one_command(command: InProcess, tmp_path: Path) ->
     assert made.returncode == 0, made.stderr
     assert {file.name for file in (tmp_path / "keys").iterdir()} >= {"ca.pem", "node.pem", "node.key", "apr02.key"}
     assert_refused(command("keys", tmp_path / "keys", "apr02"), "apr02.pem", "is there already")
+
+
+def test_a_robot_of_a_fleet_cannot_write_for_another_and_the_node_logs_it(workplace: Path, tmp_path: Path) -> None:
+    """The project's own configs, on loopback: certificates, node, rightful robot, intruder."""
+    port = free_port()
+    made = omnibench("keys", tmp_path / "keys", "node", "apr02", "apr03", "screen", "lab")
+    assert made.returncode == 0, made.stderr
+    for name in ("live_fleet.yaml", "live_fleet_client.yaml"):
+        text = (CONFIGS / name).read_text().replace("0.0.0.0:7447", f"127.0.0.1:{port}")
+        (tmp_path / name).write_text(text.replace("base.local:7447", f"127.0.0.1:{port}").replace("screen.", "apr02."))
+    shutil.copy(CONFIGS / "apr02_calibration.yaml", tmp_path)
+    client = tmp_path / "live_fleet_client.yaml"
+    with Command("live", tmp_path / "live_fleet.yaml") as node:
+        settings = ("--config", client, "--speed", "max")
+        assert omnibench("replay", workplace / "data", "--robot", "apr02", *settings).returncode == 0
+        written_for_another = omnibench("replay", workplace / "data", "--robot", "apr03", *settings, "--set", "wait=0")
+        assert "Traceback" not in written_for_another.stderr
+        heard = omnibench("listen", "--config", tmp_path / "live_fleet.yaml", "--seconds", "2", "--json")
+        assert heard.returncode == 0, heard.stderr
+        time.sleep(0.5)
+        _, said = node.stop()
+    assert re.search(r"refused: certificate 'apr02' at \S+: may not write apr03/joint_states", said), said
+    states = {news["robot"]: news for news in map(json.loads, heard.stdout.splitlines())}
+    assert states["apr02"]["health"]["status"] != "waiting"
+    assert states["apr03"]["health"]["status"] == "waiting"
 
 
 def test_the_schema_of_a_nodes_config_is_printed(command: InProcess) -> None:

@@ -224,3 +224,10 @@ def test_irregular_periods_are_taken_as_they_are_stamped() -> None:
     receiver.take(*[at(float(t), 0.5 * float(t), 0, 0) for t in times])
     for step in receiver.steps[1:]:
         assert step.angles[0] / step.duration == pytest.approx(0.5, rel=1e-5)
+    assert receiver.counts.irregular > 20
+
+
+def test_even_periods_are_not_irregular_whatever_is_missing() -> None:
+    receiver = Receiver()
+    receiver.take(*[at(PERIOD * k, k, k, k) for k in range(50) if k not in (20, 31, 32)])
+    assert receiver.counts.irregular == 0
