@@ -168,6 +168,8 @@ def _run(config: LiveConfig, seconds: float | None) -> None:
         for robot in config.robots:
             fused = "fused with SLAM" if config.fusion_of(robot) else "without fusion"
             log.info("%s: %r runs, %s", robot.name, node.trackers[robot.name].calibration.name, fused)
+        if not config.robots:
+            log.info("no robots in the config: only a router")
         verb = "listens on" if config.zenoh.listening else "is connected to"
         place = ", ".join(config.zenoh.listening or config.zenoh.connecting)
         log.info("node %s %s %s; Ctrl-C ends it", config.name, verb, place)

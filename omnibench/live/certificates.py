@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from cryptography import x509
-from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
 from cryptography.x509.oid import NameOID
@@ -22,7 +22,7 @@ _SOON: Final = timedelta(days=14)
 
 def check_files(tls: Tls) -> None:
     """ConfigError in one line when a file is missing, unreadable or expired, or a key is not the certificate's."""
-    read_certificate(tls.ca)
+    authority = read_certificate(tls.ca)
     if tls.certificate is None or tls.key is None:
         return
     certificate, key = read_certificate(tls.certificate), read_key(tls.key)
@@ -32,6 +32,18 @@ def check_files(tls: Tls) -> None:
     )
     if ours != its:
         raise ConfigError(f"tls: {tls.key} is not the key of {tls.certificate}; give the two that belong together")
+    _check_issuer(certificate, authority, tls)
+
+
+def _check_issuer(certificate: x509.Certificate, authority: x509.Certificate, tls: Tls) -> None:
+    """A warning when a lone certificate is not of a lone authority: whoever trusts that one alone will refuse it."""
+    chains = (x509.load_pem_x509_certificates(_content(path)) for path in (tls.ca, tls.certificate) if path is not None)
+    if any(len(chain) > 1 for chain in chains):
+        return
+    try:
+        certificate.verify_directly_issued_by(authority)
+    except (ValueError, TypeError, InvalidSignature):
+        LOG.warning("tls: %s was not issued by %s; whoever trusts that one alone refuses us", tls.certificate, tls.ca)
 
 
 def common_name(path: Path) -> str | None:

@@ -23,10 +23,10 @@ class Counts:
     too_fast: int = 0  # beyond max_rate
     wrong_joints: int = 0  # a wheel is not among the names, or has neither angle nor rate
     undecodable: int = 0  # wheel messages that are no sensor_msgs/JointState
-    poses: int = 0  # SLAM poses that were fused
+    poses: int = 0  # SLAM poses that were believed
     pose_rejected: int = 0  # by the gate
     pose_too_late: int = 0  # older than the history
-    pose_ahead: int = 0  # stamps in the future
+    pose_ahead: int = 0  # stamps in the future, or more than can wait for their wheel samples
     pose_duplicates: int = 0
     pose_invalid: int = 0  # not finite, no covariance, wrong frame
     pose_undecodable: int = 0  # not a geometry_msgs/PoseWithCovarianceStamped

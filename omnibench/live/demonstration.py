@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import zenoh
 
+from omnibench.errors import ConfigError
 from omnibench.live.chain import Chain, chain_recording, chained_truth
 from omnibench.live.health import Health
 from omnibench.live.live_config import LiveConfig, client_session, robot_called
@@ -21,7 +22,7 @@ from omnibench.live.replay import Player, PlayReport, Progress
 from omnibench.live.session import open_session
 from omnibench.live.subscriber import Subscription, subscribe
 from omnibench.live.topics import GraphNode
-from omnibench.robot.calibration import Calibration
+from omnibench.robot.calibration import Calibration, read_calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 
@@ -96,11 +97,12 @@ def demonstrate(
 ) -> Demonstration:
     """Run the node of ``config``, play ``recording`` to it as the config's ``replay`` says, and judge what comes out.
 
-    The node begins afresh. beside: what is open while it runs, a recorder for example. Errors as LiveNode's and
-    Player's.
+    The node begins afresh. beside: what is open while it runs, a recorder for example. ConfigError when the recording
+    is of other wheels than the robot's calibration; other errors as LiveNode's and Player's.
     """
     stop = stop or threading.Event()
     robot = robot_called(config, config.replay.robot)
+    _check_wheels(recording, read_calibration(robot.calibration), robot.name)
     chain = chain_recording(recording, pause=config.replay.pause, split=config.replay.split)
     with LiveNode(config, remember=False) as node, beside(node) if beside else nullcontext():
         tracker = node.trackers[robot.name]
@@ -134,6 +136,16 @@ def demonstrate(
             if not guarded:
                 session.close()
         return _judged(chain, recording, tracker.calibration, report, odometry, fused, health)
+
+
+def _check_wheels(recording: Recording, calibration: Calibration, robot: str) -> None:
+    """The node knows wheels by name, and what is compared afterwards by place."""
+    recorded, calibrated = recording.dataset.robot.wheel_names, calibration.robot.wheel_names
+    if recorded != calibrated:
+        raise ConfigError(
+            f"recording {recording.dataset.name!r} has wheels {', '.join(recorded)}, calibration {calibration.name!r} "
+            f"of robot {robot!r} has {', '.join(calibrated)}; play one of that robot, or calibrate with this one"
+        )
 
 
 def _wait_for_the_last(

@@ -8,43 +8,36 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from decimal import Decimal, InvalidOperation
-from pathlib import Path
 from typing import Any, Final, cast
 
 import numpy as np
 import zenoh
-from pydantic import Field
 from zenoh.handlers import Callback
 
-from omnibench.config import Model, parse_yaml, to_json, validate
-from omnibench.errors import ConfigError, DataError, OmnibenchError
+from omnibench.config import Model, to_json
+from omnibench.errors import ConfigError, DataError, OmnibenchError, one_line
 from omnibench.live.memory import RobotMemory
+from omnibench.live.orders import read_pose, read_sent_calibration, read_time
+from omnibench.live.quiet import Quiet
 from omnibench.live.tracker import RobotTracker
-from omnibench.robot.calibration import parse_calibration
+from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 
 LOG = logging.getLogger("omnibench.live")
 _READING: Final = ("info", "calibration", "health", "pose")
 _ORDERS: Final = ("set_pose", "reset", "swap")
-_NANOSECONDS = 10**14  # numbers of ``at`` from here on are ns; as s they would lie three million years ahead
-_LONGEST = 1 << 20  # bytes of a calibration
-
-
-class PoseOrder(Model):
-    """What ``set_pose`` is told: m and rad in the map."""
-
-    x: float = Field(allow_inf_nan=False)
-    y: float = Field(allow_inf_nan=False)
-    theta: float = Field(allow_inf_nan=False)
-    position_sigma: float = Field(0.05, gt=0, allow_inf_nan=False, description="standard deviation, m")
-    heading_sigma: float = Field(0.05, gt=0, allow_inf_nan=False, description="rad")
+_LONGEST: Final = 1 << 16  # bytes of a request
+_MOST_WAITING: Final = 64  # requests
 
 
 class Desk:
     """Answers queries and takes calibrations for one robot after another, in a thread of its own.
 
-    info: robot -> what ``info`` answers. calibrations: robot -> the file that its config names.
+    What is too long, or too much at once, is refused where it comes in, so that the wheels' stream goes on. A reply has
+    the congestion control of its query, whatever is said here: for a client that asked with BLOCK and does not read,
+    Zenoh waits up to 5 s and then parts with it. Until then the desk waits; the stream does not.
+
+    info: robot -> what ``info`` answers. memories: of the robots whose calibrations outlive the node.
     """
 
     def __init__(
@@ -53,13 +46,13 @@ class Desk:
         trackers: Mapping[str, RobotTracker],
         info: Callable[[RobotTracker], Mapping[str, Any]],
         memories: Mapping[str, RobotMemory],
-        calibrations: Mapping[str, Path],
     ) -> None:
         self._trackers = trackers
         self._info = info
         self._memories = memories
-        self._calibrations = calibrations
-        self._work: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._quiet = Quiet()
+        self._refused = 0
+        self._work: queue.Queue[Callable[[], None] | None] = queue.Queue(_MOST_WAITING)
         self._thread = threading.Thread(target=self._run, name="desk", daemon=True)
         self._open: list[Any] = []
         for name in trackers:
@@ -74,49 +67,78 @@ class Desk:
         self._thread.join()
 
     def _declare(self, session: zenoh.Session, name: str) -> list[Any]:
-        def asked(query: zenoh.Query) -> None:
-            self._work.put(lambda: self._answer(query))
-
-        def sent(sample: zenoh.Sample) -> None:
-            self._work.put(lambda: self._take_calibration(name, sample))
+        def asked_for(service: str) -> Callable[[zenoh.Query], None]:
+            return lambda query: self._take_query(name, service, query)
 
         # declared one by one, so that access control can tell them apart
         services: list[Any] = [
-            session.declare_queryable(f"omnibench/{name}/{service}", _direct(asked)) for service in _READING + _ORDERS
+            session.declare_queryable(f"omnibench/{name}/{service}", _direct(asked_for(service)))
+            for service in _READING + _ORDERS
         ]
-        return [*services, session.declare_subscriber(f"omnibench/{name}/calibration", _direct(sent))]
+        put = _direct(lambda sample: self._take_sample(name, sample))
+        return [*services, session.declare_subscriber(f"omnibench/{name}/calibration", put)]
+
+    def _take_query(self, name: str, service: str, query: zenoh.Query) -> None:
+        if service in _ORDERS and str(query.key_expr) != f"omnibench/{name}/{service}":
+            return  # an order to whomever it may concern is one to nobody
+        size = _size(query.payload) + _size(query.attachment) + len(str(query.parameters))
+        reason = self._queued(lambda: self._answer(name, service, query), size)
+        if reason is not None:
+            _refuse(query, name, f"omnibench/{name}/{service}: {reason}")
+
+    def _take_sample(self, name: str, sample: zenoh.Sample) -> None:
+        """A calibration that is put: there is nobody to answer (unlike ``swap``), so health and log tell."""
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        size = _size(sample.payload) + _size(sample.attachment)
+        reason = self._queued(lambda: self._take_calibration(name, sample), size)
+        if reason is not None:
+            self._trackers[name].refuse_swap(f"omnibench/{name}/calibration: {reason}")
+
+    def _queued(self, work: Callable[[], None], size: int) -> str | None:
+        """None, or why a request of so many bytes is not taken."""
+        reason = None
+        if size > _LONGEST:
+            reason = f"{size} bytes are more than a request may have, {_LONGEST}"
+        else:
+            try:
+                self._work.put_nowait(work)
+            except queue.Full:
+                reason = f"{_MOST_WAITING} requests are waiting; ask again later"
+        if reason is not None:
+            self._refused += 1
+            if self._quiet.lets("refused"):
+                LOG.warning("requests refused so far: %d; the last: %s", self._refused, reason)
+        return reason
 
     def _run(self) -> None:
         while (work := self._work.get()) is not None:
             try:
                 work()
             except Exception as error:  # whatever was asked, the next one is answered
-                LOG.error("a question could not be answered: %s: %s", type(error).__name__, error)
+                self._failed(error)
+            del work  # a query is over when nobody holds it any more
 
-    def _answer(self, query: zenoh.Query) -> None:
+    def _failed(self, error: Exception) -> None:
+        if self._quiet.lets(type(error).__name__):
+            LOG.error("a request failed: %s: %s", type(error).__name__, one_line(str(error)))
+
+    def _answer(self, name: str, service: str, query: zenoh.Query) -> None:
         with query:
-            asked = query.key_expr
-            for name in self._trackers:
-                for service in _READING + _ORDERS:
-                    key = f"omnibench/{name}/{service}"
-                    exactly = str(asked) == key
-                    if exactly or (service in _READING and asked.intersects(key)):
-                        self._reply(query, key, name, service)
-                        if exactly:
-                            return
+            try:
+                answer = to_json(self._serve(name, service, query)).encode()
+            except OmnibenchError as error:
+                _refuse(query, name, str(error))
+            except Exception as error:
+                _refuse(query, name, f"omnibench/{name}/{service}: {type(error).__name__}: {error}")
+                self._failed(error)
+            else:
+                query.reply(f"omnibench/{name}/{service}", answer, encoding=zenoh.Encoding.APPLICATION_JSON)
 
-    def _reply(self, query: zenoh.Query, key: str, name: str, service: str) -> None:
+    def _serve(self, name: str, service: str, query: zenoh.Query) -> Mapping[str, Any] | Model:
+        tracker = self._trackers[name]
         payload = b"" if query.payload is None else query.payload.to_bytes()
         parameters = dict(cast(Iterable[tuple[str, str]], query.parameters))
-        try:
-            answer = self._serve(name, service, payload, parameters)
-        except OmnibenchError as error:
-            query.reply_err(to_json({"robot": name, "error": str(error)}), encoding=zenoh.Encoding.APPLICATION_JSON)
-            return
-        query.reply(key, to_json(answer), encoding=zenoh.Encoding.APPLICATION_JSON)
-
-    def _serve(self, name: str, service: str, payload: bytes, parameters: dict[str, str]) -> Mapping[str, Any] | Model:
-        tracker = self._trackers[name]
         if service == "info":
             return self._info(tracker)
         if service == "health":
@@ -130,7 +152,7 @@ class Desk:
         if service == "swap":
             return self._swap(name, payload)
         if service == "set_pose":
-            order = _order(payload, parameters)
+            order = read_pose(payload, parameters)
             deviations = np.array([order.position_sigma, order.position_sigma, order.heading_sigma])
             tracker.set_pose(np.array([order.x, order.y, order.theta]), np.diag(deviations**2))
             LOG.info("%s: pose set to %.3f m, %.3f m, %.1f deg", name, order.x, order.y, math.degrees(order.theta))
@@ -140,9 +162,6 @@ class Desk:
         return {"robot": name, "done": "reset"}
 
     def _take_calibration(self, name: str, sample: zenoh.Sample) -> None:
-        """A calibration that was put: there is nobody to answer (unlike ``swap``), so health and log tell."""
-        if sample.kind != zenoh.SampleKind.PUT:
-            return
         try:
             self._swap(name, sample.payload.to_bytes())
         except OmnibenchError:
@@ -150,47 +169,53 @@ class Desk:
 
     def _swap(self, name: str, payload: bytes) -> Mapping[str, Any]:
         tracker = self._trackers[name]
-        where = f"omnibench/{name}/calibration"
         try:
-            if len(payload) > _LONGEST:
-                raise DataError(f"{where}: {len(payload)} bytes are no calibration file")
-            try:
-                text = payload.decode()
-            except UnicodeDecodeError as error:
-                raise DataError(f"{where}: not a text in UTF-8: {error}") from None
-            calibration = parse_calibration(text, where)
+            calibration = read_sent_calibration(payload, f"omnibench/{name}/calibration")
         except DataError as error:
             tracker.refuse_swap(str(error))
-            LOG.warning("%s: calibration refused, %s runs on: %s", name, tracker.calibration.name, error)
+            self._tell_refusal(tracker, error)
             raise
         try:
             tracker.swap(calibration)
         except DataError as error:
-            LOG.warning("%s: calibration refused, %s runs on: %s", name, tracker.calibration.name, error)
+            self._tell_refusal(tracker, error)
             raise
         LOG.info("%s: calibration %r runs", name, calibration.name)
-        if name in self._memories:
-            self._memories[name].keep_calibration(calibration, self._calibrations[name])
-        return {"robot": name, "accepted": True, "calibration": calibration.name}
+        answer = {"robot": name, "accepted": True, "calibration": calibration.name, "kept": True}
+        reason = self._not_kept(name, calibration)
+        return answer if reason is None else answer | {"kept": False, "reason": reason}
+
+    def _tell_refusal(self, tracker: RobotTracker, error: DataError) -> None:
+        if self._quiet.lets(f"calibration of {tracker.name}"):
+            LOG.warning("%s: calibration refused, %s runs on: %s", tracker.name, tracker.calibration.name, error)
+
+    def _not_kept(self, name: str, calibration: Calibration) -> str | None:
+        """Keep a calibration that runs; None, or why the node's next start will not be with it."""
+        if name not in self._memories:
+            return "the node has no `state`, so that its next start is with the config's calibration"
+        try:
+            self._memories[name].keep_calibration(calibration)
+        except OmnibenchError as error:
+            LOG.warning("%s: calibration %r runs, but not after a restart: %s", name, calibration.name, error)
+            return str(error)
+        return None
 
 
 def _direct(callback: Callable[[Any], None]) -> Any:
     return Callback(callback, indirect=False)
 
 
-def _order(payload: bytes, parameters: dict[str, str]) -> PoseOrder:
-    where = "set_pose"
-    if not payload:
-        return validate(PoseOrder, parameters, where)
-    try:
-        content = parse_yaml(payload.decode(), where)  # of which JSON is a part
-    except UnicodeDecodeError:
-        raise ConfigError(f"{where}: the payload is not text; send x, y (m) and theta (rad) in JSON") from None
-    return validate(PoseOrder, content, where)
+def _size(content: zenoh.ZBytes | None) -> int:
+    return 0 if content is None else len(content)
+
+
+def _refuse(query: zenoh.Query, name: str, reason: str) -> None:
+    answer = to_json({"robot": name, "error": one_line(reason)})
+    query.reply_err(answer, encoding=zenoh.Encoding.APPLICATION_JSON)
 
 
 def _pose_answer(tracker: RobotTracker, parameters: dict[str, str]) -> Mapping[str, Any]:
-    found = tracker.pose_at(_time(parameters["at"]) if "at" in parameters else None)
+    found = tracker.pose_at(read_time(parameters["at"]) if "at" in parameters else None)
     answer: dict[str, Any] = {"robot": tracker.name, "at": found.stamp / 1e9, "at_ns": found.stamp}
     answer["odom"] = _planar(found.odometry)
     answer["map"] = None
@@ -203,13 +228,3 @@ def _pose_answer(tracker: RobotTracker, parameters: dict[str, str]) -> Mapping[s
 def _planar(pose: Array) -> dict[str, float]:
     x, y, theta = pose.tolist()
     return {"x": x, "y": y, "theta": theta}
-
-
-def _time(text: str) -> int:
-    """A time in s (or ns, if it is that large) as ns, without going through a float, which has steps of 0.2 us."""
-    try:
-        number = Decimal(text)
-        nanoseconds = int(number) if abs(number) >= _NANOSECONDS else int((number * 10**9).to_integral_value())
-    except (InvalidOperation, OverflowError, ValueError):
-        raise ConfigError(f"at: {text!r} is not a time; give s since 1970, as 1800000000.25") from None
-    return nanoseconds

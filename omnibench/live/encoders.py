@@ -83,6 +83,8 @@ class JointStateDecoder:
         if like is None or len(payload) != self._length or any(payload[at] != was for at, was in self._known):
             return self._learn(payload)
         seconds, nanoseconds = struct.unpack_from("<iI", payload, _STAMP_AT)
+        if nanoseconds >= _SECOND:
+            return self._learn(payload)  # which refuses it
         count, positions, velocities = self._joints, self._positions, self._velocities
         return JointState(
             seconds * _SECOND + nanoseconds,
@@ -98,7 +100,8 @@ class JointStateDecoder:
         self._template = None
         count = len(message.names)
         place = len(payload) - 4  # of the number of efforts
-        if payload[:4] != b"\x00\x01\x00\x00" or payload[place:] != bytes(4) or not count:
+        numbers_given = count and (message.positions is not None or message.velocities is not None)
+        if payload[:4] != b"\x00\x01\x00\x00" or payload[place:] != bytes(4) or not numbers_given:
             return message
         size = 8 * count
         self._velocities = self._positions = 0

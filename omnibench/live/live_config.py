@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from omnibench.config import Model, read_model, read_yaml, validate
 from omnibench.errors import ConfigError, UnknownNameError
@@ -16,7 +17,17 @@ from omnibench.live.topics import Profile
 from omnibench.live.tracker import Frames
 from omnibench.live.wheels import WheelSettings
 
-FusionChoice = Literal["none", "ekf"] | FusionSettings
+
+def _form(value: Any) -> str:
+    """Which of the two forms a choice has, so that a mistake in one is not explained by the other."""
+    return "settings" if isinstance(value, Mapping | Model) else "name"
+
+
+_Form = Discriminator(_form)
+FusionChoice = Annotated[
+    Annotated[Literal["none", "ekf"], Tag("name")] | Annotated[FusionSettings, Tag("settings")], _Form
+]
+FramesChoice = Annotated[Annotated[Literal["prefixed"], Tag("name")] | Annotated[Frames, Tag("settings")], _Form]
 
 
 class RobotConfig(Model):
@@ -26,7 +37,12 @@ class RobotConfig(Model):
     calibration: Path = Field(description="calibration file")
     wheels: WheelSettings = WheelSettings()
     fusion: FusionChoice | None = Field(None, description="default: the node's")
-    frames: Frames | None = Field(None, description="default: map, odom, base_link; of several robots <name>/odom, ...")
+    frames: FramesChoice | None = Field(
+        None,
+        description="default: map, odom, base_link (REP-105); of several robots in a node map, <name>/odom, "
+        "<name>/base_link. tf is everybody's: prefixed names them so for a single robot, too, as robots of several "
+        "nodes on one network need it",
+    )
 
 
 class ReplaySource(ReplayConfig):
@@ -52,6 +68,13 @@ class LiveConfig(Model):
     foxglove: bool | int = Field(False, description="serve Foxglove's WebSocket on loopback; a number is the port")
     replay: ReplaySource = ReplaySource()
 
+    @field_validator("record")
+    @classmethod
+    def _is_mcap(cls, record: Path | None) -> Path | None:
+        if record is not None and record.suffix != ".mcap":
+            raise ValueError(f"{str(record)!r}: name a file that ends in .mcap")
+        return record
+
     @model_validator(mode="after")
     def _robots_differ(self) -> LiveConfig:
         names = [robot.name for robot in self.robots]
@@ -72,11 +95,17 @@ class LiveConfig(Model):
 
     def frames_of(self, robot: RobotConfig) -> Frames:
         """A robot's frames: tf is everybody's, so that those of several robots carry their names."""
-        if robot.frames is not None:
+        if isinstance(robot.frames, Frames):
             return robot.frames
-        if len(self.robots) == 1:
+        if robot.frames is None and len(self.robots) == 1:
             return Frames()
         return Frames(odom=f"{robot.name}/odom", base=f"{robot.name}/base_link")
+
+    def on_common_frames(self) -> list[str]:
+        """The robots that publish tf between frames whose names another node's robot has as well by default."""
+        common, fusing = Frames(), (robot for robot in self.robots if self.fusion_of(robot) is not None)
+        framed = ((robot.name, self.frames_of(robot)) for robot in fusing)
+        return [name for name, frames in framed if frames.odom == common.odom or frames.base == common.base]
 
 
 def read_live_config(path: Path | str) -> LiveConfig:

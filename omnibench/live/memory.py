@@ -8,11 +8,13 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
+import logging
 import os
 from contextlib import suppress
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import ValidationError
+from pydantic import Field, FiniteFloat, ValidationError, model_validator
 
 from omnibench.config import Model, read_model, to_yaml
 from omnibench.errors import ConfigError, DataError
@@ -20,20 +22,34 @@ from omnibench.files import remove, write_text
 from omnibench.robot.calibration import Calibration, read_calibration
 from omnibench.robot.kinematics import Array
 
+LOG = logging.getLogger("omnibench.live")
 _SLOT = 4096  # bytes
+
+SavedPose = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+SavedCovariance = Annotated[tuple[FiniteFloat, ...], Field(min_length=9, max_length=9)]
 
 
 class SavedState(Model):
-    """Where a robot was. stamp: ns, of the wheel sample; wall: unix time of its arrival, s; positions: wheel angles."""
+    """Where a robot was. stamp: ns, of the wheel sample; wall: unix time of its arrival, s; positions: wheel angles.
 
-    sequence: int
-    stamp: int
-    wall: float
-    positions: tuple[float, ...] | None
-    pose: tuple[float, float, float]
-    covariance: tuple[float, ...]
-    map_pose: tuple[float, float, float] | None = None
-    map_covariance: tuple[float, ...] | None = None
+    Poses in m, m, rad; covariances (3, 3), row by row.
+    """
+
+    sequence: int = Field(ge=0)
+    stamp: int = Field(ge=-(2**63), lt=2**63)
+    wall: FiniteFloat
+    positions: tuple[FiniteFloat, ...] | None
+    pose: SavedPose
+    covariance: SavedCovariance
+    map_pose: SavedPose | None = None
+    map_covariance: SavedCovariance | None = None
+
+    @model_validator(mode="after")
+    def _variances_are_not_negative(self) -> SavedState:
+        for covariance in (self.covariance, self.map_covariance or ()):
+            if min(covariance[::4], default=0.0) < 0:
+                raise ValueError("a variance is negative")
+        return self
 
 
 class SwappedCalibration(Model):
@@ -51,7 +67,7 @@ class RobotMemory:
         self._swapped = folder / f"{robot}.calibration.yaml"
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._file = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+            self._file: int | None = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
             raise ConfigError(f"{self._path}: cannot be written: {error.strerror}; choose another `state`") from None
         try:
@@ -60,13 +76,19 @@ class RobotMemory:
             os.close(self._file)
             raise ConfigError(f"{self._path}: another node is using it for robot {robot!r}; stop one of them") from None
         self._sequence = 0
+        self._configured = ""  # SHA-256 of the config's file when the node started
 
     def load(self) -> SavedState | None:
-        """The newest state that was written whole."""
+        """The newest state that was written whole, if there is one; a damaged one is told in the log."""
+        if self._file is None:
+            return None
         found: list[SavedState] = []
-        for slot in range(2):
-            with suppress(ValueError, ValidationError):  # torn, or never written
-                found.append(SavedState.model_validate(json.loads(os.pread(self._file, _SLOT, slot * _SLOT))))
+        slots = [os.pread(self._file, _SLOT, slot * _SLOT) for slot in range(2)]
+        for content in slots:
+            with suppress(ValueError, ValidationError, RecursionError):  # torn, or never written
+                found.append(SavedState.model_validate(json.loads(content)))
+        if not found and any(slots):
+            LOG.warning("%s: damaged; odom starts at its origin", self._path)
         newest = max(found, key=lambda state: state.sequence, default=None)
         self._sequence = 0 if newest is None else newest.sequence
         return newest
@@ -79,7 +101,9 @@ class RobotMemory:
         odometry: tuple[Array, Array],
         fused: tuple[Array, Array] | None,
     ) -> None:
-        """Write where the robot is; pairs are pose (3,) and covariance (3, 3)."""
+        """Write where the robot is; pairs are pose (3,) and covariance (3, 3). OSError when the disk refuses."""
+        if self._file is None:
+            return
         self._sequence += 1
         state = {
             "sequence": self._sequence,
@@ -94,25 +118,31 @@ class RobotMemory:
         text = json.dumps(state).encode().ljust(_SLOT - 1) + b"\n"
         os.pwrite(self._file, text, (self._sequence % 2) * _SLOT)
 
-    def keep_calibration(self, calibration: Calibration, configured: Path) -> None:
-        """Go on with this calibration after a restart, as long as the config's own file stays as it is."""
-        write_text(self._swapped, to_yaml(SwappedCalibration(instead_of=_digest(configured), calibration=calibration)))
+    def keep_calibration(self, calibration: Calibration) -> None:
+        """Go on with this calibration after a restart, as long as the config's own file stays what it was at the start.
+
+        DataError when the disk refuses.
+        """
+        write_text(self._swapped, to_yaml(SwappedCalibration(instead_of=self._configured, calibration=calibration)))
 
     def calibration(self, configured: Path) -> Calibration:
         """The calibration to start with: the last one swapped in, unless the config's file has changed since."""
+        self._configured = _digest(configured)
         if self._swapped.exists():
             try:
                 kept = read_model(SwappedCalibration, self._swapped)
             except ConfigError as error:
                 raise DataError(f"{error}; remove {self._swapped} to start with {configured}") from None
-            if kept.instead_of == _digest(configured):
+            if kept.instead_of == self._configured:
                 return kept.calibration
             remove(self._swapped)
         return read_calibration(configured)
 
     def close(self) -> None:
-        """Let another node use it."""
-        os.close(self._file)
+        """Let another node use it. May be called twice."""
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
 
 
 def _digest(path: Path) -> str:

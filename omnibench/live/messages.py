@@ -159,6 +159,8 @@ def _header(stamp: int, frame: str) -> Any:
 
 
 def _stamp(header: Any) -> int:
+    if header.stamp.nanosec >= _SECOND:
+        raise MessageError(f"its stamp has {header.stamp.nanosec} ns within a second")
     return int(header.stamp.sec) * _SECOND + int(header.stamp.nanosec)
 
 

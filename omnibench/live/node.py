@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import gc
 import logging
+import math
+import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
-import zenoh
-
 from omnibench.environment import package_versions
+from omnibench.errors import ConfigError, one_line
 from omnibench.live.desk import Desk
 from omnibench.live.health import Health
 from omnibench.live.live_config import LiveConfig, RobotConfig
 from omnibench.live.memory import RobotMemory
+from omnibench.live.presence import alive_robots
+from omnibench.live.quiet import Quiet
 from omnibench.live.service import RobotService
 from omnibench.live.session import open_session
 from omnibench.live.topics import TOPICS, GraphNode, KeySpace
@@ -24,10 +28,12 @@ from omnibench.robot.calibration import Calibration, read_calibration
 
 LOG = logging.getLogger("omnibench.live")
 _TICK = 1.0  # s
+_TURN = 0.0005  # s that a thread has the interpreter while others wait
+_LOOKING = 0.5  # s, for other robots on the network
 
 
 class LiveNode:
-    """Runs from its making until ``close``. ConfigError or DataError when it cannot start.
+    """Runs from its making until ``close``. ConfigError or DataError when it cannot start; then nothing stays open.
 
     remember: use the config's ``state``, if it has one; a replay starts afresh.
     """
@@ -36,39 +42,35 @@ class LiveNode:
         self.config = config
         self.keys = KeySpace(config.profile, config.domain)
         self._memories: dict[str, RobotMemory] = {}
-        try:
+        self._services: list[RobotService] = []
+        self._quiet = Quiet(math.inf)
+        self._stop = threading.Event()
+        with ExitStack() as started:  # what is last started is first closed
             if remember and config.state is not None:
                 for robot in config.robots:
-                    self._memories[robot.name] = RobotMemory(config.state, robot.name)
+                    self._memories[robot.name] = memory = RobotMemory(config.state, robot.name)
+                    started.callback(memory.close)
             self.trackers = {robot.name: self._tracker(robot) for robot in config.robots}
             self.session = open_session(config.zenoh, f"node {config.name}")
-        except BaseException:
-            for memory in self._memories.values():
-                memory.close()
-            raise
-        self.graph = GraphNode(self.session, self.keys, config.name)
-        self._services = [
-            RobotService(self.graph, tracker, fusing=config.fusion_of(robot) is not None)
-            for robot, tracker in zip(config.robots, self.trackers.values(), strict=True)
-        ]
-        files = {robot.name: robot.calibration for robot in config.robots}
-        self._desk = Desk(self.session, self.trackers, self._info, self._memories, files)
-        self._stop = threading.Event()
-        self._ticking = threading.Thread(target=self._tick, name="diagnostics", daemon=True)
-        self._ticking.start()
-        gc.freeze()  # what is there now stays: the collector need not look at it between two samples
+            started.callback(self.session.close)
+            self._look_around()
+            self.graph = GraphNode(self.session, self.keys, config.name)
+            for robot in config.robots:
+                fusing = config.fusion_of(robot) is not None
+                service = RobotService(self.graph, self.trackers[robot.name], fusing=fusing)
+                self._services.append(service)
+                started.callback(service.close)
+            desk = Desk(self.session, self.trackers, self._info, self._memories)
+            started.callback(desk.close)
+            self._ticking = threading.Thread(target=self._tick, name="diagnostics", daemon=True)
+            self._ticking.start()
+            started.callback(self._stop_ticking)
+            started.enter_context(_undisturbed())
+            self._started = started.pop_all()
 
     def close(self) -> None:
-        """Stop taking messages, write states down, leave."""
-        if self._stop.is_set():
-            return
-        self._stop.set()
-        self._ticking.join()
-        for service in self._services:
-            service.close()
-        self._desk.close()
-        self.session.close()
-        gc.unfreeze()
+        """Take no more orders, then no more messages; write states down; leave."""
+        self._started.close()
 
     def __enter__(self) -> LiveNode:
         return self
@@ -82,9 +84,11 @@ class LiveNode:
 
     def _tracker(self, robot: RobotConfig) -> RobotTracker:
         memory = self._memories.get(robot.name)
+        calibration = self._calibration(robot, memory)
+        _check_joints(robot, calibration)
         tracker = RobotTracker(
             robot.name,
-            self._calibration(robot, memory),
+            calibration,
             wheels=robot.wheels,
             fusion=self.config.fusion_of(robot),
             frames=self.config.frames_of(robot),
@@ -119,10 +123,72 @@ class LiveNode:
             "versions": package_versions(),
         }
 
+    def _look_around(self) -> None:
+        """Who else is there. Two nodes for one robot would publish every stamp twice: ConfigError.
+
+        tf is everybody's, and two robots on frames of the same names tear one another's apart: a warning.
+        """
+        others = set(alive_robots(self.session, _LOOKING))
+        for name in self.trackers:
+            if name in others:
+                raise ConfigError(
+                    f"robot {name!r} is run by another node already; stop that, or give this one's another name"
+                )
+        common = self.config.on_common_frames()
+        if others and common:
+            LOG.warning(
+                "robot %s publishes tf between map, odom and base_link, and so may %s on the same network; "
+                "`frames: prefixed` makes them %s/odom and %s/base_link",
+                *(common[0], ", ".join(sorted(others)), common[0], common[0]),
+            )
+
     def _tick(self) -> None:
         while not self._stop.wait(_TICK):
             for service in self._services:
                 try:
                     service.tick()
-                except zenoh.ZError as error:
-                    LOG.error("%s: diagnostics: %s", service.tracker.name, error)
+                except Exception as error:  # of one robot; the others' go on
+                    name = service.tracker.name
+                    if self._quiet.lets(f"{name} {type(error).__name__}"):
+                        LOG.error("%s: diagnostics: %s: %s", name, type(error).__name__, one_line(str(error)))
+
+    def _stop_ticking(self) -> None:
+        self._stop.set()
+        self._ticking.join()
+
+
+def _check_joints(robot: RobotConfig, calibration: Calibration) -> None:
+    joints, wheels = robot.wheels.joints, calibration.robot.wheel_names
+    if joints is not None and (len(joints) != len(wheels) or len(set(joints)) < len(joints)):
+        raise ConfigError(
+            f"robot {robot.name!r}: wheels.joints: {', '.join(joints) or 'none'}; name one joint, and a different one, "
+            f"for each of the wheels {', '.join(wheels)}"
+        )
+
+
+_running = 0  # nodes of this process
+_running_lock = threading.Lock()
+_usual_turn = sys.getswitchinterval()
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """While any node of this process runs, nothing else keeps the interpreter from a sample for long.
+
+    The collector need not look at what was there at the start, and a thread that works on and on (the desk on a large
+    calibration) gives way after 0.5 ms in place of 5.
+    """
+    global _running
+    with _running_lock:
+        _running += 1
+        gc.collect()
+        gc.freeze()
+        sys.setswitchinterval(_TURN)
+    try:
+        yield
+    finally:
+        with _running_lock:
+            _running -= 1
+            if not _running:
+                gc.unfreeze()
+                sys.setswitchinterval(_usual_turn)

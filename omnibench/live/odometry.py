@@ -48,7 +48,7 @@ class Motion:
 
 
 class LiveOdometry:
-    """Pose and twist of one robot with covariances; they never jump, also when the calibration is swapped.
+    """Pose and twist of one robot with covariances; they never jump, also when the calibration changes.
 
     The covariance is the sum of what the noise model's random walk adds along the way (bent by the heading's own error)
     and of the uncertainty of the matrix, which errs in the same way all the time and therefore adds up.
@@ -58,11 +58,22 @@ class LiveOdometry:
 
     def __init__(self, calibration: Calibration, standstill: float = 0.01) -> None:
         self._standstill = standstill
-        self._walked = _Walked()
         self._stream = calibration.model.stream()
         self.twist: Array = np.zeros(3)
         self._duration = calibration.sample_period
-        self._use(calibration)
+        noise = calibration.noise or UNKNOWN_NOISE
+        self._position_walk = noise.walk_position**2 or UNKNOWN_NOISE.walk_position**2 / 100
+        self._heading_walk = noise.walk_heading**2 or UNKNOWN_NOISE.walk_heading**2 / 100
+        self._walked = _Walked()
+        wheels = len(calibration.robot.wheels)
+        self._slopes = _Slopes(wheels, calibration.integration)
+        self._elements: Array | None = None
+        self._blocks = np.zeros((3, wheels, wheels))
+        if calibration.covariance is not None:
+            self._elements = np.array(calibration.covariance)[: 3 * wheels, : 3 * wheels]
+            by_row = self._elements.reshape(3, wheels, 3, wheels)
+            self._blocks = np.stack([by_row[row, :, row] for row in range(3)])
+        self._of_matrix = [0.0, 0.0, 0.0]  # variances of the twist by the matrix's uncertainty
 
     @property
     def pose(self) -> Array:
@@ -93,37 +104,23 @@ class LiveOdometry:
         self._walked.set(covariance)
         self._slopes.clear()
 
-    def swap(self, calibration: Calibration) -> None:
-        """Go on with another calibration from the same pose; what is uncertain by now stays uncertain."""
-        self._walked.set(self.covariance)
-        self._stream = calibration.model.stream(self.pose)
-        self._use(calibration)
-
-    def _use(self, calibration: Calibration) -> None:
-        noise = calibration.noise or UNKNOWN_NOISE
-        self._position_walk = noise.walk_position**2 or UNKNOWN_NOISE.walk_position**2 / 100
-        self._heading_walk = noise.walk_heading**2 or UNKNOWN_NOISE.walk_heading**2 / 100
-        wheels = len(calibration.robot.wheels)
-        self._elements = None
-        self._blocks = np.zeros((3, wheels, wheels))
-        if calibration.covariance is not None:
-            self._elements = np.array(calibration.covariance)[: 3 * wheels, : 3 * wheels]
-            by_row = self._elements.reshape(3, wheels, 3, wheels)
-            self._blocks = np.stack([by_row[row, :, row] for row in range(3)])
-        self._slopes = _Slopes(wheels, calibration.integration)
-        self._of_matrix = [0.0, 0.0, 0.0]  # variances of the twist by the matrix's uncertainty
+    def continued(self, calibration: Calibration) -> LiveOdometry:
+        """Odometry with another calibration from the same pose on; what is uncertain by now stays uncertain."""
+        other = LiveOdometry(calibration, self._standstill)
+        other.resume(self.pose, self.covariance)
+        other.twist, other._duration = self.twist, self._duration
+        return other
 
     def step(self, step: WheelStep) -> Motion:
         """Take a wheel step; the motion that it made."""
-        before = self._stream.pose
+        before, twist = self._stream.pose, self.twist
         self._stream.drive(step.angles)
         moved = self._stream.moved
         if step.duration > 0:
-            rates = step.angles / step.duration
-            self.twist = moved / step.duration
+            self.twist = self._stream.matrix @ step.rates if step.blind else moved / step.duration
             self._duration = step.duration
-            self._of_matrix = ((self._blocks @ rates) @ rates).tolist()
-        position, heading = self._variances(step, moved)
+            self._of_matrix = ((self._blocks @ step.rates) @ step.rates).tolist()
+        position, heading = self._variances(step, moved, twist)
         self._spread(before, step.angles, position, heading)
         return Motion(
             step.stamp, step.duration, moved, self._stream.integration, *self._of_filter(step, position, heading)
@@ -140,17 +137,16 @@ class LiveOdometry:
         ]
         return self.covariance + np.diag(growth)
 
-    def _variances(self, step: WheelStep, moved: Array) -> tuple[float, float]:
-        """What the step's noise adds to the variances of position and heading."""
+    def _variances(self, step: WheelStep, moved: Array, twist: Array) -> tuple[float, float]:
+        """What the step's noise adds to the variances of position and heading; twist: before it."""
         still = max(map(abs, step.angles.tolist())) <= _STILL * step.duration
         share = self._standstill if still and not step.blind else 1.0
         position, heading = share * self._position_walk * step.duration, share * self._heading_walk * step.duration
         if step.blind:
-            if step.counted:
-                length, turn = math.hypot(moved[0], moved[1]), 0.0
-            else:
-                length = math.hypot(self.twist[0], self.twist[1]) * step.blind
-                turn = abs(float(self.twist[2])) * step.blind
+            length, turn = math.hypot(moved[0], moved[1]), 0.0
+            if not step.counted:  # it may have gone on as before, or as after, or have stood
+                length = step.blind * max(math.hypot(each[0], each[1]) for each in (twist, self.twist))
+                turn = step.blind * max(abs(float(each[2])) for each in (twist, self.twist))
             position += (_BLIND_SHARE * length) ** 2
             heading += (_BLIND_SHARE * turn) ** 2
         return position, heading

@@ -30,6 +30,11 @@ def alive_robots(session: zenoh.Session, timeout: float = 1.0) -> tuple[str, ...
 
 def unheard(robot: str, seconds: float, alive: tuple[str, ...]) -> str:
     """One line for a robot from which nothing came in ``seconds``, with those that are there and the nearest name."""
+    if robot in alive:
+        return (
+            f"robot {robot!r} is alive, but nothing was heard of it in {seconds:.0f} s; perhaps no wheel samples come, "
+            f"or its profile is another: omnibench/{robot}/info tells"
+        )
     others = f"alive: {', '.join(alive)}" if alive else "no robot is alive; is its node running, and connected to here?"
     return f"robot {robot!r}: nothing was heard of it in {seconds:.1f} s; {nearest(robot, alive)}{others}"
 

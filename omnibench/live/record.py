@@ -56,7 +56,11 @@ def record(
             status.show(status_line(recorder, passed), passed)
     if recorder.failure is not None:
         raise DataError(recorder.failure)
-    status.tell(status_line(recorder, time.monotonic() - began))
+    seconds_recorded = time.monotonic() - began
+    if not silence_told:
+        for robot in _silent(recorder, robots):
+            status.tell(unheard(robot, seconds_recorded, alive_robots(session)))
+    status.tell(status_line(recorder, seconds_recorded))
     for name in sorted(recorder.counts.keys() | recorder.undecodable.keys()):
         status.tell(f"  {name}: {recorder.counts[name]:,}{_left_out(recorder.undecodable[name])}")
     return recorder

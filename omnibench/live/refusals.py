@@ -38,6 +38,7 @@ _REASONS: Final = (  # what Zenoh says of users, and what it means
     ("Invalid user", "unknown user"),
     ("Expected extension", "no user and password given"),
 )
+_CONSEQUENCES: Final = ("Unknown subscriber", "Unknown queryable", "Unknown token")  # undeclared, and never let in
 _IDENTITIES: Final = (("CertCommonName", "certificate"), ("Username", "user"))
 _PIPE_SIZE: Final = 1 << 20
 _PAUSE: Final = 0.02  # s; many lines at a time cost less than one by one
@@ -96,7 +97,7 @@ class Refusals:
             self._take_handshake(thread, text)
         elif target.startswith("zenoh_link"):
             self._refuse(f"a connection: {text.split('. Hint:')[0]}")
-        elif found["level"] == "ERROR":
+        elif found["level"] == "ERROR" and not text.startswith(_CONSEQUENCES):
             self._refuse(f"zenoh: {text}", refused=False)
         return True
 

@@ -11,11 +11,11 @@ import zenoh
 from omnibench.live.encoders import OdometryEncoder, TransformsEncoder
 from omnibench.live.health import Health, diagnostic
 from omnibench.live.messages import Diagnostics
+from omnibench.live.quiet import Quiet
 from omnibench.live.topics import GraphNode
 from omnibench.live.tracker import RobotTracker, Update
 
 LOG = logging.getLogger("omnibench.live")
-_PATIENCE = 10.0  # s between two lines of the same kind
 
 
 class RobotService:
@@ -27,6 +27,10 @@ class RobotService:
     def __init__(self, graph: GraphNode, tracker: RobotTracker, *, fusing: bool) -> None:
         name = tracker.name
         self.tracker = tracker
+        self._quiet = Quiet()
+        self._closed = False
+        self._anomalies: dict[str, int] = {}
+        self._status = ""
         self._order = threading.Lock()  # wheel samples may come over several links: one after another goes out
         self._odometry = graph.publisher(name, "odom")
         frames = tracker.frames
@@ -40,9 +44,6 @@ class RobotService:
         if fusing:
             self._inputs.append(graph.subscribe(name, "slam_pose", self._take_pose))
         self._token = graph.session.liveliness().declare_token(f"omnibench/{name}/alive")
-        self._told: dict[str, float] = {}
-        self._anomalies: dict[str, int] = {}
-        self._status = ""
 
     def tick(self) -> None:
         """Publish the diagnostics, and log what has changed; once a second."""
@@ -56,6 +57,7 @@ class RobotService:
         for subscriber in self._inputs:
             subscriber.undeclare()
         with self._order:
+            self._closed = True
             self._token.undeclare()
             self.tracker.close()
 
@@ -63,6 +65,8 @@ class RobotService:
         arrival = time.monotonic()
         try:
             with self._order:
+                if self._closed:  # a callback that was on its way
+                    return
                 for update in self.tracker.take_wheels(sample.payload.to_bytes(), arrival):
                     self._publish(update)
         except Exception as error:  # Zenoh would print it; the stream has to go on
@@ -81,8 +85,8 @@ class RobotService:
             self._transforms.put_encoded(self._encode_transforms(update.transforms))
 
     def _failed(self, what: str, error: Exception) -> None:
-        self.tracker.counts.failures += 1
-        if self._is_time_for(what):
+        self.tracker.count_failure()
+        if self._quiet.lets(what):
             LOG.error("%s: a %s message failed: %s: %s", self.tracker.name, what, type(error).__name__, error)
 
     def _log(self, health: Health) -> None:
@@ -92,14 +96,7 @@ class RobotService:
         anomalies = self.tracker.counts.anomalies()
         new = {kind: count - self._anomalies.get(kind, 0) for kind, count in anomalies.items()}
         told = ", ".join(f"{count} {kind}" for kind, count in new.items() if count)
-        if told and self._is_time_for("anomalies"):
+        if told and self._quiet.lets("anomalies"):
             self._anomalies = anomalies
             last = f"; the last: {health.last_refusal}" if health.last_refusal else ""
             LOG.warning("%s: %s%s", health.robot, told, last)
-
-    def _is_time_for(self, kind: str) -> bool:
-        now = time.monotonic()
-        if now - self._told.get(kind, -_PATIENCE) < _PATIENCE:
-            return False
-        self._told[kind] = now
-        return True

@@ -12,15 +12,20 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import advance
 
 _SECOND = 1e9  # ns
+_MOST_A_SECOND = 2000  # samples; a sender with nonsense for stamps shall not fill the memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fix:
-    """A pose in the map at its own time. absolute: it replaces what the filter believes, instead of correcting it."""
+    """A pose in the map at its own time.
+
+    arrival: s, monotonic. absolute: it replaces what the filter believes, instead of correcting it.
+    """
 
     stamp: int
     pose: Array
     covariance: Array
+    arrival: float = 0.0
     absolute: bool = False
 
 
@@ -40,10 +45,11 @@ class Entry:
 
 
 class Timeline:
-    """Entries of at least the last ``seconds``, by stamp; there is always one, once one was added."""
+    """Entries of at least the last ``seconds`` (up to 2 kHz), by stamp; one at least, once one was added."""
 
     def __init__(self, seconds: float) -> None:
         self._length = int(seconds * _SECOND)
+        self._most = int(seconds * _MOST_A_SECOND)
         self.entries: list[Entry] = []
         self._stamps: list[int] = []
 
@@ -59,10 +65,13 @@ class Timeline:
         """Add the newest entry and forget what is too old."""
         self.entries.append(entry)
         self._stamps.append(entry.stamp)
+        first = 0
         if self._stamps[0] < entry.stamp - 2 * self._length:  # now and then, many at once
             first = bisect_left(self._stamps, entry.stamp - self._length) - 1
-            if first > 0:
-                del self.entries[:first], self._stamps[:first]
+        elif len(self._stamps) > 2 * self._most:
+            first = self._most
+        if first > 0:
+            del self.entries[:first], self._stamps[:first]
 
     def restart(self, stamp: int) -> None:
         """Keep the newest entry alone, at another time: the clock jumped, or all before has no meaning any more."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field, model_validator
 
 from omnibench.config import Model
 from omnibench.errors import DataError
@@ -23,19 +24,32 @@ from omnibench.live.timeline import Entry, Fix, Timeline
 from omnibench.live.wheels import WheelInput, WheelSettings, WheelStep
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import correction
 
 _HISTORY = 5.0  # s of odometry without fusion
 _SAVING = 0.1  # s between states written
 _OTHER_ROBOT = 0.5  # of a row's largest element; no calibration moves a matrix so far from its design
+_FARTHEST = 1e7  # m; no robot has come as far
+_SUREST = 1e-7  # m, rad; no SLAM is as sure
+_UNSAVED = 10.0  # s until a state that could not be written is tried again
 _SECOND = 1e9  # ns
+
+
+FrameName = Annotated[str, Field(pattern=r"^[^\s/][^\s]*$", max_length=200)]
 
 
 class Frames(Model):
     """Names of the coordinate frames (REP-105)."""
 
-    map: str = "map"
-    odom: str = "odom"
-    base: str = "base_link"
+    map: FrameName = "map"
+    odom: FrameName = "odom"
+    base: FrameName = "base_link"
+
+    @model_validator(mode="after")
+    def _differ(self) -> Frames:
+        if len({self.map, self.odom, self.base}) < 3:
+            raise ValueError(f"map, odom and base must differ: {self.map}, {self.odom}, {self.base}")
+        return self
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,22 +92,17 @@ class RobotTracker:
         self.counts = Counts()
         self.frames = frames or Frames()
         self._stale_after = stale_after
-        self._settings = fusion
         self._memory = memory
         self._lock = threading.RLock()
         self._wheels = WheelInput(
             calibration.robot.wheel_names, wheels or WheelSettings(), calibration.sample_period, self.counts
         )
-        self._odometry = LiveOdometry(calibration, fusion.standstill if fusion else 1.0)
+        self._odometry = LiveOdometry(calibration, (fusion or FusionSettings()).standstill)
         self._timeline = Timeline(fusion.history if fusion else _HISTORY)
         self._fusion = Fusion(fusion, self._timeline, self.counts) if fusion else None
         self._stamps = PublishedStamps()
         self._decode = JointStateDecoder().decode
         self._arrival: float | None = None  # of the last wheel sample
-        self._began: float | None = None
-        self._pose_arrival: float | None = None
-        self._outcome: Outcome | None = None
-        self._rejected_in_a_row = 0
         self._last_refusal = ""
         self._last_swap: SwapRecord | None = None
         self._saved = -np.inf
@@ -126,27 +135,22 @@ class RobotTracker:
             if self._fusion is None:
                 return None
             try:
-                fix = self._fix(payload)
+                return self._fusion.correct(self._fix(payload, arrival))
             except MessageError as error:
                 self._last_refusal = str(error)
                 return None
-            self._outcome = self._fusion.correct(fix)
-            self._rejected_in_a_row = self._rejected_in_a_row + 1 if self._outcome == "rejected" else 0
-            if self._outcome in ("fused", "located", "reacquired", "waiting"):
-                self._pose_arrival = arrival
-            return self._outcome
 
     def swap(self, calibration: Calibration) -> None:
         """Go on with another calibration from the next sample on. DataError: it is not this robot's."""
         with self._lock:
             try:
                 self._check(calibration)
+                odometry = self._odometry.continued(calibration)
             except DataError as error:
                 self.counts.swaps_refused += 1
                 self._last_swap = SwapRecord(accepted=False, name=calibration.name, reason=str(error), at=time.time())
                 raise
-            self._odometry.swap(calibration)
-            self.calibration = calibration
+            self._odometry, self.calibration = odometry, calibration
             self.counts.swaps += 1
             self._last_swap = SwapRecord(accepted=True, name=calibration.name, reason="runs", at=time.time())
             self._save()
@@ -217,6 +221,11 @@ class RobotTracker:
                 last_swap=self._last_swap,
             )
 
+    def count_failure(self) -> None:
+        """A message that omnibench itself failed on."""
+        with self._lock:
+            self.counts.failures += 1
+
     def close(self) -> None:
         """Write down where the robot is."""
         with self._lock:
@@ -273,7 +282,7 @@ class RobotTracker:
         to_odom = Transform(stamp, frames.map, frames.odom, correction(fused, pose))
         return Update(odometry, filtered, (to_odom, to_base))
 
-    def _fix(self, payload: bytes) -> Fix:
+    def _fix(self, payload: bytes, arrival: float) -> Fix:
         try:
             message = POSE_ESTIMATE.decode(payload)
         except MessageError:
@@ -284,13 +293,18 @@ class RobotTracker:
                 raise MessageError(f"the pose is in frame {message.frame!r}, not in {self.frames.map!r}")
             if not np.isfinite(message.pose).all() or not np.isfinite(message.covariance).all():
                 raise MessageError("the pose or its covariance is not finite")
+            if np.abs(message.pose[:2]).max() > _FARTHEST:
+                raise MessageError(f"the pose lies {np.abs(message.pose[:2]).max():.3g} m away")
             covariance = message.covariance if message.covariance.any() else self._usual_covariance()
-            if not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance)[0] <= 0:
+            least, *_, largest = np.linalg.eigvalsh(covariance)
+            if not np.allclose(covariance, covariance.T) or least <= 0:
                 raise MessageError("the pose's covariance is not positive definite")
+            if largest > _FARTHEST**2 or least < _SUREST**2:
+                raise MessageError(f"the pose's standard deviations reach from {least**0.5:.1e} to {largest**0.5:.1e}")
         except MessageError:
             self.counts.pose_invalid += 1
             raise
-        return Fix(message.stamp, message.pose, covariance)
+        return Fix(message.stamp, message.pose, covariance, arrival)
 
     def _usual_covariance(self) -> Array:
         """Of a pose that comes without: white noise and bias of the reference, as the calibration knows them."""
@@ -304,13 +318,14 @@ class RobotTracker:
         if calibration.robot.wheel_names != running:
             found = ", ".join(calibration.robot.wheel_names)
             raise DataError(f"calibration {calibration.name!r} has wheels {found}; this robot has {', '.join(running)}")
-        design = calibration.robot.inverse_kinematic_matrix
-        off = np.abs(calibration.matrix_array - design).max(axis=1) / np.abs(design).max(axis=1)
-        if off.max() > _OTHER_ROBOT:
-            raise DataError(
-                f"row {int(off.argmax()) + 1} of the matrix is {off.max():.0%} off the design of its robot "
-                f"{calibration.robot.name!r}; is it another robot's, or in other units?"
-            )
+        for robot in (calibration.robot, self.calibration.robot):
+            design = robot.inverse_kinematic_matrix
+            off = np.abs(calibration.matrix_array - design).max(axis=1) / np.abs(design).max(axis=1)
+            if off.max() > _OTHER_ROBOT:
+                raise DataError(
+                    f"row {int(off.argmax()) + 1} of the matrix is {off.max():.0%} off the design of robot "
+                    f"{robot.name!r}; is it another robot's, or in other units?"
+                )
 
     def _fusing(self, what: str) -> Fusion:
         if self._fusion is None:
@@ -322,23 +337,26 @@ class RobotTracker:
             return "waiting", "no wheel sample yet"
         if age > self._stale_after:
             return "stale", f"no wheel sample for {age:.1f} s"
-        if self._settings is None or self._fusion is None:
+        if self._fusion is None:
             return "ok", "odometry"
         if not self._fusion.located:
             return "degraded", "no pose of SLAM yet"
-        pose_age = None if self._pose_arrival is None else now - self._pose_arrival
-        if pose_age is None or pose_age > self._settings.stale_after:
-            return "degraded", "no pose of SLAM" + ("" if pose_age is None else f" for {pose_age:.1f} s")
+        silent = None if self._fusion.fused_at is None else now - self._fusion.fused_at
+        if silent is None or silent > self._fusion.settings.stale_after:
+            rejected = self._fusion.rejected_in_a_row
+            why = f", {rejected} rejected" if rejected else ""
+            return "degraded", "no pose of SLAM" + ("" if silent is None else f" fused for {silent:.1f} s") + why
         return "ok", "odometry and SLAM"
 
     def _fusion_health(self, now: float) -> FusionHealth | None:
-        if self._fusion is None:
+        fusion = self._fusion
+        if fusion is None:
             return None
         return FusionHealth(
-            located=self._fusion.located,
-            pose_age_s=None if self._pose_arrival is None else now - self._pose_arrival,
-            last_outcome=self._outcome,
-            rejected_in_a_row=self._rejected_in_a_row,
+            located=fusion.located,
+            pose_age_s=None if fusion.fused_at is None else now - fusion.fused_at,
+            last_outcome=fusion.outcome,
+            rejected_in_a_row=fusion.rejected_in_a_row,
         )
 
     def _measure_rate(self, now: float) -> None:
@@ -357,13 +375,9 @@ class RobotTracker:
         if self._fusion is not None and self._fusion.located:
             fused = self._fusion.pose, self._fusion.covariance
         wall = time.time() - (time.monotonic() - self._arrival)
-        self._memory.save(stamp, wall, positions, (self._odometry.pose, self._odometry.covariance), fused)
-
-
-def correction(in_map: Array, in_odom: Array) -> Array:
-    """The pose (3,) of frame odom in frame map, from the robot's pose in both."""
-    map_x, map_y, map_heading = in_map.tolist()
-    x, y, heading = in_odom.tolist()
-    turned = map_heading - heading
-    cosine, sine = math.cos(turned), math.sin(turned)
-    return np.array([map_x - cosine * x + sine * y, map_y - sine * x - cosine * y, turned])
+        try:
+            self._memory.save(stamp, wall, positions, (self._odometry.pose, self._odometry.covariance), fused)
+        except OSError as error:  # a full disk is no reason to stand still
+            self.counts.failures += 1
+            self._last_refusal = f"the state could not be written: {error.strerror}"
+            self._saved += _UNSAVED

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import Field, FiniteFloat, field_validator, model_validator
 
 from omnibench.config import Model, parse_yaml, read_yaml, to_yaml, validate
 from omnibench.errors import ConfigError, DataError
@@ -21,6 +21,7 @@ FORMAT: Final = "omnibench-calibration/1"
 _LARGEST_ELEMENT = 1e3  # m or rad per rad of wheel
 Row = tuple[FiniteFloat, ...]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Deviation = Annotated[float, Field(ge=0, le=1e3, allow_inf_nan=False)]
 
 
 class EffectTerm(Model):
@@ -33,12 +34,12 @@ class EffectTerm(Model):
 class Noise(Model):
     """Standard deviations of the reference's noise: white, random walk along the way, bias of a run."""
 
-    pose_position: NonNegative = Field(0.0, description="white noise of each pose, m")
-    pose_heading: NonNegative = Field(0.0, description="white noise of each pose, rad")
-    walk_position: NonNegative = Field(0.0, description="random walk, m per sqrt s")
-    walk_heading: NonNegative = Field(0.0, description="random walk, rad per sqrt s")
-    bias_position: NonNegative = Field(0.0, description="constant over a run, m")
-    bias_heading: NonNegative = Field(0.0, description="constant over a run, rad")
+    pose_position: Deviation = Field(0.0, description="white noise of each pose, m")
+    pose_heading: Deviation = Field(0.0, description="white noise of each pose, rad")
+    walk_position: Deviation = Field(0.0, description="random walk, m per sqrt s")
+    walk_heading: Deviation = Field(0.0, description="random walk, rad per sqrt s")
+    bias_position: Deviation = Field(0.0, description="constant over a run, m")
+    bias_heading: Deviation = Field(0.0, description="constant over a run, rad")
 
 
 class Provenance(Model):
@@ -89,16 +90,34 @@ class Calibration(Model):
             size = 3 * wheels + sum(len(term.parameters) for term in self.effects)
             if [len(row) for row in self.covariance] != [size] * size:
                 raise ValueError(f"covariance is not {size} x {size}")
+            _check_covariance(np.array(self.covariance))
         return self
+
+    @field_validator("name")
+    @classmethod
+    def _can_be_written(cls, name: str) -> str:
+        if not name.isprintable():
+            raise ValueError("holds what cannot be printed")
+        return name
 
     @property
     def model(self) -> OdometryModel:
-        """The odometry model that the file describes."""
+        """The odometry model that the file describes. DataError: it has effects, which no model runs yet."""
+        if self.effects:
+            raise DataError(f"calibration {self.name!r}: effect {self.effects[0].name!r} cannot be run; fit it without")
         return OdometryModel(self.robot, self.matrix_array, self.integration)
 
     @property
     def matrix_array(self) -> Array:
         return np.array(self.matrix)
+
+
+def _check_covariance(covariance: Array) -> None:
+    largest = float(np.abs(covariance).max())
+    if largest > _LARGEST_ELEMENT**2 or not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-9 * largest):
+        raise ValueError("covariance is not symmetric, or its values cannot be")
+    if np.linalg.eigvalsh(covariance)[0] < -1e-6 * largest:
+        raise ValueError("covariance is not positive semi-definite: it has a negative variance in some direction")
 
 
 def matrix_rows(matrix: Array) -> tuple[Row, Row, Row]:

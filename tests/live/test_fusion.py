@@ -150,6 +150,38 @@ def test_after_so_many_rejections_slam_is_believed() -> None:
     np.testing.assert_allclose(robot.fusion.pose, robot.truth[-1] + [5, 0, 0], atol=1e-9)
 
 
+def test_one_outlier_that_is_repeated_is_not_believed() -> None:
+    robot = Robot(reacquire_after=4).drive(100)
+    robot.see(0.1)
+    assert [robot.see(0.2, (1000, 0, 0)) for _ in range(20)] == ["rejected"] + ["duplicate"] * 19
+
+
+def test_outliers_that_contradict_each_other_are_not_believed() -> None:
+    robot = Robot(reacquire_after=4).drive(100)
+    robot.see(0.1)
+    outcomes = [robot.see(0.2 + 0.01 * k, (100.0 * (k + 1), -50.0 * k, 0)) for k in range(20)]
+    assert set(outcomes) == {"rejected"}
+
+
+def test_a_robot_that_was_carried_away_is_found_while_it_drives_on() -> None:
+    robot = Robot(reacquire_after=5).drive(10)
+    robot.see(0.1)
+    outcomes = []
+    for k in range(1, 8):
+        robot.drive(20)
+        outcomes.append(robot.see(0.1 + 0.2 * k, (3.0, -2.0, 0.0)))
+    assert outcomes[:5] == ["rejected"] * 4 + ["reacquired"]
+    assert outcomes[5:] == ["fused", "fused"]
+
+
+def test_a_sender_with_nonsense_for_stamps_does_not_fill_the_memory() -> None:
+    timeline = Timeline(2.0)
+    for number in range(20_000):
+        moved = motion(ORIGIN + 1000 * number, np.zeros(3), 1e-6)
+        timeline.append(Entry(moved.stamp, moved, np.zeros(3), np.zeros(3), R))
+    assert len(timeline.entries) <= 8000
+
+
 def test_one_good_pose_ends_the_count_of_rejections() -> None:
     robot = Robot(reacquire_after=3).drive(100)
     robot.see(0.1)

@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 import yaml
 import zenoh
-from commands import Command as InProcess
 from commands import CONFIGS, assert_refused, flower, omnibench, prepare, write_config
+from commands import Command as InProcess
+from drives import calibration
 from nodes import Command, as_text, write_node
 from sessions import free_port, raw_session, until
 
 import omnibench as package
 from omnibench.data.storage import load_dataset
-from omnibench.robot.calibration import read_calibration
+from omnibench.robot.calibration import read_calibration, write_calibration
 
 
 @pytest.fixture(scope="module")
@@ -191,6 +192,19 @@ def test_a_mistake_is_one_line(
     (tmp_path / "data").mkdir()
     refused = command(*arguments)
     assert_refused(refused, *parts)
+
+
+def test_a_recording_of_other_wheels_is_refused_before_it_is_played(command: InProcess, tmp_path: Path) -> None:
+    write_node(tmp_path, "apr")
+    write_calibration(calibration(wheels=4), tmp_path / "calibration.yaml")
+    write_config(tmp_path, datasets={"flower": {"simulate": flower()}})
+    refused = command("live", "node.yaml", "--replay", "small.yaml", "--speed", "max")
+    assert_refused(refused, "recording 'flower' has wheels a, b, c", "'synthetic 1' of robot 'apr' has fl, fr, rl, rr")
+
+
+def test_joints_for_other_wheels_are_refused_in_one_line(command: InProcess, tmp_path: Path) -> None:
+    write_node(tmp_path, robots=[{"name": "apr", "calibration": "calibration.yaml", "wheels": {"joints": ["a", "b"]}}])
+    assert_refused(command("live", "node.yaml"), "robot 'apr': wheels.joints: a, b;", "each of the wheels a, b, c")
 
 
 def wait_for(address: str) -> zenoh.Session:

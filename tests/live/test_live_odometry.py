@@ -16,7 +16,7 @@ from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
 
 def driven(odometry: LiveOdometry, angles: np.ndarray, durations: np.ndarray) -> LiveOdometry:
     for turned, duration in zip(np.diff(angles, axis=0), durations, strict=True):
-        odometry.step(WheelStep(0, float(duration), turned))
+        odometry.step(WheelStep(0, float(duration), turned, turned / duration))
     return odometry
 
 
@@ -65,10 +65,10 @@ def test_a_swapped_calibration_moves_the_next_sample_and_not_the_pose(scale: flo
     durations = np.full(100, 0.01)
     live = driven(LiveOdometry(path.calibration), path.angles[: place + 1], durations[:place])
     before, spread = live.pose.copy(), live.covariance
-    live.swap(other)
+    live = live.continued(other)
     np.testing.assert_array_equal(live.pose, before)
     np.testing.assert_allclose(live.covariance, spread, rtol=1e-12)
-    live.step(WheelStep(0, 0.01, np.array([0.01, 0.0, 0.0])))
+    live.step(step(0.01, [0.01, 0.0, 0.0]))
     moved = other.matrix_array @ [0.01, 0.0, 0.0]
     assert np.linalg.norm(live.pose[:2] - before[:2]) == pytest.approx(np.linalg.norm(moved[:2]), rel=1e-9)
 
@@ -76,9 +76,13 @@ def test_a_swapped_calibration_moves_the_next_sample_and_not_the_pose(scale: flo
 def test_the_twist_is_the_matrix_times_the_rates_in_the_robots_frame() -> None:
     live = LiveOdometry(calibration())
     for _ in range(3):
-        live.step(WheelStep(0, 0.01, np.array([0.01, -0.02, 0.005])))
+        live.step(step(0.01, [0.01, -0.02, 0.005]))
     np.testing.assert_allclose(live.twist, live_matrix(calibration()) @ [1.0, -2.0, 0.5], atol=1e-12)
     assert np.linalg.eigvalsh(live.twist_covariance)[0] > 0
+
+
+def step(duration: float, angles: list[float], **more: float) -> WheelStep:
+    return WheelStep(0, duration, np.array(angles), np.array(angles) / duration, **more)  # type: ignore[arg-type]
 
 
 def live_matrix(of: Calibration) -> np.ndarray:
@@ -88,22 +92,22 @@ def live_matrix(of: Calibration) -> np.ndarray:
 def test_noise_shrinks_while_no_wheel_turns() -> None:
     still, moving = (LiveOdometry(calibration(deviation=None), standstill=0.01) for _ in range(2))
     for _ in range(100):
-        still.step(WheelStep(0, 0.01, np.zeros(3)))
-        moving.step(WheelStep(0, 0.01, np.array([0.02, 0.02, 0.02])))
+        still.step(step(0.01, [0.0, 0.0, 0.0]))
+        moving.step(step(0.01, [0.02, 0.02, 0.02]))
     assert still.covariance[2, 2] == pytest.approx(0.01 * moving.covariance[2, 2], rel=1e-6)
 
 
 def test_what_nobody_saw_makes_the_pose_less_certain() -> None:
     seen, unseen = LiveOdometry(calibration()), LiveOdometry(calibration())
     for live, blind in ((seen, 0.0), (unseen, 3.0)):
-        live.step(WheelStep(0, 0.01, np.array([0.02, 0.01, -0.02])))
-        live.step(WheelStep(0, 3.0, np.array([6.0, 3.0, -6.0]), blind=blind))
+        live.step(step(0.01, [0.02, 0.01, -0.02]))
+        live.step(step(3.0, [6.0, 3.0, -6.0], blind=blind))
     assert unseen.covariance[0, 0] > seen.covariance[0, 0] + 0.01
 
 
 def test_the_covariance_grows_while_nothing_comes() -> None:
     live = LiveOdometry(calibration())
-    live.step(WheelStep(0, 0.01, np.array([0.02, 0.01, -0.02])))
+    live.step(step(0.01, [0.02, 0.01, -0.02]))
     traces = [float(np.trace(live.grown(seconds))) for seconds in (0.0, 0.5, 1.0, 5.0)]
     assert traces == sorted(traces)
     assert traces[-1] > 2 * traces[0]
@@ -112,5 +116,5 @@ def test_the_covariance_grows_while_nothing_comes() -> None:
 def test_a_calibration_without_noise_or_covariance_still_has_an_uncertain_pose() -> None:
     bare = calibration(deviation=None).model_copy(update={"noise": None})
     live = LiveOdometry(bare)
-    live.step(WheelStep(0, 0.01, np.array([0.02, 0.01, -0.02])))
+    live.step(step(0.01, [0.02, 0.01, -0.02]))
     assert np.linalg.eigvalsh(live.covariance)[0] > 0

@@ -1,38 +1,23 @@
-"""The node on Zenoh, with real sessions: what goes in, what comes out, what it answers."""
+"""The node on Zenoh, with real sessions: what goes in, what comes out, how it starts and ends."""
 
 from __future__ import annotations
 
-import json
+import gc
+import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import zenoh
-from drives import ORIGIN, SECOND, calibration, drive, slam
-from nodes import as_text, asked, config_of, running, sent
+from drives import SECOND, drive, slam
+from heard import Heard
+from nodes import asked, config_of, running, sent
 from sessions import until
 
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.live_config import LiveConfig, read_live_config
 from omnibench.live.messages import DIAGNOSTICS, ODOMETRY, TRANSFORMS, Odometry
 from omnibench.live.node import LiveNode
-
-
-class Heard:
-    """Everything that comes on some keys, decoded."""
-
-    def __init__(self, session: zenoh.Session, **kinds: Any) -> None:
-        self.messages: dict[str, list[Any]] = {key: [] for key in kinds}
-        self._subscribers = [
-            session.declare_subscriber(key.replace("__", "/"), self._taker(key, kind)) for key, kind in kinds.items()
-        ]
-
-    def _taker(self, key: str, kind: Any) -> Any:
-        return lambda sample: self.messages[key].append(kind.decode(sample.payload.to_bytes()))
-
-    def __getitem__(self, key: str) -> list[Any]:
-        return self.messages[key]
 
 
 def test_wheel_samples_become_the_batch_odometry_on_every_topic(tmp_path: Path) -> None:
@@ -119,109 +104,6 @@ def test_a_robots_token_comes_and_goes_with_the_node(tmp_path: Path) -> None:
         until(lambda: alive(session) == ["omnibench/apr/alive"], "one token")
 
 
-@pytest.fixture(scope="module")
-def driven(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """A node that has taken a drive of a second."""
-    path = drive(1.0)
-    with running(config_of(tmp_path_factory.mktemp("driven"))) as (node, session):
-        wheels = session.declare_publisher("apr/joint_states")
-        until(lambda: wheels.matching_status.matching, "the node's subscription")
-        sent(wheels, path.samples())
-        until(lambda: node.health("apr").counts["samples"] == 101, "the samples")
-        yield node, session, path
-
-
-def test_info_says_what_runs_and_where_its_topics_are(driven: Any) -> None:
-    answer = asked(driven[1], "omnibench/apr/info")
-    assert answer["calibration"] == "synthetic 1"
-    assert answer["topics"]["odom"] == "apr/odom"
-    assert answer["wheels"] == ["a", "b", "c"]
-
-
-def test_health_tells_the_counters(driven: Any) -> None:
-    answer = asked(driven[1], "omnibench/apr/health")
-    assert answer["counts"]["samples"] == 101
-    assert answer["status"] in ("degraded", "stale")
-
-
-def test_one_question_can_be_for_all_robots(driven: Any) -> None:
-    assert asked(driven[1], "omnibench/*/health")["robot"] == "apr"
-
-
-def test_the_calibration_is_given_as_it_runs(driven: Any) -> None:
-    assert asked(driven[1], "omnibench/apr/calibration")["matrix"][0] == list(calibration().matrix[0])
-
-
-@pytest.mark.parametrize("form", ["{0}.505", "{0}505000000"])
-def test_the_pose_at_a_time_is_interpolated(driven: Any, form: str) -> None:
-    _, session, path = driven
-    answer = asked(session, "omnibench/apr/pose?at=" + form.format(ORIGIN // SECOND))
-    assert answer["at_ns"] == ORIGIN + 505_000_000
-    assert answer["odom"]["theta"] == pytest.approx(path.poses[50:52, 2].mean(), abs=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("selector", "payload", "message"),
-    [
-        ("pose?at=yesterday", None, "at: 'yesterday' is not a time"),
-        ("pose?at=12", None, "at: 12.000000 s is not within"),
-        ("set_pose", '{"x": 1}', "set_pose: key 'y' is missing (and 1 more)"),
-        ("set_pose", '{"x": 1, "y": 2, "theta": 3, "z": 4}', "set_pose: unknown key 'z'"),
-        ("set_pose", b"\xff\xfe", "the payload is not text"),
-        ("calibration", "format: something", "put it there, or ask omnibench/apr/swap"),
-        ("swap", "format: something", "format is 'something', expected 'omnibench-calibration/1'"),
-        ("swap", "{", "not valid YAML"),
-        ("swap", b"\xff\xfe", "not a text in UTF-8"),
-    ],
-)
-def test_a_bad_order_is_refused_with_the_reason(driven: Any, selector: str, payload: Any, message: str) -> None:
-    answer = asked(driven[1], f"omnibench/apr/{selector}", payload)
-    assert message in answer["error"]
-
-
-def test_a_pose_can_be_set_and_reset(driven: Any) -> None:
-    _, session, _ = driven
-    assert asked(session, "omnibench/apr/set_pose", json.dumps({"x": 3, "y": 4, "theta": 1}))["done"] == "set_pose"
-    answer = asked(session, "omnibench/apr/pose")
-    assert (answer["map"]["x"], answer["map"]["y"], answer["map"]["theta"]) == (3, 4, 1)
-    assert asked(session, "omnibench/apr/reset")["done"] == "reset"
-    assert not asked(session, "omnibench/apr/health")["fusion"]["located"]
-
-
-def test_a_wildcard_resets_nobody(driven: Any) -> None:
-    _, session, _ = driven
-    assert list(session.get("omnibench/*/reset", timeout=1.0)) == []
-
-
-def test_a_calibration_that_is_put_runs_from_the_next_sample_on_and_odom_does_not_jump(tmp_path: Path) -> None:
-    path, other = drive(1.0), calibration(scale=1.2)
-    with running(config_of(tmp_path)) as (node, session):
-        heard = Heard(session, apr__odom=ODOMETRY)
-        wheels = session.declare_publisher("apr/joint_states")
-        until(lambda: wheels.matching_status.matching, "the node's subscription")
-        sent(wheels, path.samples()[:51])
-        until(lambda: len(heard["apr__odom"]) == 51, "the first half")
-        session.put("omnibench/apr/calibration", as_text(other))
-        until(lambda: node.health("apr").counts["swaps"] == 1, "the swap")
-        sent(wheels, path.samples()[51:])
-        until(lambda: len(heard["apr__odom"]) == 101, "the second half")
-    poses = np.array([each.pose for each in heard["apr__odom"]])
-    steps = np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)
-    before = np.linalg.norm(np.diff(path.poses[:, :2], axis=0), axis=1)
-    np.testing.assert_allclose(steps[:50], before[:50], atol=1e-9)
-    np.testing.assert_allclose(steps[50:], 1.2 * before[50:], rtol=1e-3)
-
-
-def test_a_bad_calibration_that_is_put_is_refused_and_told_in_health(tmp_path: Path) -> None:
-    with running(config_of(tmp_path)) as (node, session):
-        session.put("omnibench/apr/calibration", as_text(calibration(wheels=4)))
-        until(lambda: node.health("apr").counts["swaps_refused"] == 1, "the refusal")
-        swap = asked(session, "omnibench/apr/health")["last_swap"]
-        assert not swap["accepted"]
-        assert "has wheels fl, fr, rl, rr; this robot has a, b, c" in swap["reason"]
-        assert asked(session, "omnibench/apr/info")["calibration"] == "synthetic 1"
-
-
 @pytest.mark.parametrize("profile", ["rmw", "humble"])
 def test_ros_2_finds_topics_under_its_own_keys(tmp_path: Path, profile: str) -> None:
     path = drive(0.1)
@@ -247,7 +129,11 @@ def test_a_config_is_refused_in_one_line(tmp_path: Path) -> None:
     for changes, message in (
         ({"robots": [{"name": "a b", "calibration": "c.yaml"}]}, r"robots\.0\.name"),
         ({"robots": [{"name": "a", "calibration": "c.yaml"}] * 2}, "names must differ: a, a"),
-        ({"fusion": "kalman"}, "fusion"),
+        ({"fusion": "kalman"}, r"fusion\.name: Input should be 'none' or 'ekf'"),
+        ({"fusion": {"gate": 2}}, r"fusion\.settings\.gate: Input should be less than 1"),
+        ({"fusion": {"gat": 0.9}}, r"unknown key 'fusion\.settings\.gat'; did you mean 'gate'"),
+        ({"record": "."}, "name a file that ends in .mcap"),
+        ({"robots": [{"name": "a", "calibration": "c.yaml", "frames": {"odom": "map"}}]}, "must differ: map, map"),
         ({"profil": "rmw"}, "unknown key 'profil'; did you mean 'profile'"),
         ({"robots": [], "zenoh": {"mode": "client"}}, "without robots a node can only be a router"),
     ):
@@ -255,11 +141,117 @@ def test_a_config_is_refused_in_one_line(tmp_path: Path) -> None:
             config_of(tmp_path, **changes)
 
 
+def test_a_robot_that_another_node_runs_already_is_refused(tmp_path: Path) -> None:
+    config = config_of(tmp_path)
+    with running(config):
+        client = {"mode": "client", "connect": list(config.zenoh.listening)}
+        with pytest.raises(ConfigError, match="robot 'apr' is run by another node already; stop that"):
+            LiveNode(config_of(tmp_path, zenoh=client))
+
+
 def test_a_missing_calibration_is_named(tmp_path: Path) -> None:
     config = config_of(tmp_path)
     (tmp_path / "calibration.yaml").unlink()
     with pytest.raises(DataError, match=r"calibration\.yaml: no such file"):
         LiveNode(config)
+
+
+@pytest.mark.parametrize("joints", [["a", "b"], ["a", "b", "c", "d"], ["a", "b", "a"], []])
+def test_joints_that_are_not_one_for_each_wheel_are_refused(tmp_path: Path, joints: list[str]) -> None:
+    robot = {"name": "apr", "calibration": "calibration.yaml", "wheels": {"joints": joints}}
+    given = ", ".join(joints) or "none"
+    with pytest.raises(ConfigError, match=f"robot 'apr': wheels.joints: {given}; .* each of the wheels a, b, c$"):
+        LiveNode(config_of(tmp_path, robots=[robot]))
+
+
+def test_a_node_that_fails_to_start_leaves_port_and_state_to_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = config_of(tmp_path, state="state")
+
+    def failing(*_: object) -> None:
+        raise zenoh.ZError("no more queryables")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("omnibench.live.node.Desk", failing)
+        with pytest.raises(zenoh.ZError, match="no more queryables"):
+            LiveNode(config)
+    with running(config) as (_, session):
+        assert asked(session, "omnibench/apr/health")["status"] == "waiting"
+
+
+def test_the_interpreter_is_the_streams_until_the_last_node_of_a_process_has_gone(tmp_path: Path) -> None:
+    usual = sys.getswitchinterval()
+    (tmp_path / "one").mkdir()
+    (tmp_path / "other").mkdir()
+    with LiveNode(config_of(tmp_path / "one")):
+        with LiveNode(config_of(tmp_path / "other")):
+            pass
+        assert gc.get_freeze_count() > 0
+        assert sys.getswitchinterval() < usual
+    assert gc.get_freeze_count() == 0
+    assert sys.getswitchinterval() == usual
+
+
+def test_a_robot_whose_diagnostics_fail_does_not_end_those_of_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with running(config_of(tmp_path, "apr", "bob")) as (node, session):
+        failed: list[int] = []
+
+        def failing() -> None:
+            failed.append(1)
+            "\ud800".encode()
+
+        monkeypatch.setattr(node._services[0], "tick", failing)
+        heard = Heard(session, bob__diagnostics=DIAGNOSTICS)
+        until(lambda: len(failed) >= 2 and len(heard["bob__diagnostics"]) >= 2, "diagnostics after a failure")
+    assert caplog.text.count("apr: diagnostics: UnicodeEncodeError: ") == 1
+
+
+def test_a_sample_on_its_way_while_the_node_closes_is_no_failure(tmp_path: Path) -> None:
+    with running(config_of(tmp_path)) as (node, session):
+        samples: list[zenoh.Sample] = []
+        session.declare_subscriber("apr/joint_states", samples.append)
+        sent(session.declare_publisher("apr/joint_states"), drive(0.01).samples())
+        until(lambda: samples, "a sample")
+    taken = node.health("apr").counts["samples"]
+    node._services[0]._take_wheels(samples[0])
+    assert node.health("apr").counts["failures"] == 0
+    assert node.health("apr").counts["samples"] == taken
+
+
+def test_frames_of_a_single_robot_can_carry_its_name(tmp_path: Path) -> None:
+    robot = {"name": "apr", "calibration": "calibration.yaml", "frames": "prefixed"}
+    path = drive(0.1)
+    with running(config_of(tmp_path, robots=[robot])) as (_, session):
+        heard = Heard(session, apr__odom=ODOMETRY, tf=TRANSFORMS)
+        wheels = session.declare_publisher("apr/joint_states")
+        until(lambda: wheels.matching_status.matching, "the node's subscription")
+        sent(wheels, path.samples())
+        until(lambda: len(heard["tf"]) == 11 and len(heard["apr__odom"]) == 11, "the last transform")
+    assert (heard["apr__odom"][0].frame, heard["apr__odom"][0].child_frame) == ("apr/odom", "apr/base_link")
+    assert [(each.frame, each.child_frame) for each in heard["tf"][0]] == [
+        ("map", "apr/odom"),
+        ("apr/odom", "apr/base_link"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("frames", "fusion", "told"), [(None, "ekf", True), ("prefixed", "ekf", False), (None, "none", False)]
+)
+def test_a_node_whose_frames_meet_those_of_another_is_warned(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, frames: str | None, fusion: str, told: bool
+) -> None:
+    router = {"mode": "router", "listen": config_of(tmp_path).zenoh.listening}
+    other = {"mode": "client", "connect": list(router["listen"])}
+    robots = [{"name": "bob", "calibration": "calibration.yaml", "frames": frames}]
+    with LiveNode(config_of(tmp_path, "apr", zenoh=router)):
+        assert not caplog.text
+        with LiveNode(config_of(tmp_path, robots=robots, zenoh=other, fusion=fusion)):
+            pass
+    warning = "robot bob publishes tf between map, odom and base_link, and so may apr on the same network"
+    assert (warning in caplog.text) == told
 
 
 def test_the_configs_of_the_project_are_valid() -> None:

@@ -16,8 +16,8 @@ from omnibench.errors import ConfigError, DataError
 from omnibench.live.fusion import FusionSettings
 from omnibench.live.memory import RobotMemory
 from omnibench.live.messages import JOINT_STATE, ODOMETRY, JointState
-from omnibench.live.tracker import Frames, RobotTracker, Update, correction
-from omnibench.robot.calibration import read_calibration, write_calibration
+from omnibench.live.tracker import Frames, RobotTracker, Update
+from omnibench.robot.calibration import EffectTerm, matrix_rows
 from omnibench.robot.odometry import Integration, advance
 
 
@@ -77,8 +77,8 @@ def test_covariances_come_from_the_calibration() -> None:
 @settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow])
 @given(st.data())
 def test_odom_never_jumps_and_no_stamp_comes_twice_whatever_happens(data: st.DataObject) -> None:
-    """Swaps, poses from anywhere, clocks that jump, messages lost, doubled and late."""
-    path = drive(1.0)
+    """Swaps, poses from anywhere, clocks that jump, messages lost, doubled and late, angles or rates."""
+    path, rates = drive(1.0), data.draw(st.booleans())
     robot, shift = tracker(), 0
     updates: list[Update] = []
     samples = path.samples()
@@ -93,7 +93,7 @@ def test_odom_never_jumps_and_no_stamp_comes_twice_whatever_happens(data: st.Dat
             error = 1000.0 if event == "far" else data.draw(st.floats(-0.5, 0.5))
             robot.take_pose(slam(sample.stamp + shift - 5_000_000, [error, 1.0, 0.2]), arrival)
         elif event == "jump":
-            shift += data.draw(st.sampled_from([-7200, -30, -2, 2, 3600])) * SECOND
+            shift += int(data.draw(st.sampled_from([-7200, -30, -2, -0.9, -0.15, 0.15, 0.5, 0.9, 2, 3600])) * SECOND)
         elif event == "set" and updates:
             robot.set_pose(np.array([9.0, 9.0, 1.0]), 0.01 * np.eye(3))
         elif event == "reset" and updates:
@@ -102,7 +102,8 @@ def test_odom_never_jumps_and_no_stamp_comes_twice_whatever_happens(data: st.Dat
             event, [sample]
         )
         for each in sent:
-            updates += robot.take_wheels(JOINT_STATE.encode(replace(each, stamp=each.stamp + shift)), arrival)
+            chosen = replace(each, stamp=each.stamp + shift, positions=None if rates else each.positions)
+            updates += robot.take_wheels(JOINT_STATE.encode(chosen), arrival)
     stamps = [update.odometry.stamp for update in updates]
     assert len(set(stamps)) == len(stamps)
     # no wheel turns faster than 3 rad/s, so that 0.3 m/s and 1.6 rad/s bound what the robot does in the time that
@@ -174,7 +175,7 @@ def test_a_calibration_of_another_robot_is_refused_and_the_old_one_runs_on() -> 
     running = robot.calibration
     for other, reason in (
         (calibration(wheels=4), "has wheels fl, fr, rl, rr; this robot has a, b, c"),
-        (calibration(scale=30.0), "off the design of its robot"),
+        (calibration(scale=30.0), "off the design of robot"),
     ):
         with pytest.raises(DataError, match=reason):
             robot.swap(other)
@@ -183,6 +184,93 @@ def test_a_calibration_of_another_robot_is_refused_and_the_old_one_runs_on() -> 
     assert health.last_swap is not None
     assert not health.last_swap.accepted
     assert robot.counts.swaps_refused == 2
+
+
+def test_a_calibration_of_a_larger_robot_with_the_same_wheels_is_refused() -> None:
+    robot = tracker()
+    larger = calibration().robot
+    wheels = tuple(each.model_copy(update={"radius": 5 * each.radius}) for each in larger.wheels)
+    larger = larger.model_copy(update={"wheels": wheels, "name": "giant"})
+    other = calibration().model_copy(
+        update={"robot": larger, "matrix": matrix_rows(larger.inverse_kinematic_matrix), "name": "giant"}
+    )
+    with pytest.raises(DataError, match="off the design of robot 'synthetic omni'"):
+        robot.swap(other)
+    assert robot.calibration.name == "synthetic 1"
+
+
+def test_a_calibration_with_effects_is_not_run_without_them() -> None:
+    robot = tracker()
+    other = calibration().model_copy(update={"effects": (EffectTerm(name="heading_drift", parameters={"b": 0.1}),)})
+    with pytest.raises(DataError, match="effect 'heading_drift' cannot be run"):
+        robot.swap(other)
+    assert robot.counts.swaps_refused == 1
+    path = drive(0.5)
+    np.testing.assert_allclose(poses(fed(robot, path.payloads())), path.poses, atol=1e-9)
+
+
+def test_after_a_silence_of_a_sender_of_rates_the_twist_is_true_and_the_pose_uncertain() -> None:
+    robot = tracker(fusion=None)
+    names = ("a", "b", "c")
+    rates = np.array([2.0, -1.0, 0.5])
+    times = [*np.arange(0, 1, 0.01), *np.arange(20, 20.05, 0.01)]
+    updates = []
+    for time in times:
+        payload = JOINT_STATE.encode(JointState(ORIGIN + round(float(time) * SECOND), names, None, rates))
+        updates += robot.take_wheels(payload, float(time))
+    twist = calibration().matrix_array @ rates
+    for update in updates[1:]:
+        np.testing.assert_allclose(update.odometry.twist, twist, atol=1e-9)
+    before, after = updates[99].odometry.pose_covariance, updates[100].odometry.pose_covariance
+    driven = float(np.hypot(*twist[:2])) * 19
+    assert np.sqrt(after[0, 0] - before[0, 0]) > 0.25 * driven
+
+
+def test_a_full_disk_costs_the_state_and_no_odometry(tmp_path: Path) -> None:
+    (tmp_path / "apr.state.json").symlink_to("/dev/full")
+    path = drive(1.0)
+    robot = tracker(memory=RobotMemory(tmp_path, "apr"))
+    assert len(fed(robot, path.payloads())) == 101
+    assert robot.counts.failures > 0
+    assert "the state could not be written: No space left on device" in robot.health(1.0).last_refusal
+
+
+def test_poses_that_wait_and_are_then_rejected_are_told() -> None:
+    """SLAM whose stamps are always a little ahead of the wheels', a kilometre off."""
+    path = drive(3.0)
+    robot = tracker()
+    for index, payload in enumerate(path.payloads()):
+        robot.take_wheels(payload, 0.01 * index)
+        if index % 25 == 0:
+            away = [1000.0 if index > 50 else 0.0, 0, 0]
+            robot.take_pose(slam(path.stamps[index] + 10_000_000, path.poses[min(index + 1, 300)] + away), 0.01 * index)
+    health = robot.health(3.0)
+    assert health.status == "degraded"
+    assert health.fusion is not None
+    assert health.fusion.rejected_in_a_row == health.counts["pose_rejected"] > 5
+    assert health.fusion.last_outcome in ("rejected", "waiting")
+
+
+def test_every_pose_that_waits_in_vain_is_counted() -> None:
+    path = drive(1.0)
+    robot = tracker()
+    fed(robot, path.payloads()[:50])
+    for number in range(40):
+        robot.take_pose(slam(path.stamps[50] + 10_000_000 * number, [0, 0, 0]), 0.5)
+    fed(robot, path.payloads()[50:], 0.5)
+    counts = robot.counts
+    assert counts.poses + counts.pose_rejected + counts.pose_ahead == 40
+
+
+@pytest.mark.parametrize("pose", [[1.7e308, 0.5e308, 0.1], [1e9, 0, 0]])
+def test_a_pose_beyond_the_world_is_refused(pose: list[float]) -> None:
+    path = drive(0.5)
+    robot = tracker()
+    fed(robot, path.payloads())
+    tilted = np.array([[1, 0.9, 0], [0.9, 1, 0], [0, 0, 1.0]])
+    robot.take_pose(slam(path.stamps[10], [0, 0, 0]), 0.5)
+    assert robot.take_pose(slam(path.stamps[20], pose, tilted), 0.5) is None
+    assert robot.counts.pose_invalid == 1
 
 
 def test_a_stale_stream_says_so_and_is_less_and_less_certain() -> None:
@@ -271,24 +359,6 @@ def test_two_nodes_cannot_share_a_robots_memory(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"apr\.state\.json: another node is using it for robot 'apr'"):
         RobotMemory(tmp_path, "apr")
     memory.close()
-
-
-def test_a_swapped_calibration_outlives_the_node_until_the_configs_file_changes(tmp_path: Path) -> None:
-    file = tmp_path / "calibration.yaml"
-    write_calibration(calibration(), file)
-    memory = RobotMemory(tmp_path / "state", "apr")
-    assert memory.calibration(file).name == "synthetic 1"
-    memory.keep_calibration(calibration(scale=1.1), file)
-    assert memory.calibration(file).name == "synthetic 1.1"
-    write_calibration(calibration(scale=0.9), file)
-    assert memory.calibration(file).name == read_calibration(file).name == "synthetic 0.9"
-    memory.close()
-
-
-@given(st.lists(st.floats(-10, 10), min_size=6, max_size=6))
-def test_the_correction_takes_odom_to_the_map(values: list[float]) -> None:
-    in_map, in_odom = np.array(values[:3]), np.array(values[3:])
-    np.testing.assert_allclose(advance(correction(in_map, in_odom), in_odom, "euler"), in_map, atol=1e-9)
 
 
 def test_frames_can_carry_a_robots_name() -> None:

@@ -159,7 +159,7 @@ def test_a_clock_that_jumps_is_followed_after_three_samples_and_no_motion_is_los
 def test_one_stamp_far_away_is_not_believed(jump: float) -> None:
     receiver = Receiver()
     receiver.take(at(0, 0, 0, 0), at(0.01, 0.1, 0, 0))
-    assert receiver.take(at(0.02 + jump, 0.2, 0, 0)) == []
+    assert receiver.take(at(0.02 + jump, 0.2, 0, 0), arrivals=[0.02]) == []
     (step,) = receiver.take(at(0.03, 0.3, 0, 0))
     assert step.duration == pytest.approx(0.02)
     assert receiver.counts.clock_jumps == 0
@@ -168,13 +168,110 @@ def test_one_stamp_far_away_is_not_believed(jump: float) -> None:
 
 def test_a_long_silence_is_a_gap_and_its_path_is_unknown() -> None:
     receiver = Receiver()
-    receiver.take(*[at(PERIOD * k, 0.02 * k, 0, 0) for k in range(10)])
-    made = receiver.take(*[at(5 + PERIOD * k, 3 + 0.02 * k, 0, 0) for k in range(5)])
+    receiver.take(*[at(PERIOD * k, 100 + 0.02 * k, 100, 100) for k in range(10)])
+    made = receiver.take(*[at(5 + PERIOD * k, 103 + 0.02 * k, 100, 100) for k in range(5)])
     assert receiver.counts.gaps == 1
     assert made[0].blind == pytest.approx(5 - 0.09)
     assert made[0].counted
     assert not made[0].restarted
     np.testing.assert_allclose(receiver.driven, [3.08, 0, 0])
+
+
+@pytest.mark.parametrize("settings", [{}, {"wrap": 2.0}])
+def test_whole_turns_may_be_lost_in_a_silence_of_counters_that_wrap(settings: dict[str, float]) -> None:
+    receiver = Receiver(**settings)
+    receiver.take(*[at(PERIOD * k, 0.02 * k, 0, 0) for k in range(10)])
+    (step,) = receiver.take(at(10, 0.5, 0, 0))
+    assert not step.counted
+    assert step.blind > 9
+
+
+@pytest.mark.parametrize("silence", [0.5, 10.0, 36000.0])
+def test_a_counter_that_begins_at_zero_again_after_a_silence_is_no_motion(silence: float) -> None:
+    """A controller that was switched off and on again."""
+    receiver = Receiver()
+    receiver.take(*[at(PERIOD * k, 5000 + 0.02 * k, 4200.0, 3900.0) for k in range(10)])
+    receiver.take(at(silence, 0.0, 0.0, 0.0))
+    assert np.abs(receiver.driven).max() < 0.18 + 2.1 * 0.5
+    assert receiver.counts.counter_restarts == 1
+    assert not receiver.steps[-1].counted
+
+
+def test_a_restarted_counter_is_found_out_by_a_node_that_was_itself_restarted() -> None:
+    receiver = Receiver()
+    receiver.input.resume(ORIGIN - 36_000 * SECOND, np.array([5000.0, 4200.0, 3900.0]), arrival=-36_000.0)
+    (step,) = receiver.take(at(0, 0.1, 0.0, 0.2))
+    assert step.angles.tolist() == [0, 0, 0]
+    assert receiver.counts.counter_restarts == 1
+
+
+@given(st.floats(-6.0, 6.0), st.floats(0.02, 0.9), st.booleans(), st.floats(-3.0, 3.0))
+def test_lost_samples_do_not_lose_turns_at_a_steady_rate(rate: float, lost: float, wraps: bool, begin: float) -> None:
+    receiver = Receiver()
+    times = [*np.arange(0, 0.5, 0.01), 0.5 + lost]
+    for time in times:
+        angle = begin + rate * time
+        receiver.take(at(float(time), *[(angle + math.pi) % (2 * math.pi) - math.pi if wraps else angle] * 3))
+    np.testing.assert_allclose(receiver.driven, rate * times[-1], atol=1e-6)
+
+
+def test_a_message_without_angles_among_others_costs_nothing() -> None:
+    receiver = Receiver()
+    receiver.take(*[at(PERIOD * k, 0.02 * k, 0, 0) for k in range(10)])
+    receiver.take(at(0.10, 2.0, 0, 0, rates=True))
+    receiver.take(*[at(PERIOD * k, 0.02 * k, 0, 0) for k in range(11, 20)])
+    np.testing.assert_allclose(receiver.driven, [0.38, 0, 0], atol=1e-9)
+    assert receiver.counts.wrong_joints == 0
+
+
+def test_a_sender_of_rates_that_turns_to_angles_is_followed() -> None:
+    receiver = Receiver()
+    receiver.take(*[at(PERIOD * k, 2.0, 0, 0, rates=True) for k in range(10)])
+    receiver.take(*[at(PERIOD * k, 77 + 0.02 * k, 0, 0) for k in range(10, 20)])
+    np.testing.assert_allclose(receiver.driven, [0.38, 0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("use", ["positions", "auto"])
+def test_a_state_without_angles_is_no_obstacle_to_a_sender_of_angles(use: str) -> None:
+    receiver = Receiver(use=use)
+    receiver.input.resume(ORIGIN - SECOND // 100, None, arrival=-0.01)
+    made = receiver.take(*[at(PERIOD * k, 0.02 * k, 0, 0) for k in range(10)])
+    assert len(made) == 10
+
+
+@pytest.mark.parametrize("jump", [-0.5, -0.19, -0.15, 0.3, 0.9])
+@pytest.mark.parametrize("rates", [True, False])
+def test_a_clock_that_is_set_by_less_than_a_second_neither_adds_nor_loses_motion(jump: float, rates: bool) -> None:
+    receiver = Receiver()
+    values = [(2.0, 1.0, 0.0) if rates else (100 + 0.02 * k, 0.01 * k, 0.0) for k in range(200)]
+    receiver.take(*[at(PERIOD * k, *values[k], rates=rates) for k in range(100)])
+    after = range(100, 200)
+    receiver.take(
+        *[at(PERIOD * k + jump, *values[k], rates=rates) for k in after], arrivals=[PERIOD * k for k in after]
+    )
+    np.testing.assert_allclose(receiver.driven, [3.98, 1.99, 0], atol=0.25 if rates else 1e-9)
+    assert receiver.counts.clock_jumps == 1
+
+
+def test_samples_farther_apart_than_a_gap_are_taken_one_by_one() -> None:
+    receiver = Receiver(max_gap=1.0)
+    made = receiver.take(*[at(1.2 * k, 100 + 0.5 * k, 100, 100) for k in range(30)])
+    assert len(made) == 30
+
+
+def test_the_period_is_learnt_from_the_sender() -> None:
+    receiver = Receiver()  # told of 100 Hz
+    receiver.take(*[at(0.1 * k, 0.1 * k, 0, 0) for k in range(50)])
+    assert receiver.counts.missing == 0
+    assert receiver.input.period == pytest.approx(0.1)
+
+
+def test_a_replay_at_ten_times_the_speed_may_have_gaps() -> None:
+    receiver = Receiver()
+    times = [*np.arange(0, 10, 0.01), *np.arange(15, 17, 0.01)]
+    receiver.take(*[at(float(t), 100 + 0.5 * float(t), 100, 100) for t in times], arrivals=[t / 10 for t in times])
+    assert receiver.counts.clock_jumps == 0
+    assert receiver.counts.gaps == 1
 
 
 def test_a_rate_says_nothing_of_a_long_silence_before_it() -> None:

@@ -14,7 +14,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omnibench.errors import DataError, OmnibenchError
+from omnibench.config import validate
+from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.registry import Options, effects
 from omnibench.robot.calibration import (
     Calibration,
@@ -219,3 +220,24 @@ def test_binary_content_is_refused_in_one_line_that_names_the_file(tmp_path: Pat
     file.write_bytes(b"\x89PNG\xff\xfe\x00\x01")
     with pytest.raises(DataError, match=r"calibration\.yaml: cannot be read"):
         read_calibration(file)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"covariance": (-np.eye(9)).tolist()}, "covariance is not positive semi-definite"),
+        ({"covariance": np.triu(np.ones((9, 9))).tolist()}, "covariance is not symmetric"),
+        ({"noise": {"walk_position": 1e200}}, "noise.walk_position: Input should be less than or equal to 1000"),
+        ({"name": "\ud800"}, "name: holds what cannot be printed"),
+    ],
+)
+def test_what_no_calibration_can_be_is_refused(changes: dict[str, object], reason: str) -> None:
+    content = a_calibration().model_dump(mode="json") | changes
+    with pytest.raises(ConfigError, match=reason):
+        validate(Calibration, content, "calibration.yaml")
+
+
+def test_a_calibration_with_effects_is_not_run_without_them() -> None:
+    chosen = a_calibration().model_copy(update={"effects": (EffectTerm(name="heading_drift", parameters={"b": 0.1}),)})
+    with pytest.raises(DataError, match="effect 'heading_drift' cannot be run"):
+        _ = chosen.model

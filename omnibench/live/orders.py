@@ -1,0 +1,96 @@
+"""What a request to a robot says, read and checked: a pose, a time, a calibration."""
+
+from __future__ import annotations
+
+from decimal import Decimal, InvalidOperation
+from typing import Final
+
+import yaml
+from pydantic import Field
+from pydantic_core import PydanticSerializationError
+
+from omnibench.config import Model, parse_yaml, validate
+from omnibench.errors import ConfigError, DataError
+from omnibench.robot.calibration import Calibration, parse_calibration
+
+_NANOSECONDS: Final = 10**14  # numbers of ``at`` from here on are ns; as s they would lie three million years ahead
+_LAST: Final = 2**63 - 1  # ns
+_LONGEST_NUMBER: Final = 40  # characters
+# What a calibration of a dozen wheels stays far below. What goes beyond would keep the interpreter from the stream.
+_DEEPEST: Final = 32
+_MOST_EVENTS: Final = 5_000
+_SCANNER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the one in C where there is one
+
+
+class PoseOrder(Model):
+    """What ``set_pose`` is told: m and rad in the map."""
+
+    x: float = Field(ge=-1e7, le=1e7, allow_inf_nan=False)
+    y: float = Field(ge=-1e7, le=1e7, allow_inf_nan=False)
+    theta: float = Field(ge=-100.0, le=100.0, allow_inf_nan=False)
+    position_sigma: float = Field(0.05, ge=1e-6, le=1e4, allow_inf_nan=False, description="standard deviation, m")
+    heading_sigma: float = Field(0.05, ge=1e-6, le=10.0, allow_inf_nan=False, description="rad")
+
+
+def read_pose(payload: bytes, parameters: dict[str, str]) -> PoseOrder:
+    """A pose from a payload in JSON or YAML or, without one, from the parameters. ConfigError in one line."""
+    where = "set_pose"
+    if not payload:
+        return validate(PoseOrder, parameters, where)
+    try:
+        text = payload.decode()
+    except UnicodeDecodeError:
+        raise ConfigError(f"{where}: the payload is not text; send x, y (m) and theta (rad) in JSON") from None
+    _check_size(text, where)
+    return validate(PoseOrder, parse_yaml(text, where), where)  # JSON is a part of YAML
+
+
+def read_time(text: str) -> int:
+    """A time in s (or ns, if it is that large) as ns. ConfigError in one line.
+
+    Not by way of a float, which has steps of 0.2 us there.
+    """
+    try:
+        number = Decimal(text if len(text) <= _LONGEST_NUMBER else "too long")
+        if number.is_finite() and number.adjusted() < 20:  # digits before the point; else it is no use to multiply
+            nanoseconds = int(number) if abs(number) >= _NANOSECONDS else int((number * 10**9).to_integral_value())
+            if abs(nanoseconds) <= _LAST:
+                return nanoseconds
+    except InvalidOperation:
+        pass
+    shown = text if len(text) <= _LONGEST_NUMBER else f"{text[:_LONGEST_NUMBER]}..."
+    raise ConfigError(f"at: {shown!r} is not a time; give s since 1970, as 1800000000.25")
+
+
+def read_sent_calibration(payload: bytes, where: str) -> Calibration:
+    """A calibration that came over the network. DataError, with ``where`` in front, says what is wrong."""
+    try:
+        text = payload.decode()
+    except UnicodeDecodeError as error:
+        raise DataError(f"{where}: not a text in UTF-8: {error}") from None
+    try:
+        _check_size(text, where)
+    except ConfigError as error:
+        raise DataError(str(error)) from None
+    calibration = parse_calibration(text, where)
+    try:  # YAML knows characters that no file and no message can hold
+        calibration.model_dump_json()
+    except (PydanticSerializationError, UnicodeError):
+        raise DataError(f"{where}: it holds text that is not Unicode (lone surrogates)") from None
+    return calibration
+
+
+def _check_size(text: str, where: str) -> None:
+    """Refuse what is small as a text and large or deep as a document. ConfigError."""
+    depth = 0
+    try:
+        for number, event in enumerate(yaml.parse(text, Loader=_SCANNER)):
+            if isinstance(event, yaml.AliasEvent):
+                raise ConfigError(f"{where}: not valid YAML here: write out what *{event.anchor} stands for")
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > _DEEPEST:
+                raise ConfigError(f"{where}: not valid YAML: nested too deeply")
+            if number >= _MOST_EVENTS:
+                raise ConfigError(f"{where}: more than {_MOST_EVENTS} values")
+    except yaml.YAMLError:
+        return  # the reader tells it better

@@ -1,0 +1,31 @@
+"""Poses of the plane (x, y, heading), m, m, rad, one after another. Headings are not wrapped."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import advance
+
+
+def compose(first: Array, second: Array) -> Array:
+    """The pose (3,) of what has the pose ``second`` in a frame that has the pose ``first``."""
+    return advance(first, second, "euler")
+
+
+def relative(first: Array, second: Array) -> Array:
+    """The pose (3,) of ``second`` in the frame that has the pose ``first``: compose(first, relative) is ``second``."""
+    x, y, heading = (second - first).tolist()
+    cosine, sine = math.cos(first[2]), math.sin(first[2])
+    return np.array([cosine * x + sine * y, -sine * x + cosine * y, heading])
+
+
+def correction(in_map: Array, in_odom: Array) -> Array:
+    """The pose (3,) of frame odom in frame map, from the robot's pose in both."""
+    x, y, heading = in_map.tolist()
+    odom_x, odom_y, odom_heading = in_odom.tolist()
+    turned = heading - odom_heading
+    cosine, sine = math.cos(turned), math.sin(turned)
+    return np.array([x - cosine * odom_x + sine * odom_y, y - sine * odom_x - cosine * odom_y, turned])
