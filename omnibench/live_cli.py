@@ -114,6 +114,23 @@ def listen(
 
 
 @live_app.command()
+def swap(
+    robot: Annotated[str, typer.Argument(help="Whose calibration.")],
+    calibration: Annotated[Path, typer.Argument(help="The calibration file that is to run.")],
+    config: ConfigOption = None,
+    connect: Connect = None,
+) -> None:
+    """Give a running node another calibration: it runs from the next sample on, and odom does not jump."""
+    from omnibench.live.swap import swap_calibration
+
+    with _client(config, connect, None, "swap") as (session, _):
+        swapped = swap_calibration(session, robot, calibration)
+    typer.echo(f"{robot}: {swapped.calibration} runs")
+    if not swapped.kept:
+        typer.echo(f"warning: a node that starts again begins with the old one: {swapped.reason}", err=True)
+
+
+@live_app.command()
 def record(
     robots: Annotated[list[str], typer.Argument(metavar="ROBOT...|CONFIG", help="Whose topics.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="The MCAP file to write.")],

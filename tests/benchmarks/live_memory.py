@@ -10,15 +10,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 import zenoh
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
 from live_latency import WHEELS, client, node
 
 from omnibench.live.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate

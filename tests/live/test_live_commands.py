@@ -16,7 +16,7 @@ import zenoh
 from commands import CONFIGS, assert_refused, flower, omnibench, prepare, write_config
 from commands import Command as InProcess
 from drives import calibration
-from nodes import Command, as_text, write_node
+from nodes import Command, write_node
 from sessions import free_port, raw_session, until
 
 import omnibench as package
@@ -98,8 +98,16 @@ def test_a_recording_goes_out_and_comes_back_as_a_calibration_that_is_swapped_in
         np.testing.assert_allclose(
             again.matrix_array, read_calibration(workplace / "calibration.yaml").matrix_array, atol=0.004
         )
-        session.put("omnibench/apr/calibration", as_text(again))
-        until(lambda: ask(session, "omnibench/apr/info")["calibration"] == again.name, "the swap")
+        swapped = omnibench("swap", "apr", workplace / "again.yaml", "--connect", endpoint(config))
+        assert swapped.returncode == 0, swapped.stderr
+        assert swapped.stdout == f"apr: {again.name} runs\n"
+        assert "begins with the old one" in swapped.stderr  # the config has no state
+        assert ask(session, "omnibench/apr/info")["calibration"] == again.name
+        for name, file, reason in (
+            ("apr", CONFIGS / "live.yaml", "is this a calibration file?"),
+            ("apz", workplace / "again.yaml", "did you mean 'apr'?"),
+        ):
+            assert_refused(omnibench("swap", name, file, "--connect", endpoint(config)), reason)
         session.close()
         assert node.process.poll() is None
 
