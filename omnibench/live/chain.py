@@ -19,6 +19,7 @@ from omnibench.live.recording import Recording
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
+from omnibench.robot.planar import moved_to, relative
 
 TURN = 2 * np.pi
 LONGEST_PAUSE = 3600.0  # s
@@ -72,7 +73,7 @@ def chain_runs(
     if not 0 <= pause <= LONGEST_PAUSE:
         raise ConfigError(f"pause: {pause:g} s between runs is not within 0 and {LONGEST_PAUSE:g} s")
     runs = _ordered(dataset, split)
-    moves = np.array([_motion(each.start, each.final_pose) for each in runs])
+    moves = np.array([relative(each.start, each.final_pose) for each in runs])
     starts = _composed(runs[0].start, moves)
     if anchors is not None:
         starts = _anchored(dataset, np.asarray(anchors, dtype=float), moves)
@@ -91,7 +92,7 @@ def chain_runs(
         run=np.repeat(np.arange(len(runs)), _samples(runs, rests)),
         slam_times=np.concatenate([b + each.pose_times[m] for b, each, m in zip(begins, runs, measured, strict=True)]),
         slam_poses=np.concatenate(
-            [_placed(start, each.poses)[m] for start, each, m in zip(starts, runs, measured, strict=True)]
+            [moved_to(start, each.poses)[m] for start, each, m in zip(starts, runs, measured, strict=True)]
         ),
         slam_covariances=_covariances(runs, starts, measured),
         slam_run=np.repeat(np.arange(len(runs)), [np.count_nonzero(m) for m in measured]),
@@ -224,12 +225,6 @@ def _covariances(runs: Sequence[Trajectory], starts: Array, measured: Sequence[N
     return np.concatenate(parts)
 
 
-def _motion(start: Array, end: Array) -> Array:
-    """The pose ``end`` (3,) seen from ``start``; headings keep their turns."""
-    way = complex(end[0] - start[0], end[1] - start[1]) * np.exp(-1j * start[2])
-    return np.array([way.real, way.imag, end[2] - start[2]])
-
-
 def _composed(first: Array, moves: Array) -> Array:
     """Where each of the moves (R, 3) starts that follow one another from the pose ``first``: (R, 3)."""
     headings = first[2] + np.concatenate([[0.0], np.cumsum(moves[:-1, 2])])
@@ -245,13 +240,6 @@ def _anchored(dataset: Dataset, anchors: Array, moves: Array) -> Array:
     leaps = np.diff(anchors[:, 2]) - moves[:-1, 2]
     turns = np.concatenate([[0.0], np.cumsum(np.round(leaps / TURN))])
     return np.column_stack([anchors[:, :2], anchors[:, 2] - TURN * turns])
-
-
-def _placed(start: Array, poses: Array) -> Array:
-    """Poses (K, 3) of a run that starts at ``start`` in place of its own first pose."""
-    first, turn = poses[0], start[2] - poses[0, 2]
-    path = ((poses[:, 0] - first[0]) + 1j * (poses[:, 1] - first[1])) * np.exp(1j * turn)
-    return np.column_stack([start[0] + path.real, start[1] + path.imag, poses[:, 2] + turn])
 
 
 def _truth(recording: Recording) -> OdometryModel:

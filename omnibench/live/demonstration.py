@@ -25,6 +25,7 @@ from omnibench.live.topics import GraphNode
 from omnibench.robot.calibration import Calibration, read_calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.planar import moved_to
 
 _LAST_MESSAGES = 5.0  # s that they may take
 
@@ -176,7 +177,7 @@ def _judged(
     origin = odometry.stamps[0] if odometry.stamps else 0
     rows = _rows(odometry.stamps, origin, times)
     # odom begins at its own origin, the recording anywhere
-    published = _placed(chain.starts[0], odometry.poses)
+    published = moved_to(chain.starts[0], odometry.poses) if odometry.stamps else odometry.poses
     if recording.truth is not None:
         against, reference = "the simulated truth", chained_truth(chain, recording)
         chosen = rows
@@ -214,13 +215,6 @@ def _fused_deviation(fused: _Collector, origin: int, chain: Chain, reference: Ar
 def _interpolated(chain: Chain) -> Array:
     columns = [np.interp(chain.wheel_times, chain.slam_times, chain.slam_poses[:, axis]) for axis in range(3)]
     return np.column_stack(columns)
-
-
-def _placed(start: Array, poses: Array) -> Array:
-    cosine, sine = math.cos(start[2]), math.sin(start[2])
-    x = start[0] + cosine * poses[:, 0] - sine * poses[:, 1]
-    y = start[1] + sine * poses[:, 0] + cosine * poses[:, 1]
-    return np.column_stack([x, y, start[2] + poses[:, 2]])
 
 
 def _turned(difference: Array) -> Array:

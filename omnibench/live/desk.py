@@ -8,6 +8,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from typing import Any, Final, cast
 
 import numpy as np
@@ -28,6 +29,7 @@ _READING: Final = ("info", "calibration", "health", "pose")
 _ORDERS: Final = ("set_pose", "reset", "swap")
 _LONGEST: Final = 1 << 16  # bytes of a request
 _MOST_WAITING: Final = 64  # requests
+_FAREWELL: Final = 6.0  # s
 
 
 class Desk:
@@ -63,8 +65,9 @@ class Desk:
         """Answer what was asked and no more."""
         for each in self._open:
             each.undeclare()
-        self._work.put(None)
-        self._thread.join()
+        with suppress(queue.Full):  # a client that does not read may hold the desk: not for ever, nor us
+            self._work.put(None, timeout=_FAREWELL)
+        self._thread.join(_FAREWELL)
 
     def _declare(self, session: zenoh.Session, name: str) -> list[Any]:
         def asked_for(service: str) -> Callable[[zenoh.Query], None]:

@@ -22,6 +22,13 @@ def relative(first: Array, second: Array) -> Array:
     return np.array([cosine * x + sine * y, -sine * x + cosine * y, heading])
 
 
+def moved_to(start: Array, poses: Array) -> Array:
+    """A path (K, 3), K >= 1, as a whole moved and turned so that it begins at the pose ``start`` (3,)."""
+    first, turn = poses[0], start[2] - poses[0, 2]
+    path = ((poses[:, 0] - first[0]) + 1j * (poses[:, 1] - first[1])) * np.exp(1j * turn)
+    return np.column_stack([start[0] + path.real, start[1] + path.imag, poses[:, 2] + turn])
+
+
 def correction(in_map: Array, in_odom: Array) -> Array:
     """The pose (3,) of frame odom in frame map, from the robot's pose in both."""
     x, y, heading = in_map.tolist()

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from omnibench.robot.planar import compose, correction, relative
+from omnibench.robot.planar import compose, correction, moved_to, relative
 
 POSES = arrays(float, 3, elements=st.floats(-10, 10))
 
@@ -27,3 +27,13 @@ def test_composing_is_associative(first: np.ndarray, second: np.ndarray, third: 
 @given(POSES, POSES)
 def test_the_correction_takes_odom_to_the_map(in_map: np.ndarray, in_odom: np.ndarray) -> None:
     np.testing.assert_allclose(compose(correction(in_map, in_odom), in_odom), in_map, atol=1e-9)
+
+
+@given(POSES, arrays(float, (4, 3), elements=st.floats(-10, 10)))
+def test_a_path_that_is_moved_begins_there_and_keeps_its_shape(start: np.ndarray, path: np.ndarray) -> None:
+    moved = moved_to(start, path)
+    np.testing.assert_allclose(moved[0], start, atol=1e-9)
+    for before, after in ((0, 1), (1, 3)):
+        np.testing.assert_allclose(
+            relative(moved[before], moved[after]), relative(path[before], path[after]), atol=1e-9
+        )
