@@ -111,10 +111,11 @@ class JointStateDecoder:
             end = self._velocities - 8
         if message.positions is not None:
             self._positions = end - size
-        numbers = self._positions or self._velocities
-        known = [slice(0, _STAMP_AT), slice(_STAMP_AT + 8, numbers), slice(place, len(payload))]
-        if self._positions and self._velocities:
-            known.append(slice(end, self._velocities))
+        changing = [(_STAMP_AT, _STAMP_AT + 8)]
+        changing += [(begin, begin + size) for begin in (self._positions, self._velocities) if begin]
+        ends = [0, *(end for _, end in changing)]
+        begins = [*(begin for begin, _ in changing), len(payload)]
+        known = (slice(*each) for each in zip(ends, begins, strict=True))
         self._known = tuple((at, payload[at]) for at in known)
         self._length, self._joints = len(payload), count
         self._template = message
