@@ -3,18 +3,46 @@
 Ctrl-C is heard from the first import on, so that nothing is imported before ``main``.
 """
 
+import os
+import signal
 import sys
+from contextlib import suppress
+from types import FrameType
 from typing import Any, NoReturn
+
+_COMMANDS = ("__main__.py", "cli.py", "live_cli.py")  # whose imports go on while nothing is under way yet
 
 
 def main() -> None:
     """Run the command line."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        with suppress(ValueError):  # not in the main thread
+            signal.signal(signal.SIGINT, _interrupted)
     try:
         from omnibench.cli import app
 
         _run(app)
     except KeyboardInterrupt:
         _fail("interrupted", 130)
+
+
+def _interrupted(number: int, frame: FrameType | None) -> None:
+    """As by default, but out of a command's imports at once: libraries turn Ctrl-C there into errors of their own."""
+    if _imports_of_a_command(frame):
+        os.write(2, b"interrupted\n")
+        os._exit(130)
+    signal.default_int_handler(number, frame)
+
+
+def _imports_of_a_command(frame: FrameType | None) -> bool:
+    importing = False
+    while frame is not None:
+        name = frame.f_code.co_filename
+        importing = importing or name.startswith("<frozen importlib")
+        if frame.f_code.co_name != "<module>" and name.startswith(os.path.dirname(__file__) + os.sep):
+            return importing and os.path.basename(name) in _COMMANDS
+        frame = frame.f_back
+    return False
 
 
 def _run(app: Any) -> None:
