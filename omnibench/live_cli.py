@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from omnibench.live.node import LiveNode
 
 live_app = typer.Typer()
+_LISTENING = 0.2  # s
 
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", help="YAML with zenoh, profile and domain; or the node's own config.")
@@ -173,7 +174,7 @@ def keys(
 def _run(config: LiveConfig, seconds: float | None) -> None:
     from omnibench.live.node import LiveNode
     from omnibench.live.refusals import log_refusals
-    from omnibench.live.stopping import stop_on_signals
+    from omnibench.live.stopping import stop_on_signals, ticks
 
     with (
         _logging_to(make_console(error=True)) as log,
@@ -190,7 +191,8 @@ def _run(config: LiveConfig, seconds: float | None) -> None:
         verb = "listens on" if config.zenoh.listening else "is connected to"
         place = ", ".join(config.zenoh.listening or config.zenoh.connecting)
         log.info("node %s %s %s; Ctrl-C ends it", config.name, verb, place)
-        stop.wait(seconds)
+        for _ in ticks(stop, _LISTENING, seconds):  # a signal that reaches one of Zenoh's threads wakes nobody here
+            pass
 
 
 def _replay_to_node(config: LiveConfig, dataset: Path | None, speed: str | None, file: Path) -> None:
