@@ -40,11 +40,6 @@ from omnibench.fit.calibrate import calibrate
 from omnibench.testing import ImporterConformance
 
 
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_mcap(tmp_path_factory.mktemp("bags") / "drive", messages(DRIVE))
-
-
 @FORMATS
 def test_every_format_gives_back_wheels_and_poses_exactly(
     tmp_path: Path, write: Callable[[Path, Sequence[Sent]], Path]

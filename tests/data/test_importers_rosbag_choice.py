@@ -26,11 +26,6 @@ from bag_samples import (
 from omnibench.errors import ConfigError
 
 
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_mcap(tmp_path_factory.mktemp("bags") / "drive", messages(DRIVE))
-
-
 def test_topics_are_found_among_others(tmp_path: Path) -> None:
     odometry = [
         Sent(

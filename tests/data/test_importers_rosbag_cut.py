@@ -7,7 +7,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import pytest
 from bag_samples import (
     DRIVE,
     EPOCH,
@@ -35,11 +34,6 @@ from hypothesis import strategies as st
 
 from omnibench.data.importers._rosbag_cut import between_rests, find_rests
 from omnibench.robot.kinematics import Array
-
-
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_mcap(tmp_path_factory.mktemp("bags") / "drive", messages(DRIVE))
 
 
 def test_runs_keep_a_little_rest_with_a_reference_pose_at_both_ends(bag: Path) -> None:
