@@ -17,7 +17,7 @@ from omnibench import terminal
 from omnibench.config import parse_settings, to_json
 from omnibench.errors import ConfigError
 from omnibench.live_cli import live_app
-from omnibench.registry import PluginFailure, calibrators, costs, importers, load_plugins
+from omnibench.registry import PluginFailure, calibrators, costs, effects, importers, load_plugins
 
 app = typer.Typer(
     name="omnibench",
@@ -230,32 +230,98 @@ def design(
 
 
 @app.command()
+def discover(
+    dataset: Annotated[Path, typer.Argument(help="A data set folder.")],
+    model: Annotated[
+        Path | None,
+        typer.Option("--model", metavar="CALIBRATION", help="Start from this calibration. Default: fit a matrix."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", help="Folder for results. Default: results/NAME/TIME, and a link latest.")
+    ] = None,
+    without: Annotated[
+        list[str] | None, typer.Option("--without", metavar="NAME", help="An effect not to try; may be repeated.")
+    ] = None,
+    unknown_term: Annotated[
+        bool,
+        typer.Option("--unknown-term", help="Where nothing in the catalogue fits: close the gap by a smooth function."),
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    plugins: Plugins = None,
+    as_json: Json = False,
+) -> None:
+    """Find where odometry and reference disagree, name the missing effect, add it, show how much better that is."""
+    from omnibench.data.storage import load_dataset
+    from omnibench.discover.discover import discover_effects
+    from omnibench.discover.document import discovery_document
+    from omnibench.discover.output import DiscoverOptions, check_output, write_discovery
+    from omnibench.discover.terminal import Stages, print_discovery
+    from omnibench.robot.calibration import read_calibration
+
+    _load(plugins)
+    for name in without or ():
+        effects.entry(name, "--without")
+    check_output(output)
+    start = None if model is None else read_calibration(model)
+    recordings = load_dataset(dataset)
+    with redirect_stdout(sys.stderr), Stages(terminal.make_console(error=True)) as watch:
+        found = discover_effects(
+            recordings,
+            without=tuple(without or ()),
+            unknown_term=unknown_term,
+            seed=seed,
+            watch=watch,
+            calibration=start,
+        )
+        watch.stage("writing the report")
+        options = DiscoverOptions(
+            dataset=str(dataset),
+            model=None if model is None else str(model),
+            without=tuple(without or ()),
+            unknown_term=unknown_term,
+            seed=seed,
+            plugins=tuple(map(str, plugins or ())),
+        )
+        folder = write_discovery(found, options, output)
+    _warn(recordings.warnings)
+    if as_json:
+        return _print_json(discovery_document(found, folder))
+    return print_discovery(terminal.make_console(), found, folder)
+
+
+@app.command()
 def simulate(
-    config: Annotated[Path, typer.Argument(help="A comparison config with a simulated data set.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="The data set folder to write.")],
-    truth: Annotated[Path | None, typer.Option(help="Folder for what is hidden: the true matrix.")] = None,
+    config: Annotated[Path | None, typer.Argument(help="A config with a simulated data set.")] = None,
+    truth: Annotated[Path | None, typer.Option(help="Folder for what is hidden: the true matrix, effects.")] = None,
     dataset: Annotated[str | None, typer.Option(help="Which data set, if the config has several.")] = None,
+    effects: Annotated[
+        list[str] | None,
+        typer.Option("--effect", metavar="YAML", help="Hide it, too: 'name: {parameter: value}'; may be repeated."),
+    ] = None,
+    like: Annotated[
+        Path | None, typer.Option(metavar="DATASET", help="In place of CONFIG: drive its recorded wheels again.")
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option(metavar="CALIBRATION", help="With --like: by the model of this calibration.")
+    ] = None,
+    noise: Annotated[bool, typer.Option("--noise", help="With --like: add the calibration's noise.")] = False,
+    seed: Annotated[int | None, typer.Option(min=0, help="With --noise. Default: 0.")] = None,
     table_format: Annotated[
         Literal["parquet", "csv"], typer.Option("--format", help="Format of the tables.")
     ] = "parquet",
+    plugins: Plugins = None,
 ) -> None:
-    """Simulate the data set of a config; the truth goes to another folder, or nowhere."""
-    from omnibench.compare.plan import read_compare_config, simulated_source
-    from omnibench.config import to_yaml
-    from omnibench.data.simulate.flower import simulate_dataset
-    from omnibench.data.storage import save_dataset
-    from omnibench.files import write_text
+    """Simulate the data set of a config, or a recording's own wheels; the truth goes to another folder, or nowhere."""
+    from omnibench.data.simulate.request import SimulationRequest
 
-    chosen = read_compare_config(config)
-    name, source = simulated_source(chosen, dataset)
-    if truth is not None and truth.resolve().is_relative_to(output.resolve()):
-        raise ConfigError("--truth: must be a folder apart from the data set's")
-    simulation = simulate_dataset(source, name, chosen.description)
-    save_dataset(simulation.dataset, output, table_format)
+    hidden = tuple(effects or ())
+    request = SimulationRequest(output, config, truth, dataset, hidden, like, model, noise, seed)
+    _load([*(plugins or []), *request.plugins] or None)
+    made = request.write(table_format)
     if truth is not None:
-        write_text(truth / "truth.yaml", to_yaml(simulation.truth))
         typer.echo(f"truth: {truth / 'truth.yaml'}")
-    typer.echo(f"{len(simulation.dataset.trajectories)} simulated trajectories: {output}")
+    typer.echo(f"{len(made.trajectories)} simulated trajectories: {output}")
 
 
 @app.command("import")
@@ -346,13 +412,16 @@ def schema(
 @plugin_app.command("new")
 def plugin_new(
     name: Annotated[str, typer.Argument(help="Its name in configs.")],
-    kind: Annotated[str, typer.Option(help="calibrator, importer or cost.")] = "calibrator",
+    kind: Annotated[str | None, typer.Option(help="calibrator (the default), importer, cost or effect.")] = None,
+    effect: Annotated[bool, typer.Option("--effect", help="The same as --kind effect.")] = False,
     folder: Annotated[Path, typer.Option(help="Where it goes.")] = Path("plugins"),
 ) -> None:
     """Write a working plug-in and its test."""
     from omnibench.plugin import new_plugin
 
-    for file in new_plugin(name, kind, folder):
+    if effect and kind not in (None, "effect"):
+        raise ConfigError(f"--effect and --kind {kind} contradict each other; leave one out")
+    for file in new_plugin(name, "effect" if effect else kind or "calibrator", folder):
         typer.echo(f"written: {file}")
     typer.echo(f"check it: omnibench plugin check {folder / name}.py")
 

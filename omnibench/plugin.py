@@ -14,18 +14,20 @@ from typing import Any, Literal, get_args
 from omnibench.config import validate
 from omnibench.errors import ConfigError, PluginError, UnknownNameError
 from omnibench.files import write_text
-from omnibench.registry import REGISTRIES, Entry, Registry, calibrators, costs, importers, registered_from
+from omnibench.registry import REGISTRIES, Entry, Registry, calibrators, costs, effects, importers, registered_from
 from omnibench.testing.calibrators import CalibratorConformance
 from omnibench.testing.conformance import CaseOutcome, CaseResult, Conformance, load_plugin, run_cases
 from omnibench.testing.costs import CostConformance
+from omnibench.testing.effects import EffectConformance
 from omnibench.testing.importers import ImporterConformance
 
-PluginKind = Literal["calibrator", "importer", "cost"]
+PluginKind = Literal["calibrator", "importer", "cost", "effect"]
 PLUGIN_KINDS: tuple[PluginKind, ...] = get_args(PluginKind)
 _TEMPLATES = files("omnibench") / "plugin_templates"
 _SUITES: dict[Registry[Any], type[Conformance]] = {
     calibrators: CalibratorConformance,
     costs: CostConformance,
+    effects: EffectConformance,
     importers: ImporterConformance,
 }
 

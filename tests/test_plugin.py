@@ -56,7 +56,7 @@ def test_the_tests_of_new_plugins_pass_in_pytest(tmp_path: Path) -> None:
         check=False,
     )
     assert run.returncode == 0, run.stdout + run.stderr
-    assert run.stdout.count("SKIPPED") == 1  # the seed of a calibrator that is stochastic
+    assert run.stdout.count("SKIPPED") == 3  # the seed of a calibrator that is stochastic, other kinds of effects
     assert all(f"test_my_{kind}.py" in run.stdout for kind in PLUGIN_KINDS)
 
 
@@ -73,7 +73,7 @@ def test_the_cases_run_where_pytest_is_not_installed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", PLUGIN_KINDS)
 def test_a_new_plugin_whose_class_would_hide_an_import_is_called_otherwise(kind: str, tmp_path: Path) -> None:
-    name = {"calibrator": "solution", "importer": "trajectory_", "cost": "cost_"}[kind]
+    name = {"calibrator": "solution", "importer": "trajectory_", "cost": "cost_", "effect": "signals"}[kind]
     assert check_plugin(new_plugin(name, kind, tmp_path)[0]).passed
 
 

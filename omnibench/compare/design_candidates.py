@@ -14,7 +14,7 @@ from omnibench.compare.plan import load_source, read_compare_config
 from omnibench.config import read_model, read_yaml
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.simulate.config import FlowerConfig
-from omnibench.data.simulate.flower import commands_of, stamps_of_run
+from omnibench.data.simulate.flower import commanded_rates, commands_of, duration_of, stamps_of_run
 from omnibench.data.storage import load_dataset
 from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError
 from omnibench.fit.design import Counts
@@ -180,12 +180,10 @@ def candidates_of_simulation(
 
     ConfigError: the commands leave part of the matrix open, there is one only, or the noise is zero.
     """
+    ramp = config.commands.ramp
     commands = tuple(
-        TimedCommand(
-            each, config.train.distance / each.speed if each.speed else config.commands.turn_duration
-        )
-        for each in commands_of(config)
-    )  # fmt: skip
+        TimedCommand(each, duration_of(each, config.train, config.commands), ramp) for each in commands_of(config)
+    )
     periods = (config.sample_period, config.pose_period)
     _, candidates = _driven_as_designed(config.robot, integration, periods, {name: commands})
     scale = config.train.noise_scale
@@ -240,7 +238,7 @@ def _driven_as_designed(
         command = each.command
         title = name if names.count(name) == 1 else f"{name}_t{each.duration:.4g}"
         times, pose_times = stamps_of_run(each.duration, *periods)
-        rates = np.tile(wheel_equations(robot.wheels) @ command.twist, (len(times), 1))
+        rates = commanded_rates(robot, command, times, each.ramp)
         still = Trajectory(title, "train", times, rates, pose_times, np.zeros((len(pose_times), 3)))
         (poses,) = model.poses([still.log(pose_times)])
         run = replace(
@@ -251,7 +249,7 @@ def _driven_as_designed(
             alpha=command.direction,
             omega=command.turn_rate,
             duration=float(times[-1]),
-            distance=command.speed * float(times[-1]),
+            distance=command.speed * (float(times[-1]) - each.ramp),
         )
         candidates.append(CandidateRun(title, (run,)))
     return {each: index for index, each in enumerate(commands)}, tuple(candidates)

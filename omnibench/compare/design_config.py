@@ -11,7 +11,7 @@ from pydantic import Discriminator, Field, FiniteFloat, Tag, field_validator, mo
 
 from omnibench.config import Model
 from omnibench.data.robot_option import RobotOption
-from omnibench.data.simulate.config import Commands, Positive
+from omnibench.data.simulate.config import MotionGrid, Positive
 from omnibench.data.simulate.flower import Command, grid_of
 from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import Noise
@@ -24,13 +24,14 @@ Name = Annotated[str, Field(min_length=1, max_length=60)]
 
 @dataclass(frozen=True)
 class TimedCommand:
-    """A motion command and how long it is driven, s."""
+    """A motion command, how long it is driven, and how long of that its speed rises and falls, s."""
 
     command: Command
     duration: float
+    ramp: float = 0.0
 
 
-class CommandGrid(Commands):
+class CommandGrid(MotionGrid):
     """Every direction with every rate of turn, at each speed."""
 
     distance: Positive | None = Field(None, description="length of each run, m; or give duration")

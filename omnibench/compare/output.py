@@ -6,7 +6,6 @@ import json
 import re
 from collections.abc import Iterable
 from dataclasses import asdict, fields
-from datetime import datetime
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -18,6 +17,7 @@ from omnibench.config import read_yaml, to_json, to_yaml
 from omnibench.data.dataset import Dataset
 from omnibench.errors import DataError
 from omnibench.files import remove, write_table, write_text
+from omnibench.results_folder import RESULTS, check_folder, link_latest, new_folder
 from omnibench.robot.calibration import Calibration, Provenance, Row, covariance_rows, write_calibration
 
 # The first line of config.yaml tells a folder of results from a folder that happens to hold such a file.
@@ -30,40 +30,18 @@ def prepare_output(config: CompareConfig, folder: Path | None) -> Path:
     Default: ``results/<config name>/<time>``, with a link ``latest``. DataError when it cannot be written to, or
     holds another comparison.
     """
-    chosen = folder or _new_folder(Path("results") / config.name)
-    if chosen.is_file():
-        raise DataError(f"{chosen}: is a file; name a folder for the results")
-    if chosen.is_dir() and any(chosen.iterdir()):
-        _check_comparison(chosen, config)
+    chosen = folder or new_folder(RESULTS / config.name)
+    check_folder(chosen, _MARK, "comparison")
+    _check_name(chosen, config)
     write_text(chosen / "config.yaml", f"{_MARK}\n{to_yaml(config)}")
     if folder is None:
-        _link(chosen.parent / "latest", chosen.name)
+        link_latest(chosen)
     return chosen
 
 
-def _new_folder(parent: Path) -> Path:
-    """A folder called by the time, that no other comparison takes in the same second."""
-    name = datetime.now().strftime("%Y-%m-%dT%H-%M-%S")
-    count = 1
-    while True:
-        folder = parent / (name if count == 1 else f"{name}-{count}")
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            count += 1
-        except OSError:
-            return folder  # what is wrong is told when the first file is written
-        else:
-            return folder
-
-
-def _check_comparison(folder: Path, config: CompareConfig) -> None:
-    try:
-        ours = (folder / "config.yaml").read_text(encoding="utf-8").startswith(_MARK)
-    except (OSError, UnicodeDecodeError):
-        ours = False
-    if not ours:
-        raise DataError(f"{folder}: holds other files; name a new folder, or one of an earlier comparison")
+def _check_name(folder: Path, config: CompareConfig) -> None:
+    if not (folder / "config.yaml").is_file():
+        return
     name = read_yaml(folder / "config.yaml").get("name")
     if name != config.name:
         raise DataError(f"{folder}: holds the comparison {name!r}; name another folder for {config.name!r}")
@@ -141,16 +119,6 @@ def _file_name(title: str, taken: set[str]) -> str:
         name = f"{plain}-{count}"
     taken.add(name.lower())
     return name
-
-
-def _link(link: Path, target: str) -> None:
-    """Point ``link`` at the newest results; without links in the file system it is left out."""
-    temporary = link.with_name(f".{link.name}.{target}")
-    try:
-        temporary.symlink_to(target, target_is_directory=True)
-        temporary.replace(link)
-    except OSError:
-        temporary.unlink(missing_ok=True)
 
 
 # Column types, which values alone do not tell where all are missing.

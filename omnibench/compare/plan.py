@@ -18,7 +18,6 @@ from omnibench.compare.config import CalibratorEntry, CompareConfig, DatasetSour
 from omnibench.config import read_model, validate
 from omnibench.data.dataset import Dataset
 from omnibench.data.importer import import_dataset
-from omnibench.data.simulate.config import FlowerConfig
 from omnibench.data.simulate.flower import simulate_dataset
 from omnibench.data.storage import load_dataset
 from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
@@ -115,18 +114,6 @@ def load_source(name: str, source: DatasetSource, description: str = "") -> Data
         return import_dataset(source.import_.format, source.import_.source, source.import_.options)
     assert source.path is not None  # one of the three is given
     return load_dataset(source.path)
-
-
-def simulated_source(config: CompareConfig, name: str | None) -> tuple[str, FlowerConfig]:
-    """Name and settings of the simulated data set called ``name``, or of the only one. ConfigError in one line."""
-    simulated = {key: source.simulate for key, source in config.datasets.items() if source.simulate is not None}
-    if name is not None and name not in simulated:
-        raise UnknownNameError("simulated data set", name, simulated, f"config {config.name}")
-    if name is None and len(simulated) != 1:
-        count = "several simulated data sets; choose one with --dataset" if simulated else "no simulated data set"
-        raise ConfigError(f"config {config.name} has {count}")
-    name = name or next(iter(simulated))
-    return name, simulated[name]
 
 
 def effective_config(config: CompareConfig) -> CompareConfig:

@@ -60,7 +60,8 @@ class Trajectory:
 
     def log(self, stamps: Sequence[float] | Array) -> WheelLog:
         """The wheel rates from the start pose, with poses wanted at ``stamps`` (s)."""
-        return WheelLog(self.times, self.rates, self.start, np.asarray(stamps, dtype=float))
+        wanted = np.asarray(stamps, dtype=float)
+        return WheelLog(self.times, self.rates, self.start, wanted, self.angles, self.started_at, self.session)
 
     @property
     def final_log(self) -> WheelLog:

@@ -79,12 +79,18 @@ def certify_optimum(
 
     The cost and the integration are the calibration's. ``box``: default the one that it was searched in, or ``row``.
     gap: stop when the best known matrix is proven to be this close to the optimum. seconds: or after this time.
-    Raises DataError when the wheels differ or the training split is empty, ConfigError for a cost that is no sum of
-    norms.
+    Raises DataError when the wheels differ, the calibration has effects or the training split is empty, ConfigError for
+    a cost that is no sum of norms.
     """
     if calibration.robot.wheel_names != dataset.robot.wheel_names:
         ours, theirs = ", ".join(calibration.robot.wheel_names), ", ".join(dataset.robot.wheel_names)
         raise DataError(f"the calibration is for wheels {ours}, the data set {dataset.name} has {theirs}")
+    if calibration.effects:
+        named = ", ".join(term.name for term in calibration.effects)
+        raise DataError(
+            f"calibration {calibration.name!r} has effects ({named}), and a bound is proven for a matrix alone; "
+            "certify the calibration without them"
+        )
     provenance = calibration.provenance
     searched = provenance.box if provenance else ""
     chosen: Box = box or ("paper" if searched == "paper" else "row")

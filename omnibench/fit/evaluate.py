@@ -39,26 +39,29 @@ class Evaluation:
 
 
 def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
-    """Errors of a calibration on every split of a data set. DataError when the robots' wheels differ."""
+    """Errors of a calibration on every split of a data set.
+
+    DataError: the robots' wheels differ, or the recordings lack what an effect of the calibration needs.
+    """
     if calibration.robot.wheel_names != dataset.robot.wheel_names:
         ours, theirs = ", ".join(calibration.robot.wheel_names), ", ".join(dataset.robot.wheel_names)
         raise DataError(f"the calibration is for wheels {ours}, the data set {dataset.name} has {theirs}")
     present = {split: dataset.split(split) for split in SPLITS if dataset.split(split)}
     groups: dict[str, tuple[Trajectory, ...]] = {str(name): group for name, group in present.items()}
     groups["all"] = dataset.trajectories
-    design = OdometryModel.of_design(dataset.robot, calibration.integration)
+    model, design = calibration.model, OdometryModel.of_design(dataset.robot, calibration.integration)
     return Evaluation(
         dataset=dataset.name,
         simulated=dataset.simulated,
         trajectories=len(dataset.trajectories),
-        splits={name: split_errors(calibration.model, group) for name, group in groups.items()},
+        splits={name: split_errors(model, group) for name, group in groups.items()},
         design={name: split_errors(design, group) for name, group in groups.items()},
     )
 
 
 def final_errors(model: OdometryModel, trajectories: Sequence[Trajectory]) -> Array:
-    """Odometry minus reference (Z, 3) at the last reference pose of each trajectory, m, m, rad."""
-    ends = np.concatenate(model.poses([trajectory.final_log for trajectory in trajectories]))
+    """What the model reports minus the reference (Z, 3) at the last pose of each trajectory, m, m, rad."""
+    ends = np.concatenate(model.reported([trajectory.final_log for trajectory in trajectories]))
     return ends - np.array([trajectory.final_pose for trajectory in trajectories])
 
 

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Dataset, Split, Trajectory
-from omnibench.data.simulate.flower import TruthRecord
+from omnibench.data.simulate.truth import TrueRobot
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.recording import Recording
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.planar import moved_to, relative
 
@@ -55,10 +54,15 @@ class Chain:
         """From the first sample to the last, s."""
         return float(max(self.wheel_times[-1], self.slam_times[-1]))
 
-    def log(self, stamps: Sequence[float] | Array | None = None) -> WheelLog:
-        """The wheel rates from the chain's start, for the batch odometry at ``stamps`` (s; default: every sample)."""
+    def log(self, stamps: Sequence[float] | Array | None = None, session: str | None = None) -> WheelLog:
+        """The wheel rates from the chain's start, for the batch odometry at ``stamps`` (s; default: every sample).
+
+        The chain is one session, from its start on; session: what it is called.
+        """
         wanted = self.wheel_times if stamps is None else np.asarray(stamps, dtype=float)
-        return WheelLog(self.wheel_times[1:], self.rates[1:], self.starts[0], wanted)
+        return WheelLog(
+            self.wheel_times[1:], self.rates[1:], self.starts[0], wanted, self.angles[1:], 0.0, session or ""
+        )
 
 
 def chain_runs(
@@ -113,8 +117,8 @@ def true_anchors(recording: Recording, split: Split | None = None) -> Array:
     The reference poses of a chain then err about the truth and do not drift away from it.
     """
     truth, runs = _truth(recording), _ordered(recording.dataset, split)
-    logs = [WheelLog(each.times, _targets(each), np.zeros(3), each.times[-1:]) for each in runs]
-    return _composed(runs[0].start, np.concatenate(truth.poses(logs)))
+    moves = [relative(each.start, _true_poses(truth, each, each.times[-1:])[0]) for each in runs]
+    return _composed(runs[0].start, np.array(moves))
 
 
 def chained_truth(chain: Chain, recording: Recording) -> Array:
@@ -126,13 +130,14 @@ def chained_truth(chain: Chain, recording: Recording) -> Array:
     truth = _truth(recording)
     known = {each.id: each for each in recording.dataset.trajectories}
     bounds = np.searchsorted(chain.run, np.arange(1, len(chain.ids)))
-    logs = []
+    poses = []
     for index, times in enumerate(np.split(chain.wheel_times, bounds)):
         if chain.ids[index] not in known:
             raise DataError(f"run {chain.ids[index]} is not in data set {recording.dataset.name}; chain that one")
         run = _trimmed(known[chain.ids[index]])
-        logs.append(WheelLog(run.times, _targets(run), chain.starts[index], times - chain.begins[index]))
-    return np.concatenate(truth.poses(logs))
+        driven = _true_poses(truth, run, np.append(0.0, times - chain.begins[index]))
+        poses.append(moved_to(chain.starts[index], driven)[1:])
+    return np.concatenate(poses)
 
 
 def _ordered(dataset: Dataset, split: Split | None) -> list[Trajectory]:
@@ -242,16 +247,19 @@ def _anchored(dataset: Dataset, anchors: Array, moves: Array) -> Array:
     return np.column_stack([anchors[:, :2], anchors[:, 2] - TURN * turns])
 
 
-def _truth(recording: Recording) -> OdometryModel:
-    record: TruthRecord | None = recording.truth
-    if record is None:
+def _truth(recording: Recording) -> TrueRobot:
+    if recording.truth is None:
         raise DataError(
             f"data set {recording.dataset.name}: its truth is not known; simulate it from a comparison's config"
         )
-    return OdometryModel(record.robot, np.array(record.matrix), record.integration)
+    return recording.truth.true_robot()
 
 
-def _targets(run: Trajectory) -> Array:
-    if run.targets is None:
+def _true_poses(truth: TrueRobot, run: Trajectory, stamps: Array) -> Array:
+    """Where a simulated robot truly was (K, 3) at stamps (K,) s of a run."""
+    if run.targets is None or run.angles is None:
         raise DataError(f"run {run.id}: what the motors were told is not recorded, so its truth is not known")
-    return run.targets
+    rates = truth.driven(run.times, run.targets)
+    angles = run.angles[0] - run.rates[0] * run.times[0]  # before its first sample
+    log = truth.log(run.times, rates, run.start, stamps, angles, run.started_at, run.session)
+    return truth.model.poses([log])[0]

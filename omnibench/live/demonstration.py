@@ -16,7 +16,7 @@ from omnibench.live.chain import Chain, chain_recording, chained_truth
 from omnibench.live.health import Health
 from omnibench.live.live_config import LiveConfig, client_session, robot_called
 from omnibench.live.messages import Odometry
-from omnibench.live.node import LiveNode
+from omnibench.live.node import LiveNode, load_effects
 from omnibench.live.recording import Recording
 from omnibench.live.replay import Player, PlayReport, Progress
 from omnibench.live.session import open_session
@@ -103,6 +103,7 @@ def demonstrate(
     """
     stop = stop or threading.Event()
     robot = robot_called(config, config.replay.robot)
+    load_effects(config)
     _check_wheels(recording, read_calibration(robot.calibration), robot.name)
     chain = chain_recording(recording, pause=config.replay.pause, split=config.replay.split)
     with LiveNode(config, remember=False) as node, beside(node) if beside else nullcontext():
@@ -172,7 +173,7 @@ def _judged(
     health: Health,
 ) -> Demonstration:
     times = chain.wheel_times
-    batch = calibration.model.poses([chain.log()])[0]
+    batch = calibration.model.poses([chain.log(session=calibration.session)])[0]
     design = OdometryModel.of_design(calibration.robot, calibration.integration).poses([chain.log()])[0]
     origin = odometry.stamps[0] if odometry.stamps else 0
     rows = _rows(odometry.stamps, origin, times)

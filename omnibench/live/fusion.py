@@ -15,6 +15,7 @@ from omnibench.config import Model
 from omnibench.live.counts import Counts
 from omnibench.live.odometry import Motion
 from omnibench.live.pose_filter import PoseFilter
+from omnibench.live.reference import turned
 from omnibench.live.rejections import Rejections
 from omnibench.live.timeline import Entry, Fix, Timeline
 from omnibench.robot.kinematics import Array
@@ -87,14 +88,14 @@ class Fusion:
 
     def take_waiting(self) -> None:
         """Fuse poses that came before the wheel samples of their time, once these are there."""
-        if self._waiting and min(fix.stamp for fix in self._waiting) <= self._timeline.newest:
+        if self._waiting and min(fix.latest for fix in self._waiting) <= self._timeline.newest:
             waiting, self._waiting = self._waiting, deque()
             for fix in waiting:
                 self.correct(fix)
 
     def correct(self, fix: Fix) -> Outcome:
         """Fuse a pose at its own time, or say why not; every outcome is counted."""
-        self.outcome = self._refused(fix) or self._judged(fix)
+        self.outcome = self._refused(fix) or self._judged(self._at_one_time(fix))
         if self.outcome in ("fused", "located", "reacquired"):
             self._counts.poses += 1
             self._rejections.clear()
@@ -136,14 +137,14 @@ class Fusion:
     def _refused(self, fix: Fix) -> Outcome | None:
         """Why a pose cannot be fused now, whatever it says."""
         timeline = self._timeline
-        if not timeline.entries or fix.stamp > timeline.newest:
-            ahead = (fix.stamp - timeline.newest) / _SECOND if timeline.entries else 0.0
+        if not timeline.entries or fix.latest > timeline.newest:
+            ahead = (fix.latest - timeline.newest) / _SECOND if timeline.entries else 0.0
             if ahead > self.settings.ahead or len(self._waiting) >= _WAITING:
                 self._counts.pose_ahead += 1
                 return "ahead"
             self._waiting.append(fix)
             return "waiting"
-        if fix.stamp < max(timeline.oldest, self._since):
+        if fix.earliest < timeline.oldest or fix.stamp < self._since:
             self._counts.pose_too_late += 1
             return "too late"
         known = timeline.entries[timeline.index(fix.stamp)].fixes
@@ -151,6 +152,15 @@ class Fusion:
             self._counts.pose_duplicates += 1
             return "duplicate"
         return None
+
+    def _at_one_time(self, fix: Fix) -> Fix:
+        """A pose whose heading is of another time, with the odometry's turn until its own."""
+        if fix.heading_stamp is None:
+            return fix
+        before, after = (self._timeline.odometry_at(each) for each in (fix.heading_stamp, fix.stamp))
+        assert before is not None
+        assert after is not None
+        return turned(fix, before, after)
 
     def _judged(self, fix: Fix) -> Outcome:
         """What becomes of a pose whose time is known to the timeline."""

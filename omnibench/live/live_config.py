@@ -63,6 +63,7 @@ class LiveConfig(Model):
     profile: Profile = Field("plain", description="plain: plain Zenoh and the DDS bridge; rmw, humble: rmw_zenoh")
     domain: int = Field(0, ge=0, le=232, description="ROS_DOMAIN_ID, for rmw and humble")
     zenoh: SessionConfig = SessionConfig()
+    plugins: tuple[Path, ...] = Field((), description="folders of effects that calibrations name")
     state: Path | None = Field(None, description="folder in which pose and calibration outlive the node")
     record: Path | None = Field(None, description="MCAP file to record to")
     foxglove: bool | int = Field(False, description="serve Foxglove's WebSocket on loopback; a number is the port")
@@ -120,6 +121,7 @@ def read_live_config(path: Path | str) -> LiveConfig:
     changes: dict[str, Any] = {
         "robots": tuple(each.model_copy(update={"calibration": folder / each.calibration}) for each in config.robots),
         "zenoh": config.zenoh.relative_to(folder),
+        "plugins": tuple(folder / each for each in config.plugins),
         "state": there(config.state),
         "record": there(config.record),
         "replay": config.replay.model_copy(update={"dataset": there(config.replay.dataset)}),

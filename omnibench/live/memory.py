@@ -32,7 +32,7 @@ SavedCovariance = Annotated[tuple[FiniteFloat, ...], Field(min_length=9, max_len
 class SavedState(Model):
     """Where a robot was. stamp: ns, of the wheel sample; wall: unix time of its arrival, s; positions: wheel angles.
 
-    Poses in m, m, rad; covariances (3, 3), row by row.
+    Poses in m, m, rad; covariances (3, 3), row by row. session_time: s since the session began.
     """
 
     sequence: int = Field(ge=0)
@@ -43,6 +43,7 @@ class SavedState(Model):
     covariance: SavedCovariance
     map_pose: SavedPose | None = None
     map_covariance: SavedCovariance | None = None
+    session_time: float = Field(0.0, ge=0, allow_inf_nan=False)
 
     @model_validator(mode="after")
     def _variances_are_not_negative(self) -> SavedState:
@@ -100,6 +101,7 @@ class RobotMemory:
         positions: Array | None,
         odometry: tuple[Array, Array],
         fused: tuple[Array, Array] | None,
+        session_time: float = 0.0,
     ) -> None:
         """Write where the robot is; pairs are pose (3,) and covariance (3, 3). OSError when the disk refuses."""
         if self._file is None:
@@ -114,6 +116,7 @@ class RobotMemory:
             "covariance": odometry[1].ravel().tolist(),
             "map_pose": None if fused is None else fused[0].tolist(),
             "map_covariance": None if fused is None else fused[1].ravel().tolist(),
+            "session_time": session_time,
         }
         text = json.dumps(state).encode().ljust(_SLOT - 1) + b"\n"
         os.pwrite(self._file, text, (self._sequence % 2) * _SLOT)

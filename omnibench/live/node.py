@@ -24,6 +24,7 @@ from omnibench.live.service import RobotService
 from omnibench.live.session import open_session
 from omnibench.live.topics import TOPICS, GraphNode, KeySpace
 from omnibench.live.tracker import RobotTracker
+from omnibench.registry import load_plugins
 from omnibench.robot.calibration import Calibration, read_calibration
 
 LOG = logging.getLogger("omnibench.live")
@@ -45,6 +46,7 @@ class LiveNode:
         self._services: list[RobotService] = []
         self._quiet = Quiet(math.inf)
         self._stop = threading.Event()
+        load_effects(config)
         with ExitStack() as started:  # what is last started is first closed
             if remember and config.state is not None:
                 for robot in config.robots:
@@ -155,6 +157,12 @@ class LiveNode:
     def _stop_ticking(self) -> None:
         self._stop.set()
         self._ticking.join()
+
+
+def load_effects(config: LiveConfig) -> None:
+    """Load the plug-ins whose effects calibrations may name; one that cannot be imported is told in the log."""
+    for failure in load_plugins(config.plugins):
+        LOG.warning("plug-in %s cannot be imported: %s", failure.origin, failure.error)
 
 
 def _check_joints(robot: RobotConfig, calibration: Calibration) -> None:

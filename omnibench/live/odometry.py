@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,13 +11,14 @@ import numpy as np
 from omnibench.live.wheels import WheelStep
 from omnibench.robot.calibration import Calibration, Noise
 from omnibench.robot.kinematics import Array
-from omnibench.robot.odometry import Integration
+from omnibench.robot.odometry import Integration, OdometryStream
 
 # For a calibration file that says nothing of noise: generous, so that a filter follows SLAM.
 UNKNOWN_NOISE = Noise(pose_position=0.02, pose_heading=0.02, walk_position=0.03, walk_heading=0.03)
 _BLIND_SHARE = 0.3  # of a motion whose path nobody saw
 _STILL = 1e-3  # rad/s; slower wheels stand
 _CORRELATION = 1.0  # s over which an error of the matrix looks like noise to the filter
+_REMEMBERED = 200  # steps from which effects of another calibration learn how the robot is driving
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,12 +55,20 @@ class LiveOdometry:
     The covariance is the sum of what the noise model's random walk adds along the way (bent by the heading's own error)
     and of the uncertainty of the matrix, which errs in the same way all the time and therefore adds up.
 
-    standstill: share of the noise that is left while no wheel turns.
+    Effects take the session that the calibration names for the one that is driven. Where no wheel angles are told they
+    are counted from 0.
+
+    standstill: share of the noise that is left while no wheel turns. session_time: s since the session began, at first
+    that of the node.
     """
 
-    def __init__(self, calibration: Calibration, standstill: float = 0.01) -> None:
+    def __init__(self, calibration: Calibration, standstill: float = 0.01, session_time: float = 0.0) -> None:
         self._standstill = standstill
-        self._stream = calibration.model.stream()
+        self._calibration = calibration
+        self._stream = self._new_stream(session_time)
+        self.session_time = session_time
+        self._recent: deque[WheelStep] = deque(maxlen=_REMEMBERED)
+        self._wheel_angles: Array = np.zeros(len(calibration.robot.wheels))
         self.twist: Array = np.zeros(3)
         self._duration = calibration.sample_period
         noise = calibration.noise or UNKNOWN_NOISE
@@ -98,8 +108,20 @@ class LiveOdometry:
         covariance[2, 2] = heading + turning
         return covariance
 
-    def resume(self, pose: Array, covariance: Array) -> None:
-        """Go on from a pose and covariance that another process reached."""
+    def face(self, heading: float) -> None:
+        """The heading of odom in the map is ``heading`` (rad): effects of the world act along the axes of the map.
+
+        Until it is known they act along those of odom.
+        """
+        self._stream.frame_heading = heading
+
+    def resume(self, pose: Array, covariance: Array, session_time: float = 0.0) -> None:
+        """Go on from a pose and covariance that another process reached, and its time in the session (s)."""
+        self._stream = self._new_stream(session_time)
+        self.session_time = session_time
+        self._begin(pose, covariance)
+
+    def _begin(self, pose: Array, covariance: Array) -> None:
         self._stream.pose = np.array(pose, dtype=float)
         self._walked.set(covariance)
         self._slopes.clear()
@@ -107,14 +129,24 @@ class LiveOdometry:
     def continued(self, calibration: Calibration) -> LiveOdometry:
         """Odometry with another calibration from the same pose on; what is uncertain by now stays uncertain."""
         other = LiveOdometry(calibration, self._standstill)
-        other.resume(self.pose, self.covariance)
+        begun = self.session_time - sum(step.duration for step in self._recent)
+        other._stream = other._new_stream(begun)
+        for step in self._recent:  # so that no effect takes the swap for a start from rest
+            other._stream.drive(step.angles, step.duration, step.positions)
+        other._stream.frame_heading = self._stream.frame_heading
+        other._begin(self.pose, self.covariance)
+        other.session_time, other._recent, other._wheel_angles = self.session_time, self._recent, self._wheel_angles
         other.twist, other._duration = self.twist, self._duration
         return other
 
     def step(self, step: WheelStep) -> Motion:
         """Take a wheel step; the motion that it made."""
         before, twist = self._stream.pose, self.twist
-        self._stream.drive(step.angles)
+        positions = step.positions
+        self._wheel_angles = self._wheel_angles + step.angles if positions is None else positions
+        self._stream.drive(step.angles, step.duration, self._wheel_angles)
+        self.session_time += step.duration
+        self._recent.append(step)
         moved = self._stream.moved
         if step.duration > 0:
             self.twist = self._stream.matrix @ step.rates if step.blind else moved / step.duration
@@ -136,6 +168,9 @@ class LiveOdometry:
             heading + self._heading_walk * seconds,
         ]
         return self.covariance + np.diag(growth)
+
+    def _new_stream(self, session_time: float) -> OdometryStream:
+        return self._calibration.model.stream(session=self._calibration.session, session_time=session_time)
 
     def _variances(self, step: WheelStep, moved: Array, twist: Array) -> tuple[float, float]:
         """What the step's noise adds to the variances of position and heading; twist: before it."""

@@ -19,7 +19,8 @@ _MOST_A_SECOND = 2000  # samples; a sender with nonsense for stamps shall not fi
 class Fix:
     """A pose in the map at its own time.
 
-    arrival: s, monotonic. absolute: it replaces what the filter believes, instead of correcting it.
+    arrival: s, monotonic. absolute: it replaces what the filter believes, instead of correcting it. heading_stamp: when
+    its heading was taken, if that is another time.
     """
 
     stamp: int
@@ -27,6 +28,17 @@ class Fix:
     covariance: Array
     arrival: float = 0.0
     absolute: bool = False
+    heading_stamp: int | None = None
+
+    @property
+    def latest(self) -> int:
+        """The time from which on all of it can be placed."""
+        return self.stamp if self.heading_stamp is None else max(self.stamp, self.heading_stamp)
+
+    @property
+    def earliest(self) -> int:
+        """The time since which motions must be known to place all of it."""
+        return self.stamp if self.heading_stamp is None else min(self.stamp, self.heading_stamp)
 
 
 @dataclass(slots=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from omnibench.config import Model
-from omnibench.errors import DataError
+from omnibench.errors import DataError, OmnibenchError
 from omnibench.live.counts import Counts
 from omnibench.live.encoders import JointStateDecoder
 from omnibench.live.fusion import Fusion, FusionSettings, Outcome
@@ -19,6 +20,7 @@ from omnibench.live.health import FusionHealth, Health, Status, SwapRecord
 from omnibench.live.memory import RobotMemory, SavedState
 from omnibench.live.messages import POSE_ESTIMATE, MessageError, Odometry, Transform
 from omnibench.live.odometry import UNKNOWN_NOISE, LiveOdometry, Motion
+from omnibench.live.reference import ReferenceCorrection
 from omnibench.live.stamps import PublishedStamps
 from omnibench.live.timeline import Entry, Fix, Timeline
 from omnibench.live.wheels import WheelInput, WheelSettings, WheelStep
@@ -26,6 +28,7 @@ from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import correction
 
+LOG = logging.getLogger("omnibench.live")
 _HISTORY = 5.0  # s of odometry without fusion
 _SAVING = 0.1  # s between states written
 _OTHER_ROBOT = 0.5  # of a row's largest element; no calibration moves a matrix so far from its design
@@ -100,6 +103,8 @@ class RobotTracker:
         self._odometry = LiveOdometry(calibration, (fusion or FusionSettings()).standstill)
         self._timeline = Timeline(fusion.history if fusion else _HISTORY)
         self._fusion = Fusion(fusion, self._timeline, self.counts) if fusion else None
+        self._reference = ReferenceCorrection(calibration.model)
+        self._wants_angles = _wheel_angle_effects(calibration)
         self._stamps = PublishedStamps()
         self._decode = JointStateDecoder().decode
         self._arrival: float | None = None  # of the last wheel sample
@@ -135,7 +140,7 @@ class RobotTracker:
             if self._fusion is None:
                 return None
             try:
-                return self._fusion.correct(self._fix(payload, arrival))
+                return self._fusion.correct(self._reference.corrected(self._fix(payload, arrival)))
             except MessageError as error:
                 self._last_refusal = str(error)
                 return None
@@ -146,11 +151,13 @@ class RobotTracker:
             try:
                 self._check(calibration)
                 odometry = self._odometry.continued(calibration)
-            except DataError as error:
+                reference = self._reference.continued(calibration.model)
+            except OmnibenchError as error:
                 self.counts.swaps_refused += 1
                 self._last_swap = SwapRecord(accepted=False, name=calibration.name, reason=str(error), at=time.time())
-                raise
-            self._odometry, self.calibration = odometry, calibration
+                raise DataError(str(error)) from None
+            self._odometry, self._reference, self.calibration = odometry, reference, calibration
+            self._wants_angles = _wheel_angle_effects(calibration)
             self.counts.swaps += 1
             self._last_swap = SwapRecord(accepted=True, name=calibration.name, reason="runs", at=time.time())
             self._save()
@@ -174,6 +181,7 @@ class RobotTracker:
         """Forget where the robot is in the map; odometry goes on."""
         with self._lock:
             fusion = self._fusing("reset")
+            self._reference.restart()
             if self._timeline.entries:
                 fusion.reset()
             else:
@@ -245,13 +253,21 @@ class RobotTracker:
                 )
             self._wheels.resume(saved.stamp, positions, now - (wall - saved.wall))
             covariance = np.reshape(saved.covariance, (3, 3))
-            self._odometry.resume(np.array(saved.pose), covariance)
+            self._odometry.resume(np.array(saved.pose), covariance, saved.session_time)
             if self._fusion is not None and saved.map_pose is not None and saved.map_covariance is not None:
                 self._fusion.begin(np.array(saved.map_pose), np.reshape(saved.map_covariance, (3, 3)))
             self._stamps.unique(saved.stamp)
             self._add(Motion(saved.stamp, 0.0, np.zeros(3), self.calibration.integration, 0.0, 0.0))
 
     def _drive(self, step: WheelStep) -> Update:
+        if self._wants_angles and step.positions is None:
+            LOG.warning(
+                "%s: %s acts by wheel angles, and the messages tell none: they are counted from 0, at a guess",
+                *(self.name, self._wants_angles),
+            )
+            self._wants_angles = ""
+        if self._fusion is not None and self._fusion.located:
+            self._odometry.face(float(self._fusion.pose[2] - self._odometry.pose[2]))
         motion = self._odometry.step(step)
         if motion.restarted and self._timeline.entries:
             # the motion is taken as if it ended at the new time; what came before has no time any more
@@ -376,8 +392,15 @@ class RobotTracker:
             fused = self._fusion.pose, self._fusion.covariance
         wall = time.time() - (time.monotonic() - self._arrival)
         try:
-            self._memory.save(stamp, wall, positions, (self._odometry.pose, self._odometry.covariance), fused)
+            odometry = self._odometry.pose, self._odometry.covariance
+            self._memory.save(stamp, wall, positions, odometry, fused, self._odometry.session_time)
         except OSError as error:  # a full disk is no reason to stand still
             self.counts.failures += 1
             self._last_refusal = f"the state could not be written: {error.strerror}"
             self._saved += _UNSAVED
+
+
+def _wheel_angle_effects(calibration: Calibration) -> str:
+    """The names of its effects that act by the absolute angles of the wheels."""
+    terms = calibration.model.motion_terms
+    return ", ".join(term.name for term in terms if "wheel_angles" in term.effect.needs)

@@ -47,7 +47,8 @@ class WheelStep:
 
     angles (N,): rad. rates (N,): at its end, rad/s. blind: s of the duration of whose motion nothing is known beyond
     ``angles``. counted: angles are differences of counters, so that they hold the whole motion of blind times too.
-    restarted: the clock jumped, and stamps before have no meaning any more.
+    restarted: the clock jumped, and stamps before have no meaning any more. positions (N,): what the counters say at
+    its end, rad; None where there are none.
     """
 
     stamp: int
@@ -57,6 +58,7 @@ class WheelStep:
     blind: float = 0.0
     counted: bool = True
     restarted: bool = False
+    positions: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,7 +173,7 @@ class WheelInput:
         self._last = sample
         if sample.velocities is not None:
             self._rates = sample.velocities
-        return WheelStep(sample.stamp, 0.0, np.zeros(len(self._joints)), self._rates)
+        return WheelStep(sample.stamp, 0.0, np.zeros(len(self._joints)), self._rates, positions=self._angles.known)
 
     def _step(self, sample: _Sample, elapsed: float) -> WheelStep:
         """The step to the next sample, ``elapsed`` s after the last one by its stamp."""
@@ -227,7 +229,7 @@ class WheelInput:
     ) -> WheelStep:
         self._counts.samples += 1
         self._last, self._rates = sample, rates
-        return WheelStep(sample.stamp, elapsed, angles, rates, blind, counted, restarted)
+        return WheelStep(sample.stamp, elapsed, angles, rates, blind, counted, restarted, self._angles.known)
 
     def _learn(self, elapsed: float, waited: float) -> None:
         """The period, what does not keep to it, and how fast stamps go on by our clock."""

@@ -12,7 +12,7 @@ from pydantic import Field, FiniteFloat, field_validator, model_validator
 from omnibench.config import Model, parse_yaml, read_yaml, to_yaml, validate
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import write_text
-from omnibench.registry import effects
+from omnibench.robot.effects.term import make_term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
@@ -74,6 +74,9 @@ class Calibration(Model):
     noise: Noise | None = None
     covariance: tuple[Row, ...] | None = Field(None, description="of the matrix, row by row, then of the effects")
     session: str | None = Field(None, description="what drift terms are measured from")
+    driven: tuple[tuple[FiniteFloat, FiniteFloat, FiniteFloat], ...] | None = Field(
+        None, description="motions that it was fitted to, m/s, m/s, rad/s; its effects are not known to hold beyond"
+    )
     provenance: Provenance | None = None
 
     @model_validator(mode="after")
@@ -102,10 +105,10 @@ class Calibration(Model):
 
     @property
     def model(self) -> OdometryModel:
-        """The odometry model that the file describes. DataError: it has effects, which no model runs yet."""
-        if self.effects:
-            raise DataError(f"calibration {self.name!r}: effect {self.effects[0].name!r} cannot be run; fit it without")
-        return OdometryModel(self.robot, self.matrix_array, self.integration)
+        """The odometry model that the file describes. OmnibenchError: an effect or its parameters are not known."""
+        where = f"calibration {self.name!r}"
+        terms = tuple(make_term(term.name, term.parameters, self.robot, where) for term in self.effects)
+        return OdometryModel(self.robot, self.matrix_array, self.integration, terms, self.sample_period)
 
     @property
     def matrix_array(self) -> Array:
@@ -153,7 +156,7 @@ def _checked(content: Any, where: str) -> Calibration:
         raise DataError(f"{where}: format is {found!r}, expected {FORMAT!r}; is this a calibration file?")
     calibration = validate(Calibration, content, where)
     for term in calibration.effects:
-        effects.entry(term.name, where)
+        make_term(term.name, term.parameters, calibration.robot, where)
     return calibration
 
 

@@ -3,31 +3,127 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
+import numpy as np
+
+from omnibench.robot.corrected import check_needs, corrected_twists
+from omnibench.robot.effect_stream import EffectStream
+from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
+from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration, OdometryBatch, OdometryStream, WheelLog
+from omnibench.robot.path import Path
+from omnibench.robot.signals import SignalStream, signals_of
+
+_LAST = 5  # samples whose mean rate tells how the robot goes on after the last
 
 
 @dataclass(frozen=True, eq=False)
 class OdometryModel:
-    """A robot's odometry: ``matrix`` (3, N) in m and rad per rad of wheel, and how a sample is integrated."""
+    """A robot's odometry: ``matrix`` (3, N) in m and rad per rad of wheel, how a sample is integrated, and effects.
+
+    terms: effects of any stage; those of stage actuator are for simulation and do nothing here. sample_period: the
+    nominal one, s; effects need it.
+    """
 
     robot: Robot
     matrix: Array
     integration: Integration
+    terms: tuple[Term, ...] = ()
+    sample_period: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.terms and self.sample_period is None:
+            raise ValueError("a model with effects needs the sample period")
 
     @classmethod
     def of_design(cls, robot: Robot, integration: Integration) -> OdometryModel:
         """The model of the design values, Eq. (7) for the APR-02."""
         return cls(robot, robot.inverse_kinematic_matrix, integration)
 
+    @cached_property
+    def motion_terms(self) -> tuple[Term, ...]:
+        """Those of stage wheel, clock, body and world."""
+        return tuple(term for term in self.terms if isinstance(term.effect, MotionEffect))
+
+    @cached_property
+    def reference_terms(self) -> tuple[Term, ...]:
+        """Those of stage reference."""
+        return tuple(term for term in self.terms if isinstance(term.effect, ReferenceEffect))
+
     def poses(self, logs: Sequence[WheelLog]) -> list[Array]:
-        """Poses of each log at its stamps: a list of (S, 3) in m, m, rad."""
+        """Odometry of each log at its stamps: a list of (S, 3) in m, m, rad. Effects of the reference do nothing here.
+
+        After the last sample the pose stays. DataError in one line: a log lacks what an effect needs.
+        """
+        if self.motion_terms:
+            return [self._path(log).poses(log.stamps) for log in logs]
         batch = OdometryBatch(logs, self.integration)
         poses = batch.poses(self.matrix[None])[0]
         return [poses[batch.trajectory == index] for index in range(len(logs))]
 
-    def stream(self, start: Array | None = None) -> OdometryStream:
-        """The model as a stream of samples, from a start pose (default: the origin)."""
-        return OdometryStream(self.matrix, self.integration, start)
+    def reported(self, logs: Sequence[WheelLog]) -> list[Array]:
+        """What the reference reports at each log's stamps: a list of (S, 3) in m, m, rad; ``poses`` where no effect of
+        the reference is in the model.
+
+        With one, a pose is the odometry's at the time when it was taken: before t = 0 the start pose; after the last
+        sample the robot goes on with the mean rate of its last five samples. DataError as for ``poses``.
+        """
+        if not self.reference_terms:
+            return self.poses(logs)
+        return [self._reported(log) for log in logs]
+
+    def stream(
+        self, start: Array | None = None, session: str | None = None, session_time: float = 0.0
+    ) -> OdometryStream:
+        """The model as a stream of samples, from a start pose (default: the origin).
+
+        session: its name; None for one that no calibration knows. session_time: at the start, s.
+        """
+        if not self.motion_terms:
+            return OdometryStream(self.matrix, self.integration, start)
+        assert self.sample_period is not None  # there are terms
+        signals = SignalStream(self.robot, self.matrix, self.sample_period, session, session_time)
+        return EffectStream(self.motion_terms, signals, self.integration, start)
+
+    def _path(self, log: WheelLog) -> Path:
+        durations = np.diff(log.times, prepend=0.0)[:, None]
+        if not self.motion_terms:
+            return Path(log.times, log.start, (log.rates @ self.matrix.T) * durations, self.integration)
+        assert self.sample_period is not None  # there are terms
+        check_needs(self.motion_terms, log)
+        signals = signals_of(log, self.robot, self.matrix, self.sample_period)
+        twists, drift = corrected_twists(self.motion_terms, signals, self.matrix)
+        world = None if drift is None else drift * durations
+        return Path(log.times, log.start, twists * durations, self.integration, world)
+
+    def _reported(self, log: WheelLog) -> Array:
+        taken, heading_taken = log.stamps, log.stamps
+        for term in self.reference_terms:
+            assert isinstance(term.effect, ReferenceEffect)
+            of_position, of_heading = term.effect.delays(log.stamps, term.values)
+            taken, heading_taken = taken - of_position, heading_taken - of_heading
+        path = self._path(_going_on(log, max(taken.max(initial=0.0), heading_taken.max(initial=0.0))))
+        poses = path.poses(taken)
+        poses[:, 2] = path.poses(heading_taken)[:, 2]
+        for term in self.reference_terms:
+            assert isinstance(term.effect, ReferenceEffect)
+            poses = term.effect.reported(poses, log.start, term.values)
+        return poses
+
+
+def _going_on(log: WheelLog, until: float) -> WheelLog:
+    """The log with a sample more if its samples end before ``until`` (s): the mean rate of the last ones goes on."""
+    end = log.times[-1]
+    if until <= end:
+        return log
+    rates = log.rates[-_LAST:].mean(axis=0)
+    angles = log.wheel_angles
+    return replace(
+        log,
+        times=np.append(log.times, until),
+        rates=np.vstack([log.rates, rates]),
+        wheel_angles=None if angles is None else np.vstack([angles, angles[-1] + rates * (until - end)]),
+    )

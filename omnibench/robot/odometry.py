@@ -34,12 +34,17 @@ class WheelLog:
 
     times (F,): end of each sample, s, increasing, > 0. rates (F, N): mean wheel rates over each sample, rad/s.
     start (3,): pose at t = 0 (m, m, rad). stamps (S,): when poses are wanted, s, increasing, >= 0.
+    What only some effects need, None where it is not known: wheel_angles (F, N): absolute, at the end of each sample,
+    rad. started_at: s since the session's start. session: its name.
     """
 
     times: Array
     rates: Array
     start: Array
     stamps: Array
+    wheel_angles: Array | None = None
+    started_at: float | None = None
+    session: str | None = None
 
 
 class OdometryBatch:
@@ -179,7 +184,8 @@ class OdometryBatch:
 class OdometryStream:
     """The same odometry, one sample at a time: ``step`` moves ``pose`` (3,) in m, m, rad.
 
-    moved (3,): what the last step drove, in the robot's frame: m, m, rad.
+    moved (3,): what the last step drove, in the robot's frame: m, m, rad. frame_heading: the heading of the stream's
+    frame in the reference's, rad; effects of the world act along the axes of the reference.
     """
 
     def __init__(self, matrix: Array, integration: Integration, start: Array | None = None) -> None:
@@ -187,13 +193,21 @@ class OdometryStream:
         self.integration: Integration = integration
         self.pose = np.zeros(3) if start is None else np.array(start, dtype=float)
         self.moved = np.zeros(3)
+        self.frame_heading = 0.0
 
-    def step(self, rates: Array, duration: float) -> Array:
-        """Advance by one sample of mean wheel rates (N,) rad/s over ``duration`` s; the new pose."""
-        return self.drive(np.asarray(rates) * duration)
+    def step(self, rates: Array, duration: float, wheel_angles: Array | None = None) -> Array:
+        """Advance by one sample of mean wheel rates (N,) rad/s over ``duration`` s; the new pose.
 
-    def drive(self, angles: Array) -> Array:
-        """Advance by one sample in which the wheels turned by ``angles`` (N,) rad; the new pose."""
+        wheel_angles (N,): absolute, at the sample's end, rad; what is not known is counted on from 0.
+        """
+        return self.drive(np.asarray(rates) * duration, duration, wheel_angles)
+
+    def drive(self, angles: Array, duration: float | None = None, wheel_angles: Array | None = None) -> Array:  # noqa: ARG002
+        """Advance by one sample in which the wheels turned by ``angles`` (N,) rad; the new pose.
+
+        duration (s) and wheel_angles, as for ``step``, matter to effects only. ValueError: there are effects, and the
+        duration is not given.
+        """
         self.moved = self.matrix @ angles
         self.pose = advance(self.pose, self.moved, self.integration)
         return self.pose

@@ -13,6 +13,8 @@ pytest is not needed to run the cases: see :func:`run_cases`.
 from omnibench.testing.calibrators import Attempt, CalibratorConformance
 from omnibench.testing.conformance import CaseOutcome, CaseResult, Conformance, Nonconformance, load_plugin, run_cases
 from omnibench.testing.costs import CostConformance
+from omnibench.testing.effect_inputs import driven_signals
+from omnibench.testing.effects import EffectConformance
 from omnibench.testing.importers import ImporterConformance
 from omnibench.testing.synthetic import ObservedProblem, synthetic_problem, synthetic_robot, synthetic_trajectories
 
@@ -23,9 +25,11 @@ __all__ = [
     "CaseResult",
     "Conformance",
     "CostConformance",
+    "EffectConformance",
     "ImporterConformance",
     "Nonconformance",
     "ObservedProblem",
+    "driven_signals",
     "load_plugin",
     "run_cases",
     "synthetic_problem",

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from omnibench.errors import OmnibenchError, PluginError
-from omnibench.registry import Registry, load_plugin_file
+from omnibench.registry import Options, Registry, load_plugin_file
 
 
 class Nonconformance(AssertionError):  # noqa: N818 (reads as what it is in a test report)
@@ -40,7 +40,7 @@ class Conformance:
         """``omnibench list`` and the JSON schema show these texts."""
         cls = type(self.make())
         require(bool((cls.__doc__ or "").strip()), f"{cls.__name__} has no docstring; its first line is its summary")
-        model: type[BaseModel] = cls.Options
+        model: type[BaseModel] = getattr(cls, "Options", Options)
         bare = [name for name, field in model.model_fields.items() if not field.description]
         require(not bare, f"options without a description: {', '.join(bare)}; use Field(..., description=...)")
 

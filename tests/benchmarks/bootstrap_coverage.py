@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binom
 
-from omnibench.compare.plan import read_compare_config, simulated_source
+from omnibench.compare.plan import read_compare_config
 from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.source import read_simulation
 from omnibench.fit.bootstrap import bootstrap_intervals
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
@@ -28,7 +29,7 @@ CONFIG = Path(__file__).parents[2] / "configs" / "apr02.yaml"
 def covered(seed: int, resamples: int) -> np.ndarray:
     """Which elements (3, 3) of the hidden matrix lie in their intervals, for one seed of the simulation."""
     config = read_compare_config(CONFIG)
-    _, flower = simulated_source(config, None)
+    flower = read_simulation(CONFIG).config
     session = flower.train.model_copy(update={"seed": 10_000 + seed})
     simulation = simulate_dataset(flower.model_copy(update={"train": session, "validation": None}))
     dataset = simulation.dataset

@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binomtest
 
-from omnibench.compare.plan import read_compare_config, simulated_source
 from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.source import read_simulation
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.physical import geometry_of
 
@@ -42,8 +42,7 @@ class Coverage:
 
 def covered(seed: int, calibrator: str = "closed_form", repetitions: int = 5) -> Coverage:
     """Calibrate one simulated flower and compare it with its truth."""
-    config = read_compare_config(CONFIG)
-    _, flower = simulated_source(config, None)
+    flower = read_simulation(CONFIG).config
     session = flower.train.model_copy(update={"seed": 20_000 + seed})
     changes = {"train": session, "validation": None, "repetitions": repetitions}
     simulation = simulate_dataset(flower.model_copy(update=changes))

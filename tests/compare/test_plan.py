@@ -19,7 +19,6 @@ from omnibench.compare.plan import (
     load_datasets,
     make_plan,
     read_compare_config,
-    simulated_source,
 )
 from omnibench.config import to_yaml
 from omnibench.errors import OmnibenchError
@@ -271,16 +270,3 @@ def test_the_key_of_a_run_changes_with_the_plugin_that_does_the_search(tmp_path:
     before = [run.key for run in planned(tmp_path, plugins=[str(plugins)], calibrators=[entry])]
     write_plugin(plugins, "inner", body + "# changed\n")
     assert [run.key for run in planned(tmp_path, plugins=[str(plugins)], calibrators=[entry])] != before
-
-
-def test_a_simulated_data_set_is_found_by_name_or_alone(tmp_path: Path) -> None:
-    config = read_compare_config(write_config(tmp_path))
-    assert simulated_source(config, None)[0] == simulated_source(config, "flower")[0] == "flower"
-    with pytest.raises(OmnibenchError, match=r"unknown simulated data set 'flour'; did you mean 'flower'\?"):
-        simulated_source(config, "flour")
-    two = write_config(tmp_path, datasets={name: {"simulate": flower()} for name in "ab"})
-    with pytest.raises(OmnibenchError, match="several simulated data sets; choose one with --dataset"):
-        simulated_source(read_compare_config(two), None)
-    none = write_config(tmp_path, datasets={"a": {"path": "x"}})
-    with pytest.raises(OmnibenchError, match="no simulated data set"):
-        simulated_source(read_compare_config(none), None)

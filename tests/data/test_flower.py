@@ -17,7 +17,8 @@ import yaml
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Split
 from omnibench.data.simulate.config import EncoderNoise, FlowerConfig
-from omnibench.data.simulate.flower import Simulation, commands_of, simulate_dataset, true_matrix
+from omnibench.data.simulate.flower import Simulation, commands_of, simulate_dataset
+from omnibench.data.simulate.truth import true_matrix
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.evaluate import split_errors

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.source import read_simulation
 from omnibench.errors import ConfigError
 from omnibench.fit.bootstrap import bootstrap_intervals
 from omnibench.fit.calibrator import run_calibrator
@@ -27,8 +28,7 @@ def study():
 
 
 def flower_problem(parameterisation="matrix", repetitions=1):
-    config = study().read_compare_config(study().CONFIG)
-    _, flower = study().simulated_source(config, None)
+    flower = read_simulation(study().CONFIG).config
     dataset = simulate_dataset(flower.model_copy(update={"repetitions": repetitions, "validation": None})).dataset
     training = dataset.split("train")
     searched = make_parameterisation(parameterisation, dataset.robot, training, box="row")

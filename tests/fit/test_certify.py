@@ -22,7 +22,7 @@ from omnibench.fit.lower_bound import LowerBounds
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
-from omnibench.robot.calibration import Calibration, matrix_rows
+from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration
 from omnibench.testing.synthetic import PERIOD, synthetic_dataset, synthetic_robot, true_robot
@@ -245,6 +245,13 @@ def test_a_wheel_geometry_is_refused() -> None:
 def test_other_wheels_are_refused() -> None:
     with pytest.raises(DataError, match="wheels fl, fr, rl, rr"):
         certify_optimum(design_of(synthetic_dataset(4), "arc"), synthetic_dataset())
+
+
+def test_a_calibration_with_effects_is_refused_as_a_bound_is_of_matrices() -> None:
+    dataset, drift = synthetic_dataset(), EffectTerm(name="heading_drift", parameters={"b": 0.001})
+    extended = design_of(dataset, "arc").model_copy(update={"effects": (drift,)})
+    with pytest.raises(DataError, match=r"'design' has effects \(heading_drift\), and a bound is proven for a matrix"):
+        certify_optimum(extended, dataset)
 
 
 def test_recordings_without_a_training_split_are_refused() -> None:

@@ -12,7 +12,7 @@ from fit_samples import noisy_trajectories
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.errors import DataError
 from omnibench.fit.evaluate import evaluate, split_errors
-from omnibench.robot.calibration import Calibration, matrix_rows
+from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
@@ -85,3 +85,26 @@ def test_a_calibration_of_other_wheels_is_refused_in_one_line() -> None:
     with pytest.raises(DataError) as refusal:
         evaluate(calibration(other), dataset())
     assert str(refusal.value) == "the calibration is for wheels a1, b1, c1, the data set synthetic has a, b, c"
+
+
+def test_a_calibration_with_effects_is_judged_by_what_its_reference_reports() -> None:
+    effects = (
+        EffectTerm(name="quadratic_rotation_slip", parameters={"k": 0.05}),
+        EffectTerm(name="reference_time_offset", parameters={"tau": 0.3}),
+        EffectTerm(name="lidar_lever_arm", parameters={"x": 0.05, "y": -0.02}),
+    )
+    extended, recordings = calibration().model_copy(update={"effects": effects}), dataset()
+    model = extended.model
+    seen = [
+        replace(run, poses=np.vstack([run.start, model.reported([run.reference_log])[0]]))
+        for run in recordings.trajectories
+    ]
+    reported = make_dataset("reported", ROBOT, 0.2, seen, simulated=True)
+    assert evaluate(extended, reported).splits["all"].cost < 1e-12
+    assert evaluate(calibration(), reported).splits["all"].cost > 0.05
+
+
+def test_a_data_set_that_lacks_what_an_effect_needs_is_refused_in_one_line() -> None:
+    drifting = (EffectTerm(name="thermal_radius_drift", parameters={"k": 1e-5}),)
+    with pytest.raises(DataError, match=r"^effect 'thermal_radius_drift' needs the time since the session's start"):
+        evaluate(calibration().model_copy(update={"effects": drifting}), dataset())

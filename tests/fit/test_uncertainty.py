@@ -17,6 +17,7 @@ from motions import FLOWER, RING, driven
 
 from omnibench.data.dataset import Trajectory
 from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.source import read_simulation
 from omnibench.errors import DataError
 from omnibench.fit.bootstrap import bootstrap_intervals
 from omnibench.fit.calibrator import RunResult, run_calibrator
@@ -294,8 +295,7 @@ class TestParameters:
 
 def flower_problem() -> tuple[CalibrationProblem, RunResult]:
     """The flower of the paper's comparison in a box that holds its truth."""
-    config = study().read_compare_config(study().CONFIG)
-    _, flower = study().simulated_source(config, None)
+    flower = read_simulation(study().CONFIG).config
     dataset = simulate_dataset(flower.model_copy(update={"validation": None})).dataset
     problem = CalibrationProblem(
         dataset.robot,

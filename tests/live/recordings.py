@@ -11,6 +11,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.simulate.config import Commands, EncoderNoise, FlowerConfig, Session, Tolerances, Truth
 from omnibench.data.simulate.flower import simulate_dataset
 from omnibench.live.recording import Recording
+from omnibench.robot.calibration import EffectTerm
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
@@ -40,7 +41,9 @@ def random_dataset(seed: int, runs: int = 3, **known: Any) -> Dataset:
     return make_dataset("random", ROBOT, PERIOD, [random_run(f"run {n}", rng, **known) for n in range(runs)])
 
 
-def simulated_recording(noise: EncoderNoise | None = None, repetitions: int = 1) -> Recording:
+def simulated_recording(
+    noise: EncoderNoise | None = None, repetitions: int = 1, effects: tuple[EffectTerm, ...] = ()
+) -> Recording:
     """Six commands of 1 s, repeated, by a robot that is not as designed."""
     config = FlowerConfig(
         robot=ROBOT,
@@ -48,7 +51,7 @@ def simulated_recording(noise: EncoderNoise | None = None, repetitions: int = 1)
         pose_period=0.1,
         commands=Commands(speeds=(0.3,), directions_deg=(0, 120, 240), turn_rates=(-0.5, 0.5)),
         repetitions=repetitions,
-        truth=Truth(tolerances=Tolerances(radius=0.02, distance=0.02, angle_deg=1, seed=5)),
+        truth=Truth(tolerances=Tolerances(radius=0.02, distance=0.02, angle_deg=1, seed=5), effects=effects),
         noise=noise or EncoderNoise(),
         train=Session(seed=1, distance=0.3),
     )

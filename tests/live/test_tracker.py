@@ -199,10 +199,10 @@ def test_a_calibration_of_a_larger_robot_with_the_same_wheels_is_refused() -> No
     assert robot.calibration.name == "synthetic 1"
 
 
-def test_a_calibration_with_effects_is_not_run_without_them() -> None:
+def test_a_calibration_with_an_effect_that_nobody_knows_is_refused() -> None:
     robot = tracker()
-    other = calibration().model_copy(update={"effects": (EffectTerm(name="heading_drift", parameters={"b": 0.1}),)})
-    with pytest.raises(DataError, match="effect 'heading_drift' cannot be run"):
+    other = calibration().model_copy(update={"effects": (EffectTerm(name="heading_drft", parameters={"b": 0.1}),)})
+    with pytest.raises(DataError, match=r"unknown effect 'heading_drft'; did you mean 'heading_drift'\?"):
         robot.swap(other)
     assert robot.counts.swaps_refused == 1
     path = drive(0.5)

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from effect_samples import a_drive
 from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.config import validate
 from omnibench.errors import ConfigError, DataError, OmnibenchError
-from omnibench.registry import Options, effects
+from omnibench.registry import effects
 from omnibench.robot.calibration import (
     Calibration,
     EffectTerm,
@@ -26,8 +27,10 @@ from omnibench.robot.calibration import (
     read_calibration,
     write_calibration,
 )
-from omnibench.robot.kinematics import Robot, Wheel
+from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
+from omnibench.robot.kinematics import Array, Robot, Wheel
 from omnibench.robot.published import published_matrix
+from omnibench.robot.signals import Signals
 
 ROBOT = Robot(
     name="APR-02",
@@ -103,17 +106,67 @@ def test_everything_in_a_calibration_comes_back(tmp_path: Path) -> None:
     assert read_calibration(tmp_path / "calibration.yaml") == written
 
 
-@pytest.mark.usefixtures("registries_as_before")
-def test_a_known_effect_comes_back_with_its_parameters(tmp_path: Path) -> None:
-    @effects.register("slip")
-    class Slip:
-        """Wheels that slip."""
+TERMS = (
+    EffectTerm(name="wheel_eccentricity", parameters={f"{part}_{wheel}": 1 / 300 for part in "ba" for wheel in "cab"}),
+    EffectTerm(
+        name="roller_ripple",
+        parameters={f"{part}_{wheel}": 0.01 for part in "ab" for wheel in "abc"} | {"rollers": 9.0},
+    ),
+    EffectTerm(name="tyre_wear", parameters={"radius_2023-01-12": -0.001}),
+    EffectTerm(name="reference_time_offset", parameters={"tau": 0.1}),
+)
 
-        Options = Options
 
-    written = a_calibration(effects=(EffectTerm(name="slip", parameters={"k": 0.1, "tau": 1 / 3}),))
+def test_effects_come_back_with_their_parameters_in_their_order(tmp_path: Path) -> None:
+    size = 9 + 6 + 7 + 1 + 1
+    covariance = np.random.default_rng(0).normal(size=(size, size))
+    written = a_calibration(
+        effects=TERMS, covariance=tuple(tuple(values) for values in (covariance @ covariance.T).tolist())
+    )
     write_calibration(written, tmp_path / "calibration.yaml")
-    assert read_calibration(tmp_path / "calibration.yaml") == written
+    found = read_calibration(tmp_path / "calibration.yaml")
+    assert found == written
+    assert [list(term.parameters) for term in found.effects] == [list(term.parameters) for term in TERMS]
+
+
+def test_the_covariance_has_the_parameters_of_the_effects_after_the_matrix() -> None:
+    content = a_calibration(effects=TERMS).model_dump(mode="json") | {"covariance": np.eye(9).tolist()}
+    with pytest.raises(ConfigError, match="covariance is not 24 x 24"):
+        validate(Calibration, content, "calibration.yaml")
+
+
+def test_the_model_of_a_calibration_has_its_effects() -> None:
+    model = a_calibration(effects=TERMS).model
+    assert [(term.name, dict(term.values)) for term in model.terms] == [(each.name, each.parameters) for each in TERMS]
+    assert model.sample_period == 0.01
+    assert [term.name for term in model.reference_terms] == ["reference_time_offset"]
+
+
+def test_the_model_of_a_file_gives_the_same_poses_to_the_last_bit(tmp_path: Path) -> None:
+    written, log = a_calibration(effects=TERMS), a_drive(1)
+    write_calibration(written, tmp_path / "calibration.yaml")
+    again = read_calibration(tmp_path / "calibration.yaml").model
+    np.testing.assert_array_equal(again.reported([log])[0], written.model.reported([log])[0])
+
+
+@pytest.mark.usefixtures("registries_as_before")
+def test_an_effect_of_a_plug_in_is_run(tmp_path: Path) -> None:
+    @effects.register("standstill")
+    class Standstill(MotionEffect):
+        """Wheels that turn in vain."""
+
+        stage = "wheel"
+        physics, source, shows_in = "Ice.", "nobody", "command"
+        fixed_parameters = (Parameter("share", "1", 0.0, 1.0, "of the rates"),)
+
+        def correction(self, signals: Signals, values: Values) -> Array:
+            return -values["share"] * signals.rates
+
+    written = a_calibration(effects=(EffectTerm(name="standstill", parameters={"share": 1.0}),))
+    write_calibration(written, tmp_path / "calibration.yaml")
+    log = a_drive(1)
+    (found,) = read_calibration(tmp_path / "calibration.yaml").model.poses([log])
+    np.testing.assert_allclose(found, np.tile(log.start, (len(found), 1)), rtol=0, atol=1e-12)
 
 
 def test_the_file_holds_what_the_design_says(tmp_path: Path) -> None:
@@ -175,8 +228,16 @@ REFUSED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "an unknown integration": (put("integration", "runge_kutta"), "integration: "),
     "an unknown effect": (put("effects", [{"name": "sllip"}]), "unknown effect 'sllip'; "),
     "an infinite parameter of an effect": (
-        put("effects", [{"name": "slip", "parameters": {"k": math.inf}}]),
+        put("effects", [{"name": "centripetal_slip", "parameters": {"k": math.inf}}]),
         "effects.0.parameters.k: ",
+    ),
+    "an unknown parameter of an effect": (
+        put("effects", [{"name": "heading_drift", "parameters": {"b": 0.001, "bias": 0.1}}]),
+        "effect 'heading_drift': unknown parameter 'bias'; known: b",
+    ),
+    "a missing parameter of an effect": (
+        put("effects", [{"name": "heading_drift"}]),
+        "effect 'heading_drift': parameter 'b' (rad/s) is missing; ",
     ),
 }
 
@@ -192,9 +253,7 @@ def test_a_file_that_is_wrong_is_refused_in_one_line_that_names_it(tmp_path: Pat
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.usefixtures("registries_as_before")
 def test_an_unknown_effect_is_answered_with_the_nearest_one(tmp_path: Path) -> None:
-    effects.register("centripetal_slip")(type("Slip", (), {"Options": Options}))
     file = broken(tmp_path, put("effects", [{"name": "centripetal_slipp"}]))
     with pytest.raises(OmnibenchError, match="did you mean 'centripetal_slip'"):
         read_calibration(file)
@@ -237,7 +296,7 @@ def test_what_no_calibration_can_be_is_refused(changes: dict[str, object], reaso
         validate(Calibration, content, "calibration.yaml")
 
 
-def test_a_calibration_with_effects_is_not_run_without_them() -> None:
-    chosen = a_calibration().model_copy(update={"effects": (EffectTerm(name="heading_drift", parameters={"b": 0.1}),)})
-    with pytest.raises(DataError, match="effect 'heading_drift' cannot be run"):
+def test_a_calibration_whose_effects_cannot_be_run_says_so_by_its_name() -> None:
+    chosen = a_calibration().model_copy(update={"effects": (EffectTerm(name="heading_drift", parameters={"k": 0.1}),)})
+    with pytest.raises(OmnibenchError, match=r"^calibration 'flower closed_form': effect 'heading_drift': unknown par"):
         _ = chosen.model

@@ -9,7 +9,7 @@ from pydantic import Field, FiniteFloat, field_validator, model_validator
 
 from omnibench.config import Model
 from omnibench.errors import UnknownNameError
-from omnibench.robot.calibration import Noise
+from omnibench.robot.calibration import EffectTerm, Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import Integration
 from omnibench.robot.published import PUBLISHED
@@ -30,11 +30,12 @@ class Tolerances(Model):
 
 
 class Truth(Model):
-    """The matrix that the simulated robot really has: exactly one of the three."""
+    """What the simulated robot really is: its matrix, by exactly one of the first three, and effects."""
 
     published: str | None = Field(None, description=f"one of {', '.join(PUBLISHED)}")
     matrix: tuple[tuple[FiniteFloat, ...], ...] | None = Field(None, description="3 rows of N")
     tolerances: Tolerances | None = Field(None, description="drawn about the design")
+    effects: tuple[EffectTerm, ...] = Field((), description="what is hidden in the data; see omnibench list")
 
     @model_validator(mode="after")
     def _one_is_given(self) -> Truth:
@@ -43,6 +44,10 @@ class Truth(Model):
             raise ValueError(f"give one of published, matrix, tolerances (given: {', '.join(given) or 'none'})")
         if self.published is not None and self.published not in PUBLISHED:
             raise ValueError(str(UnknownNameError("published matrix", self.published, PUBLISHED)))
+        names = [term.name for term in self.effects]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"effects: {name} is given twice; add the parameters up, or leave one out")
         return self
 
 
@@ -54,7 +59,7 @@ class Session(Model):
     noise_scale: float = Field(1.0, ge=0, allow_inf_nan=False, description="factor on all the reference's noise")
 
 
-class Commands(Model):
+class MotionGrid(Model):
     """Motion commands: every direction with every rate of turn, at each speed."""
 
     speeds: tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...] = Field(
@@ -65,6 +70,14 @@ class Commands(Model):
     turn_duration: Positive = Field(6.0, description="duration of turns on the spot, s")
 
 
+class Commands(MotionGrid):
+    """How the commands of a grid are driven."""
+
+    ramp: float = Field(
+        0.0, ge=0, allow_inf_nan=False, description="wheel rates rise and fall in so long; the run takes longer, s"
+    )
+
+
 class EncoderNoise(Noise):
     """The whole noise model: encoders, and the reference poses as in a calibration file."""
 
@@ -72,7 +85,7 @@ class EncoderNoise(Noise):
 
 
 class FlowerConfig(Model):
-    """A flower-shaped experiment, simulated: constant commands, wheel rates with noise, noisy reference poses."""
+    """A flower-shaped experiment, simulated: constant commands or ramps, wheel rates and reference poses with noise."""
 
     generator: Literal["flower"] = "flower"
     robot: Robot
@@ -86,6 +99,8 @@ class FlowerConfig(Model):
     train: Session
     validation: Session | None = None
     order: Literal["shuffled", "sorted"] = "shuffled"
+    start: Literal["fixed", "random"] = Field("fixed", description="at the origin, or anywhere with any heading")
+    start_area: Positive = Field(4.0, description="side of the square about the origin for random starts, m")
 
     @field_validator("robot")
     @classmethod
@@ -105,6 +120,13 @@ class FlowerConfig(Model):
         shortest = min(session.distance for session in self._sessions()) / max(*self.commands.speeds, 1e-9)
         if math.isfinite(shortest) and shortest < self.sample_period:
             raise ValueError("runs are shorter than one sample; raise distance or lower sample_period")
+        if 0.0 in self.commands.speeds:
+            shortest = min(shortest, self.commands.turn_duration)
+        if self.commands.ramp > shortest:
+            raise ValueError(
+                f"commands.ramp: {self.commands.ramp:g} s; the shortest run would have to slow down before it has its "
+                f"speed, give it less than {shortest:g} s"
+            )
         if self._rows() > _MOST_ROWS:
             raise ValueError(
                 f"this is {self._rows():.1g} wheel samples and poses, more than {_MOST_ROWS:.0e}; "
@@ -115,8 +137,9 @@ class FlowerConfig(Model):
     def _rows(self) -> float:
         """Wheel samples and poses in all."""
         chosen = self.commands
-        driven = [session.distance / speed for session in self._sessions() for speed in chosen.speeds if speed]
-        turns = chosen.turn_duration * len(self._sessions()) * (0.0 in chosen.speeds)
+        ways = [session.distance for session in self._sessions()]
+        driven = [way / speed + chosen.ramp for way in ways for speed in chosen.speeds if speed]
+        turns = (chosen.turn_duration + chosen.ramp) * len(ways) * (0.0 in chosen.speeds)
         runs = len(chosen.turn_rates) * self.repetitions
         seconds = runs * (len(chosen.directions_deg) * sum(driven) + turns)
         return seconds / self.sample_period + seconds / self.pose_period

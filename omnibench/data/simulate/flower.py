@@ -9,26 +9,14 @@ from itertools import product
 
 import numpy as np
 
-from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Split, Trajectory, make_dataset
-from omnibench.data.simulate.config import Commands, EncoderNoise, FlowerConfig, Session, Truth
-from omnibench.robot.calibration import Row, matrix_rows
-from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrices, wheel_equations
-from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import Integration, WheelLog
-from omnibench.robot.published import published_matrix
+from omnibench.data.simulate.config import Commands, FlowerConfig, MotionGrid, Session
+from omnibench.data.simulate.noise import reference_noise
+from omnibench.data.simulate.truth import TrueRobot, TruthRecord, complete_effects, true_matrix
+from omnibench.robot.calibration import matrix_rows
+from omnibench.robot.kinematics import Array, Robot, wheel_equations
 
 _PAUSE = 10.0  # s between runs
-
-
-class TruthRecord(Model):
-    """What was hidden: goes to its own folder, which fitting and comparing never read."""
-
-    dataset: str
-    robot: Robot
-    matrix: tuple[Row, Row, Row]
-    integration: Integration
-    noise: EncoderNoise
 
 
 @dataclass(frozen=True)
@@ -59,11 +47,24 @@ class Command:
 
 
 def simulate_dataset(config: FlowerConfig, name: str = "flower", description: str = "") -> Simulation:
-    """Simulate the training session and, if there is one, the validation session."""
-    matrix = true_matrix(config.truth, config.robot)
-    trajectories = list(_session(config, matrix, "train", config.train))
+    """Simulate the training session and, if there is one, the validation session.
+
+    ConfigError or DataError in one line: an effect of the truth, or a parameter of one, is not known or is missing.
+    """
+    sessions: dict[Split, Session] = {"train": config.train}
     if config.validation is not None:
-        trajectories += _session(config, matrix, "validation", config.validation)
+        sessions["validation"] = config.validation
+    truth = TruthRecord(
+        dataset=name,
+        robot=config.robot,
+        sample_period=config.sample_period,
+        matrix=matrix_rows(true_matrix(config.truth, config.robot)),
+        integration=config.integration,
+        noise=config.noise,
+        effects=complete_effects(config.truth, config.robot, tuple(sessions), name),
+    )
+    robot = truth.true_robot()
+    trajectories = [run for split, session in sessions.items() for run in _session(config, robot, split, session)]
     dataset = make_dataset(
         name,
         config.robot,
@@ -73,31 +74,7 @@ def simulate_dataset(config: FlowerConfig, name: str = "flower", description: st
         source="simulated by omnibench",
         simulated=True,
     )
-    record = TruthRecord(
-        dataset=name,
-        robot=config.robot,
-        matrix=matrix_rows(matrix),
-        integration=config.integration,
-        noise=config.noise,
-    )
-    return Simulation(dataset, record)
-
-
-def true_matrix(truth: Truth, robot: Robot) -> Array:
-    """The hidden inverse kinematic matrix (3, N)."""
-    if truth.published is not None:
-        return published_matrix(truth.published)
-    if truth.matrix is not None:
-        return np.array(truth.matrix)
-    assert truth.tolerances is not None  # one of the three is given
-    rng = np.random.default_rng(truth.tolerances.seed)
-    draws = rng.standard_normal((3, len(robot.wheels)))
-    wheels = robot.wheels
-    radius = np.array([wheel.radius for wheel in wheels]) * (1 + truth.tolerances.radius * draws[0])
-    distance = np.array([wheel.distance for wheel in wheels]) * (1 + truth.tolerances.distance * draws[1])
-    angle = np.array([wheel.angle for wheel in wheels]) + math.radians(truth.tolerances.angle_deg) * draws[2]
-    rollers = np.array([wheel.roller_angle for wheel in wheels])
-    return inverse_kinematic_matrices(radius[None], distance[None], angle[None], rollers)[0]
+    return Simulation(dataset, truth)
 
 
 def commands_of(config: FlowerConfig) -> list[Command]:
@@ -105,7 +82,7 @@ def commands_of(config: FlowerConfig) -> list[Command]:
     return grid_of(config.commands)
 
 
-def grid_of(chosen: Commands) -> list[Command]:
+def grid_of(chosen: MotionGrid) -> list[Command]:
     """Every direction with every rate of turn, at each speed; the direction of a turn on the spot is 0."""
     return [
         Command(speed, math.radians(direction), turn_rate)
@@ -115,15 +92,39 @@ def grid_of(chosen: Commands) -> list[Command]:
     ]
 
 
-def _session(config: FlowerConfig, matrix: Array, split: Split, session: Session) -> Iterator[Trajectory]:
+def duration_of(command: Command, session: Session, chosen: Commands) -> float:
+    """How long a command is driven in a session, s; ramps lengthen a run so that the way stays."""
+    driven = session.distance / command.speed if command.speed else chosen.turn_duration
+    return driven + chosen.ramp
+
+
+def commanded_rates(robot: Robot, command: Command, times: Array, ramp: float) -> Array:
+    """Mean wheel rates (F, N) by the design values, rad/s, in samples that end at times (F,), s.
+
+    ramp: s in which they rise and fall, linearly.
+    """
+    rates: Array = np.tile(wheel_equations(robot.wheels) @ command.twist, (len(times), 1))
+    return rates if not ramp else rates * _mean_shares(times, ramp)[:, None]
+
+
+def _mean_shares(times: Array, ramp: float) -> Array:
+    """The share of its full speed (F,) that a robot has on average in each sample, from rest to rest."""
+    ends = np.append(0.0, times)
+    ramp = min(ramp, times[-1] / 2)
+    rising, falling = np.minimum(ends, ramp), np.maximum(ends - (times[-1] - ramp), 0.0)
+    driven = rising**2 / (2 * ramp) + (ends - rising) - falling**2 / (2 * ramp)  # s at full speed
+    return np.diff(driven) / np.diff(ends)
+
+
+def _session(config: FlowerConfig, robot: TrueRobot, split: Split, session: Session) -> Iterator[Trajectory]:
     rng = np.random.default_rng(session.seed)
     runs = [(command, repetition) for command in commands_of(config) for repetition in range(1, config.repetitions + 1)]
     if config.order == "shuffled":
         runs = [runs[index] for index in rng.permutation(len(runs))]
-    model = OdometryModel(config.robot, matrix, config.integration)
     started_at, angles = 0.0, np.zeros(len(config.robot.wheels))
     for number, (command, repetition) in enumerate(runs, 1):
-        run = _drive(config, model, command, session, rng, angles)
+        before = _Before(split, started_at, angles)
+        run = _drive(config, robot, command, session, rng, before)
         yield Trajectory(
             id=f"{split}-{number:03d}",
             split=split,
@@ -135,7 +136,7 @@ def _session(config: FlowerConfig, matrix: Array, split: Split, session: Session
             alpha=command.direction,
             omega=command.turn_rate,
             duration=float(run.times[-1]),
-            distance=command.speed * float(run.times[-1]),
+            distance=command.speed * (float(run.times[-1]) - config.commands.ramp),
             times=run.times,
             rates=run.rates,
             pose_times=run.pose_times,
@@ -145,6 +146,15 @@ def _session(config: FlowerConfig, matrix: Array, split: Split, session: Session
         )
         started_at += float(run.times[-1]) + _PAUSE
         angles = run.angles[-1]
+
+
+@dataclass(frozen=True)
+class _Before:
+    """What a run begins with: session, s since its start, and wheel angles (N,), rad."""
+
+    session: str
+    started_at: float
+    angles: Array
 
 
 @dataclass(frozen=True)
@@ -159,26 +169,39 @@ class _Run:
 
 def _drive(
     config: FlowerConfig,
-    model: OdometryModel,
+    robot: TrueRobot,
     command: Command,
     session: Session,
     rng: np.random.Generator,
-    angles: Array,
+    before: _Before,
 ) -> _Run:
-    """One run: the robot's own matrix turns the command into wheel rates, its true one into motion."""
-    duration = session.distance / command.speed if command.speed else config.commands.turn_duration
+    """One run: the design values turn the command into targets, motors these into rates, the truth these into motion.
+
+    Encoders are exact between runs: their noise does not part the true wheel angles from the recorded ones.
+    """
+    duration = duration_of(command, session, config.commands)
     times, pose_times = stamps_of_run(duration, config.sample_period, config.pose_period)
-    targets = np.tile(wheel_equations(config.robot.wheels) @ command.twist, (len(times), 1))
-    rates = targets + config.noise.encoder * rng.standard_normal(targets.shape)
-    (poses,) = model.poses([WheelLog(times, targets, np.zeros(3), pose_times)])
+    targets = commanded_rates(config.robot, command, times, config.commands.ramp)
+    start = _start(config, rng)
+    driven = robot.driven(times, targets)
+    rates = driven + config.noise.encoder * rng.standard_normal(targets.shape)
+    log = robot.log(times, driven, start, pose_times, before.angles, before.started_at, before.session)
+    (poses,) = robot.model.reported([log])
     return _Run(
         times=times,
         rates=rates,
-        angles=angles + np.cumsum(rates * config.sample_period, axis=0),
+        angles=before.angles + np.cumsum(rates * config.sample_period, axis=0),
         targets=targets,
         pose_times=pose_times,
-        poses=poses + session.noise_scale * _reference_noise(config.noise, pose_times, rng),
+        poses=poses + session.noise_scale * reference_noise(config.noise, pose_times, rng),
     )
+
+
+def _start(config: FlowerConfig, rng: np.random.Generator) -> Array:
+    if config.start == "fixed":
+        return np.zeros(3)
+    half = config.start_area / 2
+    return rng.uniform((-half, -half, -math.pi), (half, half, math.pi))
 
 
 def stamps_of_run(duration: float, sample_period: float, pose_period: float) -> tuple[Array, Array]:
@@ -187,17 +210,3 @@ def stamps_of_run(duration: float, sample_period: float, pose_period: float) -> 
     times: Array = sample_period * np.arange(1, samples + 1)
     between = pose_period * np.arange(1, math.ceil(times[-1] / pose_period))
     return times, np.concatenate([[0.0], between[between < times[-1] - 1e-9], times[-1:]])
-
-
-def _reference_noise(noise: EncoderNoise, times: Array, rng: np.random.Generator) -> Array:
-    """Noise (K, 3) of the reference poses in m, m, rad; none at t = 0, where the start pose is exact."""
-    white = np.array([noise.pose_position, noise.pose_position, noise.pose_heading])
-    walk = np.array([noise.walk_position, noise.walk_position, noise.walk_heading])
-    bias = np.array([noise.bias_position, noise.bias_position, noise.bias_heading])
-    steps = np.sqrt(np.diff(times))[:, None] * rng.standard_normal((len(times) - 1, 3))
-    after_start = (
-        bias * rng.standard_normal(3)
-        + walk * np.cumsum(steps, axis=0)
-        + white * rng.standard_normal((len(times) - 1, 3))
-    )
-    return np.vstack([np.zeros(3), after_start])

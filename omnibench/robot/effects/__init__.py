@@ -1,1 +1,1 @@
-"""Terms that can be added to the odometry model, one family a file. None is built in yet; plug-ins register here."""
+"""Terms that can be added to the odometry model, one family a file; plug-ins register theirs beside them."""

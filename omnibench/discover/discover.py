@@ -1,0 +1,85 @@
+"""Discovering what a model lacks: fit, look, name, extend, compare. The whole way on one page."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from omnibench.data.dataset import Dataset
+from omnibench.discover.actuators import look_at_actuators
+from omnibench.discover.extend import extend
+from omnibench.discover.groups import check_names
+from omnibench.discover.look import look_at
+from omnibench.discover.model_fit import fit_matrix
+from omnibench.discover.outcome import told
+from omnibench.discover.recording import usable_runs
+from omnibench.discover.result import Discovery
+from omnibench.discover.rivals import rivals_of
+from omnibench.errors import DataError
+from omnibench.robot.calibration import Calibration
+from omnibench.robot.kinematics import Array
+
+
+class Watch(Protocol):
+    """Who wants to know how far it is."""
+
+    def stage(self, text: str) -> None:
+        """What is being done now."""
+
+
+class _Nobody:
+    def stage(self, text: str) -> None:
+        pass
+
+
+def discover_effects(
+    dataset: Dataset,
+    *,
+    without: Sequence[str] = (),
+    unknown_term: bool = False,
+    seed: int = 0,
+    watch: Watch | None = None,
+    calibration: Calibration | None = None,
+) -> Discovery:
+    """Find where the odometry of a data set's training split disagrees with its reference, and name what is missing.
+
+    without: effects that are not to be tried. unknown_term: where nothing has a name, add a smooth term over what was
+    located. calibration: whose matrix to begin at. The validation split is looked at when all is decided, and only to
+    say how well that predicts it.
+
+    Raises UnknownNameError for a name in ``without`` that is no effect's, DataError for a training split without
+    reference poses or another robot's calibration.
+    """
+    began, tell = time.monotonic(), watch or _Nobody()
+    check_names(without)
+    rng = np.random.default_rng(seed)
+    runs = usable_runs(dataset.split("train"))
+    tell.stage("fitting the plain matrix")
+    plain = fit_matrix(runs, dataset.robot, dataset.sample_period, _start(dataset, calibration))
+    tell.stage("looking where it fails, and at the catalogue")
+    look = look_at(plain, None, None, without, rng)
+    extended = extend(plain, look.named.chosen)
+    if look.named.chosen:
+        tell.stage("looking again, now that the noise is known better")
+        again = look_at(extended.fit, extended, look.groups, without, rng)
+        if not again.named.is_same_as(look.named):
+            extended = extend(plain, again.named.chosen)
+        look = again
+    rivals = rivals_of(plain, look, extended)
+    tell.stage("looking at the motors")
+    motors = look_at_actuators(runs, dataset.robot, without, rng)
+    tell.stage("comparing on runs that were held out")
+    return told(dataset, plain, look, rivals, motors, seed, unknown_term, began)
+
+
+def _start(dataset: Dataset, calibration: Calibration | None) -> Array:
+    """The matrix (3, N) to begin at."""
+    if calibration is None:
+        return dataset.robot.inverse_kinematic_matrix
+    if calibration.robot.wheel_names != dataset.robot.wheel_names:
+        ours, theirs = ", ".join(calibration.robot.wheel_names), ", ".join(dataset.robot.wheel_names)
+        raise DataError(f"the calibration is for wheels {ours}, the data set {dataset.name} has {theirs}")
+    return calibration.matrix_array

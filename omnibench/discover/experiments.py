@@ -1,0 +1,58 @@
+"""Experiments that tell look-alikes apart, as configs for ``omnibench simulate`` or for the robot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from omnibench.config import to_yaml
+from omnibench.data.dataset import Dataset
+from omnibench.data.simulate.config import FlowerConfig
+from omnibench.discover.model_fit import Fit
+from omnibench.discover.result import Experiment, NamedEffect
+from omnibench.robot.calibration import matrix_rows
+
+
+def experiments_for(
+    dataset: Dataset, effects: Sequence[NamedEffect], classes: Sequence[tuple[str, ...]], fit: Fit
+) -> tuple[Experiment, ...]:
+    """One experiment for each effect that is confusable with others."""
+    del classes
+    found = []
+    for effect in effects:
+        if effect.confusable_with:
+            members = (effect.name, *effect.confusable_with)
+            found.append(Experiment(members, _WORDS.format(names=", ".join(members)), _config(dataset, effect, fit)))
+    return tuple(found)
+
+
+_WORDS = (
+    "Tells {names} apart: straight runs and curves at two speeds, turns on the spot, random start headings and a "
+    "random order, each command five times."
+)
+
+
+def _config(dataset: Dataset, effect: NamedEffect, fit: Fit) -> str:
+    speed = max((run.v or 0.0 for run in dataset.trajectories), default=0.0) or 0.2
+    turn = max((abs(run.omega or 0.0) for run in dataset.trajectories), default=0.0) or 0.35
+    noise = fit.noise.noise.model_dump()
+    config = FlowerConfig.model_validate(
+        {
+            "robot": dataset.robot.model_dump(),
+            "sample_period": dataset.sample_period,
+            "pose_period": max(0.2, dataset.sample_period),
+            "commands": {
+                "speeds": [0.0, round(speed / 2, 3), round(speed, 3)],
+                "directions_deg": [0, 60, 120, 180, 240, 300],
+                "turn_rates": [-round(turn, 3), 0.0, round(turn, 3)],
+                "ramp": 0.3,
+            },
+            "start": "random",
+            "truth": {
+                "matrix": matrix_rows(fit.model.matrix),
+                "effects": [{"name": effect.name, "parameters": {each.name: each.value for each in effect.parameters}}],
+            },
+            "noise": noise,
+            "train": {"seed": 1, "distance": max(6 * speed, 0.5)},
+        }
+    )
+    return to_yaml(config)

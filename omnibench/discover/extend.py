@@ -1,0 +1,124 @@
+"""Adding effects to the model: matrix and parameters fitted together, without shortcuts, noise and nuisances anew."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from omnibench.data.dataset import Trajectory
+from omnibench.discover.groups import Group
+from omnibench.discover.model_fit import Fit, at_model, matrix_jacobian, model_with, paths_of, split_runs, with_noise
+from omnibench.discover.paths import Paths, make_paths
+from omnibench.discover.whitened import Whitened, given
+from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
+from omnibench.robot.effects.term import Term
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import OdometryBatch
+
+_STEPS = 4
+_STILL = 0.05  # standard errors
+
+
+@dataclass(frozen=True, eq=False)
+class Extended:
+    """A fit with effects. data: whitened columns of matrix elements, then of the effects' linear parameters.
+
+    values (n,): of these parameters. covariance: of matrix elements and parameters, by the scatter of the runs'
+    scores where that is wider than the noise model says.
+    """
+
+    fit: Fit
+    groups: tuple[Group, ...]
+    data: Whitened
+    columns: tuple[Array, ...]
+    values: Array
+    covariance: Array
+
+
+def extend(plain: Fit, groups: Sequence[Group]) -> Extended:
+    """Fit matrix and effects together, beginning at the plain matrix."""
+    fit = plain
+    values: Array = np.zeros(sum(len(group.parameters) for group in groups))
+    for round_ in range(2):
+        fit, values, data, columns = _descend(fit, groups, values)
+        if round_ == 0 and groups:
+            fit = with_noise(fit)
+        else:
+            break
+    return Extended(fit, tuple(groups), data, columns, values, _covariance(data))
+
+
+def terms_of(groups: Sequence[Group], values: Array) -> list[Term]:
+    """The effects as terms of a model; values: of all their linear parameters in turn."""
+    terms, first = [], 0
+    for group in groups:
+        own = {each.name: float(value) for each, value in zip(group.parameters, values[first:], strict=False)}
+        first += len(group.parameters)
+        assert group.effect is not None
+        terms.append(Term(group.effect, own | dict(group.shapes)))
+    return terms
+
+
+def columns_of(fit: Fit, groups: Sequence[Group]) -> tuple[Array, ...]:
+    """Slopes (K, 3, n) of each run's poses by matrix elements and by the effects' parameters, about a fit."""
+    columns = [matrix_jacobian(fit)]
+    if groups:
+        columns += _of_groups(paths_of(fit), groups)
+    return tuple(split_runs(np.concatenate(columns, axis=2), fit.runs))
+
+
+def columns_at(extended: Extended, runs: Sequence[Trajectory]) -> list[Array]:
+    """The same slopes (K, 3, n) for other runs."""
+    model = extended.fit.model
+    assert model.sample_period is not None
+    ordered = sorted(range(len(runs)), key=lambda index: str(runs[index].session))
+    logs = [runs[index].reference_log for index in ordered]
+    batch = OdometryBatch(logs, model.integration)
+    paths = make_paths(model.robot, model.matrix, logs, model.sample_period)
+    columns = [batch.jacobian(model.matrix).reshape(len(batch.trajectory), 3, -1), *_of_groups(paths, extended.groups)]
+    parts = split_runs(np.concatenate(columns, axis=2), [runs[index] for index in ordered])
+    return [part for _, part in sorted(zip(ordered, parts, strict=True), key=lambda pair: pair[0])]
+
+
+def _of_groups(paths: Paths, groups: Sequence[Group]) -> Iterator[Array]:
+    for group in groups:
+        assert isinstance(group.effect, MotionEffect | ReferenceEffect)
+        base = {each.name: 0.0 for each in group.parameters} | dict(group.shapes)
+        for each in group.parameters:
+            yield paths.of_effect(group.effect, each.name, base)
+
+
+def _descend(fit: Fit, groups: Sequence[Group], values: Array) -> tuple[Fit, Array, Whitened, tuple[Array, ...]]:
+    columns = columns_of(fit, groups)
+    elements = fit.model.matrix.size
+    data = fit.whitened(columns)
+    for _ in range(_STEPS):
+        step, covariance = given(data, []).estimate(range(elements + len(values)))
+        values = values + step[elements:]
+        matrix = fit.model.matrix + step[:elements].reshape(fit.model.matrix.shape)
+        fit = at_model(fit, model_with(fit.model, matrix, terms_of(groups, values)))
+        data = fit.whitened(columns)
+        if _size(step, covariance) < _STILL:
+            break
+    return fit, values, data, columns
+
+
+def _size(step: Array, covariance: Array) -> float:
+    deviations = np.sqrt(np.diag(covariance))
+    return float((np.abs(step) / np.maximum(deviations, 1e-300)).max())
+
+
+def _covariance(data: Whitened) -> Array:
+    """Of the fitted numbers: by the noise model, or wider where the runs' scores scatter more."""
+    now = given(data, [])
+    everything = list(range(data.information.shape[0]))
+    roots = now.roots(everything)
+    runs = len(data.scores)
+    centred = data.scores @ roots
+    scatter = centred.T @ centred * runs / max(runs - roots.shape[1], 1)
+    sizes, directions = np.linalg.eigh(scatter)
+    wider = (directions * np.maximum(sizes, 1.0)) @ directions.T
+    covariance: Array = roots @ wider @ roots.T
+    return covariance

@@ -1,0 +1,64 @@
+"""One look at what a model leaves: everything that could explain it, what does, and what that leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.discover.extend import Extended
+from omnibench.discover.groups import Groups, make_groups
+from omnibench.discover.held_out import folds_of, gains_on_held_out
+from omnibench.discover.model_fit import Fit, matrix_jacobian, paths_of, split_runs
+from omnibench.discover.naming import Named, name_effects
+from omnibench.discover.significance import Gains, gains_of
+from omnibench.discover.whitened import Whitened
+from omnibench.robot.kinematics import Array
+
+_COARSE = 0.03  # s; what is looked for varies more slowly, and the fit itself takes every sample
+_HELD_OUT = 2.0  # standard errors by which runs that are held out must gain
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What was looked at and found. data: all columns against what the plain matrix leaves; places: before any effect.
+
+    columns (K, 3, p): of every run, not whitened. folds (Z,): by which runs are held out.
+    """
+
+    groups: Groups
+    columns: tuple[Array, ...]
+    data: Whitened
+    folds: NDArray[np.intp]
+    named: Named
+    places: Gains
+
+
+def look_at(
+    fit: Fit, extended: Extended | None, groups: Groups | None, without: Sequence[str], rng: np.random.Generator
+) -> Look:
+    """Look at what the plain matrix leaves, with the noise, nuisances and poses of a fit.
+
+    extended: the fit with effects, whose noise is better known; their share is put back into the residuals. groups:
+    of an earlier look at the same poses.
+    """
+    if groups is None or len(groups.columns) != sum(len(own) for own in fit.residuals):
+        groups = make_groups(paths_of(fit, _COARSE), matrix_jacobian(fit), fit.runs, without)
+    residuals = fit.free_residuals
+    if extended is not None:
+        elements = fit.model.matrix.size
+        residuals = [
+            own + columns[..., elements:] @ extended.values
+            for own, columns in zip(residuals, extended.columns, strict=True)
+        ]
+    columns = tuple(split_runs(groups.columns, fit.runs))
+    data, folds = fit.whitened(columns, residuals), folds_of(fit.runs)
+
+    def confirmed(before: Sequence[int], new: Sequence[int]) -> bool:
+        gains = gains_on_held_out(data, before, [*before, *new], folds)
+        return float(gains.mean()) > _HELD_OUT * float(gains.std()) / np.sqrt(len(gains))
+
+    named = name_effects(data, groups, confirmed, rng)
+    return Look(groups, columns, data, folds, named, gains_of(data, groups.matrix.index, groups.places, rng))

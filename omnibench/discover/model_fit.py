@@ -1,0 +1,196 @@
+"""A model with effects fitted to runs: least squares of whole trajectories, weighted by the noise of repetitions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from omnibench.data.dataset import Trajectory
+from omnibench.discover.paths import Paths, make_paths
+from omnibench.discover.recording import Nuisances, deviation_of, log_of, without_jumps
+from omnibench.discover.whitened import Whitened, given, whitened
+from omnibench.fit.noise import NoiseEstimate, Whitener, estimate_noise
+from omnibench.robot.calibration import Noise
+from omnibench.robot.effects.term import Term
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import OdometryBatch, WheelLog
+
+_FIRST = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.01, walk_heading=0.01)
+_ROUNDS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted model and what it leaves.
+
+    runs: without poses that jump; jumps: how many these were. residuals: of each run (K, 3), reference minus model, m,
+    m, rad, at pose_times[1:]. slopes: derivatives (K, 3, 3) of the model's poses by the run's nuisances.
+    """
+
+    model: OdometryModel
+    runs: tuple[Trajectory, ...]
+    nuisances: Nuisances
+    noise: NoiseEstimate
+    residuals: tuple[Array, ...]
+    slopes: tuple[Array, ...]
+    jumps: int
+
+    @property
+    def free_residuals(self) -> list[Array]:
+        """Residuals as they would be without any of the nuisances' present values, to first order."""
+        return [
+            own + slopes @ values
+            for own, slopes, values in zip(self.residuals, self.slopes, self.nuisances.values, strict=True)
+        ]
+
+    @property
+    def stamps(self) -> list[Array]:
+        """Of each run's residuals, s."""
+        return [run.pose_times[1:] for run in self.runs]
+
+    def whitened(self, columns: Sequence[Array], residuals: Sequence[Array] | None = None) -> Whitened:
+        """Columns (K, 3, p) of every run, independent and of unit variance, nuisances eliminated, with the residuals.
+
+        residuals (K, 3): others than the fit's own free ones.
+        """
+        own = self.free_residuals if residuals is None else residuals
+        return whitened(own, columns, self.stamps, self.noise.noise, self.slopes, self.nuisances.deviations)
+
+
+def fit_matrix(runs: Sequence[Trajectory], robot: Robot, sample_period: float, start: Array) -> Fit:
+    """The plain matrix from a start (3, N), with noise, nuisances and jumping poses found on the way.
+
+    Exact arcs: Euler steps would leave what looks like centripetal slip.
+    """
+    model = OdometryModel(robot, start, "arc", (), sample_period)
+    nuisances = Nuisances(np.zeros((len(runs), 3)), np.zeros(3))
+    first = NoiseEstimate(_FIRST, "within runs", 1, "")
+    fit = _at(model, tuple(runs), nuisances, first, 0)
+    for _ in range(3):
+        fit = _matrix_step(fit)
+    for _ in range(_ROUNDS):
+        before = fit.noise.noise
+        fit = with_noise(fit)
+        for _ in range(2 if fit.nuisances.deviations.any() else 1):
+            fit = _matrix_step(fit)
+        if _is_near(before, fit.noise.noise):
+            break
+    return fit
+
+
+def with_noise(fit: Fit) -> Fit:
+    """The same with noise, nuisances and jumping poses estimated anew from its residuals."""
+    found = estimate_noise(fit.runs, fit.residuals)
+    runs, jumps = without_jumps(fit.runs, fit.residuals, found.noise)
+    if jumps:
+        fit = _at(fit.model, runs, fit.nuisances, found, fit.jumps + jumps)
+        found = estimate_noise(fit.runs, fit.residuals, found.noise)
+    deviations = np.array(
+        [
+            deviation_of(fit.runs, fit.free_residuals, [slopes[..., kind] for slopes in fit.slopes], found.noise, kind)
+            for kind in range(3)
+        ]
+    )
+    values = np.where(deviations > 0, fit.nuisances.values, 0.0)
+    return _at(fit.model, fit.runs, Nuisances(values, deviations), found, fit.jumps)
+
+
+def matrix_jacobian(fit: Fit) -> Array:
+    """Derivatives (S, 3, 3N) of all poses by the elements of the matrix."""
+    batch = OdometryBatch(_logs(fit.runs, fit.nuisances.values), "arc")
+    columns = batch.jacobian(fit.model.matrix)
+    return columns.reshape(len(columns), 3, -1)
+
+
+def paths_of(fit: Fit, coarse: float = 0.0) -> Paths:
+    """The paths of a fit's runs by its matrix alone, samples put together up to ``coarse`` s."""
+    assert fit.model.sample_period is not None
+    together = max(1, int(coarse / fit.model.sample_period))
+    logs = [_coarser(log, together) for log in _logs(fit.runs, fit.nuisances.values)]
+    return make_paths(fit.model.robot, fit.model.matrix, logs, together * fit.model.sample_period)
+
+
+def _coarser(log: WheelLog, together: int) -> WheelLog:
+    """A log with the mean rates of so many samples each."""
+    if together == 1:
+        return log
+    ends = np.unique(np.append(np.arange(together - 1, len(log.times), together), len(log.times) - 1))
+    angles = np.cumsum(log.rates * np.diff(log.times, prepend=0.0)[:, None], axis=0)[ends]
+    times = log.times[ends]
+    rates = np.diff(angles, axis=0, prepend=np.zeros((1, angles.shape[1]))) / np.diff(times, prepend=0.0)[:, None]
+    phases = None if log.wheel_angles is None else log.wheel_angles[ends]
+    return replace(log, times=times, rates=rates, wheel_angles=phases)
+
+
+def at_model(fit: Fit, model: OdometryModel) -> Fit:
+    """The fit with another model; the nuisances follow: the most likely ones given the residuals that are left."""
+    return _with_nuisances(_at(model, fit.runs, fit.nuisances, fit.noise, fit.jumps))
+
+
+def _with_nuisances(fit: Fit) -> Fit:
+    """The most likely nuisances for the residuals that the model leaves."""
+    deviations = fit.nuisances.deviations
+    known = deviations > 0
+    if not known.any():
+        return fit
+    values = np.zeros_like(fit.nuisances.values)
+    for row, (run, own, slopes) in enumerate(zip(fit.runs, fit.free_residuals, fit.slopes, strict=True)):
+        white = Whitener(fit.noise.noise, run.pose_times[1:])(np.concatenate([own[..., None], slopes[..., known]], -1))
+        flat = white.reshape(3 * len(own), -1)
+        columns = flat[:, 1:]
+        prior = np.diag(deviations[known] ** -2.0)
+        values[row, known] = np.linalg.solve(columns.T @ columns + prior, columns.T @ flat[:, 0])
+    return _at(fit.model, fit.runs, Nuisances(values, deviations), fit.noise, fit.jumps)
+
+
+def _matrix_step(fit: Fit) -> Fit:
+    """One Gauss-Newton step of the matrix, and the nuisances that go with it."""
+    jacobian = matrix_jacobian(fit)
+    data = fit.whitened(split_runs(jacobian, fit.runs))
+    everything = list(range(jacobian.shape[2]))
+    step, _ = given(data, []).estimate(everything)
+    matrix = fit.model.matrix + step.reshape(3, -1)
+    return _with_nuisances(_at(replace(fit.model, matrix=matrix), fit.runs, fit.nuisances, fit.noise, fit.jumps))
+
+
+def _at(
+    model: OdometryModel, runs: tuple[Trajectory, ...], nuisances: Nuisances, noise: NoiseEstimate, jumps: int
+) -> Fit:
+    logs = _logs(runs, nuisances.values)
+    poses = model.reported(logs)
+    residuals = tuple(run.poses[1:] - own for run, own in zip(runs, poses, strict=True))
+    slopes = tuple(_nuisance_slopes(log, own) for log, own in zip(logs, poses, strict=True))
+    return Fit(model, runs, nuisances, noise, residuals, slopes, jumps)
+
+
+def _logs(runs: Sequence[Trajectory], nuisances: Array) -> list[WheelLog]:
+    return [log_of(run, own) for run, own in zip(runs, nuisances, strict=True)]
+
+
+def _nuisance_slopes(log: WheelLog, poses: Array) -> Array:
+    """Derivatives (K, 3, 3) of poses (K, 3) by start heading, clock offset and clock slope."""
+    lever = poses - log.start
+    turning = np.stack([-lever[:, 1], lever[:, 0], np.ones(len(poses))], axis=1)
+    velocity = np.gradient(
+        np.vstack([log.start, poses]), np.concatenate([[min(0.0, log.stamps[0] - 1e-3)], log.stamps]), axis=0
+    )[1:]
+    return np.stack([turning, -velocity, -velocity * log.stamps[:, None]], axis=2)
+
+
+def split_runs(columns: Array, runs: Sequence[Trajectory]) -> list[Array]:
+    """What belongs to each run (K, ...), of all poses (S, ...)."""
+    ends = np.cumsum([len(run.pose_times) - 1 for run in runs])[:-1]
+    return np.split(columns, ends)
+
+
+def _is_near(first: Noise, second: Noise) -> bool:
+    ours, theirs = (np.array(list(each.model_dump().values())) for each in (first, second))
+    return bool((np.abs(ours - theirs) <= 0.02 * np.maximum(ours, theirs).max()).all())
+
+
+def model_with(model: OdometryModel, matrix: Array, terms: Sequence[Term]) -> OdometryModel:
+    """The model with another matrix and other terms."""
+    return replace(model, matrix=matrix, terms=tuple(terms))

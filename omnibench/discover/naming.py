@@ -1,0 +1,228 @@
+"""Which effects are missing: sets of effects compared by their evidence, their idealised forms allowed for.
+
+Every set A of at most m effects lowers the whitened chi2 by Q(A) and costs what its parameters and its choice among
+the catalogue are worth (Schwarz 1978). The form that the catalogue gives an effect is an idealisation, off by a share
+``DISCREPANCY`` of its size: with an effect of non-centrality N that moves differences in Q by DISCREPANCY^2 N times as
+much as noise does, so that evidence counts that much less. A name's weight is the sum over the sets that hold it,
+times the probability that what is there is in the catalogue at all: what generic bases still find after the effects,
+in their own forms or slightly different ones, says how likely that is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from omnibench.discover.groups import Group, Groups
+from omnibench.discover.significance import Gains, gains_of
+from omnibench.discover.whitened import Given, Whitened, given
+from omnibench.robot.kinematics import Array
+
+DISCREPANCY = 0.12
+SURE = 0.95
+CHANCE = 0.002  # of naming anything where nothing is missing
+_PRIOR = float(np.log(20))  # an effect is missing once in 20 robots
+_MOST = 3  # effects
+_LEFT_RIGHT = 0.04  # share that right names leave, in the mean; wrong ones leave anything
+_BEYOND_RIGHT = 0.01  # likewise, when their forms may differ a little
+_MOST_ODDS = 10.0  # that another form may lend a name
+_CANCELLING = 0.35  # effects that undo each other to such a share imitate something else rather than being there all
+_IMITATION = 0.05  # odds that they are
+_WRONG = 0.2  # of what is missing is not in the catalogue
+_CONFUSABLE = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class Named:
+    """Names and how sure they are.
+
+    chosen: the effects in the order in which they were found. weights: of every candidate. steps: gains of all
+    candidates when each effect was looked for. known: probability that what is there is in the catalogue. confusable:
+    of each chosen effect, as stand_ins. left: what generic bases find after the effects.
+    """
+
+    chosen: tuple[Group, ...]
+    weights: dict[str, float]
+    known: float
+    confusable: tuple[tuple[str, ...], ...]
+    stand_ins: tuple[tuple[Group, ...], ...]
+    steps: tuple[Gains, ...]
+    left: Gains
+    left_share: float
+
+    def is_same_as(self, other: Named) -> bool:
+        """Whether the same effects were chosen, in the same shapes."""
+        ours, theirs = ([(group.name, dict(group.shapes)) for group in each.chosen] for each in (self, other))
+        return ours == theirs
+
+
+def name_effects(
+    data: Whitened, groups: Groups, confirmed: Callable[[Sequence[int], Sequence[int]], bool], rng: np.random.Generator
+) -> Named:
+    """Effects by forward selection, with exchange of all that were chosen before.
+
+    data: all columns against what the matrix leaves. confirmed: whether held-out runs gain by columns (second) beyond
+    others (first).
+    """
+    start = given(data, groups.matrix.index)
+    steps: list[Gains] = []
+    chosen: tuple[Group, ...] = ()
+    pool: list[Group] = []
+    while len(chosen) < _MOST:
+        others = [each for each in groups.effects if each.name not in _names(chosen)]
+        found = gains_of(data, [*groups.matrix.index, *_indices(chosen)], others, rng)
+        steps.append(found)
+        pool += [group for group in _best_shapes(found) if group not in pool]
+        if not others or found.p_value(found.best) > CHANCE:
+            break
+        larger = _sets(start, pool, len(chosen) + 1)
+        best = larger.best
+        if len(best) <= len(chosen):
+            break
+        if not all(
+            confirmed([*groups.matrix.index, *_indices([other for other in best if other is not each])], each.index)
+            for each in best
+        ):
+            break
+        chosen = best
+    sets = _sets(start, pool, max(len(chosen), 1))
+    fitted = [*groups.matrix.index, *_indices(chosen)]
+    left = gains_of(data, fitted, groups.places, rng)
+    share, known = 0.0, 1.0
+    if chosen:
+        forms = [index for group in chosen for index in group.forms]
+        share, known = _known(sets, start, chosen, left, gains_of(data, [*fitted, *forms], groups.places, rng))
+    weights = {name: known * weight for name, weight in sets.weights(chosen).items()}
+    ordered = tuple(sorted(chosen, key=lambda group: -start.gain(group.index)))
+    return Named(
+        ordered,
+        weights,
+        known,
+        tuple(tuple(each.name for each in sets.stand_ins(group, chosen)) for group in ordered),
+        tuple(sets.stand_ins(group, chosen) for group in ordered),
+        tuple(steps),
+        left,
+        share,
+    )
+
+
+def _indices(chosen: Sequence[Group]) -> list[int]:
+    return [index for group in chosen for index in group.index]
+
+
+def _names(chosen: Sequence[Group]) -> set[str]:
+    return {group.name for group in chosen}
+
+
+def _best_shapes(found: Gains) -> list[Group]:
+    """Of every effect the shape that gains most."""
+    best: dict[str, tuple[float, Group]] = {}
+    for group, gain, rank in zip(found.groups, found.gain, found.rank, strict=True):
+        if rank and (group.name not in best or gain > best[group.name][0]):
+            best[group.name] = (float(gain), group)
+    return [group for _, group in best.values()]
+
+
+@dataclass(frozen=True, eq=False)
+class _Sets:
+    """Sets of effects with the logarithms of their evidence."""
+
+    sets: tuple[tuple[Group, ...], ...]
+    evidence: Array
+    gain: Array
+    energy: float
+
+    @property
+    def best(self) -> tuple[Group, ...]:
+        return self.sets[int(self.evidence.argmax())]
+
+    @property
+    def probabilities(self) -> Array:
+        likely = np.exp(self.evidence - self.evidence.max())
+        return np.asarray(likely / likely.sum())
+
+    def weights(self, chosen: Sequence[Group]) -> dict[str, float]:
+        """Of every name, the sum over the sets that hold it; where some were chosen, something is known to be there."""
+        found: dict[str, float] = {}
+        likely = self.probabilities
+        if chosen:
+            likely = np.where([bool(each) for each in self.sets], likely, 0.0)
+            likely = likely / likely.sum()
+        for each, probability in zip(self.sets, likely, strict=True):
+            for name in _names(each):
+                found[name] = found.get(name, 0.0) + float(probability)
+        return found
+
+    def stand_ins(self, group: Group, chosen: Sequence[Group]) -> tuple[Group, ...]:
+        """Effects that could stand in a group's place among those that were chosen, the likeliest first."""
+        others = _names(chosen) - {group.name}
+        found: dict[str, tuple[float, Group]] = {}
+        for each, probability in zip(self.sets, self.probabilities, strict=True):
+            names = _names(each)
+            if group.name not in names and others <= names and len(each) == len(chosen):
+                (other,) = (own for own in each if own.name not in others)
+                before, best = found.get(other.name, (0.0, other))
+                found[other.name] = before + float(probability), best
+        likely = sorted(found.values(), key=lambda item: -item[0])
+        return tuple(other for weight, other in likely if weight > _CONFUSABLE)
+
+
+def _sets(start: Given, pool: Sequence[Group], most: int) -> _Sets:
+    sets = [each for size in range(most + 1) for each in combinations(pool, size) if len(_names(each)) == size]
+    gain = np.array([start.gain(_indices(each)) if each else 0.0 for each in sets])
+    rank = np.array([start.rank(_indices(each)) if each else 0 for each in sets])
+    choices = np.array([sum(_PRIOR + np.log(group.tries) for group in each) for each in sets])
+    energy = float(max((gain - rank).max(), 0.0))
+    per_rank = np.maximum(gain / np.maximum(rank, 1), 1.0)
+    evidence = (gain - rank) / 2 / (1 + DISCREPANCY**2 * energy) - rank * np.log(per_rank) / 2 - choices
+    return _Sets(tuple(sets), evidence, gain, energy)
+
+
+def _known(sets: _Sets, start: Given, chosen: Sequence[Group], left: Gains, beyond: Gains) -> tuple[float, float]:
+    """The share that the chosen effects leave, and how likely it is that their names are right.
+
+    left: what generic bases find after the effects; beyond: after the effects in slightly different forms, too.
+    """
+    energy = max(sets.energy, 1.0)
+    gain, scatter = left.surplus_gain
+    after = start.given(_indices(chosen))
+    forms = [index for group in chosen for index in group.forms]
+    of_forms = max(after.gain(forms) - after.rank(forms), 0.0) if forms else 0.0
+    shares = [
+        (max(gain, of_forms), scatter, _LEFT_RIGHT),
+        (*beyond.surplus_gain, _BEYOND_RIGHT),
+    ]
+    odds = (1 - _WRONG) / _WRONG
+    for (found, spread, usual), most in zip(shares, (np.inf, _MOST_ODDS), strict=True):
+        odds *= min(_odds(found, float(np.sqrt(spread**2 + 4 * found)), energy, usual), most)
+    if len(chosen) > 1 and _cancelling(start, chosen) < _CANCELLING:
+        odds *= _IMITATION
+    share = shares[0][0] / (shares[0][0] + energy)
+    return share, odds / (1 + odds)
+
+
+def _odds(left: float, spread: float, energy: float, usual: float) -> float:
+    """How much likelier right names are than wrong ones to leave so much; usual: the mean share of right ones."""
+    shares = (np.arange(400) + 0.5) / 400 * 0.99
+    right, wrong = -usual * np.log1p(-shares / 0.99), shares
+
+    def likelihood(each: Array) -> float:
+        expected = energy * np.minimum(each, 0.99) / (1 - np.minimum(each, 0.99))
+        return float(np.exp(-(((left - expected) / spread) ** 2) / 2).mean())
+
+    return likelihood(right) / max(likelihood(wrong), 1e-300)
+
+
+def _cancelling(start: Given, chosen: Sequence[Group]) -> float:
+    """What the effects make together against what they make apart: little, where they mostly undo each other."""
+    index = _indices(chosen)
+    values, _ = start.estimate(index)
+    apart, first = 0.0, 0
+    for group in chosen:
+        own, rows = values[first : first + len(group.index)], list(group.index)
+        apart += float(own @ start.information[np.ix_(rows, rows)] @ own)
+        first += len(group.index)
+    return start.gain(index) / max(apart, 1e-300)

@@ -1,0 +1,106 @@
+"""The folder of a discovery: discovery.json, report, calibrations, experiments, tables. Whole or not at all."""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from omnibench.config import Model, to_json, to_yaml
+from omnibench.discover.document import discovery_document, experiment_file
+from omnibench.discover.report import discovery_report
+from omnibench.discover.result import Discovery
+from omnibench.files import encode_table, remove, write_files
+from omnibench.report.render import render
+from omnibench.results_folder import RESULTS, check_folder, link_latest, new_folder
+from omnibench.robot.kinematics import Array
+
+# The first line of config.yaml tells a folder of results from a folder that happens to hold such a file.
+_MARK = "# The effective options of a discovery; the results beside it were made with them."
+
+
+class DiscoverOptions(Model):
+    """What a discovery was asked for: the content of its config.yaml."""
+
+    dataset: str
+    model: str | None = None
+    without: tuple[str, ...] = ()
+    unknown_term: bool = False
+    seed: int = 0
+    plugins: tuple[str, ...] = ()
+
+
+def check_output(folder: Path | None) -> None:
+    """DataError when ``folder`` is a file, or holds something else than an earlier discovery; asked before the work."""
+    if folder is not None:
+        check_folder(folder, _MARK, "discovery")
+
+
+def write_discovery(discovery: Discovery, options: DiscoverOptions, folder: Path | None = None) -> Path:
+    """Write everything that a discovery says; the folder.
+
+    Default: ``results/<data set name>/<time>``, with a link ``latest``. DataError when it cannot be written to, or
+    holds other files; then all is as it was.
+    """
+    check_output(folder)
+    chosen = folder or new_folder(RESULTS / _plain(discovery.dataset.name))
+    try:
+        write_files(_contents(discovery, options, chosen))
+    except BaseException:
+        with suppress(OSError):
+            chosen.rmdir()  # only if it is empty
+        raise
+    for stale in chosen.glob("experiment-*.yaml"):  # of an earlier discovery
+        if stale.name not in map(experiment_file, range(1, len(discovery.experiments) + 1)):
+            remove(stale)
+    if folder is None:
+        link_latest(chosen)
+    return chosen
+
+
+def _contents(discovery: Discovery, options: DiscoverOptions, folder: Path) -> dict[Path, bytes]:
+    config = to_yaml(options)
+    texts = {
+        "config.yaml": f"{_MARK}\n{config}",
+        "discovery.json": to_json(discovery_document(discovery, folder)) + "\n",
+        "report.html": render(discovery_report(discovery, config)),
+        "model.yaml": to_yaml(discovery.extended),
+        "plain.yaml": to_yaml(discovery.plain),
+    }
+    texts |= {experiment_file(number): each.config for number, each in enumerate(discovery.experiments, 1)}
+    contents = {folder / name: text.encode("utf-8") for name, text in texts.items()}
+    contents[folder / "residuals.parquet"] = encode_table(residual_table(discovery), "parquet")
+    return contents
+
+
+def residual_table(discovery: Discovery) -> pl.DataFrame:
+    """Every reference pose of the training runs after their starts, with its residuals before and after.
+
+    Residuals are reference minus odometry, by the plain matrix (before) and by the extended model (after), in m and
+    rad; whitened ones are independent and of unit variance under the noise.
+    """
+    trajectories = {trajectory.id: trajectory for trajectory in discovery.dataset.trajectories}
+    runs = [trajectories[name] for name in discovery.trajectories]
+    columns: dict[str, list[object] | Array] = {
+        "trajectory": [run.id for run in runs for _ in run.pose_times[1:]],
+        "command": [run.command for run in runs for _ in run.pose_times[1:]],
+        "t": np.concatenate([run.pose_times[1:] for run in runs]),
+    }
+    poses = np.concatenate([run.poses[1:] for run in runs])
+    columns |= dict(zip(("x", "y", "theta"), poses.T, strict=True))
+    for label, values, names in (
+        ("before", discovery.before, ("x_m", "y_m", "heading_rad")),
+        ("after", discovery.after, ("x_m", "y_m", "heading_rad")),
+        ("whitened_before", discovery.whitened_before, ("x", "y", "heading")),
+        ("whitened_after", discovery.whitened_after, ("x", "y", "heading")),
+    ):
+        columns |= dict(zip((f"{label}_{name}" for name in names), np.concatenate(values).T, strict=True))
+    return pl.DataFrame(columns, schema_overrides={"command": pl.String})
+
+
+def _plain(name: str) -> str:
+    """A name as a folder's."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("_.") or "dataset"

@@ -1,0 +1,251 @@
+"""The paths of many runs under one model, and how their poses respond to small changes of the motion.
+
+With z = x + iy and theta along a path, a change (dv, dw) of the twist, dv = dvx + i dvy in the robot's frame, moves the
+pose at time t, to first order, by
+
+    d theta(t) = int dw dt',    d z(t) = int (exp(i theta) dv - i z dw) dt' + i z(t) d theta(t),
+
+so that any number of changes costs one sum over the samples each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.odometry import WheelLog
+from omnibench.robot.signals import Signals, signals_of
+
+_STEP = 0.1  # of the plausible range: by so much a reference effect's parameter is moved to see its slope
+_BLOCK = 8_000_000  # numbers that are summed at once
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """Runs end to end: F samples, S stamps.
+
+    signals: of each session's samples, in the order of ``owner`` (F,), the run of each sample. middle (F, 3): pose in
+    the middle of each sample; poses (S, 3): at the stamps. run (S,): the run of each stamp. parts: the stamps of each
+    run.
+    """
+
+    robot: Robot
+    matrix: Array
+    logs: tuple[WheelLog, ...]
+    signals: Signals
+    sessions: tuple[tuple[str | None, slice], ...]
+    owner: NDArray[np.intp]
+    middle: Array
+    poses: Array
+    run: NDArray[np.intp]
+    parts: tuple[slice, ...]
+    ends: tuple[Array, ...]
+    _sums: csr_array
+    _turns: Array  # (F, 4): cosine, sine, x and y from the run's start, each times the sample's duration
+    _lever: Array  # (S, 2): from the run's start
+
+    @property
+    def stamps(self) -> Array:
+        """(S,): s."""
+        return np.concatenate([log.stamps for log in self.logs])
+
+    def of_twist(self, direction: Array, shares: Array) -> Array:
+        """Slopes (S, 3, J) of the poses by changes direction (F, 3) times shares (F, J) of the twist."""
+        return self.respond(self.changes(direction), shares)
+
+    def of_wheel(self, wheel: int, changes: Array) -> Array:
+        """Slopes (S, 3, J) of the poses by changes (F, J) of one wheel's rate, rad/s."""
+        return self.respond(self.changes(self.matrix[:, wheel]), changes)
+
+    def of_rates(self, change: Array) -> Array:
+        """Slopes (S, 3, 1) by a change (F, N) of all wheel rates."""
+        return self.respond(self.changes(change @ self.matrix.T), None)
+
+    def of_velocity(self, change: Array) -> Array:
+        """Slopes (S, 3, 1) by a change (F, 2) of the velocity in the reference's frame, m/s."""
+        column = np.zeros((len(change), 3))
+        column[:, :2] = change * self.signals.durations[:, None]
+        return self.respond(column, None)
+
+    def correction(self, effect: MotionEffect, values: Mapping[str, float]) -> Array:
+        """What an effect adds at its stage, of every sample."""
+        parts = []
+        for session, part in self.sessions:
+            parts.append(effect.correction(_part(self.signals, part, session), values))
+        return np.concatenate(parts)
+
+    def of_effect(self, effect: MotionEffect | ReferenceEffect, unit: str, values: Mapping[str, float]) -> Array:
+        """Slopes (S, 3, 1) by the parameter ``unit`` of an effect, where all but the shapes among ``values`` are 0."""
+        if isinstance(effect, ReferenceEffect):
+            return self._of_reference(effect, unit, values)
+        change = self.correction(effect, {**values, unit: 1.0})
+        if effect.stage == "body":
+            return self.of_twist(change, np.ones((len(change), 1)))
+        return self.of_velocity(change) if effect.stage == "world" else self.of_rates(change)
+
+    def _of_reference(self, effect: ReferenceEffect, unit: str, values: Mapping[str, float]) -> Array:
+        step = _STEP * next(each.high for each in effect.parameters(self.robot) if each.name == unit)
+        after, before = (self.reported(effect, {**values, unit: sign * step}) for sign in (1, -1))
+        return ((after - before) / (2 * step))[..., None]
+
+    def reported(self, effect: ReferenceEffect, values: Mapping[str, float]) -> Array:
+        """What the reference would report (S, 3) with an effect."""
+        found = []
+        for log, path in zip(self.logs, self.ends, strict=True):
+            position, heading = effect.delays(log.stamps, values)
+            times = np.concatenate([[0.0], log.times])
+            poses = np.column_stack(
+                [
+                    *(_along(log.stamps - position, times, path[:, axis]) for axis in (0, 1)),
+                    _along(log.stamps - heading, times, path[:, 2]),
+                ]
+            )
+            found.append(effect.reported(poses, log.start, values))
+        return np.concatenate(found)
+
+    def respond(self, column: Array, shares: Array | None) -> Array:
+        """Slopes (S, 3, J) by column (F, 3), changes of (z, theta) in each sample, times shares (F, J)."""
+        if shares is None:
+            shares = np.ones((len(column), 1))
+        width = max(1, _BLOCK // (3 * len(column)))
+        blocks = [self._summed(column, shares[:, low : low + width]) for low in range(0, shares.shape[1], width)]
+        return np.concatenate(blocks, axis=2)
+
+    def changes(self, twist: Array) -> Array:
+        """What a change (3,) or (F, 3) of the twist adds in each sample to z - i z dw and to theta, (F, 3)."""
+        cosine, sine, east, north = self._turns.T
+        forward, left, turn = twist.T
+        changes = np.empty((len(cosine), 3))
+        changes[:, 0] = cosine * forward - sine * left + north * turn
+        changes[:, 1] = sine * forward + cosine * left - east * turn
+        changes[:, 2] = self.signals.durations * turn
+        return changes
+
+    def _summed(self, column: Array, shares: Array) -> Array:
+        changes = (column[:, :, None] * shares[:, None, :]).reshape(len(column), -1)
+        steps = np.asarray(self._sums @ changes).reshape(-1, 3, shares.shape[1])
+        np.cumsum(steps, axis=0, out=steps)
+        firsts = [part.start for part in self.parts[1:]]
+        before = np.concatenate([np.zeros((1, *steps.shape[1:])), steps[[first - 1 for first in firsts]]])
+        steps -= before[self.run]
+        turned = steps[:, 2]
+        steps[:, 0] -= self._lever[:, 1, None] * turned
+        steps[:, 1] += self._lever[:, 0, None] * turned
+        return steps
+
+
+def make_paths(robot: Robot, matrix: Array, logs: Sequence[WheelLog], sample_period: float) -> Paths:
+    """The paths of runs by a matrix alone, with exact arcs."""
+    order = sorted(range(len(logs)), key=lambda index: str(logs[index].session))
+    assert order == list(range(len(logs))), "runs come by session"
+    found = [signals_of(log, robot, matrix, sample_period) for log in logs]
+    ends, middles = zip(*(_path(log, signals) for log, signals in zip(logs, found, strict=True)), strict=True)
+    counts = [len(log.times) for log in logs]
+    owner = np.repeat(np.arange(len(logs)), counts)
+    edges = np.cumsum([0, *(len(log.stamps) for log in logs)])
+    parts = tuple(slice(int(low), int(high)) for low, high in pairwise(edges))
+    middle = np.concatenate(middles)
+    signals = _joined(found)
+    sums, poses = _sums(logs, ends)
+    run = np.repeat(np.arange(len(logs)), np.diff(edges))
+    starts = np.array([log.start for log in logs])
+    from_start = middle[:, :2] - starts[owner, :2]
+    turns = np.column_stack([np.cos(middle[:, 2]), np.sin(middle[:, 2]), from_start]) * signals.durations[:, None]
+    return Paths(
+        robot=robot,
+        matrix=matrix,
+        logs=tuple(logs),
+        signals=signals,
+        sessions=_sessions(logs, counts),
+        owner=owner,
+        middle=middle,
+        poses=poses,
+        run=run,
+        parts=parts,
+        ends=tuple(ends),
+        _sums=sums,
+        _turns=turns,
+        _lever=poses[:, :2] - starts[run, :2],
+    )
+
+
+def _path(log: WheelLog, signals: Signals) -> tuple[Array, Array]:
+    """Poses at the ends of the samples, the start before them (F + 1, 3), and in their middles (F, 3)."""
+    moved = signals.twists * signals.durations[:, None]
+    heading = log.start[2] + np.concatenate([[0.0], np.cumsum(moved[:, 2])])
+    middle = (heading[1:] + heading[:-1]) / 2
+    steps = (moved[:, 0] + 1j * moved[:, 1]) * np.sinc(moved[:, 2] / (2 * np.pi)) * np.exp(1j * middle)
+    path = log.start[0] + 1j * log.start[1] + np.concatenate([[0.0], np.cumsum(steps)])
+    between = (path[1:] + path[:-1]) / 2
+    return np.column_stack([path.real, path.imag, heading]), np.column_stack([between.real, between.imag, middle])
+
+
+def _along(times: Array, ends: Array, values: Array) -> Array:
+    """A coordinate of a path at any times: at rest before the start, straight on after the last sample."""
+    found: Array = np.interp(times, ends, values)
+    late = times > ends[-1]
+    if late.any():
+        back = max(len(ends) - 6, 0)
+        slope = (values[-1] - values[back]) / (ends[-1] - ends[back])
+        found[late] = values[-1] + slope * (times[late] - ends[-1])
+    return found
+
+
+def _sums(logs: Sequence[WheelLog], ends: Sequence[Array]) -> tuple[csr_array, Array]:
+    """The matrix (S, F) that adds up what samples do between one stamp and the next, and the poses (S, 3) there."""
+    rows, columns, weights, poses = [], [], [], []
+    stamp, first = 0, 0
+    for log, path in zip(logs, ends, strict=True):
+        times = np.concatenate([[0.0], log.times])
+        poses.append(np.column_stack([_along(log.stamps, times, path[:, axis]) for axis in range(3)]))
+        edges = np.unique(np.concatenate([times, np.clip(log.stamps, 0.0, times[-1])]))
+        middles = (edges[1:] + edges[:-1]) / 2
+        sample = np.searchsorted(log.times, middles)
+        interval = np.searchsorted(log.stamps, middles)
+        inside = interval < len(log.stamps)
+        share = np.diff(edges) / np.diff(times)[np.minimum(sample, len(log.times) - 1)]
+        rows.append(stamp + interval[inside])
+        columns.append(first + sample[inside])
+        weights.append(share[inside])
+        stamp, first = stamp + len(log.stamps), first + len(log.times)
+    entries = (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns)))
+    return csr_array(entries, shape=(stamp, first)), np.concatenate(poses)
+
+
+def _sessions(logs: Sequence[WheelLog], counts: Sequence[int]) -> tuple[tuple[str | None, slice], ...]:
+    """The samples of each session, whose runs come one after another."""
+    found: list[tuple[str | None, slice]] = []
+    first = 0
+    for log, count in zip(logs, counts, strict=True):
+        if found and found[-1][0] == log.session:
+            found[-1] = (log.session, slice(found[-1][1].start, first + count))
+        else:
+            found.append((log.session, slice(first, first + count)))
+        first += count
+    return tuple(found)
+
+
+def _part(signals: Signals, part: slice, session: str | None) -> Signals:
+    """Some of the samples, of one session."""
+    values = {item.name: getattr(signals, item.name) for item in fields(signals)}
+    chosen: dict[str, Any] = {name: value[part] for name, value in values.items() if isinstance(value, np.ndarray)}
+    chosen["session"] = session
+    return replace(signals, **chosen)
+
+
+def _joined(signals: Sequence[Signals]) -> Signals:
+    """Samples of all runs one after another; what one run lacks, all lack."""
+    joined: dict[str, Any] = {}
+    for item in fields(Signals):
+        values = [getattr(each, item.name) for each in signals]
+        if isinstance(values[0], np.ndarray) or item.name in ("wheel_angles", "session_time"):
+            joined[item.name] = None if any(value is None for value in values) else np.concatenate(values)
+    return replace(signals[0], **joined)

@@ -1,0 +1,206 @@
+"""A discovery in words: parameters in units that people read, verdicts, places and gaps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from omnibench.discover.result import (
+    Discovery,
+    EstimatedParameter,
+    Gap,
+    HeldOut,
+    NamedEffect,
+    Novelty,
+    Step,
+    Verdict,
+)
+from omnibench.report.numbers import NOTHING, decimals_for, fixed, percent, plural, significant, span
+from omnibench.robot.calibration import Noise
+from omnibench.robot.effects.effect import Stage
+
+VERDICTS: Mapping[Verdict, str] = {
+    "none": "nothing is missing",
+    "named": "found and named",
+    "class": "found; which of a class is open",
+    "incomplete": "found and named, but something is left",
+    "unknown": "something is missing that has no name",
+}
+VERDICTS_AT_LENGTH: Mapping[Verdict, str] = {
+    "none": "The residuals of the plain matrix are what the noise leaves: no effect is missing that these data show.",
+    "named": "Every effect that was added has a weight of 95 % or more, and the residuals that are left are noise.",
+    "class": "An effect is missing, and the data cannot tell the members of its class apart.",
+    "incomplete": "What was added is named with a weight of 95 % or more, but the residuals still depend on something.",
+    "unknown": "The residuals depend on something, and no effect explains it with a weight of 95 %.",
+}
+STAGES: Mapping[Stage, str] = {
+    "actuator": "target to wheel rate",
+    "wheel": "wheel rate to motion of the wheel",
+    "clock": "stamps of the wheel samples",
+    "body": "wheels to twist",
+    "world": "twist to pose",
+    "reference": "pose to reported pose",
+}
+HELD_OUT: Mapping[Literal["repetitions", "session"], str] = {
+    "repetitions": "held-out repetitions",
+    "session": "held-out session",
+}
+METRICS: Mapping[Literal["eq6", "chi2"], str] = {"eq6": "Eq. (6), final poses", "chi2": "whitened χ² per residual"}
+
+_COUNTS = ("", "1")  # units of shares, and of numbers that shape an effect
+_DEGREES = math.degrees(1.0)
+# Where the SI unit is not what a person reads: factor and unit.
+_READ_AS: Mapping[str, tuple[float, str]] = {
+    **dict.fromkeys(_COUNTS, (100.0, "%")),
+    "m": (1e3, "mm"),
+    "m/s": (1e3, "mm/s"),
+    "s": (1e3, "ms"),
+    "rad": (_DEGREES, "°"),
+    "rad/s": (_DEGREES, "°/s"),
+    "1/s": (3.6e5, "%/h"),
+    "s/s": (1e6, "µs/s"),
+}
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a quantity of an SI unit is shown: multiplied by ``factor``, with ``unit``."""
+
+    factor: float
+    unit: str
+
+    def number(self, value: float, digits: int = 3, signed: bool = False) -> str:
+        """A value to so many digits, without its unit."""
+        return significant(self.factor * value, digits, signed)
+
+    def words(self, value: float, digits: int = 3, signed: bool = False) -> str:
+        """A value to so many digits, with its unit."""
+        return with_unit(self.number(value, digits, signed), self.unit)
+
+
+def reading(unit: str) -> Reading:
+    """How a quantity in an SI unit (of the effects' parameters) is read."""
+    return Reading(*_READ_AS.get(unit, (1.0, unit.replace("s2", "s²"))))
+
+
+def with_unit(number: str, unit: str) -> str:
+    """A number and its unit, degrees without a space."""
+    return f"{number}{unit}" if unit.startswith("°") else f"{number} {unit}".rstrip()
+
+
+def value_and_interval(parameter: EstimatedParameter) -> tuple[str, str, str]:
+    """A parameter as value, 95 % interval (empty where there is none) and unit, with shared decimals."""
+    shown = Reading(1.0, "") if parameter.shape and parameter.unit in _COUNTS else reading(parameter.unit)
+    value = shown.factor * parameter.value
+    low, high = shown.factor * parameter.low, shown.factor * parameter.high
+    if parameter.shape or not (math.isfinite(low) and math.isfinite(high)):
+        return f"{value:.4g}".replace("-", "−"), "", shown.unit
+    decimals = decimals_for(max((high - low) / 2, 1e-4 * abs(value)), 2)
+    return fixed(value, decimals, signed=True), span(low, high, decimals, signed=True), shown.unit
+
+
+def parameter_in_words(parameter: EstimatedParameter) -> str:
+    """``tau = +31.2 ms (+30.1 to +32.3)``."""
+    value, interval, unit = value_and_interval(parameter)
+    words = f"{parameter.name} = {with_unit(value, unit)}"
+    if parameter.shape:
+        return f"{words} (chosen)"
+    return f"{words} ({interval})" if interval else words
+
+
+def effect_in_words(effect: NamedEffect) -> str:
+    """An effect's name, with the others of its class."""
+    others = [name for name in effect.confusable_with if name != effect.name]
+    return effect.name if not others else f"{effect.name}, or {' or '.join(others)}"
+
+
+def added(step: Step) -> str:
+    """The effect that a step added."""
+    return step.name.removeprefix("+ ")
+
+
+def weight_in_words(weight: float) -> str:
+    """A weight as per cent, neither rounded up to certainty nor down to nothing."""
+    if weight > 0.999:
+        return "> 99.9 %"
+    return "< 0.1 %" if weight < 0.001 else percent(weight)
+
+
+def chance(p_value: float) -> str:
+    """A p-value."""
+    if p_value < 1e-99:
+        return "< 10⁻⁹⁹"
+    return significant(p_value, 2) if p_value >= 1e-3 else significant(p_value, 1)
+
+
+def closed_in_words(gap: Gap) -> str:
+    """Which share of a gap is gone, or why there is none to close."""
+    if gap.closed is None:
+        return "no gap to close"
+    return percent(gap.closed)
+
+
+def gap_decimals(*gaps: Gap) -> int:
+    """Decimals in which before, after and floor of these gaps are best read."""
+    smallest = min((value for gap in gaps for value in (gap.before, gap.after, gap.floor) if value > 0), default=0.0)
+    return min(6, max(2, decimals_for(smallest, 3)))
+
+
+def gap_in_words(gap: Gap) -> str:
+    """``0.0412 → 0.0213 (floor 0.0205), 96.1 %``."""
+    decimals = gap_decimals(gap)
+    before, after, floor = (fixed(value, decimals) for value in (gap.before, gap.after, gap.floor))
+    return f"{before} → {after} (floor {floor}), {closed_in_words(gap)}"
+
+
+def final_errors_in_words(held: HeldOut) -> tuple[str, str]:
+    """Mean final position and heading error, before and after."""
+    before, after = held.position_m
+    position = f"{fixed(1e3 * before, 1)} → {fixed(1e3 * after, 1)} mm"
+    turned, turned_after = (math.degrees(value) for value in held.heading_rad)
+    return position, f"{fixed(turned, 2)}° → {fixed(turned_after, 2)}°"
+
+
+def decisive(discovery: Discovery) -> HeldOut | None:
+    """The held-out data that say most: another session if there is one, else repetitions."""
+    return max(discovery.held_out, key=lambda held: held.data == "session", default=None)
+
+
+def novelties_in_words(novelties: tuple[Novelty, ...]) -> tuple[str, ...]:
+    """Where the extended model leaves the motions that it was fitted to."""
+    return tuple(
+        f"{each.command}: {each.description}. Final position within {_millimetres(each.before_m)} by the plain matrix, "
+        f"within {_millimetres(each.after_m)} by the extended model (95 %)."
+        for each in novelties
+    )
+
+
+def _millimetres(metres: float) -> str:
+    if not math.isfinite(metres):
+        return NOTHING
+    return f"{significant(1e3 * metres, 3)} mm" if metres < 1 else f"{significant(metres, 3)} m"
+
+
+def data_in_words(discovery: Discovery) -> str:
+    """Of what the discovery is: ``flower (simulated data): 180 training runs, 4,320 poses``."""
+    kind = "simulated data" if discovery.dataset.simulated else "recorded data"
+    runs = plural(len(discovery.trajectories), "training run")
+    return f"{discovery.dataset.name} ({kind}): {runs}, {plural(discovery.poses, 'reference pose')}"
+
+
+def noise_in_words(noise: Noise) -> tuple[str, str]:
+    """The noise of positions and of headings, without what is zero."""
+    kinds = (("white", ""), ("walk", "/√s"), ("bias of a run", ""))
+    position = (noise.pose_position, noise.walk_position, noise.bias_position)
+    heading = (noise.pose_heading, noise.walk_heading, noise.bias_heading)
+    shown = []
+    for values, factor, unit in ((position, 1e3, " mm"), (heading, _DEGREES, "°")):
+        parts = [
+            f"{kind} {significant(factor * value, 2)}{unit}{per}"
+            for (kind, per), value in zip(kinds, values, strict=True)
+            if value > 0
+        ]
+        shown.append(", ".join(parts) or "none")
+    return shown[0], shown[1]

@@ -1,0 +1,71 @@
+"""What motors and their controllers make of target wheel rates. For simulation: odometry sees the wheels themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omnibench.registry import effects
+from omnibench.robot.effects.effect import ActuatorEffect, Parameter, Values
+from omnibench.robot.kinematics import Array
+
+_SOURCE = "first principles"
+
+
+@effects.register("motor_lag")
+class MotorLag(ActuatorEffect):
+    """Wheels follow their targets with a first-order lag."""
+
+    physics = "Inertia and a controller of finite bandwidth delay what was told."
+    source = _SOURCE
+    shows_in = "acceleration"
+    needs = frozenset({"targets"})
+    fixed_parameters = (Parameter("tau", "s", 0.0, 0.3, "time constant"),)
+
+    def driven(self, durations: Array, targets: Array, values: Values) -> Array:
+        """Means over the samples of the exact solution for targets that are constant within each."""
+        tau = values["tau"]
+        if tau <= 0:
+            return targets.copy()
+        mean_left = (-np.expm1(-durations / tau) * tau / durations)[:, None]
+        return targets + (_reached(np.exp(-durations / tau), targets) - targets) * mean_left
+
+
+def _reached(left: Array, targets: Array) -> Array:
+    """Rates (F, N) at the beginning of each sample; left (F,): what a sample leaves of the distance to its target."""
+    from scipy.signal import lfilter  # takes as long to import as a live node takes to start
+
+    before = np.zeros(targets.shape)
+    if np.allclose(left, left[0], rtol=1e-9, atol=0.0):
+        before[1:] = lfilter([1 - left[0]], [1.0, -left[0]], targets[:-1], axis=0)
+        return before
+    for sample in range(1, len(targets)):
+        before[sample] = targets[sample - 1] + (before[sample - 1] - targets[sample - 1]) * left[sample - 1]
+    return before
+
+
+@effects.register("motor_dead_band")
+class MotorDeadBand(ActuatorEffect):
+    """Targets below a threshold do not move a wheel, and larger ones lose as much."""
+
+    physics = "Static friction takes a part of what drives the motor."
+    source = "H. Olsson et al., Friction models and friction compensation, 1998"
+    shows_in = "wheel rate"
+    needs = frozenset({"targets"})
+    fixed_parameters = (Parameter("band", "rad/s", 0.0, 0.1, "half the width of the dead band"),)
+
+    def driven(self, durations: Array, targets: Array, values: Values) -> Array:  # noqa: ARG002
+        return np.sign(targets) * np.maximum(np.abs(targets) - values["band"], 0.0)
+
+
+@effects.register("motor_gain")
+class MotorGain(ActuatorEffect):
+    """Wheels turn faster or slower than they were told, by a factor."""
+
+    physics = "The controller's scale of counts per turn, or its supply, is off."
+    source = _SOURCE
+    shows_in = "wheel rate"
+    needs = frozenset({"targets"})
+    fixed_parameters = (Parameter("g", "1", -0.05, 0.05, "by how much wheels turn faster than they were told"),)
+
+    def driven(self, durations: Array, targets: Array, values: Values) -> Array:  # noqa: ARG002
+        return (1 + values["g"]) * targets

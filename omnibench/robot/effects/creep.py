@@ -1,0 +1,46 @@
+"""What friction takes off a wheel, whatever its rate: dead zone and creep."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omnibench.registry import effects
+from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
+from omnibench.robot.kinematics import Array
+from omnibench.robot.signals import Signals
+
+_KNEE = 0.05  # rad/s, over which the sign of a wheel rate changes
+
+
+def _smooth_sign(rates: Array) -> Array:
+    return np.tanh(rates / _KNEE)
+
+
+@effects.register("wheel_dead_zone")
+class WheelDeadZone(MotionEffect):
+    """A constant rate is lost or gained in the direction of rotation: omega + c sign(omega)."""
+
+    stage = "wheel"
+    physics = "Play in the drive and dry friction of the rollers take a constant rate off every wheel that turns."
+    source = "H. Olsson et al., Friction models and friction compensation, 1998"
+    shows_in = "wheel rate"
+    fixed_parameters = (Parameter("c", "rad/s", -0.02, 0.02, "rate that is gained in the direction of rotation"),)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return values["c"] * _smooth_sign(signals.rates)
+
+
+@effects.register("coulomb_creep")
+class CoulombCreep(MotionEffect):
+    """A rate in proportion to the robot's speed, against each wheel's rotation: omega + c sign(omega) abs(v) / r."""
+
+    stage = "wheel"
+    physics = "Rollers drag with a friction that does not depend on their speed, and the wheels creep against it."
+    source = "F. W. Carter, On the action of a locomotive driving wheel, 1926; H. Olsson et al., 1998 (friction)"
+    shows_in = "wheel rate"
+    fixed_parameters = (Parameter("c", "1", -0.02, 0.02, "creep as a share of the robot's speed"),)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        speed = np.hypot(signals.twists[:, 0], signals.twists[:, 1])
+        radii = np.array([wheel.radius for wheel in signals.robot.wheels])
+        return values["c"] * _smooth_sign(signals.rates) * (speed[:, None] / radii)

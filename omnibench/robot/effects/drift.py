@@ -1,0 +1,90 @@
+"""Motion that no wheel rate tells of: drifts while the robot drives, at its start, and across the floor."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.registry import effects
+from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
+from omnibench.robot.kinematics import Array
+from omnibench.robot.signals import STILL, Signals
+
+
+def _driving(rates: Array) -> NDArray[np.bool_]:
+    """Where a wheel turns (F,)."""
+    driving: NDArray[np.bool_] = np.abs(rates).max(axis=1) > STILL
+    return driving
+
+
+@effects.register("heading_drift")
+class HeadingDrift(MotionEffect):
+    """The robot turns a little all the time while it drives: w + b."""
+
+    stage = "body"
+    physics = "Something pulls to one side whatever the command: a dragged cable, a bent wheel, a drifting reference."
+    source = "first principles"
+    shows_in = "elapsed time"
+    fixed_parameters = (Parameter("b", "rad/s", -0.005, 0.005, "rate of turn that is added while a wheel turns"),)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        added = np.zeros(signals.twists.shape)
+        added[:, 2] = values["b"] * _driving(signals.rates)
+        return added
+
+
+@effects.register("body_velocity_bias")
+class BodyVelocityBias(MotionEffect):
+    """The robot moves a little in its own frame all the time while it drives: v + b."""
+
+    stage = "body"
+    physics = "Something pulls the robot the same way whatever the command: a dragged cable, rollers that shake it on."
+    source = "first principles"
+    shows_in = "elapsed time"
+    fixed_parameters = (
+        Parameter("bx", "m/s", -0.005, 0.005, "velocity forward that is added while a wheel turns"),
+        Parameter("by", "m/s", -0.005, 0.005, "velocity to the left that is added while a wheel turns"),
+    )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return _driving(signals.rates)[:, None] * np.array([values["bx"], values["by"], 0.0])
+
+
+@effects.register("start_transient")
+class StartTransient(MotionEffect):
+    """The robot falls behind at the start of a run: v (1 - k exp(-s / length)), s the way since it stood."""
+
+    stage = "body"
+    physics = "Play has to be taken up and rollers have to align themselves before the wheels drive the robot in full."
+    source = "first principles"
+    shows_in = "elapsed time"
+    fixed_parameters = (
+        Parameter("k", "1", -0.2, 0.2, "share of the velocity that is lost at first"),
+        Parameter(
+            "length", "m", 1e-3, 10, "way over which it comes back by a factor of e", (0.03, 0.05, 0.1, 0.2, 0.4)
+        ),
+    )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        lost = values["k"] * np.exp(-signals.travelled / values["length"])
+        added = np.zeros(signals.twists.shape)
+        added[:, :2] = -lost[:, None] * signals.twists[:, :2]
+        return added
+
+
+@effects.register("floor_drift")
+class FloorDrift(MotionEffect):
+    """The floor carries the robot the same way wherever it heads: v_world + d abs(v)."""
+
+    stage = "world"
+    physics = "The floor is tilted, or its pile lies one way, and the wheels slip towards there."
+    source = "first principles"
+    shows_in = "heading"
+    fixed_parameters = (
+        Parameter("dx", "1", -0.02, 0.02, "drift along x of the reference, as a share of the speed"),
+        Parameter("dy", "1", -0.02, 0.02, "drift along y of the reference, as a share of the speed"),
+    )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        speed = np.hypot(signals.twists[:, 0], signals.twists[:, 1])
+        return speed[:, None] * np.array([values["dx"], values["dy"]])

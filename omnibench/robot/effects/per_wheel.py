@@ -1,0 +1,22 @@
+"""Parameters that every wheel has for itself: a prefix with the wheel's name behind it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omnibench.robot.effects.effect import Parameter, Values
+from omnibench.robot.kinematics import Array, Robot
+
+
+def one_for_each_wheel(
+    robot: Robot, prefix: str, unit: str, low: float, high: float, description: str
+) -> tuple[Parameter, ...]:
+    """The parameters ``prefix_<wheel>`` of a robot's wheels."""
+    return tuple(
+        Parameter(f"{prefix}_{name}", unit, low, high, f"{description}, wheel {name}") for name in robot.wheel_names
+    )
+
+
+def of_wheels(robot: Robot, prefix: str, values: Values) -> Array:
+    """Their values (N,)."""
+    return np.array([values[f"{prefix}_{name}"] for name in robot.wheel_names])

@@ -1,0 +1,76 @@
+"""A term of the odometry model: an effect with the values of its parameters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from numbers import Real
+from types import MappingProxyType
+
+from omnibench.errors import DataError, UnknownNameError
+from omnibench.registry import effects
+from omnibench.robot.effects.effect import Effect, Parameter, Values
+from omnibench.robot.kinematics import Robot
+
+_FAR_OUTSIDE = 1e3  # times the plausible range
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Term:
+    """An effect with the values of its parameters, each in its unit."""
+
+    effect: Effect
+    values: Values
+
+    @property
+    def name(self) -> str:
+        """The effect's name."""
+        return self.effect.name
+
+
+def make_term(
+    name: str,
+    parameters: Mapping[str, float],
+    robot: Robot,
+    where: str = "",
+    *,
+    sessions: tuple[str, ...] = (),
+) -> Term:
+    """The effect called ``name`` with its parameters for a robot, in the order in which they are given.
+
+    UnknownNameError: no such effect, or no such parameter of it. DataError: a parameter is missing, is no finite
+    number, is a thousand times as large as is plausible, or shapes the correction and lies outside its range.
+    Messages begin with ``where``.
+    """
+    effect = effects.create(name, where=where)
+    place = f"{where}: effect {name!r}" if where else f"effect {name!r}"
+    known = {parameter.name: parameter for parameter in effect.parameters(robot, sessions)}
+    for given, value in parameters.items():
+        if given not in known and not effect.accepts(given):
+            raise UnknownNameError("parameter", given, known, place)
+        if not _is_number(value) or not math.isfinite(value):
+            raise DataError(f"{place}: parameter {given!r} is {value!r}, not a finite number")
+        low, high = _limits(known.get(given))
+        if not low <= value <= high:
+            raise DataError(f"{place}: parameter {given!r} is {value:g}, not within {low:g} and {high:g}")
+    for parameter in known.values():
+        if parameter.name not in parameters:
+            raise DataError(
+                f"{place}: parameter {parameter.name!r} ({parameter.unit}) is missing; {parameter.description}"
+            )
+    return Term(effect, MappingProxyType({given: float(value) for given, value in parameters.items()}))
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def _limits(parameter: Parameter | None) -> tuple[float, float]:
+    """Between which a value can be at all; None: of a parameter that is accepted without being known."""
+    if parameter is None:
+        return -_FAR_OUTSIDE, _FAR_OUTSIDE
+    if parameter.choices:
+        return parameter.low, parameter.high
+    largest = _FAR_OUTSIDE * max(abs(parameter.low), abs(parameter.high))
+    return -largest, largest

@@ -1,0 +1,70 @@
+"""What repeats with every turn of a wheel: its eccentricity, and the ripple of its rollers."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omnibench.registry import effects
+from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
+from omnibench.robot.effects.per_wheel import of_wheels, one_for_each_wheel
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.signals import Signals
+
+
+def _ripple(signals: Signals, harmonic: float, values: Values) -> Array:
+    """The mean of omega (a cos(n phi) + b sin(n phi)) over each sample, phi turning at the constant rate omega.
+
+    Of the phase n phi in the middle of a sample of duration d, it is (a cos + b sin) 2 sin(n omega d / 2) / (n d).
+    """
+    assert signals.wheel_angles is not None  # they are needed
+    added = np.zeros(signals.rates.shape)
+    half = harmonic / 2 * signals.durations
+    amplitudes = np.stack([of_wheels(signals.robot, prefix, values) for prefix in "ab"], axis=1)
+    for wheel, (a, b) in enumerate(amplitudes):
+        if a or b:
+            phase = harmonic * signals.wheel_angles[:, wheel]
+            wave = (a * np.cos(phase) if a else 0.0) + (b * np.sin(phase) if b else 0.0)
+            added[:, wheel] = wave * np.sin(half * signals.rates[:, wheel]) / half
+    return added
+
+
+@effects.register("wheel_eccentricity")
+class WheelEccentricity(MotionEffect):
+    """A wheel's radius changes over one turn: r (1 + a cos phi + b sin phi)."""
+
+    stage = "wheel"
+    physics = "The axle does not stand in the middle of the wheel."
+    source = "first principles"
+    shows_in = "wheel angle"
+    needs = frozenset({"wheel_angles"})
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return (
+            *one_for_each_wheel(robot, "a", "1", -0.02, 0.02, "share of the radius, with the cosine of the angle"),
+            *one_for_each_wheel(robot, "b", "1", -0.02, 0.02, "share of the radius, with the sine of the angle"),
+        )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return _ripple(signals, 1.0, values)
+
+
+@effects.register("roller_ripple")
+class RollerRipple(MotionEffect):
+    """A wheel's radius changes from roller to roller: r (1 + a cos(n phi) + b sin(n phi)), n rollers."""
+
+    stage = "wheel"
+    physics = "The rollers do not make a perfect circle: the wheel sinks in between two of them."
+    source = "first principles"
+    shows_in = "wheel angle"
+    needs = frozenset({"wheel_angles"})
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        counts = tuple(float(count) for count in range(3, 17))
+        return (
+            *one_for_each_wheel(robot, "a", "1", -0.03, 0.03, "share of the radius, with the cosine of n angles"),
+            *one_for_each_wheel(robot, "b", "1", -0.03, 0.03, "share of the radius, with the sine of n angles"),
+            Parameter("rollers", "1", 2, 64, "rollers along a wheel's circumference, n", choices=counts),
+        )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return _ripple(signals, values["rollers"], values)

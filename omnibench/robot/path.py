@@ -1,0 +1,47 @@
+"""The path of a robot that keeps its twist within every sample, at any times: Eq. (1) and (2), or exact arcs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import Complex, Integration
+
+
+class Path:
+    """The path that F samples make.
+
+    times (F,): their ends, s. start (3,): pose at t = 0. moved (F, 3): in the robot's frame, m, m, rad. drift (F, 2):
+    what the reference's frame adds to every sample, m; None for nothing.
+    """
+
+    def __init__(
+        self, times: Array, start: Array, moved: Array, integration: Integration, drift: Array | None = None
+    ) -> None:
+        self._times, self._arc = times, integration == "arc"
+        self._moved = moved
+        self._drift: Complex = np.zeros(len(moved), dtype=complex) if drift is None else drift[:, 0] + 1j * drift[:, 1]
+        self._headings = start[2] + np.concatenate([[0.0], np.cumsum(moved[:, 2])])
+        steps = self._steps(moved, self._headings[:-1]) + self._drift
+        self._positions: Complex = complex(start[0], start[1]) + np.concatenate([[0.0], np.cumsum(steps)])
+
+    def poses(self, stamps: Array) -> Array:
+        """Poses (S, 3) in m, m, rad at stamps (S,) in s, in any order; headings are not wrapped.
+
+        Before t = 0 that is the start pose, after the last sample the pose at its end.
+        """
+        sample = np.minimum(np.searchsorted(self._times, stamps), len(self._times) - 1)
+        begin = np.where(sample > 0, self._times[sample - 1], 0.0)
+        share = np.clip((stamps - begin) / (self._times[sample] - begin), 0.0, 1.0)
+        piece = share[:, None] * self._moved[sample]
+        heading = self._headings[sample]
+        position = self._positions[sample] + self._steps(piece, heading) + share * self._drift[sample]
+        return np.column_stack([position.real, position.imag, heading + piece[:, 2]])
+
+    def _steps(self, moved: Array, headings: Array) -> Complex:
+        """x + iy of motions (n, 3) that begin with headings (n,)."""
+        steps: Complex = moved[:, 0] + 1j * moved[:, 1]
+        if not self._arc:
+            return steps * np.exp(1j * headings)
+        half = moved[:, 2] / 2
+        return steps * (np.sinc(half / np.pi) * np.exp(1j * (headings + half)))

@@ -1,0 +1,139 @@
+"""What a correction may depend on: causal quantities of every wheel sample, the same in batch and in a stream."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.odometry import WheelLog
+
+STILL = 1e-3  # rad/s; a slower wheel stands
+_SMOOTHING = 0.05  # s, the time constant of the twist of which accelerations are taken
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Signals:
+    """F wheel samples as recorded; every quantity is computed from the uncorrected rates.
+
+    durations (F,): s. rates (F, N): mean wheel rates, rad/s. elapsed (F,): s from the start of the run to the middle of
+    the sample. twists (F, 3): by the model's matrix, m/s, m/s, rad/s. accelerations (F, 3): of the twists, smoothed
+    over 50 ms, at rest before the first sample. travelled (F,): way since the robot last stood still, m. wheel_angles
+    (F, N): absolute, in the middle of the sample, rad; None where they were not recorded. session_time (F,): s since
+    the session's start; None where it is not known. session: its name.
+    """
+
+    robot: Robot
+    durations: Array
+    rates: Array
+    elapsed: Array
+    twists: Array
+    accelerations: Array
+    travelled: Array
+    wheel_angles: Array | None = None
+    session_time: Array | None = None
+    session: str | None = None
+
+
+def signals_of(log: WheelLog, robot: Robot, matrix: Array, sample_period: float) -> Signals:
+    """The signals of a log's F samples by a matrix (3, N); sample_period: the nominal one, s.
+
+    With u_k the twist of sample k, d_k its duration and y_k = y_{k-1} + a (u_k - y_{k-1}), y_0 = 0, the twist smoothed
+    with a = 1 - exp(-sample_period / 50 ms), its acceleration is (y_k - y_{k-1}) / d_k: causal, and their sum over time
+    is right whatever the samples' durations are.
+    """
+    from scipy.signal import lfilter  # takes as long to import as a live node takes to start
+
+    durations = np.diff(log.times, prepend=0.0)
+    twists = log.rates @ matrix.T
+    share = smoothing_share(sample_period)
+    smoothed = lfilter([share], [1.0, share - 1.0], twists, axis=0)
+    elapsed = log.times - durations / 2
+    return Signals(
+        robot=robot,
+        durations=durations,
+        rates=log.rates,
+        elapsed=elapsed,
+        twists=twists,
+        accelerations=np.diff(smoothed, axis=0, prepend=np.zeros((1, 3))) / durations[:, None],
+        travelled=_travelled(log.rates, np.hypot(twists[:, 0], twists[:, 1]) * durations),
+        wheel_angles=None if log.wheel_angles is None else log.wheel_angles - log.rates * (durations / 2)[:, None],
+        session_time=None if log.started_at is None else log.started_at + elapsed,
+        session=log.session,
+    )
+
+
+class SignalStream:
+    """The same signals, one sample at a time, from rest.
+
+    session_time: at the first sample's start, s.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        matrix: Array,
+        sample_period: float,
+        session: str | None = None,
+        session_time: float = 0.0,
+    ) -> None:
+        self.matrix = matrix
+        self._robot, self._session, self._session_time = robot, session, session_time
+        self._share = smoothing_share(sample_period)
+        self._elapsed = self._way = 0.0
+        self._smoothed = np.zeros(3)
+        self._angles = np.zeros(matrix.shape[1])
+
+    def turn(self, angles: Array, wheel_angles: Array | None = None) -> None:
+        """The wheels turned by angles (N,) rad, to absolute ones (N,) where they are known."""
+        self._angles = self._angles + angles if wheel_angles is None else np.asarray(wheel_angles, dtype=float)
+
+    def next(self, rates: Array, duration: float, wheel_angles: Array | None = None) -> Signals:
+        """The signals (F = 1) of one sample: mean rates (N,) rad/s over a duration > 0 s, absolute angles at its end.
+
+        Angles that are not known are counted on from the last, at first from 0.
+        """
+        turned = rates * duration
+        self.turn(turned, wheel_angles)
+        twist = self.matrix @ rates
+        gained = self._share * (twist - self._smoothed)
+        self._smoothed = self._smoothed + gained
+        middle = self._elapsed + duration / 2
+        self._elapsed += duration
+        if max(map(abs, rates.tolist())) < STILL:
+            self._way = step = 0.0
+        else:
+            vx, vy, _ = twist.tolist()
+            step = math.hypot(vx, vy) * duration
+            self._way += step
+        elapsed, session_time, travelled, durations = np.array(
+            [[middle], [self._session_time + middle], [self._way - step / 2], [duration]]
+        )
+        return Signals(
+            self._robot,
+            durations,
+            rates[None],
+            elapsed,
+            twist[None],
+            (gained / duration)[None],
+            travelled,
+            (self._angles - turned / 2)[None],
+            session_time,
+            self._session,
+        )
+
+
+def smoothing_share(sample_period: float) -> float:
+    """The share a of a new twist in the smoothed one."""
+    return -math.expm1(-sample_period / _SMOOTHING)
+
+
+def _travelled(rates: Array, steps: Array) -> Array:
+    """Way (F,) to the middle of each sample since the last one in which all wheels stood, from the samples' own."""
+    still = (np.abs(rates) < STILL).all(axis=1)
+    way = np.cumsum(steps)
+    last = np.maximum.accumulate(np.where(still, np.arange(len(steps)), -1))
+    before = np.where(last >= 0, way[last], 0.0)
+    return np.where(still, 0.0, way - steps / 2 - before)

@@ -1,0 +1,133 @@
+"""What effects are tried on: robots, parameters within their ranges, and the inputs of each kind of effect."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from omnibench.robot.effects.effect import ActuatorEffect, Effect, MotionEffect, Parameter, ReferenceEffect, Values
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.signals import Signals
+from omnibench.testing.synthetic import synthetic_robot
+
+PERIOD: Final = 0.01  # s
+SAMPLES: Final = 200
+SESSIONS: Final = ("morning", "evening")
+Poses = tuple[Array, Array, Array]  # stamps (K,), poses (K, 3), start (3,)
+Motors = tuple[Array, Array]  # durations (F,), targets (F, N)
+Input = Signals | Poses | Motors
+
+
+def driven_signals(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> Signals:
+    """Signals of a varied drive: so many samples, with rates of about 5 ``speed`` rad/s; 0: the robot stands."""
+    rng = np.random.default_rng(0)
+    ends = PERIOD * np.arange(1, samples + 1)
+    phases = rng.uniform(0, 2 * math.pi, (2, len(robot.wheels)))
+    rates = 5 * speed * (np.sin(2 * ends[:, None] + phases[0]) + 0.3 * np.sin(9 * ends[:, None] + phases[1]))
+    twists = rates @ robot.inverse_kinematic_matrix.T
+    middle = ends - PERIOD / 2
+    return Signals(
+        robot=robot,
+        durations=np.full(samples, PERIOD),
+        rates=rates,
+        elapsed=middle,
+        twists=twists,
+        accelerations=np.diff(twists, axis=0, prepend=0.0) / PERIOD,
+        travelled=np.cumsum(np.hypot(twists[:, 0], twists[:, 1])) * PERIOD,
+        wheel_angles=3.0 + np.cumsum(rates, axis=0) * PERIOD,
+        session_time=600.0 + middle,
+        session=SESSIONS[1],
+    )
+
+
+def robots() -> tuple[Robot, Robot]:
+    """Three wheels, and four."""
+    return synthetic_robot(3), synthetic_robot(4)
+
+
+def trial_values(effect: Effect, robot: Robot, seed: int = 0) -> Iterator[Values]:
+    """Parameters within their ranges, once for each choice of those that have choices."""
+    rng = np.random.default_rng(seed)
+    found = effect.parameters(robot, SESSIONS)
+    free = {each.name: float(rng.uniform(each.low, each.high)) for each in found if not each.choices}
+    shapes = [each for each in found if each.choices]
+    for number in range(max((len(each.choices) for each in shapes), default=1)):
+        yield {each.name: _choice(each, number) if each.choices else free[each.name] for each in found}
+
+
+def without(effect: Effect, robot: Robot, values: Values) -> Values:
+    """The same with 0 for all that has no choices."""
+    shapes = {each.name for each in effect.parameters(robot, SESSIONS) if each.choices}
+    return {name: value if name in shapes else 0.0 for name, value in values.items()}
+
+
+def trial_input(effect: Effect, robot: Robot, speed: float = 1.0, samples: int = SAMPLES) -> Input:
+    """What an effect of this kind is called with; speed as for ``driven_signals``."""
+    if isinstance(effect, MotionEffect):
+        return driven_signals(robot, samples, speed)
+    if isinstance(effect, ActuatorEffect):
+        return motor_input(robot, samples, speed)
+    poses = trial_poses(samples)
+    return 0.25 * np.arange(1, samples + 1), poses[0] + speed * (poses - poses[0]), poses[0]
+
+
+def trial_poses(count: int = SAMPLES) -> Array:
+    """A path (K, 3) that curves, away from the origin."""
+    angle = np.linspace(0.4, 2.4, count)
+    return np.column_stack([1.0 + np.cos(angle), -2.0 + np.sin(2 * angle), 0.3 + angle])
+
+
+def motor_input(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> Motors:
+    """Durations and targets of a varied drive."""
+    return np.full(samples, PERIOD), driven_signals(robot, samples, speed).rates
+
+
+def results(effect: Effect, given: Input, values: Values) -> dict[str, Array]:
+    """What each method of the effect says, by name."""
+    if isinstance(given, Signals):
+        assert isinstance(effect, MotionEffect)
+        return {"correction": effect.correction(given, values)}
+    if len(given) == 2:
+        assert isinstance(effect, ActuatorEffect)
+        return {"driven": effect.driven(given[0], given[1], values)}
+    assert isinstance(effect, ReferenceEffect)
+    stamps, poses, start = given
+    position, heading = effect.delays(stamps, values)
+    return {
+        "delays of position": position,
+        "delays of heading": heading,
+        "reported": effect.reported(poses, start, values),
+        "corrected": effect.corrected(poses, start, values),
+    }
+
+
+def changes(effect: Effect, given: Input, values: Values) -> Array:
+    """By how much each row is changed: corrections, wheel rates (F, N), or delays and poses, there and back (K, 8)."""
+    found = results(effect, given, values)
+    changed = {"driven": given[1], "reported": given[1], "corrected": given[1]} if isinstance(given, tuple) else {}
+    return np.column_stack([np.asarray(value) - changed.get(name, 0.0) for name, value in found.items()])
+
+
+def arrays(given: Input) -> dict[str, Array]:
+    """The arrays of an input by name."""
+    if isinstance(given, tuple):
+        return {str(number): array for number, array in enumerate(given)}
+    found = {name: getattr(given, name) for name in type(given).__dataclass_fields__}
+    return {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
+
+
+def one_row(given: Signals | Poses, row: int) -> Signals | Poses:
+    """One sample, or one pose, alone."""
+    if isinstance(given, Signals):
+        alone: dict[str, Any] = {name: value[row : row + 1] for name, value in arrays(given).items()}
+        return replace(given, **alone)
+    stamps, poses, start = given
+    return stamps[row : row + 1], poses[row : row + 1], start
+
+
+def _choice(parameter: Parameter, number: int) -> float:
+    return parameter.choices[number % len(parameter.choices)]

@@ -1,0 +1,243 @@
+"""Conformance cases for effects."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any, get_args
+from unittest import SkipTest
+
+import numpy as np
+
+from omnibench.registry import effects
+from omnibench.robot.effects.effect import ActuatorEffect, MotionEffect, Need, Parameter, ReferenceEffect
+from omnibench.robot.signals import Signals
+from omnibench.testing.conformance import Conformance, global_random_fingerprint, global_random_state, require
+from omnibench.testing.effect_inputs import (
+    SAMPLES,
+    SESSIONS,
+    Input,
+    arrays,
+    changes,
+    driven_signals,
+    motor_input,
+    one_row,
+    results,
+    robots,
+    trial_input,
+    trial_poses,
+    trial_values,
+    without,
+)
+
+_KINDS = {
+    "MotionEffect": (MotionEffect, ("wheel", "clock", "body", "world")),
+    "ReferenceEffect": (ReferenceEffect, ("reference",)),
+    "ActuatorEffect": (ActuatorEffect, ("actuator",)),
+}
+_ROUNDING = 1e-9  # share of the largest value
+_NOTHING = 1e-12  # m, rad, rad/s
+
+
+class EffectConformance(Conformance):
+    """What every effect must keep to. Cases that are not for its kind are skipped."""
+
+    registry = effects
+
+    def test_physics_and_source_are_told(self) -> None:
+        """Reports print them beside the name."""
+        effect = self.make()
+        for item in ("physics", "source", "shows_in"):
+            text = getattr(effect, item, "")
+            require(isinstance(text, str) and bool(text.strip()), f"{item} is missing; set it in the class")
+
+    def test_stage_is_one_of_its_kind(self) -> None:
+        """A MotionEffect acts on wheels, clock, body or world."""
+        effect = self.make()
+        kinds = [name for name, (kind, _) in _KINDS.items() if isinstance(effect, kind)]
+        require(len(kinds) == 1, f"it must derive from one of {', '.join(_KINDS)}")
+        _, stages = _KINDS[kinds[0]]
+        found = getattr(effect, "stage", None)
+        require(found in stages, f"stage is {found!r}; of a {kinds[0]} it is one of {', '.join(stages)}")
+
+    def test_needs_are_known(self) -> None:
+        """What must have been recorded, by the names of the contract."""
+        unknown = set(self.make().needs) - set(get_args(Need))
+        require(not unknown, f"needs holds {sorted(map(str, unknown))}; known are {', '.join(get_args(Need))}")
+
+    def test_parameters_have_units_and_plausible_ranges(self) -> None:
+        """Every parameter can be told to a reader, and drawn."""
+        for robot in robots():
+            found = self.make().parameters(robot, SESSIONS)
+            parameters = isinstance(found, tuple) and all(isinstance(each, Parameter) for each in found)
+            require(parameters, "parameters must give a tuple of Parameter")
+            require(any(not each.choices for each in found), "it has no parameter that is 0 where it does not act")
+            for each in found:
+                _check_parameter(each)
+
+    def test_parameters_have_names_of_their_own(self) -> None:
+        """They are keys of the calibration file, the same every time."""
+        for robot in robots():
+            first, again = (self.make().parameters(robot, SESSIONS) for _ in range(2))
+            names = [each.name for each in first]
+            require(len(set(names)) == len(names), f"two parameters have one name: {', '.join(names)}")
+            require(first == again, "parameters gives others the second time")
+
+    def test_shapes_are_those_of_the_contract(self) -> None:
+        """For one sample and for many, on three wheels and on four."""
+        effect = self.make()
+        for robot in robots():
+            for values in trial_values(effect, robot):
+                for samples in (1, SAMPLES):
+                    given = trial_input(effect, robot, samples=samples)
+                    for name, result in results(effect, given, values).items():
+                        found, expected = np.shape(result), _shape(name, effect.stage, given, len(robot.wheels))
+                        require(found == expected, f"{name} has shape {found}, expected {expected}")
+
+    def test_zero_parameters_change_nothing(self) -> None:
+        """An effect whose parameters are 0 is not there."""
+        effect = self.make()
+        for robot in robots():
+            given = trial_input(effect, robot)
+            for values in trial_values(effect, robot):
+                largest = float(np.abs(changes(effect, given, without(effect, robot, values))).max())
+                require(largest <= _NOTHING, f"parameters of 0 change something, by {largest:.3g}")
+
+    def test_parameters_change_something(self) -> None:
+        """Somewhere in a varied drive it can be seen."""
+        effect = self.make()
+        for robot in robots():
+            given = trial_input(effect, robot)
+            seen = any((np.abs(changes(effect, given, each)) > 0).any() for each in trial_values(effect, robot))
+            require(seen, f"no parameters change anything on {len(robot.wheels)} wheels")
+
+    def test_results_are_finite(self) -> None:
+        """While it drives, drives fast and stands."""
+        effect = self.make()
+        for robot in robots():
+            for values in trial_values(effect, robot):
+                for speed in (0.0, 1.0, 20.0):
+                    finite = np.isfinite(changes(effect, trial_input(effect, robot, speed), values)).all()
+                    require(bool(finite), f"a result is not finite where the robot {'drives' if speed else 'stands'}")
+
+    def test_it_is_linear_in_its_parameters(self) -> None:
+        """Fits and the search for effects rely on it; a parameter with choices may shape the correction freely."""
+        effect = self.make()
+        if isinstance(effect, ActuatorEffect):
+            raise SkipTest("is for effects that a fit looks for")
+        # what is reported need be linear for small parameters only: a map turns by sine and cosine
+        size, tolerance = (1.0, _ROUNDING) if isinstance(effect, MotionEffect) else (1e-5, 1e-3)
+        for robot in robots():
+            given = trial_input(effect, robot)
+            for first, second in zip(trial_values(effect, robot, 1), trial_values(effect, robot, 2), strict=True):
+                free = [name for name in first if first[name] != second[name]]
+                one, other = (dict(values) | {name: size * values[name] for name in free} for values in (first, second))
+                both = one | {name: one[name] - 2 * other[name] for name in free}
+                of_one, of_other, of_both = (changes(effect, given, values) for values in (one, other, both))
+                error = float(np.abs(of_both - (of_one - 2 * of_other)).max())
+                scale = float(max(np.abs(of_one).max(), np.abs(of_other).max()))
+                require(error <= tolerance * scale, f"it is not linear in its parameters: off by {error:.3g}")
+
+    def test_inputs_are_left_unchanged(self) -> None:
+        """Signals and poses belong to the model, values to the calibration."""
+        effect = self.make()
+        for robot in robots():
+            given = trial_input(effect, robot)
+            before = {name: array.copy() for name, array in arrays(given).items()}
+            for values in trial_values(effect, robot):
+                kept = dict(values)
+                results(effect, given, values)
+                same = all(np.array_equal(array, before[name]) for name, array in arrays(given).items())
+                require(same and values == kept, "it changed its arguments; work on copies")
+
+    def test_each_sample_is_corrected_by_itself(self) -> None:
+        """No memory: a stream has one sample at a time, and gives the same."""
+        effect = self.make()
+        for robot in robots():
+            given = trial_input(effect, robot)
+            if not isinstance(given, Signals) and len(given) == 2:
+                raise SkipTest("is for effects that act in a stream")
+            for values in trial_values(effect, robot):
+                together = changes(effect, given, values)
+                for row in (0, 7, SAMPLES - 1, 3):
+                    alone = changes(effect, one_row(given, row), values)
+                    same = len(alone) == 1 and np.allclose(alone[0], together[row], rtol=1e-9, atol=_NOTHING)
+                    require(same, f"row {row} of a batch is not what it is alone; it must not look at other samples")
+
+    def test_it_says_the_same_again(self) -> None:
+        """Another instance too; and the global random generators are left alone."""
+        for robot in robots():
+            given = trial_input(self.make(), robot)
+            for values in trial_values(self.make(), robot):
+                found = []
+                for seed in (1, 2):
+                    with global_random_state(seed):
+                        before = global_random_fingerprint()
+                        effect = self.make()
+                        found += [changes(effect, given, values) for _ in range(2)]
+                        require(global_random_fingerprint() == before, "it draws random numbers")
+                require(all(np.array_equal(found[0], each) for each in found[1:]), "it says something else each time")
+
+    def test_it_does_with_what_it_needs(self) -> None:
+        """Recordings without what ``needs`` does not name must do."""
+        effect = self.make()
+        if not isinstance(effect, MotionEffect):
+            raise SkipTest("is for effects of motion")
+        unused = {"wheel_angles", "session_time", "session"} - set(effect.needs)
+        bare: dict[str, Any] = dict.fromkeys(unused)
+        for robot in robots():
+            signals = replace(driven_signals(robot), **bare)
+            for values in trial_values(effect, robot):
+                try:
+                    effect.correction(signals, values)
+                except (TypeError, AttributeError) as error:
+                    missing = ", ".join(sorted(unused))
+                    require(False, f"without {missing} it raises {type(error).__name__}: {error}; name it in needs")
+
+    def test_corrected_poses_are_the_true_ones(self) -> None:
+        """``corrected`` undoes ``reported``."""
+        effect = self.make()
+        if not isinstance(effect, ReferenceEffect):
+            raise SkipTest("is for effects of the reference")
+        poses = trial_poses()
+        for robot in robots():
+            for values in trial_values(effect, robot):
+                back = effect.corrected(effect.reported(poses, poses[0], values), poses[0], values)
+                error = float(np.abs(back - poses).max())
+                require(error <= _ROUNDING, f"corrected(reported(poses)) is off by {error:.3g}")
+
+    def test_motors_know_nothing_of_what_comes(self) -> None:
+        """What they do depends on earlier targets only, and they stand until the first."""
+        effect = self.make()
+        if not isinstance(effect, ActuatorEffect):
+            raise SkipTest("is for effects of the motors")
+        for robot in robots():
+            durations, targets = motor_input(robot)
+            for values in trial_values(effect, robot):
+                early = effect.driven(durations[:50], targets[:50], values)
+                same = np.allclose(early, effect.driven(durations, targets, values)[:50], rtol=1e-9, atol=_NOTHING)
+                require(same, "later targets change earlier wheel rates")
+                still = effect.driven(durations, np.zeros_like(targets), values)
+                require(not np.any(still), "the wheels turn though no target ever said so")
+
+
+def _check_parameter(parameter: Parameter) -> None:
+    place = f"parameter {parameter.name!r}"
+    low, high = parameter.low, parameter.high
+    require(bool(parameter.name) and parameter.name.isprintable(), f"{place}: its name is empty, or cannot be printed")
+    require(bool(parameter.unit.strip()), f"{place} has no unit; that of a ratio is 1")
+    require(bool(parameter.description.strip()), f"{place} has no description")
+    require(math.isfinite(low) and math.isfinite(high), f"{place}: its range is not finite")
+    require(low < high, f"{place}: low {low:g} is not below high {high:g}")
+    if parameter.choices:
+        inside = all(low <= each <= high for each in parameter.choices)
+        require(inside, f"{place}: a choice is not within {low:g} and {high:g}")
+    else:
+        require(low <= 0 <= high, f"{place}: 0, where it does not act, is not within {low:g} and {high:g}")
+
+
+def _shape(result: str, stage: str, given: Input, wheels: int) -> tuple[int, ...]:
+    """The shape that the contract gives to a result."""
+    if isinstance(given, Signals):
+        return len(given.durations), {"body": 3, "world": 2}.get(stage, wheels)
+    return given[0].shape if result.startswith("delays") else given[1].shape

@@ -1,0 +1,106 @@
+"""Small flower experiments with hidden effects, and what is discovered in them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+from omnibench.data.dataset import Dataset
+from omnibench.data.simulate.config import FlowerConfig
+from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.discover.discover import discover_effects
+from omnibench.discover.result import Discovery, Experiment, HeldOut, Novelty, Place
+
+APR02 = {
+    "name": "APR-02",
+    "wheels": [
+        {"name": name, "radius": 0.148, "distance": 0.195, "angle": math.radians(degrees)}
+        for name, degrees in zip("abc", (60, 180, 300), strict=True)
+    ],
+}
+Effects = tuple[dict[str, Any], ...]
+COUPLING: Effects = ({"name": "rotation_translation_coupling", "parameters": {"kx": 0.3, "ky": -0.2}},)
+ECCENTRICITY: Effects = ({"name": "wheel_eccentricity", "parameters": {"a_a": 0.02, "b_a": 0.0}},)
+DELAY: Effects = ({"name": "reference_time_offset", "parameters": {"tau": 0.06}},)
+
+
+def flower(effects: Effects = COUPLING, **changes: Any) -> dict[str, Any]:
+    """A small flower experiment: what a config's ``simulate`` says."""
+    return {
+        "robot": APR02,
+        "sample_period": 0.04,
+        "commands": {"directions_deg": [0, 60, 120, 180, 240, 300], "turn_rates": [-0.35, 0, 0.35], "ramp": 0.3},
+        "repetitions": 2,
+        "truth": {"published": "palacin2023_eq8", "effects": list(effects)},
+        "noise": {"encoder": 0.01, "pose_position": 0.004, "pose_heading": 0.004, "bias_position": 0.002},
+        "train": {"seed": 1, "distance": 1.2},
+        "validation": {"seed": 2, "distance": 1.2},
+        **changes,
+    }
+
+
+def simulated(effects: Effects = COUPLING, **changes: Any) -> Dataset:
+    """A simulated data set with hidden effects."""
+    return simulate_dataset(FlowerConfig.model_validate(flower(effects, **changes))).dataset
+
+
+def shorn(dataset: Dataset, **values: Any) -> Dataset:
+    """A data set whose runs lack something, or have it otherwise."""
+    return replace(dataset, trajectories=tuple(replace(run, **values) for run in dataset.trajectories))
+
+
+@cache
+def named() -> Discovery:
+    """A strong effect that the catalogue has."""
+    return discover_effects(simulated())
+
+
+@cache
+def nothing() -> Discovery:
+    """Noise alone."""
+    return discover_effects(simulated(()))
+
+
+@cache
+def nameless() -> Discovery:
+    """A strong effect that is left out of the catalogue."""
+    return discover_effects(simulated(), without=("rotation_translation_coupling",))
+
+
+def incomplete() -> Discovery:
+    """Named, with more of whatever a discovery may hold than these data give rise to."""
+    found = named()
+    place = Place("wheel rate", "wheel", 2e-11, 90.0, 24, "what is left depends on how fast the wheels turn")
+    return replace(
+        found,
+        verdict="incomplete",
+        left=(place,),
+        novelties=(NOVELTY,),
+        experiments=(EXPERIMENT,),
+        classes=(("acceleration_slip", "reference_time_offset"),),
+        outliers=12,
+    )
+
+
+def poor(found: Discovery) -> Discovery:
+    """The same of recordings of which little is known: no wheel angles, no order, no commands, no held-out runs."""
+    dataset = shorn(
+        found.dataset, angles=None, session=None, started_at=None, command=None, v=None, alpha=None, omega=None,
+        distance=None, duration=None, repetition=None, targets=None,
+    )  # fmt: skip
+    return replace(found, dataset=dataset, held_out=())
+
+
+def held_out(found: Discovery, data: str) -> HeldOut:
+    """Its figures on one kind of held-out runs."""
+    return next(each for each in found.held_out if each.data == data)
+
+
+NOVELTY = Novelty("v0.4_a90_w1", "turns at 1.0 rad/s, where training had at most 0.35 rad/s", 0.041, 0.152)
+EXPERIMENT = Experiment(
+    ("acceleration_slip", "reference_time_offset"),
+    "Turn on the spot at two rates: only a time offset shows there.",
+    "generator: flower\ncommands: {speeds: [0.0], directions_deg: [0], turn_rates: [-1.0, 1.0]}\n",
+)

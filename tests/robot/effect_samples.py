@@ -1,0 +1,102 @@
+"""Robots, drives and terms that the tests of effects share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from omnibench.registry import effects
+from omnibench.robot.effects.effect import Effect, MotionEffect, ReferenceEffect
+from omnibench.robot.effects.term import Term, make_term
+from omnibench.robot.kinematics import Robot, Wheel
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import Integration, OdometryStream, WheelLog
+
+PERIOD = 0.02
+SESSIONS = ("morning", "evening")
+APR_02 = Robot(
+    name="APR-02",
+    wheels=tuple(
+        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle))
+        for name, angle in zip("abc", (60, 180, 300), strict=True)
+    ),
+)
+MECANUM = Robot(
+    name="youBot",
+    wheels=tuple(
+        Wheel(name=name, radius=0.0475, distance=0.385, angle=side * math.pi / 2, roller_angle=slant * math.pi / 4)
+        for name, side, slant in (("fl", 1, 1), ("fr", -1, -1), ("rl", 1, -1), ("rr", -1, 1))
+    ),
+)
+ROBOTS = {"three": APR_02, "four": MECANUM}
+
+
+def built_in(*kinds: type[Effect]) -> list[str]:
+    """Names of the built-in effects of some kinds."""
+    return [
+        entry.name
+        for entry in effects.entries()
+        if entry.origin == "built in" and isinstance(effects.create(entry.name), kinds)
+    ]
+
+
+MOTION, REFERENCE = built_in(MotionEffect), built_in(ReferenceEffect)
+
+
+def a_drive(seed: int, samples: int = 40, robot: Robot = APR_02, stamps: int = 7) -> WheelLog:
+    """Random rates with rests among them, irregular samples, all that an effect can need, and stamps anywhere."""
+    rng = np.random.default_rng(seed)
+    durations = PERIOD * rng.uniform(0.2, 2.0, samples)
+    times = np.cumsum(durations)
+    rates = rng.normal(0, 4, (samples, len(robot.wheels)))
+    rates[rng.random(samples) < 0.2] = rng.choice([0.0, 5e-4])
+    return WheelLog(
+        times=times,
+        rates=rates,
+        start=rng.normal(0, 2, 3),
+        stamps=np.concatenate([[0.0], np.sort(rng.uniform(0, times[-1], stamps - 2)), times[-1:]]),
+        wheel_angles=rng.uniform(-9, 9, len(robot.wheels)) + np.cumsum(rates * durations[:, None], axis=0),
+        started_at=float(rng.uniform(0, 3600)),
+        session=SESSIONS[int(rng.integers(2))],
+    )
+
+
+def a_term(name: str, robot: Robot, seed: int = 0, scale: float = 1.0) -> Term:
+    """An effect with parameters anywhere in their plausible range, times a factor for those without choices."""
+    rng = np.random.default_rng(seed)
+    values = {
+        each.name: float(rng.choice(each.choices)) if each.choices else scale * float(rng.uniform(each.low, each.high))
+        for each in effects.create(name).parameters(robot, SESSIONS)
+    }
+    return make_term(name, values, robot, sessions=SESSIONS)
+
+
+def mixture(seed: int, robot: Robot, scale: float = 1.0) -> list[Term]:
+    """Several effects of any motion stage, some of them twice."""
+    rng = np.random.default_rng(seed)
+    names = rng.choice(MOTION, size=int(rng.integers(2, 8)))
+    return [a_term(str(name), robot, seed + place, scale) for place, name in enumerate(names)]
+
+
+def term(name: str, **values: float) -> Term:
+    """An effect of the APR-02."""
+    return make_term(name, values, APR_02)
+
+
+def model(*terms: Term, robot: Robot = APR_02, integration: Integration = "arc") -> OdometryModel:
+    """The design values with effects."""
+    return OdometryModel(robot, robot.inverse_kinematic_matrix, integration, terms, PERIOD)
+
+
+def at_every_sample(log: WheelLog) -> WheelLog:
+    return replace(log, stamps=log.times)
+
+
+def streamed(stream: OdometryStream, log: WheelLog) -> np.ndarray:
+    """Poses (F, 3) after every sample."""
+    assert log.wheel_angles is not None
+    durations = np.diff(log.times, prepend=0.0)
+    samples = zip(log.rates, durations, log.wheel_angles, strict=True)
+    return np.array([stream.step(rates, duration, angles) for rates, duration, angles in samples])
