@@ -19,13 +19,13 @@ from omnibench.discover.wording import (
     gap_decimals,
     reading,
     weight_in_words,
+    worst_of_each,
 )
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import fixed
 from omnibench.report.style import INK, QUIET, logarithmic, plot, text
 
 _CANDIDATES = 8  # of each step
-_HIDDEN = 40
 _UNCHOSEN = "#b9c0c8"
 _GAINED, _LOST = "#7fb8d8", "#e3a3a3"
 _FLOOR_LEGEND = LegendItem("floor", "floor that repetitions allow", FLOOR, "dash")
@@ -147,10 +147,16 @@ def waterfall_grid(discovery: Discovery) -> FigureGrid | None:
     legend = (
         LegendItem("before", "plain matrix", BEFORE),
         LegendItem("down", "gained by an effect", _GAINED),
+        *((LegendItem("up", "lost by an effect", _LOST),) if any(_rises(own) for own in values) else ()),
         LegendItem("after", "extended model", AFTER),
         *((_FLOOR_LEGEND,) if any(floor is not None for floor in floors) else ()),
     )
     return FigureGrid(figures, legend, 2)
+
+
+def _rises(values: Sequence[float | None]) -> bool:
+    known = [value for value in values if value is not None]
+    return any(after > before for before, after in pairwise(known))
 
 
 def _waterfall(steps: Sequence[Step], values: Sequence[float], floor: float | None, title: str) -> go.Figure:
@@ -176,7 +182,7 @@ def gap_grid(discovery: Discovery) -> FigureGrid:
         gaps.append(("training runs", discovery.gap))
     figures = tuple(
         Figure(
-            f"{METRICS[gap.metric]}: {name}",
+            f"{METRICS[gap.metric]}, {name}: {closed_in_words(gap)}{'' if gap.closed is None else ' closed'}",
             _gap_bars(gap),
             f"{METRICS[gap.metric]} on {name}: before {gap.before:.4g}, after {gap.after:.4g}, floor {gap.floor:.4g}",
             190,
@@ -197,19 +203,17 @@ def gap_grid(discovery: Discovery) -> FigureGrid:
 
 def _gap_bars(gap: Gap) -> go.Figure:
     decimals = gap_decimals(gap)
-    closed = f"  ({closed_in_words(gap)}{' closed' if gap.closed is not None else ''})"
     bars = [
         _Bar("before", 0.0, gap.before, fixed(gap.before, decimals), "before", BEFORE),
-        _Bar("after", 0.0, gap.after, fixed(gap.after, decimals) + closed, "after", AFTER),
+        _Bar("after", 0.0, gap.after, fixed(gap.after, decimals), "after", AFTER),
         _Bar("floor", 0.0, gap.floor, fixed(gap.floor, decimals), "floor", FLOOR),
     ]
-    return _bars(bars, METRICS[gap.metric], 1.6)
+    return _bars(bars, METRICS[gap.metric], 1.25)
 
 
 def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
     """How large each effect could be unseen, as a share of what is plausible."""
-    rated = [each for each in hidden if each.plausible > 0 and each.limit > 0]
-    shown = sorted(rated, key=lambda each: each.limit / each.plausible)[-_HIDDEN:]
+    shown = [each for each in reversed(worst_of_each(hidden)) if each.plausible > 0 and each.limit > 0]
     if not shown:
         return None
     names = [text(f"{each.name}: {each.parameter}") for each in shown]
@@ -251,8 +255,8 @@ def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
             LegendItem("detectable", "found nearly always from here on", INK, "dot"),
         ),
         1,
-        "Left of the dotted line the data tell more than what is plausible of such an effect anyway; right of it an "
-        "effect of plausible size could hide.",
+        "Of each effect the parameter that could be largest. Left of the dotted line the data tell more than what is "
+        "plausible of such an effect anyway; right of it an effect of plausible size could hide.",
     )
 
 

@@ -1,11 +1,11 @@
 """Which effects are missing: sets of effects compared by their evidence, their idealised forms allowed for.
 
-Every set A of at most m effects lowers the whitened chi2 by Q(A) and costs what its parameters and its choice among
-the catalogue are worth (Schwarz 1978). The form that the catalogue gives an effect is an idealisation, off by a share
-``DISCREPANCY`` of its size: with an effect of non-centrality N that moves differences in Q by DISCREPANCY^2 N times as
-much as noise does, so that evidence counts that much less. A name's weight is the sum over the sets that hold it,
-times the probability that what is there is in the catalogue at all: what generic bases still find after the effects,
-in their own forms or slightly different ones, says how likely that is.
+Every set A of at most m effects lowers the whitened chi2 by Q(A) and costs what its parameters (a g-prior, as wide as
+the data say: Liang et al. 2008) and its choice among the catalogue are worth. The form that the catalogue gives an
+effect is an idealisation, off by a share ``DISCREPANCY`` of its size: with an effect of non-centrality N that moves
+differences in Q by DISCREPANCY^2 N times as much as noise does, so that evidence counts that much less. A name's
+weight is the sum over the sets that hold it, times the probability that what is there is in the catalogue at all:
+what generic bases still find after the effects, in their own forms or slightly different ones, says how likely that is.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from omnibench.discover.significance import Gains, gains_of
 from omnibench.discover.whitened import Given, Whitened, given
 from omnibench.robot.kinematics import Array
 
-DISCREPANCY = 0.12
+DISCREPANCY = 0.1
 SURE = 0.95
 CHANCE = 0.002  # of naming anything where nothing is missing
 _PRIOR = float(np.log(20))  # an effect is missing once in 20 robots
@@ -30,7 +30,7 @@ _LEFT_RIGHT = 0.04  # share that right names leave, in the mean; wrong ones leav
 _BEYOND_RIGHT = 0.01  # likewise, when their forms may differ a little
 _MOST_ODDS = 10.0  # that another form may lend a name
 _CANCELLING = 0.35  # effects that undo each other to such a share imitate something else rather than being there all
-_IMITATION = 0.05  # odds that they are
+_IMITATION = 1.0  # odds, at most, that they are
 _WRONG = 0.2  # of what is missing is not in the catalogue
 _CONFUSABLE = 0.03
 
@@ -176,8 +176,8 @@ def _sets(start: Given, pool: Sequence[Group], most: int) -> _Sets:
     rank = np.array([start.rank(_indices(each)) if each else 0 for each in sets])
     choices = np.array([sum(_PRIOR + np.log(group.tries) for group in each) for each in sets])
     energy = float(max((gain - rank).max(), 0.0))
-    per_rank = np.maximum(gain / np.maximum(rank, 1), 1.0)
-    evidence = (gain - rank) / 2 / (1 + DISCREPANCY**2 * energy) - rank * np.log(per_rank) / 2 - choices
+    trusted = gain / (1 + DISCREPANCY**2 * energy)
+    evidence = (trusted - rank - rank * np.log(np.maximum(trusted / np.maximum(rank, 1), 1.0))) / 2 - choices
     return _Sets(tuple(sets), evidence, gain, energy)
 
 
@@ -199,7 +199,7 @@ def _known(sets: _Sets, start: Given, chosen: Sequence[Group], left: Gains, beyo
     for (found, spread, usual), most in zip(shares, (np.inf, _MOST_ODDS), strict=True):
         odds *= min(_odds(found, float(np.sqrt(spread**2 + 4 * found)), energy, usual), most)
     if len(chosen) > 1 and _cancelling(start, chosen) < _CANCELLING:
-        odds *= _IMITATION
+        odds = min(odds, _IMITATION)
     share = shares[0][0] / (shares[0][0] + energy)
     return share, odds / (1 + odds)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 from omnibench.data.dataset import Dataset
@@ -17,6 +16,7 @@ from omnibench.discover.wording import (
     final_errors_in_words,
     gap_decimals,
     reading,
+    share_of_plausible,
     value_and_interval,
     weight_in_words,
 )
@@ -74,7 +74,7 @@ def parameter_table(found: Sequence[NamedEffect], dataset: Dataset) -> Table:
                 Row((Cell(each.name, meanings.get(each.name, "")), Cell(value), Cell(kept), Cell(unit or NOTHING)))
             )
     return Table(
-        "Parameters of what was found",
+        "Parameters of what was added",
         (Column("Parameter", numeric=False), Column("Value"), Column("95 % interval"), Column("Unit", numeric=False)),
         tuple(rows),
     )
@@ -162,15 +162,14 @@ def step_table(discovery: Discovery) -> Table:
 
 def hidden_table(hidden: Sequence[Hidden]) -> Table:
     """How large every effect could still be, the largest for its kind first."""
-    ordered = sorted(hidden, key=lambda each: -(each.limit / each.plausible if each.plausible else math.inf))
     rows = []
-    for each in ordered:
-        shown = reading(each.unit)
-        share = each.limit / each.plausible if each.plausible else math.inf
+    for each in sorted(hidden, key=share_of_plausible, reverse=True):
+        shown, share = reading(each.unit), share_of_plausible(each)
         rows.append(
             Row(
                 (
-                    Cell(each.name, each.parameter),
+                    Cell(each.name),
+                    Cell(each.parameter),
                     Cell(f"±{shown.number(each.limit, 2)}"),
                     Cell(f"±{shown.number(each.detectable, 2)}"),
                     Cell(f"±{shown.number(each.plausible, 2)}"),
@@ -183,6 +182,7 @@ def hidden_table(hidden: Sequence[Hidden]) -> Table:
         "How large an effect of each kind could still hide",
         (
             Column("Effect", numeric=False),
+            Column("Parameter", numeric=False),
             Column("At most (95 %)"),
             Column("Found nearly always from"),
             Column("Plausible"),

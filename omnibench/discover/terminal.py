@@ -12,7 +12,7 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from omnibench.discover.document import experiment_file
-from omnibench.discover.result import Discovery, Gap, Hidden, NamedEffect
+from omnibench.discover.result import Discovery, Gap, NamedEffect
 from omnibench.discover.wording import (
     VERDICTS,
     chance,
@@ -24,6 +24,7 @@ from omnibench.discover.wording import (
     value_and_interval,
     weight_in_words,
     with_unit,
+    worst_of_each,
 )
 from omnibench.report.numbers import fixed, listing, plural
 
@@ -91,7 +92,7 @@ def _tables(discovery: Discovery) -> Iterator[Table]:
 def _effect_title(effect: NamedEffect) -> str:
     others = [name for name in effect.confusable_with if name != effect.name]
     alike = f", or {' or '.join(others)}" if others else ""
-    return f"missing: {effect.name}{alike} (stage {effect.stage}), weight {weight_in_words(effect.weight)}"
+    return f"added: {effect.name}{alike} (stage {effect.stage}), weight {weight_in_words(effect.weight)}"
 
 
 def _effect_table(effect: NamedEffect) -> Table:
@@ -104,7 +105,8 @@ def _effect_table(effect: NamedEffect) -> Table:
 
 def _place_table(discovery: Discovery) -> Table:
     table = _table("where the plain matrix fails", ("residual over", "in words"), ("chance",))
-    for place in discovery.where[:_PLACES]:
+    strongest = {place.covariate: place for place in reversed(discovery.where)}  # the first of each
+    for place in [place for place in discovery.where if strongest[place.covariate] is place][:_PLACES]:
         table.add_row(place.covariate, place.description, chance(place.p_value))
     return table
 
@@ -134,23 +136,21 @@ def _gap_cells(gap: Gap) -> tuple[str, ...]:
 def _hidden_table(discovery: Discovery) -> Table:
     """The effects that could be largest for what is plausible of them."""
     table = _table("what could still hide", ("effect", "parameter"), ("at most ±", "plausible ±"))
-    for each in sorted(discovery.hidden, key=_share_of_plausible, reverse=True)[:_HIDDEN]:
+    worst = worst_of_each(discovery.hidden)
+    for each in worst[:_HIDDEN]:
         shown = reading(each.unit)
         table.add_row(each.name, each.parameter, shown.words(each.limit, 2), shown.words(each.plausible, 2))
-    if len(discovery.hidden) > _HIDDEN:
-        table.caption = f"the largest for their kind; {len(discovery.hidden) - _HIDDEN} more in the report"
+    if len(worst) > _HIDDEN:
+        table.caption = f"the largest for their kind; {plural(len(worst) - _HIDDEN, 'more effect')} in the report"
         table.caption_justify = "left"
     return table
-
-
-def _share_of_plausible(hidden: Hidden) -> float:
-    return hidden.limit / hidden.plausible if hidden.plausible else math.inf
 
 
 def _remarks(discovery: Discovery) -> Iterator[str]:
     yield ""
     if discovery.left:
-        left = listing([f"{place.covariate} ({chance(place.p_value)})" for place in discovery.left])
+        first = {place.covariate: place for place in reversed(discovery.left)}
+        left = listing([f"{p.covariate} ({chance(p.p_value)})" for p in discovery.left if first[p.covariate] is p])
         yield f"Left over: the residuals still depend on {left}."
     for effect in discovery.effects:
         if effect.in_doubt:
@@ -160,15 +160,15 @@ def _remarks(discovery: Discovery) -> Iterator[str]:
     if discovery.absorbed:
         absorbed = listing([each.name for each in discovery.absorbed], 12)
         yield f"Absorbed by any matrix, and so never named: {absorbed}."
-    yield from _first(novelties_in_words(discovery.novelties), "warning: not driven in training: ", "such warnings")
-    yield from _first(discovery.notes, "- ", "notes")
+    yield from _first(novelties_in_words(discovery.novelties), "warning: not driven in training: ", "such warning")
+    yield from _first(discovery.notes, "- ", "note")
 
 
 def _first(lines: Sequence[str], head: str, kind: str) -> Iterator[str]:
     """As many lines as a screen has room for."""
     yield from (f"{head}{line}" for line in lines[:_LINES])
     if len(lines) > _LINES:
-        yield f"{len(lines) - _LINES} more {kind} in the report"
+        yield f"{plural(len(lines) - _LINES, f'more {kind}')} in the report"
 
 
 def _print_files(console: Console, discovery: Discovery, folder: Path) -> None:

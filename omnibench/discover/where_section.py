@@ -10,6 +10,7 @@ from omnibench.discover.command_figures import command_blocks
 from omnibench.discover.drawing import ALONE, EXTENDED, PLAIN, Look
 from omnibench.discover.floor_figures import floor_grids
 from omnibench.discover.motion_figures import acceleration_grid, heading_grid, wheel_angle_grid, wheel_rate_grid
+from omnibench.discover.motor_figures import motor_grid
 from omnibench.discover.residuals import Residuals
 from omnibench.discover.result import Discovery
 from omnibench.discover.tables import place_table
@@ -46,6 +47,7 @@ _NOT_DRAWN = {
     "wheel angle": "the wheels' absolute angles were not recorded",
     "acceleration": "hardly any run accelerates",
     "stamps": "nothing moves",
+    "motors": "targets of the wheel rates were not recorded, or are copies of the rates",
 }
 
 
@@ -53,24 +55,31 @@ def where_section(discovery: Discovery) -> Section:
     """What the residuals depend on, by covariate, before and after."""
     residuals = Residuals(discovery)
     looks = _looks(discovery)
-    named = [name for name in dict.fromkeys(place.covariate for place in discovery.where) if name in _PICTURES]
+    motors = motor_grid(discovery, residuals.runs)
     drawn = {name: tuple(block for block in make(residuals, looks) if block) for name, make in _PICTURES.items()}
+    drawn["motors"] = () if motors is None else (motors,)
+    places = ["motors" if place.stage == "actuator" else place.covariate for place in discovery.where]
+    named = [name for name in dict.fromkeys(places) if name in drawn]
     sections = [Section("where-command", "Residuals by command", command_blocks(residuals, looks))]
     for number, name in enumerate(named, 1):
         if drawn[name]:
-            sections.append(Section(f"where-{number}", f"Residuals over {_OVER.get(name, name)}", drawn[name]))
+            sections.append(Section(f"where-{number}", _title(name), drawn[name]))
     others: list[Block] = [
-        Details(_OVER.get(name, name).capitalize(), drawn[name])
-        for name in _PICTURES
-        if name not in named and drawn[name]
+        Details(_title(name), blocks) for name, blocks in drawn.items() if name not in named and blocks
     ]
-    not_drawn = [f"{name} ({_NOT_DRAWN[name]})" for name in _PICTURES if not drawn[name]]
+    not_drawn = [f"{name} ({_NOT_DRAWN[name]})" for name, blocks in drawn.items() if not blocks]
     if not_drawn:
-        others.append(Paragraph(f"Not drawn: residuals over {'; '.join(not_drawn)}.", "note"))
+        others.append(Paragraph(f"Not drawn: {'; '.join(not_drawn)}.", "note"))
     if others:
         title = "Residuals over other things" if named else "Residuals over all that was looked at"
         sections.append(Section("where-others", title, tuple(others)))
     return Section("where", "Where", (*_places(discovery), Paragraph(_HOW, "note")), tuple(sections))
+
+
+def _title(name: str) -> str:
+    return (
+        "Measured wheel rates against their targets" if name == "motors" else f"Residuals over {_OVER.get(name, name)}"
+    )
 
 
 def _places(discovery: Discovery) -> Iterator[Block]:
@@ -79,11 +88,17 @@ def _places(discovery: Discovery) -> Iterator[Block]:
             "The residuals of the plain matrix depend on nothing that was looked at by more than noise explains."
         )
         return
-    words = listing(list(dict.fromkeys(place.covariate for place in discovery.where)), 9)
-    yield Paragraph(
-        f"The residuals of the plain matrix depend on {words}. What makes them may show in several of these; the first "
-        "stands out most."
-    )
+    words = listing(list(dict.fromkeys(place.covariate for place in discovery.where if place.stage != "actuator")), 9)
+    if words:
+        yield Paragraph(
+            f"The residuals of the plain matrix depend on {words}. What makes them may show in several of these; the "
+            "first stands out most."
+        )
+    if any(place.stage == "actuator" for place in discovery.where):
+        yield Paragraph(
+            "The wheels do not turn as their motors were told. Odometry sees the wheels themselves and is not worse for "
+            "it; a simulation is."
+        )
     yield place_table(discovery.where, "Where the plain matrix fails")
 
 

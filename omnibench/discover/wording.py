@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,6 +12,7 @@ from omnibench.discover.result import (
     EstimatedParameter,
     Gap,
     HeldOut,
+    Hidden,
     NamedEffect,
     Novelty,
     Step,
@@ -126,6 +127,20 @@ def weight_in_words(weight: float) -> str:
     if weight > 0.999:
         return "> 99.9 %"
     return "< 0.1 %" if weight < 0.001 else percent(weight)
+
+
+def worst_of_each(hidden: Sequence[Hidden]) -> tuple[Hidden, ...]:
+    """Of each effect the parameter that could be largest for what is plausible of it; the largest first."""
+    ordered = sorted(hidden, key=share_of_plausible, reverse=True)
+    first: dict[str, Hidden] = {}
+    for each in ordered:
+        first.setdefault(each.name, each)
+    return tuple(first.values())
+
+
+def share_of_plausible(hidden: Hidden) -> float:
+    """How large it could be, as a share of what is plausible."""
+    return hidden.limit / hidden.plausible if hidden.plausible else math.inf
 
 
 def chance(p_value: float) -> str:

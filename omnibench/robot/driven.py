@@ -18,7 +18,7 @@ def motions_of(matrix: Array, times: Array, rates: Array) -> Array:
     totals = np.cumsum(np.vstack([np.zeros(3), rates @ matrix.T]), axis=0)
     if len(times) <= width:
         return totals[-1:] / len(times)
-    smooth: Array = (totals[width:] - totals[:-width]) / width
+    smooth: Array = (totals[width:] - totals[:-width])[:: max(1, width // 2)] / width
     return smooth
 
 
@@ -36,9 +36,11 @@ def representatives(robot: Robot, motions: Array) -> Array:
 
 def new_share(robot: Robot, driven: Array, motions: Array) -> tuple[float, str]:
     """The share of motions (k, 3) that are far from all that were driven (n, 3), and what they are, in words."""
+    from scipy.spatial import KDTree  # a live node does not need it
+
     known, own = driven * _scale(robot), motions * _scale(robot)
     size = _size(known)
-    away = np.array([np.linalg.norm(known - each, axis=1).min() for each in own]) > _NEAR * size
+    away = KDTree(known).query(own)[0] > _NEAR * size
     if away.mean() < _OFTEN:
         return 0.0, ""
     return float(away.mean()), _in_words(own[away], motions[away])

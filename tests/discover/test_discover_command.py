@@ -8,17 +8,19 @@ import signal
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import polars as pl
 import pytest
-from commands import COMMAND, ENVIRONMENT, Command, assert_refused
-from discovery_samples import EXPERIMENT, flower, named, nothing, simulated
+from commands import COMMAND, ENVIRONMENT, Command, assert_refused, omnibench
+from discovery_samples import EXPERIMENT, named, nothing, simulated
 
 from omnibench.config import parse_yaml
 from omnibench.data.dataset import Dataset
-from omnibench.data.storage import save_dataset
+from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.discover.output import DiscoverOptions, write_discovery
 from omnibench.errors import DataError
+from omnibench.fit.evaluate import evaluate
 from omnibench.robot.calibration import read_calibration
 
 OPTIONS = DiscoverOptions(dataset="data")
@@ -37,30 +39,64 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+class Told(NamedTuple):
+    """A run of the command and its folder."""
+
+    run: subprocess.CompletedProcess[str]
+    folder: Path
+
+    @property
+    def document(self) -> dict[str, Any]:
+        content: dict[str, Any] = json.loads(self.run.stdout)
+        return content
+
+
 def small() -> Dataset:
     commands = {"directions_deg": [0, 120, 240], "turn_rates": [-0.35, 0.35], "ramp": 0.3}
     return simulated(commands=commands, repetitions=2)
 
 
-def test_json_is_one_document_and_the_same_as_the_file(command: Command, data: Path) -> None:
-    run = command("discover", data, "--output", "out", "--json")
-    assert run.returncode == 0
-    assert run.stdout == Path("out/discovery.json").read_text(encoding="utf-8")
-    document = json.loads(run.stdout)
-    assert list(document)[: len(KEYS)] == KEYS
+@pytest.fixture(scope="module")
+def told(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Told:
+    """What the command says of the data, in one real process."""
+    folder = tmp_path_factory.mktemp("told") / "out"
+    return Told(omnibench("discover", data, "--output", folder, "--json"), folder)
+
+
+def test_json_is_one_document_and_the_same_as_the_file(told: Told) -> None:
+    assert told.run.returncode == 0
+    assert told.run.stdout == (told.folder / "discovery.json").read_text(encoding="utf-8")
+    assert list(told.document)[: len(KEYS)] == KEYS
+    assert {path.name for path in told.folder.iterdir()} == FILES
+
+
+def test_the_hidden_effect_is_named_and_is_in_the_extended_calibration(told: Told) -> None:
+    document = told.document
     assert document["verdict"] == "named"
     assert [effect["name"] for effect in document["effects"]] == ["rotation_translation_coupling"]
     assert set(document["held_out"]) == {"repetitions", "session"}
     extended = read_calibration(document["model"])
     assert [term.name for term in extended.effects] == ["rotation_translation_coupling"]
     assert not read_calibration(document["plain_model"]).effects
-    assert {path.name for path in Path("out").iterdir()} == FILES
+
+
+def test_the_extended_model_is_better_on_the_held_out_session(told: Told, data: Path) -> None:
+    costs = {
+        name: evaluate(read_calibration(told.document[name]), load_dataset(data)).splits["validation"].cost
+        for name in ("model", "plain_model")
+    }
+    assert costs["model"] < 0.3 * costs["plain_model"]
+
+
+def test_stages_are_told_on_standard_error(told: Told) -> None:
+    assert "fitting the plain matrix\n" in told.run.stderr
+    assert told.run.stderr.endswith("writing the report\n")
 
 
 def test_the_default_folder_has_the_name_of_the_data_and_the_newest_is_linked(command: Command, data: Path) -> None:
     run = command("discover", data, "--without", "rotation_translation_coupling", "--seed", 3)
     assert run.returncode == 0
-    assert "missing: rotation_translation_coupling" not in run.stdout
+    assert "added: rotation_translation_coupling" not in run.stdout
     latest = Path("results/flower/latest")
     assert latest.is_symlink()
     assert {path.name for path in latest.iterdir()} >= FILES
@@ -75,21 +111,6 @@ def test_the_default_folder_has_the_name_of_the_data_and_the_newest_is_linked(co
     assert f"report: {Path('results/flower')}" in run.stdout
 
 
-def test_the_extended_model_is_better_on_the_held_out_session(command: Command, data: Path) -> None:
-    document = json.loads(command("discover", data, "--output", "out", "--json").stdout)
-    costs = {}
-    for name in ("model", "plain_model"):
-        evaluated = json.loads(command("evaluate", document[name], data, "--json").stdout)
-        costs[name] = evaluated["splits"]["validation"]["cost"]
-    assert costs["model"] < 0.3 * costs["plain_model"]
-
-
-def test_stages_are_told_on_standard_error(command: Command, data: Path) -> None:
-    run = command("discover", data, "--output", "out", "--json")
-    assert "fitting the plain matrix\n" in run.stderr
-    assert "writing the report\n" in run.stderr
-
-
 def test_an_unknown_effect_gets_the_nearest_name(command: Command, data: Path) -> None:
     run = command("discover", data, "--without", "centripetal_slipp")
     assert_refused(run, "--without", "did you mean 'centripetal_slip'?")
@@ -99,11 +120,9 @@ def test_a_missing_data_set_is_one_line(command: Command) -> None:
     assert_refused(command("discover", "nowhere"), "nowhere")
 
 
-def test_another_robots_calibration_is_refused(command: Command, data: Path) -> None:
-    wheels = [{**wheel, "name": f"w{wheel['name']}"} for wheel in flower()["robot"]["wheels"]]
-    other = named().plain.model_dump(mode="json")
-    other["robot"]["wheels"] = wheels
-    Path("other.yaml").write_text(json.dumps(other), encoding="utf-8")
+def test_another_robots_calibration_is_refused(command: Command, told: Told, data: Path) -> None:
+    plain = (told.folder / "plain.yaml").read_text(encoding="utf-8")
+    Path("other.yaml").write_text(plain.replace("{name: ", "{name: w"), encoding="utf-8")
     assert_refused(command("discover", data, "--model", "other.yaml"), "wheels wa, wb, wc")
 
 

@@ -117,7 +117,7 @@ def test_what_the_residuals_depend_on_comes_first_in_pictures_and_the_rest_is_fo
     positions = [report.text.rindex(heading) for heading in headings]
     assert positions == sorted(positions)
     assert "Residuals over other things" in report.text
-    assert "Residuals over acceleration" not in report.text
+    assert "<summary>Residuals over acceleration</summary>" in report.html
 
 
 def test_every_place_stands_in_a_table_with_its_significance(report: Page) -> None:
@@ -127,7 +127,7 @@ def test_every_place_stands_in_a_table_with_its_significance(report: Page) -> No
 
 
 def test_parameters_have_intervals_and_units(report: Page) -> None:
-    rows = report.tables["Parameters of what was found"]
+    rows = report.tables["Parameters of what was added"]
     assert "rotation_translation_coupling (body), weight > 99.9 %" in rows[1][0]
     for row, name, true in zip(rows[2:], ("kx", "ky"), COUPLING[0]["parameters"].values(), strict=True):
         assert row[0].startswith(f"{name} | relative change of the rate of turn")
@@ -139,7 +139,7 @@ def test_parameters_have_intervals_and_units(report: Page) -> None:
 
 def test_a_shape_was_chosen_and_has_no_interval() -> None:
     effect = replace(named().effects[0], parameters=(EstimatedParameter("rollers", 10.0, "1", 10.0, 10.0, shape=True),))
-    rows = part(what_section(replace(named(), effects=(effect,)))).tables["Parameters of what was found"]
+    rows = part(what_section(replace(named(), effects=(effect,)))).tables["Parameters of what was added"]
     assert rows[2][:3] == ["rollers", "10", "chosen among a few"]
 
 
@@ -157,10 +157,10 @@ def test_a_class_names_its_members_and_the_experiment_that_separates_them() -> N
 def test_without_an_effect_the_report_says_how_large_each_could_still_be() -> None:
     found = nothing()
     told = whole(nothing)
-    assert "Parameters of what was found" not in told.tables
+    assert "Parameters of what was added" not in told.tables
     rows = told.tables["How large an effect of each kind could still hide"][1:]
     assert len(rows) == len(found.hidden) > 5
-    shares = [float(re.sub(r"[>,% ]", "", row[5])) for row in rows]
+    shares = [float(re.sub(r"[>,% ]", "", row[6])) for row in rows]
     assert shares == sorted(shares, reverse=True)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from commands import flower, omnibench, write_config
-from drives import EXACT, ORIGIN, PERIOD, Drive, calibration, drive, slam
+from drives import ORIGIN, PERIOD, Drive, calibration, drive, slam
 from hypothesis import given
 from hypothesis import strategies as st
 from nodes import config_of
@@ -32,7 +32,7 @@ from omnibench.live.wheels import WheelStep
 from omnibench.robot.calibration import Calibration, EffectTerm, covariance_rows, matrix_rows, write_calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import WheelLog
-from omnibench.robot.planar import compose, moved_to, relative
+from omnibench.robot.planar import relative
 from omnibench.testing import synthetic_robot
 from omnibench.testing.synthetic import true_robot
 
@@ -220,91 +220,6 @@ class TestSessions:
         second.resume(saved, 0.0, saved.wall)
         updates = fed(second, path.payloads()[201:])
         np.testing.assert_allclose(odometry(updates), batch(path, using)[200:], atol=1e-9)
-
-
-def seen(using: Calibration, tau: tuple[float, float], arm: Array | None = None) -> tuple[Array, Array]:
-    """What a node with a calibration makes of SLAM poses that are late: errors of fused poses, and the last of them.
-
-    tau: by how much earlier positions and headings were taken than their stamps say, s. arm (2,): where the LIDAR is.
-    """
-    path = drive(6.0, using=calibration())
-    start = np.array([2.0, -1.0, 0.7])
-    truth = moved_to(start, path.poses)
-    robot = RobotTracker("apr", using, fusion=FusionSettings(gate=0.999999))
-    errors = []
-    for index, payload in enumerate(path.payloads()):
-        updates = robot.take_wheels(payload, 0.01 * index)
-        if index % 25 == 0:
-            taken, heading = (min(max(index - round(each / PERIOD), 0), 600) for each in tau)
-            pose = np.append(truth[taken, :2], truth[heading, 2])
-            if arm is not None:
-                for sign, angle in ((1, pose[2]), (-1, start[2])):
-                    pose[:2] += sign * compose(np.array([0, 0, angle]), np.append(arm, 0.0))[:2]
-            robot.take_pose(slam(path.stamps[index], pose, 1e-2 * EXACT), 0.01 * index)
-        if updates and updates[0].filtered is not None and index > 300:
-            errors.append(updates[0].filtered.pose - truth[index])
-    return np.abs(errors).max(axis=0), robot.health(6.0).counts["poses"]  # type: ignore[return-value]
-
-
-class TestReference:
-    LATE = term("reference_time_offset", tau=0.12)
-
-    def test_late_poses_are_put_where_they_were_taken(self) -> None:
-        uncorrected, _ = seen(calibration(), (0.12, 0.12))
-        corrected, poses = seen(with_effects(self.LATE), (0.12, 0.12))
-        assert uncorrected[:2].max() > 0.01
-        assert corrected.max() < 1e-6
-        assert poses == 24  # the first was taken before there were wheel samples
-
-    def test_early_poses_wait_for_the_wheels_of_their_time(self) -> None:
-        corrected, poses = seen(with_effects(term("reference_time_offset", tau=-0.1)), (-0.1, -0.1))
-        assert corrected.max() < 1e-6
-        assert poses == 24  # the last one's time has not come
-
-    @pytest.mark.parametrize("tau", [0.08, -0.08])
-    def test_a_heading_of_another_time_is_turned_to_that_of_its_position(self, tau: float) -> None:
-        uncorrected, _ = seen(calibration(), (0.0, tau))
-        corrected, _ = seen(with_effects(term("heading_latency", tau=tau)), (0.0, tau))
-        assert uncorrected[2] > 0.01
-        assert corrected.max() < 1e-6
-
-    def test_a_lever_arm_is_taken_off(self) -> None:
-        arm = np.array([0.05, -0.03])
-        uncorrected, _ = seen(calibration(), (0.0, 0.0), arm)
-        corrected, _ = seen(with_effects(term("lidar_lever_arm", x=0.05, y=-0.03)), (0.0, 0.0), arm)
-        assert uncorrected[:2].max() > 0.01
-        assert corrected.max() < 1e-6
-
-    def test_all_together_are_undone(self) -> None:
-        arm, terms = np.array([0.05, -0.03]), (self.LATE, term("heading_latency", tau=-0.05))
-        corrected, _ = seen(with_effects(*terms, term("lidar_lever_arm", x=0.05, y=-0.03)), (0.12, 0.07), arm)
-        assert corrected.max() < 1e-6
-
-    def test_odom_does_not_know_of_them(self) -> None:
-        path = drive(1.0)
-        updates = fed(RobotTracker("apr", with_effects(self.LATE), fusion=FusionSettings()), path.payloads())
-        np.testing.assert_allclose(odometry(updates), path.poses, atol=1e-9)
-
-    def test_a_swap_brings_its_own(self) -> None:
-        robot = RobotTracker("apr", calibration(), fusion=FusionSettings())
-        path = drive(1.0)
-        fed(robot, path.payloads()[:51])
-        assert robot.take_pose(slam(path.stamps[50], path.poses[50]), 0.5) == "located"
-        robot.swap(with_effects(self.LATE))
-        assert robot.take_pose(slam(path.stamps[50], path.poses[38]), 0.5) == "fused"  # another time: no duplicate
-
-    def test_the_floor_carries_the_robot_along_the_axes_of_the_map(self) -> None:
-        using = with_effects(term("floor_drift", dx=0.02, dy=0.0))
-        path = drive(2.0, using=using)
-        robot = RobotTracker("apr", using, fusion=FusionSettings())
-        payloads = path.payloads()
-        fed(robot, payloads[:1])
-        robot.take_pose(slam(ORIGIN, [0.0, 0.0, 1.2]), 0.0)
-        carried = odometry(fed(robot, payloads[1:]))[-1]
-        plain = odometry(fed(RobotTracker("apr", calibration()), payloads))[-1]
-        along = compose(np.array([0.0, 0.0, 1.2]), carried - plain)
-        assert along[0] > 0.005
-        assert abs(along[1]) < 1e-6
 
 
 class TestAngles:

@@ -73,11 +73,15 @@ class Run:
 
 @dataclass(frozen=True)
 class Design:
-    """A plan of runs. sessions: into how many the training is divided; scattered: start poses differ between runs."""
+    """A plan of runs. sessions: into how many the training is divided; scattered: start poses differ between runs.
+
+    noise: factor on the noise of the reference.
+    """
 
     commands: tuple[Command, ...]
     sessions: int = 1
     scattered: bool = False
+    noise: float = 1.0
 
 
 def _flower() -> tuple[Command, ...]:
@@ -100,6 +104,7 @@ DESIGNS = {
     "flower": Design(_flower()),
     "rich": Design(_rich(), scattered=True),
     "sessions": Design(_rich(), sessions=3, scattered=True),
+    "precise": Design(_rich(), scattered=True, noise=0.3),  # cameras instead of SLAM
 }
 
 

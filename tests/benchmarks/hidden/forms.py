@@ -7,7 +7,7 @@ from . import wheel_forms as wheel
 from .form import Form, wheelwise
 
 SESSIONS = {"radius_s2": 0.01, "radius_s3": 0.01, "radius_s4": 0.01}  # of the design "sessions"
-LENGTHS = (0.03, 0.05, 0.1, 0.2)  # m
+LENGTHS = (0.05, 0.1, 0.2)  # m
 ROLLERS = tuple(range(3, 13))
 
 FORMS: dict[str, Form] = {
@@ -22,7 +22,7 @@ FORMS: dict[str, Form] = {
         wheel.ripple,
         wheel.ripple_with_edges,
         wheelwise("a", 0.03) | wheelwise("b", 0.03),
-        designs=("rich",),
+        designs=("precise",),
         shapes={"rollers": ROLLERS},
     ),
     "thermal_radius_drift": Form(wheel.thermal, wheel.thermal_exponential, {"k": 2e-5}),

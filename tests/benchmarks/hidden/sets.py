@@ -98,7 +98,8 @@ def make_set(
     key = [zlib.crc32(" ".join([kind, form, *names]).encode()), seed]
     rng = np.random.default_rng(key)
     design = design or _design_of(kind, names, seed)
-    runs, matrix, disturbance = plan(DESIGNS[design], rng), true_matrix(rng), DISTURBANCES[noise]
+    runs, matrix = plan(DESIGNS[design], rng), true_matrix(rng)
+    disturbance = scaled(DISTURBANCES[noise], DESIGNS[design].noise)
     seeds = tuple((*key, number) for number in range(len(names)))
     training = [run for run in runs if run.split == "train"]
     sight = Sight(training, matrix, disturbance.known(matrix)) if names else None
