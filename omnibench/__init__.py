@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from omnibench.data.importer import import_dataset
     from omnibench.data.simulate.flower import simulate_dataset
     from omnibench.data.storage import load_dataset, save_dataset
+    from omnibench.discover.discover import discover_effects
     from omnibench.errors import OmnibenchError
     from omnibench.fit.calibrate import calibrate
     from omnibench.fit.certify import certify_optimum
@@ -28,6 +29,7 @@ __all__ = [
     "calibrate",
     "certify_optimum",
     "design_experiment",
+    "discover_effects",
     "evaluate",
     "export_calibration",
     "import_dataset",
@@ -52,6 +54,7 @@ _HOMES = {
     "data.importer": ("import_dataset",),
     "data.simulate.flower": ("simulate_dataset",),
     "data.storage": ("load_dataset", "save_dataset"),
+    "discover.discover": ("discover_effects",),
     "errors": ("OmnibenchError",),
     "fit.calibrate": ("calibrate",),
     "fit.certify": ("certify_optimum",),

@@ -17,7 +17,8 @@ from omnibench import terminal
 from omnibench.config import parse_settings, to_json
 from omnibench.errors import ConfigError
 from omnibench.live_cli import live_app
-from omnibench.registry import PluginFailure, calibrators, costs, effects, importers, load_plugins
+from omnibench.plugin_option import Plugins, load_given_plugins
+from omnibench.registry import calibrators, costs, effects, importers
 
 app = typer.Typer(
     name="omnibench",
@@ -32,10 +33,6 @@ app.add_typer(plugin_app, name="plugin")
 app.add_typer(live_app)
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
-Plugins = Annotated[
-    list[Path] | None,
-    typer.Option("--plugins", help="Folder of plug-ins; may be repeated. Default: ./plugins, if it is there."),
-]
 Settings = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="An option, value in YAML; may be repeated.")
 ]
@@ -103,7 +100,7 @@ def calibrate(
     from omnibench.fit.problem import Budget
     from omnibench.robot.calibration import write_calibration
 
-    _load(plugins)
+    load_given_plugins(plugins)
     calibrators.entry(calibrator, "--calibrator")
     costs.entry(cost, "--cost")
     if output is None and not as_json:
@@ -143,6 +140,7 @@ def calibrate(
 def evaluate(
     calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
     dataset: Annotated[Path, typer.Argument(help="A data set folder.")],
+    plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
     """Cost and final errors of a calibration on a data set."""
@@ -150,12 +148,17 @@ def evaluate(
     from omnibench.fit.evaluate import evaluate as judge
     from omnibench.robot.calibration import read_calibration
 
+    load_given_plugins(plugins)
     recordings = load_dataset(dataset)
     evaluation = judge(read_calibration(calibration), recordings)
-    _warn(recordings.warnings)
+    warnings = [*recordings.warnings, *evaluation.warnings]
+    _warn(warnings)
     if as_json:
-        splits = {name: errors.model_dump(exclude={"trajectories"}) for name, errors in evaluation.splits.items()}
-        return _print_json({"dataset": evaluation.dataset, "trajectories": evaluation.trajectories, "splits": splits})
+        document: dict[str, Any] = {"dataset": evaluation.dataset, "trajectories": evaluation.trajectories}
+        document["splits"] = {
+            name: errors.model_dump(exclude={"trajectories"}) for name, errors in evaluation.splits.items()
+        }
+        return _print_json(document | {"warnings": warnings})
     return terminal.print_evaluation(terminal.make_console(), evaluation)
 
 
@@ -169,6 +172,7 @@ def certify(
     ] = None,
     gap: Annotated[float, typer.Option(min=1e-9, max=0.999, help="Stop when this share of the cost is left.")] = 1e-3,
     seconds: Annotated[float, typer.Option(min=0.0, help="Or after this time; what is proven by then holds.")] = 60.0,
+    plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
     """Prove how much better than a calibration any matrix of the box could be, on the training split."""
@@ -176,6 +180,7 @@ def certify(
     from omnibench.fit.certify import certify_optimum
     from omnibench.robot.calibration import read_calibration
 
+    load_given_plugins(plugins)
     recordings = load_dataset(dataset)
     with terminal.ProofLine() as watch:
         certified = certify_optimum(
@@ -214,7 +219,7 @@ def design(
     from omnibench.compare.design_terminal import print_design
     from omnibench.files import write_text
 
-    _load(plugins)
+    load_given_plugins(plugins)
     found = design_experiment(
         source, use=use, per=per, runs=runs, repetitions=repetitions, dataset=dataset, integration=integration
     )
@@ -258,7 +263,7 @@ def discover(
     from omnibench.discover.terminal import Stages, print_discovery
     from omnibench.robot.calibration import read_calibration
 
-    _load(plugins)
+    load_given_plugins(plugins)
     for name in without or ():
         effects.entry(name, "--without")
     check_output(output)
@@ -317,8 +322,9 @@ def simulate(
 
     hidden = tuple(effects or ())
     request = SimulationRequest(output, config, truth, dataset, hidden, like, model, noise, seed)
-    _load([*(plugins or []), *request.plugins] or None)
+    load_given_plugins([*(plugins or []), *request.plugins] or None)
     made = request.write(table_format)
+    _warn(made.warnings)
     if truth is not None:
         typer.echo(f"truth: {truth / 'truth.yaml'}")
     typer.echo(f"{len(made.trajectories)} simulated trajectories: {output}")
@@ -339,7 +345,7 @@ def import_(
     from omnibench.data.importer import import_dataset
     from omnibench.data.storage import save_dataset
 
-    _load(plugins)
+    load_given_plugins(plugins)
     importers.entry(importer, "import")
     dataset = import_dataset(importer, source, parse_settings(settings))
     save_dataset(dataset, output, table_format)
@@ -354,12 +360,14 @@ def export(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="File to write; default: standard output.")
     ] = None,
+    plugins: Plugins = None,
 ) -> None:
     """Write a calibration for other software."""
     from omnibench.files import write_text
     from omnibench.robot.calibration import read_calibration
     from omnibench.robot.export import export_calibration
 
+    load_given_plugins(plugins)
     exported = export_calibration(read_calibration(calibration), to)
     _warn(exported.warnings)
     if output is None:
@@ -386,7 +394,7 @@ def inspect(dataset: Annotated[Path, typer.Argument(help="A data set folder.")],
 @app.command("list")
 def list_(plugins: Plugins = None, as_json: Json = False) -> None:
     """Calibrators, effects, costs and importers, and where each comes from."""
-    failures = _load(plugins)
+    failures = load_given_plugins(plugins)
     if as_json:
         return _print_json(terminal.registry_document(failures))
     return terminal.print_registries(terminal.make_console())
@@ -396,12 +404,15 @@ _CONFIGS = {
     "compare": ("omnibench.compare.config", "CompareConfig"),
     "design": ("omnibench.compare.design_config", "DesignConfig"),
     "live": ("omnibench.live.live_config", "LiveConfig"),
+    "simulate": ("omnibench.data.simulate.source", "SimulationConfig"),
 }
 
 
 @app.command()
 def schema(
-    kind: Annotated[Literal["compare", "design", "live"], typer.Argument(help="Configs of which command.")] = "compare",
+    kind: Annotated[
+        Literal["compare", "design", "live", "simulate"], typer.Argument(help="Configs of which command.")
+    ] = "compare",
 ) -> None:
     """JSON schema of the configs, for editors."""
     module, name = _CONFIGS[kind]
@@ -442,14 +453,6 @@ def plugin_check(
     typer.echo(", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
     if report.failures:
         raise typer.Exit(1)
-
-
-def _load(folders: list[Path] | None) -> list[PluginFailure]:
-    default = [Path("plugins")] if folders is None and Path("plugins").is_dir() else []
-    with redirect_stdout(sys.stderr):  # what a plug-in prints is not our output
-        failures = load_plugins(folders or default)
-    _warn(f"plug-in {failure.origin} cannot be imported: {failure.error}" for failure in failures)
-    return failures
 
 
 def _warn(messages: Iterable[str]) -> None:

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from omnibench.errors import ConfigError
 from omnibench.live_terminal import LogLines, ReplayBar, print_demonstration, print_played
+from omnibench.plugin_option import Plugins, load_given_plugins, plugin_folders
 from omnibench.terminal import make_console
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ def live(
     speed: Annotated[str | None, typer.Option(help="Of the replay: 1, 10, max. Default: the config's.")] = None,
     foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve Foxglove's WebSocket on loopback.")] = False,
     seconds: Seconds = None,
+    plugins: Plugins = None,
 ) -> None:
     """Run the node: wheel samples in, calibrated odometry out, over Zenoh."""
     from omnibench.live.live_config import read_live_config
@@ -48,6 +50,7 @@ def live(
     if replay and config.is_dir() and dataset is not None:  # --replay DATASET before CONFIG
         config, dataset = dataset, config
     chosen = read_live_config(config)
+    chosen = chosen.model_copy(update={"plugins": (*chosen.plugins, *plugin_folders(plugins))})
     if foxglove and not chosen.foxglove:
         chosen = chosen.model_copy(update={"foxglove": True})
     if not replay:
@@ -71,6 +74,7 @@ def replay(
     config: ConfigOption = None,
     connect: Connect = None,
     profile: ProfileOption = None,
+    plugins: Plugins = None,
 ) -> None:
     """Play a recording onto Zenoh, as the robot and its SLAM would."""
     from omnibench.config import parse_settings, validate
@@ -84,6 +88,7 @@ def replay(
     from omnibench.robot.calibration import read_calibration
 
     checked_robot(robot)
+    load_given_plugins(plugins)
     chosen = validate(ReplayConfig, {"speed": _speed(speed), **parse_settings(settings)}, "replay")
     noise = None if calibration is None else read_calibration(calibration).noise
     recording = load_recording(dataset)
@@ -120,10 +125,12 @@ def swap(
     calibration: Annotated[Path, typer.Argument(help="The calibration file that is to run.")],
     config: ConfigOption = None,
     connect: Connect = None,
+    plugins: Plugins = None,
 ) -> None:
     """Give a running node another calibration: it runs from the next sample on, and odom does not jump."""
     from omnibench.live.swap import swap_calibration
 
+    load_given_plugins(plugins)
     with _client(config, connect, None, "swap") as (session, _):
         swapped = swap_calibration(session, robot, calibration)
     typer.echo(f"{robot}: {swapped.calibration} runs")

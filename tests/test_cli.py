@@ -50,7 +50,8 @@ def test_help_is_shown_on_standard_output(arguments: list[str], command: Command
 
 def test_evaluate_prints_the_documented_document(command: Command, prepared: Prepared) -> None:
     found = document(command("evaluate", prepared.calibration, prepared.data, "--json"))
-    assert {*found} == {"dataset", "trajectories", "splits"}
+    assert [*found] == ["dataset", "trajectories", "splits", "warnings"]
+    assert found["warnings"] == []
     assert (found["dataset"], found["trajectories"]) == ("flower", 12)
     assert [*found["splits"]] == ["train", "validation", "all"]
     for split in found["splits"].values():

@@ -118,7 +118,7 @@ def _turns_on_the_spot(still: Sequence[CommandResidual], looks: Sequence[Look]) 
     if not still:
         return ()
     parts = []
-    for each in still:
+    for each in sorted(still, key=_motion):
         values = " → ".join(f"{fixed(math.degrees(mean_of(each, look)[2]), 2, signed=True)}°" for look in looks)
         noise = fixed(math.degrees(NORMAL_95 * each.error[2]), 2)
         parts.append(f"{command_in_words(each)}: {values} (noise ±{noise}°)")

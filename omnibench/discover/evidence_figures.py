@@ -11,12 +11,13 @@ import plotly.graph_objects as go
 from omnibench.discover.drawing import AFTER, BEFORE, FLOOR
 from omnibench.discover.result import Candidate, Discovery, Gap, Hidden, Step
 from omnibench.discover.wording import (
-    HELD_OUT,
     METRICS,
     added,
     closed_in_words,
     decisive,
+    floor_in_words,
     gap_decimals,
+    held_out_in_words,
     reading,
     weight_in_words,
     worst_of_each,
@@ -28,7 +29,7 @@ from omnibench.report.style import INK, QUIET, logarithmic, plot, text
 _CANDIDATES = 8  # of each step
 _UNCHOSEN = "#b9c0c8"
 _GAINED, _LOST = "#7fb8d8", "#e3a3a3"
-_FLOOR_LEGEND = LegendItem("floor", "floor that repetitions allow", FLOOR, "dash")
+_FLOOR_LEGEND = LegendItem("floor", "floor", FLOOR, "dash")
 
 
 def candidate_grid(discovery: Discovery) -> FigureGrid | None:
@@ -128,7 +129,7 @@ def waterfall_grid(discovery: Discovery) -> FigureGrid | None:
     held = decisive(discovery)
     unseen = held is not None and all(step.eq6_held_out is not None and step.held_out is not None for step in steps)
     if unseen and held is not None:
-        where = HELD_OUT[held.data]
+        where = held_out_in_words(discovery, held)
         values = [[step.eq6_held_out for step in steps], [step.held_out for step in steps]]
         floors: list[float | None] = [held.eq6.floor, held.chi2.floor]
     else:
@@ -177,7 +178,8 @@ def gap_grid(discovery: Discovery) -> FigureGrid:
     """Before, after and floor of every gap, on the training runs and on those held out."""
     gaps: list[tuple[str, Gap]] = []
     for held in discovery.held_out:
-        gaps += [(f"held-out {held.data}", held.eq6), (f"held-out {held.data}", held.chi2)]
+        where = held_out_in_words(discovery, held)
+        gaps += [(where, held.eq6), (where, held.chi2)]
     if not gaps:
         gaps.append(("training runs", discovery.gap))
     figures = tuple(
@@ -194,10 +196,10 @@ def gap_grid(discovery: Discovery) -> FigureGrid:
         (
             LegendItem("before", "plain matrix (before)", BEFORE),
             LegendItem("after", "extended model (after)", AFTER),
-            LegendItem("floor", "floor that repetitions allow", FLOOR),
+            LegendItem("floor", "floor", FLOOR),
         ),
         2 if len(figures) > 1 else 1,
-        "The floor is what the scatter between repetitions of a command leaves to any model.",
+        floor_in_words(discovery),
     )
 
 

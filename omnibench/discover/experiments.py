@@ -21,13 +21,13 @@ def experiments_for(
     for effect in effects:
         if effect.confusable_with:
             members = (effect.name, *effect.confusable_with)
-            found.append(Experiment(members, _WORDS.format(names=", ".join(members)), _config(dataset, effect, fit)))
+            found.append(Experiment(members, _WORDS, _config(dataset, effect, fit)))
     return tuple(found)
 
 
 _WORDS = (
-    "Tells {names} apart: straight runs and curves at two speeds, turns on the spot, random start headings and a "
-    "random order, each command five times."
+    "Straight runs and curves at two speeds, turns on the spot, random start headings and a random order, each command "
+    "five times."
 )
 
 

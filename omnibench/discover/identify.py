@@ -9,6 +9,7 @@ import numpy as np
 
 from omnibench.discover.groups import Group
 from omnibench.discover.look import Look
+from omnibench.discover.naming import Named
 from omnibench.discover.result import Absorbed, Hidden
 from omnibench.discover.whitened import Given, given
 from omnibench.registry import effects
@@ -101,10 +102,11 @@ def _made_by(now: Given, group: Group, *others: Group) -> float:
     return float(np.square(taken).sum()) / whole if whole > 0 else 0.0
 
 
-def hidden_sizes(look: Look, spread: float) -> tuple[Hidden, ...]:
-    """How large effects that were not named could still be; spread: by how much chance exceeds the noise model."""
-    chosen = {group.name for group in look.named.chosen}
-    fitted = [index for group in look.named.chosen for index in group.index]
+def hidden_sizes(look: Look, named: Named) -> tuple[Hidden, ...]:
+    """How large effects could still be that were neither named nor are confusable with a name."""
+    chosen = {group.name for group in named.chosen} | {name for names in named.confusable for name in names}
+    fitted = [index for group in named.chosen for index in group.index]
+    spread = float(np.median(named.left.spread))  # by how much chance exceeds the noise model
     now = given(look.data, [*look.groups.matrix.index, *fitted])
     found = []
     for group in _visible(look):

@@ -18,7 +18,8 @@ from omnibench.robot.kinematics import Array
 
 _BINS = 12
 _START = 2.0  # s of a run in which motors settle
-_TOLD, _EXPECTED = Look(0, "before", "than told", BEFORE), Look(1, "after", "than expected with the effects", AFTER)
+_TOLD = Look(0, "before", "measured less told", BEFORE)
+_EXPECTED = Look(1, "after", "measured less expected with the effects", AFTER)
 
 
 def motor_grid(discovery: Discovery, runs: Sequence[Trajectory]) -> FigureGrid | None:
@@ -30,10 +31,8 @@ def motor_grid(discovery: Discovery, runs: Sequence[Trajectory]) -> FigureGrid |
     found = [effect for effect in discovery.effects if effect.stage == "actuator"]
     errors: list[tuple[Look, list[Array]]] = [(_TOLD, before)]
     if found:
-        after: list[Array] = [
-            own - _changes(run, targets, found) for (run, targets), own in zip(told, before, strict=True)
-        ]
-        errors.append((_EXPECTED, after))
+        changes = [_changes(run, targets, found) for run, targets in told]
+        errors.append((_EXPECTED, [own - change for own, change in zip(before, changes, strict=True)]))
     targets = [each for _, each in told]
     top = max(float(np.quantile(np.abs(each), 0.999)) for each in targets)
     edges = np.linspace(-top, top, _BINS + 1) * (1 + 1e-9)
@@ -45,15 +44,15 @@ def motor_grid(discovery: Discovery, runs: Sequence[Trajectory]) -> FigureGrid |
     edges = np.linspace(0.0, min(_START, max(float(run.times[-1]) for run, _ in told)), _BINS + 1)
     bins = [shares(run.times, edges) for run, _ in told]
     curves = tuple(
-        _curve(look, bins, [(np.sign(t) * e).mean(axis=1) for t, e in zip(targets, own, strict=True)])
-        for look, own in errors
+        _curve(look, bins, [100 * _share(e, t) for e, t in zip(own, targets, strict=True)]) for look, own in errors
     )
-    panels.append(_panel("All wheels, in the direction of their targets", edges, curves, "time since the start (s)"))
+    panels.append(
+        _panel("All wheels, at the start of the runs", edges, curves, "time since the start (s)", "% of told")
+    )
     return grid(
         [panel for panel in panels if not panel.empty],
         [look for look, _ in errors],
-        "By how much faster the wheels turn: measured rates less the targets, mean over the runs; the bands hold 95 % "
-        "of what the scatter of the runs does to the mean.",
+        "Mean over the runs; the bands hold 95 % of what the scatter of the runs does to the mean.",
     )
 
 
@@ -82,5 +81,12 @@ def _curve(look: Look, bins: Sequence[Array], errors: Sequence[Array]) -> Curve:
     return Curve(look, value, NORMAL_95 * spread)
 
 
-def _panel(title: str, edges: Array, curves: tuple[Curve, ...], x_title: str) -> Panel:
-    return Panel(title, (edges[1:] + edges[:-1]) / 2, curves, x_title, "faster by (rad/s)", "rad/s")
+def _share(errors: Array, targets: Array) -> Array:
+    """Errors (F, N) in the direction of the targets, as shares (F,) of these."""
+    told = np.abs(targets).mean(axis=1)
+    share: Array = (np.sign(targets) * errors).mean(axis=1) / np.where(told > 0, told, np.inf)
+    return share
+
+
+def _panel(title: str, edges: Array, curves: tuple[Curve, ...], x_title: str, unit: str = "rad/s") -> Panel:
+    return Panel(title, (edges[1:] + edges[:-1]) / 2, curves, x_title, f"difference ({unit})", unit)

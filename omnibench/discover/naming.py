@@ -32,6 +32,7 @@ _MOST_ODDS = 10.0  # that another form may lend a name
 _CANCELLING = 0.35  # effects that undo each other to such a share imitate something else rather than being there all
 _IMITATION = 1.0  # odds, at most, that they are
 _WRONG = 0.2  # of what is missing is not in the catalogue
+_CREDIBLE = 0.3  # what is less likely to have a name in the catalogue gets none, and no model holds it
 _CONFUSABLE = 0.03
 
 
@@ -96,6 +97,8 @@ def name_effects(
         forms = [index for group in chosen for index in group.forms]
         share, known = _known(sets, start, chosen, left, gains_of(data, [*fitted, *forms], groups.places, rng))
     weights = {name: known * weight for name, weight in sets.weights(chosen).items()}
+    if known < _CREDIBLE:
+        chosen, left = (), gains_of(data, groups.matrix.index, groups.places, rng)
     ordered = tuple(sorted(chosen, key=lambda group: -start.gain(group.index)))
     return Named(
         ordered,

@@ -36,7 +36,7 @@ from omnibench.discover.significance import Gains
 from omnibench.discover.verdict import headline_of, verdict_of
 from omnibench.fit.noise import Whitener
 from omnibench.robot.calibration import Noise
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 
 _SHOWN = 0.01  # chance up to which a place is mentioned
@@ -72,7 +72,7 @@ def told(
         absorbed=absorbed_effects(look),
         not_looked_for=look.groups.not_looked_for,
         classes=classes_of(look),
-        hidden=hidden_sizes(look, float(np.median(look.named.left.spread))),
+        hidden=hidden_sizes(look, rivals.named),
         gap=held_out[-1].eq6,
         held_out=held_out,
         steps=steps,
@@ -112,9 +112,8 @@ def places_of(gains: Gains, when: str) -> tuple[Place, ...]:
 
 
 def _named_effects(rivals: Rivals, motors: Actuators | None) -> tuple[tuple[NamedEffect, ...], tuple[float, ...]]:
-    extended = rivals.used
-    effects, sure = _of_names(rivals.named, extended.values, extended.covariance, extended.fit.model.matrix.size,
-                              len(extended.fit.runs))  # fmt: skip
+    extended, model, runs = rivals.used, rivals.used.fit.model, len(rivals.used.fit.runs)
+    effects, sure = _of_names(rivals.named, model.robot, extended.values, extended.covariance, model.matrix.size, runs)
     effects = tuple(
         replace(effect, in_doubt="; ".join(filter(None, (effect.in_doubt, reason)))) if effect.confusable_with
         else effect
@@ -122,12 +121,12 @@ def _named_effects(rivals: Rivals, motors: Actuators | None) -> tuple[tuple[Name
     )  # fmt: skip
     if motors is None or not motors.named.chosen:
         return effects, sure
-    more, of_more = _of_names(motors.named, motors.values, motors.covariance, 0, len(extended.fit.runs))
+    more, of_more = _of_names(motors.named, model.robot, motors.values, motors.covariance, 0, runs)
     return effects + more, sure + of_more
 
 
 def _of_names(
-    named: Named, values: Array, covariance: Array, first: int, runs: int
+    named: Named, robot: Robot, values: Array, covariance: Array, first: int, runs: int
 ) -> tuple[tuple[NamedEffect, ...], tuple[float, ...]]:
     """Effects with their intervals, and how sure their classes are; first: where the covariance of effects begins."""
     deviations = np.sqrt(np.diag(covariance))[first:]
@@ -147,7 +146,7 @@ def _of_names(
             )
             for row, each in enumerate(group.parameters)
         ]
-        estimates += _shapes(group)
+        estimates += _shapes(group, robot)
         at += len(group.parameters)
         weight = named.weights.get(group.name, 0.0)
         gain, rank = gains.get(group.name, (0.0, 0.0))
@@ -162,12 +161,10 @@ def _of_names(
     return tuple(effects), tuple(sure)
 
 
-def _shapes(group: Group) -> list[EstimatedParameter]:
+def _shapes(group: Group, robot: Robot) -> list[EstimatedParameter]:
     assert group.effect is not None
-    return [
-        EstimatedParameter(name, float(value), "", float(value), float(value), shape=True)
-        for name, value in group.shapes.items()
-    ]
+    chosen = [(each, group.shapes[each.name]) for each in group.effect.parameters(robot) if each.name in group.shapes]
+    return [EstimatedParameter(each.name, value, each.unit, value, value, shape=True) for each, value in chosen]
 
 
 def _candidates(step: Gains, named: Named) -> tuple[Candidate, ...]:
@@ -214,7 +211,7 @@ def _steps(plain: Fit, bare: Extended, extended: Extended, validation: Sequence[
 
 
 def _step(name: str, fit: Fit, noise: Noise, validation: Sequence[Trajectory]) -> Step:
-    held = _residuals(fit.model, validation)
+    held = _residuals(fit.model, validation) if validation else []
     return Step(
         name,
         _chi2(noise, fit.runs, fit.residuals),
@@ -246,13 +243,15 @@ def _white(fit: Fit, residuals: Sequence[Array]) -> tuple[Array, ...]:
 def _notes(look: Look, fit: Fit) -> tuple[str, ...]:
     notes = [f"Noise: {fit.noise.description}."]
     if fit.jumps:
-        notes.append(f"{fit.jumps} reference poses that contradict their neighbours were left out.")
-    for name, size, unit in zip(
-        ("start headings", "reference clocks' offsets", "reference clocks' slopes"), fit.nuisances.deviations,
-        ("rad", "s", "s/s"), strict=True,
-    ):  # fmt: skip
+        poses = "pose that contradicts its" if fit.jumps == 1 else "poses that contradict their"
+        notes.append(f"{fit.jumps} reference {poses} neighbours left out.")
+    heading, offset, slope = fit.nuisances.deviations
+    for size, words in (
+        (heading, f"start headings scatter from run to run by {np.degrees(heading):.2g} deg"),
+        (offset, f"offsets of the reference's clock scatter from run to run by {1e3 * offset:.2g} ms"),
+        (slope, f"the reference's clock gains or loses {60e3 * slope:.2g} ms a minute, differently from run to run"),
+    ):
         if size:
-            notes.append(f"The {name} scatter from run to run by {size:.2g} {unit}; they were estimated for each run.")
-    for name, others in sums_of(look):
-        notes.append(f"{name} could be imitated by {' and '.join(others)} together.")
+            notes.append(f"{words[0].upper()}{words[1:]}; estimated for each run.")
+    notes += [f"{name} could be imitated by {' and '.join(others)} together." for name, others in sums_of(look)]
     return tuple(notes)

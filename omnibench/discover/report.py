@@ -22,7 +22,6 @@ from omnibench.discover.tables import (
 )
 from omnibench.discover.where_section import where_section
 from omnibench.discover.wording import (
-    HELD_OUT,
     STAGES,
     VERDICTS,
     VERDICTS_AT_LENGTH,
@@ -32,6 +31,7 @@ from omnibench.discover.wording import (
     final_errors_in_words,
     gap_decimals,
     gap_in_words,
+    held_out_in_words,
     noise_in_words,
     novelties_in_words,
     parameter_in_words,
@@ -100,7 +100,7 @@ def _tiles(discovery: Discovery) -> Iterator[Fact]:
         yield Fact("Gap closed, training runs", closed_in_words(gap), gap_in_words(gap))
         return
     position, heading = final_errors_in_words(held)
-    where = f"{HELD_OUT[held.data]}, {plural(held.runs, 'run')}"
+    where = f"{held_out_in_words(discovery, held)}, {plural(held.runs, 'run')}"
     yield Fact("Final position error, mean", position, where)
     yield Fact("Final heading error, mean", heading, where)
     yield Fact("Gap closed, Eq. (6)", closed_in_words(held.eq6), where)
@@ -208,7 +208,7 @@ def _how_much_better(discovery: Discovery) -> Iterator[Block]:
     grid = waterfall_grid(discovery)
     if grid is not None:
         yield grid
-    yield held_out_table(discovery.held_out) if discovery.held_out else gap_table(discovery.gap)
+    yield held_out_table(discovery) if discovery.held_out else gap_table(discovery)
     if len(discovery.steps) > 1:
         yield Details("Every step in numbers", (step_table(discovery),))
     if discovery.novelties:
@@ -223,7 +223,7 @@ def _how_much_better(discovery: Discovery) -> Iterator[Block]:
 def _better_in_words(discovery: Discovery) -> str:
     held = decisive(discovery)
     assert held is not None
-    where = f"On the {HELD_OUT[held.data]}, {plural(held.runs, 'run')}, "
+    where = f"On the {held_out_in_words(discovery, held)}, {plural(held.runs, 'run')}, "
     before, after = (
         f"{fixed(1e3 * position, 1)} mm and {fixed(math.degrees(heading), 2)}°"
         for position, heading in zip(held.position_m, held.heading_rad, strict=True)

@@ -56,7 +56,7 @@ class Candidate:
     weight: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Place:
     """Where the residual depends on something, before any effect is added or after all are.
 

@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from omnibench.data.dataset import Dataset
-from omnibench.discover.result import Discovery, Gap, HeldOut, Hidden, NamedEffect, Novelty, Place
+from omnibench.discover.result import Discovery, Gap, Hidden, NamedEffect, Novelty, Place
 from omnibench.discover.wording import (
-    HELD_OUT,
     METRICS,
     STAGES,
     added,
     chance,
     closed_in_words,
     final_errors_in_words,
+    floor_in_words,
     gap_decimals,
+    held_out_in_words,
     reading,
     share_of_plausible,
     value_and_interval,
@@ -22,7 +23,7 @@ from omnibench.discover.wording import (
 )
 from omnibench.registry import effects
 from omnibench.report.blocks import Cell, Column, Row, Table
-from omnibench.report.numbers import NOTHING, count, fixed, percent, significant
+from omnibench.report.numbers import NOTHING, count, fixed, percent, plural, significant
 from omnibench.robot.effects.effect import Effect
 
 
@@ -31,8 +32,7 @@ def place_table(places: Sequence[Place], caption: str) -> Table:
     rows = tuple(
         Row(
             (
-                Cell(each.covariate),
-                Cell(each.stage, STAGES[each.stage]),
+                Cell(each.covariate, f"{each.stage}: {STAGES[each.stage]}"),
                 Cell(each.description),
                 Cell(chance(each.p_value)),
                 Cell(significant(each.excess, 3)),
@@ -45,7 +45,6 @@ def place_table(places: Sequence[Place], caption: str) -> Table:
         caption,
         (
             Column("Residual over", numeric=False),
-            Column("Stage", numeric=False),
             Column("In words", numeric=False),
             Column("Chance"),
             Column("Excess", "χ²"),
@@ -89,20 +88,20 @@ def _meanings(name: str, dataset: Dataset) -> Mapping[str, str]:
     return {each.name: each.description for each in effect.parameters(dataset.robot, sessions)}
 
 
-def held_out_table(held: Sequence[HeldOut]) -> Table:
+def held_out_table(discovery: Discovery) -> Table:
     """Both gaps and the final errors on the runs that no fit has seen."""
     rows: list[Row] = []
-    for each in held:
-        rows.append(Row((Cell(f"{HELD_OUT[each.data]}: {count(each.runs)} runs"),), "group"))
-        rows += [_gap_row(each.eq6), _gap_row(each.chi2)]
+    for each in discovery.held_out:
+        where = f"{held_out_in_words(discovery, each)}: {plural(each.runs, 'run')}"
+        rows += [Row((Cell(where),), "group"), _gap_row(each.eq6), _gap_row(each.chi2)]
         position, heading = final_errors_in_words(each)
         rows += [_plain_row("Final position error, mean", position), _plain_row("Final heading error, mean", heading)]
-    return Table("On runs that no fit has seen", _GAP_COLUMNS, tuple(rows), _GAP_NOTE)
+    return Table("On runs that no fit has seen", _GAP_COLUMNS, tuple(rows), _gap_note(discovery))
 
 
-def gap_table(gap: Gap) -> Table:
+def gap_table(discovery: Discovery) -> Table:
     """The gap on its own."""
-    return Table("The gap on the training runs", _GAP_COLUMNS, (_gap_row(gap),), _GAP_NOTE)
+    return Table("The gap on the training runs", _GAP_COLUMNS, (_gap_row(discovery.gap),), _gap_note(discovery))
 
 
 _GAP_COLUMNS = (
@@ -113,10 +112,13 @@ _GAP_COLUMNS = (
     Column("Closed"),
     Column("Std. error of the gap"),
 )
-_GAP_NOTE = (
-    "Before: the plain matrix; after: the extended model; floor: what the scatter between repetitions leaves to any "
-    "model. Closed: the share of before − floor that is gone, where that is more than two standard errors."
-)
+
+
+def _gap_note(discovery: Discovery) -> str:
+    return (
+        f"Before: the plain matrix; after: the extended model. {floor_in_words(discovery)} Closed: the share of "
+        "before − floor that is gone, where that is more than two standard errors."
+    )
 
 
 def _gap_row(gap: Gap) -> Row:

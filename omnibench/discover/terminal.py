@@ -19,6 +19,7 @@ from omnibench.discover.wording import (
     closed_in_words,
     data_in_words,
     gap_decimals,
+    held_out_in_words,
     novelties_in_words,
     reading,
     value_and_interval,
@@ -31,6 +32,7 @@ from omnibench.report.numbers import fixed, listing, plural
 _WIDTH = 80
 _HIDDEN = 4  # effects of which the terminal says how large they could be
 _PLACES = 4
+_PARAMETERS = 9  # of each effect
 _LINES = 3  # of notes, and of warnings
 
 
@@ -97,9 +99,12 @@ def _effect_title(effect: NamedEffect) -> str:
 
 def _effect_table(effect: NamedEffect) -> Table:
     table = _table(None, ("parameter",), ("value", "95 % interval"))
-    for parameter in effect.parameters:
+    for parameter in effect.parameters[:_PARAMETERS]:
         value, interval, unit = value_and_interval(parameter)
         table.add_row(parameter.name, with_unit(value, unit), "chosen" if parameter.shape else interval)
+    if len(effect.parameters) > _PARAMETERS:
+        table.caption = f"{len(effect.parameters) - _PARAMETERS} more in the report"
+        table.caption_justify = "left"
     return table
 
 
@@ -114,7 +119,7 @@ def _place_table(discovery: Discovery) -> Table:
 def _gap_table(discovery: Discovery) -> Table:
     table = _table("the gap", ("data", "measure"), ("before", "after", "floor", "closed"))
     for held in discovery.held_out:
-        where = f"held-out {held.data}, {plural(held.runs, 'run')}"
+        where = f"{held_out_in_words(discovery, held)}, {plural(held.runs, 'run')}"
         table.add_row(where, *_gap_cells(held.eq6))
         table.add_row("", *_gap_cells(held.chi2))
         before, after = (f"{1000 * value:.1f} mm" for value in held.position_m)

@@ -96,8 +96,8 @@ def _places(discovery: Discovery) -> Iterator[Block]:
         )
     if any(place.stage == "actuator" for place in discovery.where):
         yield Paragraph(
-            "The wheels do not turn as their motors were told. Odometry sees the wheels themselves and is not worse for "
-            "it; a simulation is."
+            "The wheels do not turn as their motors were told. Odometry sees the wheels themselves and is not worse "
+            "for it; a simulation is."
         )
     yield place_table(discovery.where, "Where the plain matrix fails")
 

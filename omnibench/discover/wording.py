@@ -44,10 +44,6 @@ STAGES: Mapping[Stage, str] = {
     "world": "twist to pose",
     "reference": "pose to reported pose",
 }
-HELD_OUT: Mapping[Literal["repetitions", "session"], str] = {
-    "repetitions": "held-out repetitions",
-    "session": "held-out session",
-}
 METRICS: Mapping[Literal["eq6", "chi2"], str] = {"eq6": "Eq. (6), final poses", "chi2": "whitened χ² per residual"}
 
 _COUNTS = ("", "1")  # units of shares, and of numbers that shape an effect
@@ -176,6 +172,20 @@ def final_errors_in_words(held: HeldOut) -> tuple[str, str]:
     position = f"{fixed(1e3 * before, 1)} → {fixed(1e3 * after, 1)} mm"
     turned, turned_after = (math.degrees(value) for value in held.heading_rad)
     return position, f"{fixed(turned, 2)}° → {fixed(turned_after, 2)}°"
+
+
+def held_out_in_words(discovery: Discovery, held: HeldOut) -> str:
+    """On which runs no fit has seen: ``held-out repetitions``."""
+    if held.data == "session":
+        return "held-out session"
+    return "held-out repetitions" if discovery.noise.source == "repetitions" else "held-out runs"
+
+
+def floor_in_words(discovery: Discovery) -> str:
+    """What the floor of a gap is."""
+    if discovery.noise.source == "repetitions":
+        return "The floor is what the scatter between repetitions of a command leaves to any model."
+    return "No command is repeated: the floor is what the residuals within the runs say of the noise."
 
 
 def decisive(discovery: Discovery) -> HeldOut | None:

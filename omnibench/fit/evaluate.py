@@ -9,6 +9,7 @@ import numpy as np
 
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory
+from omnibench.data.unfitted import unfitted_motions
 from omnibench.errors import DataError
 from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration
@@ -29,13 +30,17 @@ class SplitErrors(Model):
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A calibration's errors, and those of the design values, by split; ``all`` is every trajectory."""
+    """A calibration's errors, and those of the design values, by split; ``all`` is every trajectory.
+
+    warnings: in words, where the calibration's effects are not known to hold.
+    """
 
     dataset: str
     simulated: bool
     trajectories: int
     splits: dict[str, SplitErrors]
     design: dict[str, SplitErrors]
+    warnings: tuple[str, ...] = ()
 
 
 def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
@@ -50,12 +55,14 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
     groups: dict[str, tuple[Trajectory, ...]] = {str(name): group for name, group in present.items()}
     groups["all"] = dataset.trajectories
     model, design = calibration.model, OdometryModel.of_design(dataset.robot, calibration.integration)
+    unfitted = unfitted_motions(calibration, dataset.trajectories)
     return Evaluation(
         dataset=dataset.name,
         simulated=dataset.simulated,
         trajectories=len(dataset.trajectories),
         splits={name: split_errors(model, group) for name, group in groups.items()},
         design={name: split_errors(design, group) for name, group in groups.items()},
+        warnings=() if unfitted is None else (unfitted,),
     )
 
 

@@ -33,7 +33,8 @@ class Health(Model):
     """A robot's health, as the queryable ``health`` gives it.
 
     rate_hz: wheel samples a second, as they came. age_s: since the last one came. position_sigma_m, heading_sigma_rad:
-    standard deviations now, growing while nothing comes.
+    standard deviations now, growing while nothing comes. unfitted_motion_s: for how long the robot has driven motions
+    that the effects of its calibration were not fitted to, where these are known.
     """
 
     robot: str
@@ -50,6 +51,7 @@ class Health(Model):
     counts: dict[str, int]
     last_refusal: str
     last_swap: SwapRecord | None
+    unfitted_motion_s: float | None = None
 
 
 def diagnostic(health: Health, hardware: str) -> Diagnostic:
@@ -66,6 +68,8 @@ def diagnostic(health: Health, hardware: str) -> Diagnostic:
         values["located"] = health.fusion.located
         values["pose_age_s"] = "-" if health.fusion.pose_age_s is None else f"{health.fusion.pose_age_s:.3f}"
         values["last_outcome"] = health.fusion.last_outcome or "-"
+    if health.unfitted_motion_s is not None:
+        values["unfitted_motion_s"] = f"{health.unfitted_motion_s:.1f}"
     if health.last_refusal:
         values["last_refusal"] = health.last_refusal
     if health.last_swap is not None:

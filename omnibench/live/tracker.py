@@ -23,6 +23,7 @@ from omnibench.live.odometry import UNKNOWN_NOISE, LiveOdometry, Motion
 from omnibench.live.reference import ReferenceCorrection
 from omnibench.live.stamps import PublishedStamps
 from omnibench.live.timeline import Entry, Fix, Timeline
+from omnibench.live.unfitted import MotionWatch
 from omnibench.live.wheels import WheelInput, WheelSettings, WheelStep
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
@@ -105,6 +106,7 @@ class RobotTracker:
         self._fusion = Fusion(fusion, self._timeline, self.counts) if fusion else None
         self._reference = ReferenceCorrection(calibration.model)
         self._wants_angles = _wheel_angle_effects(calibration)
+        self._watch = MotionWatch(name, calibration)
         self._stamps = PublishedStamps()
         self._decode = JointStateDecoder().decode
         self._arrival: float | None = None  # of the last wheel sample
@@ -158,6 +160,7 @@ class RobotTracker:
                 raise DataError(str(error)) from None
             self._odometry, self._reference, self.calibration = odometry, reference, calibration
             self._wants_angles = _wheel_angle_effects(calibration)
+            self._watch = MotionWatch(self.name, calibration)
             self.counts.swaps += 1
             self._last_swap = SwapRecord(accepted=True, name=calibration.name, reason="runs", at=time.time())
             self._save()
@@ -227,6 +230,7 @@ class RobotTracker:
                 counts=self.counts.as_dict(),
                 last_refusal=self._last_refusal,
                 last_swap=self._last_swap,
+                unfitted_motion_s=self._watch.seconds,
             )
 
     def count_failure(self) -> None:
@@ -269,6 +273,7 @@ class RobotTracker:
         if self._fusion is not None and self._fusion.located:
             self._odometry.face(float(self._fusion.pose[2] - self._odometry.pose[2]))
         motion = self._odometry.step(step)
+        self._watch.take(step)
         if motion.restarted and self._timeline.entries:
             # the motion is taken as if it ended at the new time; what came before has no time any more
             self._timeline.restart(motion.stamp - round(motion.duration * _SECOND))

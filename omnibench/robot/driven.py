@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array, Robot
 
 _NEAR = 0.15  # of the largest motion: what is nearer to one that was driven is not new
 _SPACING = 0.05  # of the largest motion, between those that are kept
 _SMOOTHING = 0.25  # s
+_STANDING = 0.02  # of the largest motion: who stands drives nothing new
 _OFTEN = 0.05  # of a run's time: what is driven for less is a transition
 
 
@@ -36,14 +40,49 @@ def representatives(robot: Robot, motions: Array) -> Array:
 
 def new_share(robot: Robot, driven: Array, motions: Array) -> tuple[float, str]:
     """The share of motions (k, 3) that are far from all that were driven (n, 3), and what they are, in words."""
-    from scipy.spatial import KDTree  # a live node does not need it
+    known = DrivenMotions(robot, driven)
+    away = known.new_in_run(motions)
+    return (float(away.mean()), known.in_words(motions[away])) if away.any() else (0.0, "")
 
-    known, own = driven * _scale(robot), motions * _scale(robot)
-    size = _size(known)
-    away = KDTree(known).query(own)[0] > _NEAR * size
-    if away.mean() < _OFTEN:
-        return 0.0, ""
-    return float(away.mean()), _in_words(own[away], motions[away])
+
+class DrivenMotions:
+    """The motions (n, 3) that a model of a robot was fitted to, m/s, m/s, rad/s, and which others are far from all."""
+
+    def __init__(self, robot: Robot, motions: Array | Sequence[Sequence[float]]) -> None:
+        self._scale = _scale(robot)
+        self._known = np.asarray(motions, dtype=float) * self._scale
+        self._size = _size(self._known)
+
+    def is_new(self, motion: Array) -> bool:
+        """Whether one motion (3,) is far from all: for a live node, which has no time for SciPy."""
+        own = motion * self._scale
+        if np.linalg.norm(own) < _STANDING * self._size:
+            return False
+        return bool(np.linalg.norm(self._known - own, axis=1).min() > _NEAR * self._size)
+
+    def new_among(self, motions: Array) -> NDArray[np.bool_]:
+        """The same of many motions (k, 3): (k,)."""
+        from scipy.spatial import KDTree
+
+        own = motions * self._scale
+        away = KDTree(self._known).query(own)[0] > _NEAR * self._size
+        new: NDArray[np.bool_] = away & (np.linalg.norm(own, axis=1) >= _STANDING * self._size)
+        return new
+
+    def new_in_run(self, motions: Array) -> NDArray[np.bool_]:
+        """As ``new_among`` of the motions of one run, but none where it drives new ones only in passing."""
+        away = self.new_among(motions)
+        return away if away.mean() >= _OFTEN else np.zeros_like(away)
+
+    def in_words(self, motions: Array) -> str:
+        """What kind of motion these (k, 3) are, by their medians."""
+        return _in_words(motions * self._scale, motions)
+
+
+def not_known_to_hold(effects: Sequence[str]) -> str:
+    """What follows for effects of these names beyond the motions that they were fitted to."""
+    verb = "is" if len(effects) == 1 else "are"
+    return f"{', '.join(effects)} {verb} not known to hold there, and errors may be larger than stated"
 
 
 def _scale(robot: Robot) -> Array:

@@ -6,10 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from discovery_samples import DELAY, ECCENTRICITY, named, nothing, simulated
+from discovery_samples import DELAY, ECCENTRICITY, Effects, named, nothing, simulated
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.drawing import EXTENDED, PLAIN, Panel
+from omnibench.discover.motor_figures import motor_grid
 from omnibench.discover.residuals import NORMAL_95, Residuals, shares
 
 
@@ -154,3 +157,40 @@ def test_shares_put_every_value_in_one_bin_and_those_outside_in_none() -> None:
 
 def test_a_panel_without_any_known_value_is_empty() -> None:
     assert Panel("", np.zeros(1), (), "", "", "").empty
+
+
+def test_motors_are_drawn_less_what_their_effects_explain() -> None:
+    lag: Effects = ({"name": "motor_lag", "parameters": {"tau": 0.15}},)
+    found = discover_effects(simulated(lag))
+    assert [effect.name for effect in found.effects] == ["motor_lag"]
+    drawn = motor_grid(found, Residuals(found).runs)
+    assert drawn is not None
+    before, after = (
+        np.array([value for value in trace.y if value is not None], dtype=float)
+        for trace in drawn.figures[-1].plot.data
+        if trace.mode == "lines+markers"
+    )
+    assert before.min() < -5  # % of what was told, while the wheels start
+    assert np.abs(after).max() < 0.3 * np.abs(before).max()
+
+
+def test_targets_that_are_copies_of_the_rates_are_not_drawn() -> None:
+    found = nothing()
+    runs = [replace(run, targets=run.rates) for run in Residuals(found).runs]
+    assert motor_grid(found, runs) is None
+
+
+@settings(max_examples=15, suppress_health_check=[HealthCheck.too_slow])
+@given(st.lists(st.floats(-0.1, 0.1), min_size=12, max_size=12))
+def test_errors_of_the_motion_are_recovered_from_the_residuals_that_they_make(values: list[float]) -> None:
+    here = Residuals(nothing())
+    bins = shares(here.paths.signals.elapsed, [0.0, 1.5, 3.0, 4.5, 20.0])
+    columns = np.concatenate([here.paths.of_twist(np.tile(each, (len(bins), 1)), bins) for each in np.eye(3)], axis=2)
+    made = columns @ np.array(values)
+    found = replace(
+        nothing(),
+        trajectories=tuple(run.id for run in here.runs),
+        before=tuple(made[part] for part in here.paths.parts),
+    )
+    fitted = Residuals(found).fit(columns)
+    np.testing.assert_allclose(fitted.values[:, PLAIN.index], values, atol=1e-9)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
+from discovery_samples import held_out, named
 
 from omnibench.discover.drawing import round_down
 from omnibench.discover.result import EstimatedParameter, Gap, Step
@@ -10,7 +13,9 @@ from omnibench.discover.wording import (
     added,
     chance,
     closed_in_words,
+    floor_in_words,
     gap_in_words,
+    held_out_in_words,
     noise_in_words,
     parameter_in_words,
     reading,
@@ -82,3 +87,12 @@ def test_noise_that_is_not_there_is_not_told() -> None:
 @pytest.mark.parametrize(("value", "step"), [(7.3, 5), (5.0, 5), (1.0, 1), (0.37, 0.2), (99.0, 50)])
 def test_enlargements_are_round(value: float, step: float) -> None:
     assert round_down(value) == pytest.approx(step)
+
+
+def test_runs_of_which_none_is_repeated_are_not_called_repetitions() -> None:
+    found = named()
+    repetitions = held_out(found, "repetitions")
+    assert held_out_in_words(found, repetitions) == "held-out repetitions"
+    alone = replace(found, noise=replace(found.noise, source="within runs"))
+    assert held_out_in_words(alone, repetitions) == "held-out runs"
+    assert "No command is repeated" in floor_in_words(alone)

@@ -108,3 +108,11 @@ def test_a_data_set_that_lacks_what_an_effect_needs_is_refused_in_one_line() -> 
     drifting = (EffectTerm(name="thermal_radius_drift", parameters={"k": 1e-5}),)
     with pytest.raises(DataError, match=r"^effect 'thermal_radius_drift' needs the time since the session's start"):
         evaluate(calibration().model_copy(update={"effects": drifting}), dataset())
+
+
+def test_motions_that_the_effects_were_not_fitted_to_are_warned_of() -> None:
+    slip = (EffectTerm(name="centripetal_slip", parameters={"k": 0.01}),)
+    extended = calibration().model_copy(update={"effects": slip, "driven": ((0.3, 0.0, 0.0),)})
+    (warning,) = evaluate(extended, dataset()).warnings
+    assert "of 12 runs drive motions that calibration 'truth' was not fitted to" in warning
+    assert evaluate(extended.model_copy(update={"driven": None}), dataset()).warnings == ()

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from commands import flower, omnibench, write_config
+from commands import Command as InProcess
+from commands import assert_refused, flower, omnibench, write_config
 from drives import ORIGIN, PERIOD, Drive, calibration, drive, slam
 from hypothesis import given
 from hypothesis import strategies as st
-from nodes import config_of
+from nodes import config_of, write_node
 from recordings import random_dataset, simulated_recording
 from sessions import free_port
 
@@ -316,3 +317,17 @@ def test_a_node_runs_effects_of_the_plugins_that_its_config_names(tmp_path: Path
     with LiveNode(config) as node:
         updates = fed(node.trackers["apr"], path.payloads())
     np.testing.assert_allclose(odometry(updates)[:, 2], 1.1 * path.poses[:, 2], atol=1e-9)
+
+
+@pytest.mark.usefixtures("registries_as_before")
+def test_live_takes_the_plugins_that_are_named(command: InProcess, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "stretched_turns.py").write_text(PLUGIN)
+    write_node(tmp_path, "apr", replay={"dataset": "small.yaml", "speed": "max"})
+    write_config(tmp_path, datasets={"flower": {"simulate": flower()}})
+    using = with_effects(term("stretched_turns", k=0.1), session=None, sample_period=0.05)
+    (tmp_path / "calibration.yaml").write_text(to_yaml(using))
+    assert_refused(command("live", "node.yaml", "--replay"), "unknown effect 'stretched_turns'")
+    shown = command("live", "node.yaml", "--replay", "--plugins", "mine")
+    assert shown.returncode == 0, shown.stderr
+    assert "0 messages of odom lost" in shown.stdout

@@ -8,6 +8,7 @@ import numpy as np
 
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.data.simulate.noise import reference_noise
+from omnibench.data.unfitted import unfitted_motions
 from omnibench.errors import DataError
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
@@ -17,8 +18,9 @@ def simulate_like(dataset: Dataset, calibration: Calibration, noise_seed: int | 
     """The runs of a data set with poses by a calibration's model, from each run's recorded start pose on.
 
     Everything else is as recorded, stamps, wheel samples, splits and sessions too, so that both lie side by side.
-    noise_seed: adds the calibration's noise of the reference; None: poses without noise. DataError in one line: the
-    calibration is another robot's, it has no noise, or the recording lacks what one of its effects needs.
+    noise_seed: adds the calibration's noise of the reference; None: poses without noise. Its warnings tell of motions
+    that the calibration's effects were not fitted to, too. DataError in one line: the calibration is another robot's,
+    it has no noise, or the recording lacks what one of its effects needs.
     """
     ours, theirs = calibration.robot.wheel_names, dataset.robot.wheel_names
     if ours != theirs:
@@ -33,7 +35,7 @@ def simulate_like(dataset: Dataset, calibration: Calibration, noise_seed: int | 
         poses = _with_noise(dataset, poses, calibration, noise_seed)
         how = f"with its noise, seed {noise_seed}"
     runs = zip(dataset.trajectories, poses, strict=True)
-    return make_dataset(
+    made = make_dataset(
         dataset.name,
         dataset.robot,
         dataset.sample_period,
@@ -44,6 +46,8 @@ def simulate_like(dataset: Dataset, calibration: Calibration, noise_seed: int | 
         licence=dataset.licence,
         simulated=True,
     )
+    unfitted = unfitted_motions(calibration, dataset.trajectories)
+    return made if unfitted is None else replace(made, warnings=(*made.warnings, unfitted))
 
 
 def _with_noise(dataset: Dataset, poses: list[Array], calibration: Calibration, seed: int) -> list[Array]:

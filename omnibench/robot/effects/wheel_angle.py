@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from omnibench.registry import effects
@@ -17,6 +19,8 @@ def _ripple(signals: Signals, harmonic: float, values: Values) -> Array:
     Of the phase n phi in the middle of a sample of duration d, it is (a cos + b sin) 2 sin(n omega d / 2) / (n d).
     """
     assert signals.wheel_angles is not None  # they are needed
+    if len(signals.rates) == 1:
+        return _ripple_of_one_sample(signals, signals.wheel_angles, harmonic, values)
     added = np.zeros(signals.rates.shape)
     half = harmonic / 2 * signals.durations
     amplitudes = np.stack([of_wheels(signals.robot, prefix, values) for prefix in "ab"], axis=1)
@@ -26,6 +30,17 @@ def _ripple(signals: Signals, harmonic: float, values: Values) -> Array:
             wave = (a * np.cos(phase) if a else 0.0) + (b * np.sin(phase) if b else 0.0)
             added[:, wheel] = wave * np.sin(half * signals.rates[:, wheel]) / half
     return added
+
+
+def _ripple_of_one_sample(signals: Signals, angles: Array, harmonic: float, values: Values) -> Array:
+    """The same in Python's own floats, for a stream: three numbers are no work for NumPy."""
+    half = harmonic / 2 * float(signals.durations[0])
+    samples = zip(signals.robot.wheels, signals.rates[0].tolist(), angles[0].tolist(), strict=True)
+    added = []
+    for wheel, rate, angle in samples:
+        a, b, phase = values[f"a_{wheel.name}"], values[f"b_{wheel.name}"], harmonic * angle
+        added.append((a * math.cos(phase) + b * math.sin(phase)) * math.sin(half * rate) / half)
+    return np.array([added])
 
 
 @effects.register("wheel_eccentricity")
