@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from commands import Command, Printed, assert_refused, flower, omnibench
 
+from omnibench.data.storage import load_dataset
 from omnibench.registry import load_plugins
 from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
+from omnibench.robot.driven import motions_of, representatives
 
 TRUE_K = 0.15  # s/m
 COMMANDS = {"speeds": [0.1, 0.4], "directions_deg": [0, 120, 240], "turn_rates": [-0.5, 0.5], "ramp": 0.3}
@@ -76,12 +79,12 @@ def test_evaluate_takes_the_plugins_of_the_folder_one_is_in(
     told(command("evaluate", "out/model.yaml", "data"))
 
 
-def test_evaluate_warns_of_runs_that_the_effect_was_not_fitted_to(
-    command: Command, work: Path, extended: Path
-) -> None:
+def test_evaluate_warns_of_runs_that_the_effect_was_not_fitted_to(command: Command, work: Path, extended: Path) -> None:
     known = known_to(work)
-    slow = tuple(motion for motion in known.driven or () if abs(complex(motion[0], motion[1])) < 0.15)
-    write_calibration(known.model_copy(update={"driven": slow}), extended)
+    slow = [run for run in load_dataset(work / "data").trajectories if run.v == 0.1]
+    motions = np.concatenate([motions_of(known.matrix_array, run.times, run.rates) for run in slow])
+    driven = tuple(map(tuple, representatives(known.robot, motions).tolist()))
+    write_calibration(known.model_copy(update={"driven": driven}), extended)
     run = told(command("evaluate", extended, work / "data", "--json", "--plugins", work / "plugins"))
     (warning,) = json.loads(run.stdout)["warnings"]
     assert warning.startswith("24 of 48 runs drive motions that calibration 'flower extended' was not fitted to (")

@@ -110,7 +110,7 @@ def _candidates(without: Sequence[str]) -> Iterator[ActuatorEffect]:
     for entry in effects.entries():
         if entry.name not in without:
             effect = effects.create(entry.name)
-            if isinstance(effect, ActuatorEffect):
+            if isinstance(effect, ActuatorEffect) and effect.in_catalogue:
                 yield effect
 
 

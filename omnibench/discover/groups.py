@@ -50,10 +50,10 @@ class Groups:
     not_looked_for: tuple[tuple[str, str], ...]
 
 
-def make_groups(paths: Paths, jacobian: Array, trajectories: Sequence[Trajectory], without: Sequence[str]) -> Groups:
-    """Groups and columns; jacobian (S, 3, n): by the matrix elements. without: names that are not to be tried."""
-    columns: list[Array] = [jacobian]
-    count = jacobian.shape[2]
+def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Sequence[str]) -> Groups:
+    """Groups and columns. without: names that are not to be tried."""
+    columns: list[Array] = [_of_matrix(paths)]
+    count = columns[0].shape[2]
     matrix = Group("matrix", "matrix", tuple(range(count)))
     named: list[Group] = []
     missing: list[tuple[str, str]] = []
@@ -87,12 +87,18 @@ def make_groups(paths: Paths, jacobian: Array, trajectories: Sequence[Trajectory
     return Groups(matrix, tuple(named), tuple(places), np.concatenate(columns, axis=2), tuple(missing))
 
 
+def _of_matrix(paths: Paths) -> Array:
+    """Slopes (S, 3, 3N) by the elements of the matrix, of the same samples as all other columns."""
+    rates = paths.signals.rates
+    return np.concatenate([paths.of_twist(np.tile(row, (len(rates), 1)), rates) for row in np.eye(3)], axis=2)
+
+
 def _candidates(without: Sequence[str]) -> Iterator[MotionEffect | ReferenceEffect]:
     for entry in effects.entries():
         if entry.name in without:
             continue
         effect: Effect = effects.create(entry.name)
-        if isinstance(effect, MotionEffect | ReferenceEffect) and not effect.run_nuisance:
+        if isinstance(effect, MotionEffect | ReferenceEffect) and effect.in_catalogue and not effect.run_nuisance:
             yield effect
 
 

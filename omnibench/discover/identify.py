@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
 
 from omnibench.discover.groups import Group
 from omnibench.discover.look import Look
-from omnibench.discover.naming import Named
+from omnibench.discover.naming import ABSORBED, Named
 from omnibench.discover.result import Absorbed, Hidden
 from omnibench.discover.whitened import Given, given
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Array
 
-_ABSORBED = 1e-4  # share of an effect's signature that a matrix leaves
 _ALIKE = 0.95  # share of one effect's signature that another makes
 _SUM = 0.98  # that several others make together
 _TOGETHER = 3
@@ -28,7 +26,7 @@ def absorbed_effects(look: Look) -> tuple[Absorbed, ...]:
     found = {
         group.name: Absorbed(group.name, group.effect.stage, group.effect.measurement or "another kind of motion")
         for group in look.groups.effects
-        if group.effect is not None and _share_left(now, group.index) < _ABSORBED
+        if group.effect is not None and now.share_left(group.index) < ABSORBED
     }
     for name, reason in look.groups.not_looked_for:
         if reason == ONE_SESSION:
@@ -40,19 +38,12 @@ def absorbed_effects(look: Look) -> tuple[Absorbed, ...]:
 ONE_SESSION = "all runs are of one session"
 
 
-def _share_left(now: Given, index: Sequence[int]) -> float:
-    """The largest share of its signature that any direction of a group keeps beyond the matrix."""
-    scale = 1 / np.sqrt(np.maximum(now.total[list(index)], 1e-300))
-    inner = now.information[np.ix_(list(index), list(index))] * np.outer(scale, scale)
-    return float(np.linalg.eigvalsh(inner)[-1])
-
-
 def _visible(look: Look) -> list[Group]:
     """One group of each effect that is not absorbed: of several shapes the one that gains most."""
     now = given(look.data, look.groups.matrix.index)
     best: dict[str, Group] = {}
     for group in look.groups.effects:
-        if _share_left(now, group.index) < _ABSORBED:
+        if now.share_left(group.index) < ABSORBED:
             continue
         if group.name not in best or now.gain(group.index) > now.gain(best[group.name].index):
             best[group.name] = group

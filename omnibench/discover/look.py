@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from omnibench.discover.extend import Extended
 from omnibench.discover.groups import Groups, make_groups
 from omnibench.discover.held_out import folds_of, gains_on_held_out
-from omnibench.discover.model_fit import Fit, matrix_jacobian, paths_of, split_runs
+from omnibench.discover.model_fit import Fit, paths_of, split_runs
 from omnibench.discover.naming import Named, name_effects
 from omnibench.discover.significance import Gains, gains_of
 from omnibench.discover.whitened import Whitened
@@ -45,7 +45,7 @@ def look_at(
     of an earlier look at the same poses.
     """
     if groups is None or len(groups.columns) != sum(len(own) for own in fit.residuals):
-        groups = make_groups(paths_of(fit, _COARSE), matrix_jacobian(fit), fit.runs, without)
+        groups = make_groups(paths_of(fit, _COARSE), fit.runs, without)
     residuals = fit.free_residuals
     if extended is not None:
         elements = fit.model.matrix.size

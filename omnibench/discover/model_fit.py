@@ -18,7 +18,10 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import OdometryBatch, WheelLog
 
-_FIRST = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.01, walk_heading=0.01)
+# Before anything is known of the noise: 1 cm or 0.01 rad, and as much again in a second.
+_NOTHING_KNOWN = NoiseEstimate(
+    Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.01, walk_heading=0.01), "within runs", 1, ""
+)
 _ROUNDS = 4
 
 
@@ -67,8 +70,7 @@ def fit_matrix(runs: Sequence[Trajectory], robot: Robot, sample_period: float, s
     """
     model = OdometryModel(robot, start, "arc", (), sample_period)
     nuisances = Nuisances(np.zeros((len(runs), 3)), np.zeros(3))
-    first = NoiseEstimate(_FIRST, "within runs", 1, "")
-    fit = _at(model, tuple(runs), nuisances, first, 0)
+    fit = _at(model, tuple(runs), nuisances, _NOTHING_KNOWN, 0)
     for _ in range(3):
         fit = _matrix_step(fit)
     for _ in range(_ROUNDS):
@@ -83,7 +85,8 @@ def fit_matrix(runs: Sequence[Trajectory], robot: Robot, sample_period: float, s
 
 def with_noise(fit: Fit) -> Fit:
     """The same with noise, nuisances and jumping poses estimated anew from its residuals."""
-    found = estimate_noise(fit.runs, fit.residuals)
+    near = fit.noise.noise if fit.noise is not _NOTHING_KNOWN else None
+    found = estimate_noise(fit.runs, fit.residuals, near)
     runs, jumps = without_jumps(fit.runs, fit.residuals, found.noise)
     if jumps:
         fit = _at(fit.model, runs, fit.nuisances, found, fit.jumps + jumps)

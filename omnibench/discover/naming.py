@@ -26,12 +26,13 @@ SURE = 0.95
 CHANCE = 0.002  # of naming anything where nothing is missing
 _PRIOR = float(np.log(20))  # an effect is missing once in 20 robots
 _MOST = 3  # effects
+ABSORBED = 1e-4  # share of its signature that an effect must keep beyond the matrix to be told at all
 _LEFT_RIGHT = 0.04  # share that right names leave, in the mean; wrong ones leave anything
 _BEYOND_RIGHT = 0.01  # likewise, when their forms may differ a little
 _MOST_ODDS = 10.0  # that another form may lend a name
 _CANCELLING = 0.35  # effects that undo each other to such a share imitate something else rather than being there all
 _IMITATION = 1.0  # odds, at most, that they are
-_WRONG = 0.2  # of what is missing is not in the catalogue
+_WRONG = 0.1  # of what is missing is not in the catalogue
 _CREDIBLE = 0.3  # what is less likely to have a name in the catalogue gets none, and no model holds it
 _CONFUSABLE = 0.03
 
@@ -69,11 +70,12 @@ def name_effects(
     others (first).
     """
     start = given(data, groups.matrix.index)
+    told = [each for each in groups.effects if start.share_left(each.index) > ABSORBED]
     steps: list[Gains] = []
     chosen: tuple[Group, ...] = ()
     pool: list[Group] = []
     while len(chosen) < _MOST:
-        others = [each for each in groups.effects if each.name not in _names(chosen)]
+        others = [each for each in told if each.name not in _names(chosen)]
         found = gains_of(data, [*groups.matrix.index, *_indices(chosen)], others, rng)
         steps.append(found)
         pool += [group for group in _best_shapes(found) if group not in pool]

@@ -153,7 +153,7 @@ def make_paths(robot: Robot, matrix: Array, logs: Sequence[WheelLog], sample_per
     edges = np.cumsum([0, *(len(log.stamps) for log in logs)])
     parts = tuple(slice(int(low), int(high)) for low, high in pairwise(edges))
     middle = np.concatenate(middles)
-    signals = _joined(found)
+    signals = replace(_joined(found), poses=middle)
     sums, poses = _sums(logs, ends)
     run = np.repeat(np.arange(len(logs)), np.diff(edges))
     starts = np.array([log.start for log in logs])

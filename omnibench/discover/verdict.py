@@ -31,7 +31,8 @@ def headline_of(verdict: Verdict, effects: Sequence[NamedEffect], where: Sequenc
     """One or two sentences for the top of a report."""
     names = "; ".join(" or ".join((effect.name, *effect.confusable_with)) for effect in effects)
     with_weights = " and ".join(f"{effect.name} ({_percent(effect.weight)})" for effect in effects)
-    place = where[0].description if where else ""
+    odometry = [place for place in where if place.stage != "actuator"]
+    place = (odometry or list(where))[0].description if where else ""
     if verdict == "none":
         return "Nothing is missing that these recordings could show: what the matrix leaves looks like its noise."
     if verdict == "named":

@@ -133,6 +133,12 @@ class Given:
         found: Array = scale[:, None] * vectors[:, known] / np.sqrt(values[known])
         return found
 
+    def share_left(self, index: Sequence[int]) -> float:
+        """The largest share of itself that any direction of some columns keeps beyond those that are fitted."""
+        index = list(index)
+        scale = 1 / np.sqrt(np.maximum(self.total[index], 1e-300))
+        return float(np.linalg.eigvalsh(self.information[np.ix_(index, index)] * np.outer(scale, scale))[-1])
+
     def estimate(self, index: Sequence[int]) -> tuple[Array, Array]:
         """Values (n,) of some columns and their covariance (n, n), by the noise model."""
         roots = self.roots(index)

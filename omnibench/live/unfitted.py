@@ -30,7 +30,8 @@ class MotionWatch:
             self._known, self.seconds = DrivenMotions(calibration.robot, calibration.driven), 0.0
         self._matrix = calibration.matrix_array
         self._lasted = 0.0  # s of the motion that goes on
-        self._begin()
+        self._turned: Array = np.zeros(self._matrix.shape[1])  # rad, in the window that goes on
+        self._elapsed = 0.0  # s of it
 
     def take(self, step: WheelStep) -> None:
         """Take a wheel step."""
@@ -46,7 +47,7 @@ class MotionWatch:
             self._begin()
 
     def _begin(self) -> None:
-        self._turned: Array = np.zeros(self._matrix.shape[1])
+        self._turned = np.zeros(self._matrix.shape[1])
         self._elapsed = 0.0
 
     def _judge(self, known: DrivenMotions, motion: Array) -> None:

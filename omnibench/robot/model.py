@@ -94,7 +94,8 @@ class OdometryModel:
             return Path(log.times, log.start, (log.rates @ self.matrix.T) * durations, self.integration)
         assert self.sample_period is not None  # there are terms
         check_needs(self.motion_terms, log)
-        signals = signals_of(log, self.robot, self.matrix, self.sample_period)
+        with_poses = any("poses" in term.effect.needs for term in self.motion_terms)
+        signals = signals_of(log, self.robot, self.matrix, self.sample_period, with_poses=with_poses)
         twists, drift = corrected_twists(self.motion_terms, signals, self.matrix)
         world = None if drift is None else drift * durations
         return Path(log.times, log.start, twists * durations, self.integration, world)

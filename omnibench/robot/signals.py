@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import WheelLog
+from omnibench.robot.odometry import WheelLog, advance
+from omnibench.robot.path import Path
 
 STILL = 1e-3  # rad/s; a slower wheel stands
 _SMOOTHING = 0.05  # s, the time constant of the twist of which accelerations are taken
@@ -22,7 +23,9 @@ class Signals:
     the sample. twists (F, 3): by the model's matrix, m/s, m/s, rad/s. accelerations (F, 3): of the twists, smoothed
     over 50 ms, at rest before the first sample. travelled (F,): way since the robot last stood still, m. wheel_angles
     (F, N): absolute, in the middle of the sample, rad; None where they were not recorded. session_time (F,): s since
-    the session's start; None where it is not known. session: its name.
+    the session's start; None where it is not known. session: its name. poses (F, 3): in the reference's frame by the
+    twists alone and exact arcs, the mean of those before and after the sample, m, m, rad; None where no effect needs
+    them.
     """
 
     robot: Robot
@@ -35,10 +38,15 @@ class Signals:
     wheel_angles: Array | None = None
     session_time: Array | None = None
     session: str | None = None
+    poses: Array | None = None
 
 
-def signals_of(log: WheelLog, robot: Robot, matrix: Array, sample_period: float) -> Signals:
+def signals_of(
+    log: WheelLog, robot: Robot, matrix: Array, sample_period: float, *, with_poses: bool = False
+) -> Signals:
     """The signals of a log's F samples by a matrix (3, N); sample_period: the nominal one, s.
+
+    with_poses: an effect needs them.
 
     With u_k the twist of sample k, d_k its duration and y_k = y_{k-1} + a (u_k - y_{k-1}), y_0 = 0, the twist smoothed
     with a = 1 - exp(-sample_period / 50 ms), its acceleration is (y_k - y_{k-1}) / d_k: causal, and their sum over time
@@ -62,13 +70,15 @@ def signals_of(log: WheelLog, robot: Robot, matrix: Array, sample_period: float)
         wheel_angles=None if log.wheel_angles is None else log.wheel_angles - log.rates * (durations / 2)[:, None],
         session_time=None if log.started_at is None else log.started_at + elapsed,
         session=log.session,
+        poses=_middles(log, twists * durations[:, None]) if with_poses else None,
     )
 
 
 class SignalStream:
     """The same signals, one sample at a time, from rest.
 
-    session_time: at the first sample's start, s.
+    session_time: at the first sample's start, s. pose (3,): where the twists alone have led by now, m, m, rad; None
+    where no effect needs it.
     """
 
     def __init__(
@@ -78,8 +88,10 @@ class SignalStream:
         sample_period: float,
         session: str | None = None,
         session_time: float = 0.0,
+        pose: Array | None = None,
     ) -> None:
         self.matrix = matrix
+        self.pose = pose
         self._robot, self._session, self._session_time = robot, session, session_time
         self._share = smoothing_share(sample_period)
         self._elapsed = self._way = 0.0
@@ -90,10 +102,22 @@ class SignalStream:
         """The wheels turned by angles (N,) rad, to absolute ones (N,) where they are known."""
         self._angles = self._angles + angles if wheel_angles is None else np.asarray(wheel_angles, dtype=float)
 
-    def next(self, rates: Array, duration: float, wheel_angles: Array | None = None) -> Signals:
+    def move(self, moved: Array) -> Array | None:
+        """The robot moved (3,) in its own frame, m, m, rad: the mean of its poses (1, 3) before and after."""
+        if self.pose is None:
+            return None
+        before = self.pose
+        self.pose = advance(before, moved, "arc")
+        middle: Array = (before + self.pose)[None] / 2
+        return middle
+
+    def next(
+        self, rates: Array, duration: float, wheel_angles: Array | None = None, frame_heading: float = 0.0
+    ) -> Signals:
         """The signals (F = 1) of one sample: mean rates (N,) rad/s over a duration > 0 s, absolute angles at its end.
 
-        Angles that are not known are counted on from the last, at first from 0.
+        Angles that are not known are counted on from the last, at first from 0. frame_heading: of the stream's frame
+        in the reference's, with which it shares its origin, rad.
         """
         turned = rates * duration
         self.turn(turned, wheel_angles)
@@ -122,12 +146,29 @@ class SignalStream:
             (self._angles - turned / 2)[None],
             session_time,
             self._session,
+            _turned(self.move(twist * duration), frame_heading),
         )
 
 
 def smoothing_share(sample_period: float) -> float:
     """The share a of a new twist in the smoothed one."""
     return -math.expm1(-sample_period / _SMOOTHING)
+
+
+def _middles(log: WheelLog, moved: Array) -> Array:
+    """Means (F, 3) of the poses before and after each sample that moved the robot by (F, 3)."""
+    ends = Path(log.times, log.start, moved, "arc").poses(log.times)
+    middles: Array = (ends + np.vstack([log.start, ends[:-1]])) / 2
+    return middles
+
+
+def _turned(poses: Array | None, angle: float) -> Array | None:
+    """Poses (F, 3) about the origin by an angle, rad."""
+    if poses is None or not angle:
+        return poses
+    cosine, sine = math.cos(angle), math.sin(angle)
+    x, y, heading = poses.T
+    return np.column_stack([cosine * x - sine * y, sine * x + cosine * y, heading + angle])
 
 
 def _travelled(rates: Array, steps: Array) -> Array:

@@ -41,7 +41,14 @@ def driven_signals(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> 
         wheel_angles=3.0 + np.cumsum(rates, axis=0) * PERIOD,
         session_time=600.0 + middle,
         session=SESSIONS[1],
+        poses=_poses(twists, middle),
     )
+
+
+def _poses(twists: Array, elapsed: Array) -> Array:
+    """A path (F, 3) that turns as the twists do, in a loop about a place beside the origin."""
+    heading = 0.3 + PERIOD * np.cumsum(twists[:, 2])
+    return np.column_stack([0.5 + 0.8 * np.sin(elapsed), -0.4 + 0.8 * np.cos(1.3 * elapsed), heading])
 
 
 def robots() -> tuple[Robot, Robot]:

@@ -183,7 +183,7 @@ class EffectConformance(Conformance):
         effect = self.make()
         if not isinstance(effect, MotionEffect):
             raise SkipTest("is for effects of motion")
-        unused = {"wheel_angles", "session_time", "session"} - set(effect.needs)
+        unused = {"wheel_angles", "session_time", "session", "poses"} - set(effect.needs)
         bare: dict[str, Any] = dict.fromkeys(unused)
         for robot in robots():
             signals = replace(driven_signals(robot), **bare)

@@ -40,8 +40,8 @@ def test_runs_commands_motions_and_effects_are_told_in_one_line() -> None:
     runs = [run("1", FORWARDS), run("2", FORWARDS, SIDEWAYS, command="corner"), run("3", SIDEWAYS, command="side")]
     other = EffectTerm(name="heading_drift", parameters={"b": 0.001})
     assert unfitted_motions(calibration(SLIP, other), runs) == (
-        "2 of 3 runs drive motions that calibration 'mine' was not fitted to (side, corner), such as driving straight at "
-        "0.20 m/s: centripetal_slip, heading_drift are not known to hold there, and errors may be larger than stated"
+        "2 of 3 runs drive motions that calibration 'mine' was not fitted to (side, corner), such as driving straight "
+        "at 0.20 m/s: centripetal_slip, heading_drift are not known to hold there, and errors may be larger than stated"
     )
 
 
@@ -49,7 +49,9 @@ def test_repetitions_of_a_command_count_as_runs_and_are_named_once() -> None:
     runs = [run(str(number), ON_THE_SPOT, command="turn") for number in range(4)]
     told = unfitted_motions(calibration(), runs)
     assert told is not None
-    assert told.startswith("4 of 4 runs drive motions that calibration 'mine' was not fitted to (turn), such as turning")
+    assert told.startswith(
+        "4 of 4 runs drive motions that calibration 'mine' was not fitted to (turn), such as turning"
+    )
 
 
 def test_three_commands_are_named_and_the_others_counted() -> None:

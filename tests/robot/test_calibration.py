@@ -175,7 +175,7 @@ def test_the_file_holds_what_the_design_says(tmp_path: Path) -> None:
     assert content["format"] == "omnibench-calibration/1"
     assert list(content) == [
         *("format", "name", "created", "robot", "sample_period", "matrix", "integration", "effects"),
-        *("noise", "covariance", "session", "provenance"),
+        *("noise", "covariance", "session", "driven", "provenance"),
     ]
 
 

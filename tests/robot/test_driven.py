@@ -57,14 +57,15 @@ def test_another_direction_or_speed_is_new(motion: Array) -> None:
     assert known(FORWARDS).is_new(motion)
 
 
-@pytest.mark.parametrize("motion", [FORWARDS, 1.1 * FORWARDS, FORWARDS + [0.0, 0.02, 0.0], STANDING, 0.01 * SIDEWAYS])
+@pytest.mark.parametrize("motion", [FORWARDS, 1.1 * FORWARDS, FORWARDS + 0.1 * SIDEWAYS, STANDING, 0.01 * SIDEWAYS])
 def test_what_is_near_is_not_new_and_to_stand_neither(motion: Array) -> None:
     assert not known(FORWARDS).is_new(motion)
 
 
 def test_turning_counts_as_what_it_moves_at_the_wheels() -> None:
-    assert not known(FORWARDS, ON_THE_SPOT).is_new([0.0, 0.0, 1.0 + 0.1 * 0.2 / DISTANCE])
-    assert known(FORWARDS, ON_THE_SPOT).is_new([0.0, 0.0, 1.0 + 0.2 * 0.2 / DISTANCE])
+    driven, more = known(FORWARDS, ON_THE_SPOT), ON_THE_SPOT * 0.2 / DISTANCE
+    assert not driven.is_new(ON_THE_SPOT + 0.1 * more)
+    assert driven.is_new(ON_THE_SPOT + 0.2 * more)
 
 
 def test_new_motions_in_passing_do_not_make_a_run_new() -> None:
@@ -79,7 +80,7 @@ def test_new_motions_in_passing_do_not_make_a_run_new() -> None:
     [
         (ON_THE_SPOT, "turning on the spot"),
         (SIDEWAYS, "driving straight at 0.20 m/s"),
-        ([0.3, 0.4, -1.0], "turning while driving at 0.50 m/s"),
+        (np.array([0.3, 0.4, -1.0]), "turning while driving at 0.50 m/s"),
     ],
 )
 def test_new_motions_are_told_in_words_with_their_share(motion: Array, words: str) -> None:

@@ -12,7 +12,7 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals
 
 Stage = Literal["actuator", "wheel", "clock", "body", "world", "reference"]
-Need = Literal["wheel_angles", "session_time", "session", "targets"]
+Need = Literal["wheel_angles", "session_time", "session", "targets", "poses"]
 Values = Mapping[str, float]
 
 
@@ -39,7 +39,8 @@ class Effect(ABC):
     stage: where it acts. physics: a sentence on why it happens. source: where it is described. shows_in: the covariate
     over which the residual shows it. needs: what must have been recorded. run_nuisance: one value for each run, which
     is estimated and reported and is never an answer. measurement: what would tell it, where a matrix absorbs it.
-    fixed_parameters: for an effect that has the same for every robot; else override ``parameters``.
+    fixed_parameters: for an effect that has the same for every robot; else override ``parameters``. in_catalogue: it is
+    a name for what is missing; else it is a shape without physics, never tried as a name.
     """
 
     name: ClassVar[str]
@@ -49,6 +50,7 @@ class Effect(ABC):
     shows_in: ClassVar[str]
     needs: ClassVar[frozenset[Need]] = frozenset()
     run_nuisance: ClassVar[bool] = False
+    in_catalogue: ClassVar[bool] = True
     measurement: ClassVar[str] = ""
     fixed_parameters: ClassVar[tuple[Parameter, ...]] = ()
 

@@ -13,7 +13,7 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals
 
 
-def _ripple(signals: Signals, harmonic: float, values: Values) -> Array:
+def ripple(signals: Signals, harmonic: float, values: Values) -> Array:
     """The mean of omega (a cos(n phi) + b sin(n phi)) over each sample, phi turning at the constant rate omega.
 
     Of the phase n phi in the middle of a sample of duration d, it is (a cos + b sin) 2 sin(n omega d / 2) / (n d).
@@ -60,7 +60,7 @@ class WheelEccentricity(MotionEffect):
         )
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        return _ripple(signals, 1.0, values)
+        return ripple(signals, 1.0, values)
 
 
 @effects.register("roller_ripple")
@@ -82,4 +82,4 @@ class RollerRipple(MotionEffect):
         )
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        return _ripple(signals, values["rollers"], values)
+        return ripple(signals, values["rollers"], values)

@@ -1,0 +1,249 @@
+"""Smooth functions of a covariate, for what has no name: changes of the motion along the way, across it and in turning.
+
+They say how a robot errs and not why, and are never tried as names. A change in turning is counted per way of the
+wheels, so that a robot that stands is never changed. Beyond what was seen no function is extrapolated: each holds its
+value at the edge or fades to zero.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from omnibench.registry import effects
+from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.signals import Signals
+
+ORDERS = 6  # of functions of time
+NO_PHYSICS = "None: a function that was fitted to what the model left, without a cause."
+NO_SOURCE = "fitted to data"
+SURFACES = ("x", "y", "xx", "xy", "yy", "xxx", "xxy", "xyy", "yyy")
+_LARGEST = 0.1  # of a share
+_MODES = {
+    "along": "along the way",
+    "across": "across the way, to the left",
+    "turn": "in turning, per way of the wheels",
+    "rotation": "of the rate of turn",
+}
+
+
+def scale(name: str, unit: str, low: float, high: float, usual: float, description: str) -> Parameter:
+    """A parameter that says where a function begins and ends."""
+    return Parameter(name, unit, low, high, description, choices=(usual,))
+
+
+def shared(modes: Sequence[str], labels: Sequence[str], of_what: str) -> tuple[Parameter, ...]:
+    """Coefficients ``mode_label``, all of them shares of the motion."""
+    return tuple(
+        Parameter(f"{mode}_{label}", "1", -_LARGEST, _LARGEST, f"change {_MODES[mode]}, with {label} of {of_what}")
+        for mode in modes
+        for label in labels
+    )
+
+
+def direction(mode: str, signals: Signals) -> Array:
+    """The change of the twist (F, 3) that a share of 1 is."""
+    twists = signals.twists
+    changes = np.zeros(twists.shape)
+    if mode == "along":
+        changes[:, :2] = twists[:, :2]
+    elif mode == "across":
+        changes[:, 0], changes[:, 1] = -twists[:, 1], twists[:, 0]
+    elif mode == "rotation":
+        changes[:, 2] = twists[:, 2]
+    else:
+        changes[:, 2] = np.abs(twists[:, 2]) + np.hypot(twists[:, 0], twists[:, 1]) / lever(signals.robot)
+    return changes
+
+
+def lever(robot: Robot) -> float:
+    """Mean distance of the wheels, m: what turning is compared with driving by."""
+    return float(np.mean([wheel.distance for wheel in robot.wheels]))
+
+
+def waves(angle: Array, harmonics: Sequence[float]) -> Array:
+    """Cosine and sine (F, 2 m) of multiples of an angle (F,)."""
+    return np.concatenate([[np.cos(each * angle), np.sin(each * angle)] for each in harmonics]).T
+
+
+def surfaces(inside: Array) -> Array:
+    """The nine polynomials (F, 9) of degree 1 to 3 in the plane, of places (F, 2)."""
+    x, y = inside.T
+    return np.column_stack([x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3])
+
+
+def inside_of(places: Array, values: Values) -> Array:
+    """Places (F, 2) from the centre in units of the reach; those beyond are moved to the edge of that circle."""
+    away = (places - [values["centre_x"], values["centre_y"]]) / values["reach"]
+    return away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1.0)
+
+
+AREA = (
+    scale("centre_x", "m", -1e6, 1e6, 0.0, "middle of the places that were seen"),
+    scale("centre_y", "m", -1e6, 1e6, 0.0, "middle of the places that were seen"),
+    scale("reach", "m", 1e-6, 1e6, 2.0, "how far from there places were seen"),
+)
+
+
+class SmoothEffect(MotionEffect):
+    """Shares of the motion that vary with a covariate: sums of ``labels`` functions, for each of the ``modes``."""
+
+    stage = "body"
+    physics = NO_PHYSICS
+    source = NO_SOURCE
+    in_catalogue = False
+    modes: ClassVar[tuple[str, ...]] = ("along", "across", "turn")
+    labels: ClassVar[tuple[str, ...]]
+
+    @abstractmethod
+    def shares(self, signals: Signals, values: Values) -> Array:
+        """The functions (F, J)."""
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        shares, added = self.shares(signals, values), np.zeros(signals.twists.shape)
+        for mode in self.modes:
+            factors = np.array([values[f"{mode}_{label}"] for label in self.labels])
+            if factors.any():
+                added += (shares @ factors)[:, None] * direction(mode, signals)
+        return added
+
+
+_TIMES = tuple(str(order) for order in range(ORDERS))
+
+
+@effects.register("smooth_elapsed_time")
+class SmoothElapsedTime(SmoothEffect):
+    """Without a name: cosines of the time since the start of a run; after the longest run seen the value is held."""
+
+    shows_in = "elapsed time"
+    labels = _TIMES
+    fixed_parameters = (
+        *shared(SmoothEffect.modes, _TIMES, "the time since the start"),
+        scale("duration", "s", 1e-3, 1e6, 5.0, "of the longest run that was seen"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        part = np.clip(signals.elapsed / values["duration"], 0.0, 1.0)
+        return np.cos(np.pi * np.arange(ORDERS) * part[:, None])
+
+
+_TURNS = ("cos1", "sin1", "cos2", "sin2", "cos3", "sin3")
+
+
+@effects.register("smooth_heading")
+class SmoothHeading(SmoothEffect):
+    """Without a name: the first three harmonics of the robot's heading."""
+
+    shows_in = "heading"
+    needs = frozenset({"poses"})
+    labels = _TURNS
+    fixed_parameters = shared(SmoothEffect.modes, _TURNS, "the heading")
+
+    def shares(self, signals: Signals, values: Values) -> Array:  # noqa: ARG002
+        assert signals.poses is not None  # they are needed
+        return waves(signals.poses[:, 2], (1, 2, 3))
+
+
+@effects.register("smooth_course")
+class SmoothCourse(SmoothEffect):
+    """Without a name: a steady push along the way in the world, and two harmonics of the direction of travel there."""
+
+    shows_in = "heading"
+    needs = frozenset({"poses"})
+    labels = _TURNS[:4]
+    fixed_parameters = (
+        Parameter("east", "1", -_LARGEST, _LARGEST, "push along x of the reference, of the speed"),
+        Parameter("north", "1", -_LARGEST, _LARGEST, "push along y of the reference, of the speed"),
+        *shared(SmoothEffect.modes, labels, "the direction of travel"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:  # noqa: ARG002
+        assert signals.poses is not None  # they are needed
+        return waves(signals.poses[:, 2] + np.arctan2(signals.twists[:, 1], signals.twists[:, 0]), (1, 2))
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        assert signals.poses is not None
+        added = super().correction(signals, values)
+        push = complex(values["east"], values["north"]) * np.exp(-1j * signals.poses[:, 2])
+        push *= np.hypot(signals.twists[:, 0], signals.twists[:, 1])
+        added[:, 0] += push.real
+        added[:, 1] += push.imag
+        return added
+
+
+@effects.register("smooth_place")
+class SmoothPlace(SmoothEffect):
+    """Without a name: polynomials of degree 3 in the place on the floor; beyond the places seen the value is held."""
+
+    shows_in = "place"
+    needs = frozenset({"poses"})
+    labels = SURFACES
+    fixed_parameters = (*shared(SmoothEffect.modes, SURFACES, "the place"), *AREA)
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.poses is not None  # they are needed
+        return surfaces(inside_of(signals.poses[:, :2], values))
+
+
+@effects.register("smooth_patch")
+class SmoothPatch(SmoothEffect):
+    """Without a name: a round patch of the floor, outside of which the change fades to zero."""
+
+    shows_in = "place"
+    needs = frozenset({"poses"})
+    labels = ("bump",)
+    fixed_parameters = (
+        *shared(SmoothEffect.modes, labels, "the place"),
+        *AREA[:2],
+        scale("radius", "m", 1e-6, 1e6, 0.5, "from the centre, where 1/e of the change is left"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.poses is not None  # they are needed
+        away = (signals.poses[:, :2] - [values["centre_x"], values["centre_y"]]) / values["radius"]
+        return np.exp(-np.square(away).sum(axis=1, keepdims=True))
+
+
+@effects.register("smooth_command")
+class SmoothCommand(SmoothEffect):
+    """Without a name: motions near one, by direction of travel and turning; for all others the change fades to zero."""
+
+    shows_in = "command"
+    labels = ("bump",)
+    fixed_parameters = (
+        *shared(SmoothEffect.modes, labels, "the motion"),
+        scale("vx", "m/s", -1e3, 1e3, 0.2, "the motion, forwards"),
+        scale("vy", "m/s", -1e3, 1e3, 0.0, "the motion, to the left"),
+        scale("omega", "rad/s", -1e3, 1e3, 0.0, "the motion, turning"),
+        scale("width", "m/s", 1e-9, 1e3, 0.3, "how far other motions are, at the wheels, where 61 % of it is left"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        away = signals.twists - [values["vx"], values["vy"], values["omega"]]
+        away = away * [1.0, 1.0, lever(signals.robot)] / values["width"]
+        return np.exp(-np.square(away).sum(axis=1, keepdims=True) / 2)
+
+
+@effects.register("smooth_order_of_runs")
+class SmoothOrderOfRuns(SmoothEffect):
+    """Without a name: polynomials of the time since the session's start; after the longest seen the value is held."""
+
+    shows_in = "order of runs"
+    needs = frozenset({"session_time"})
+    modes = ("along", "rotation", "turn")
+    labels = tuple(str(order) for order in range(1, ORDERS + 1))
+    fixed_parameters = (
+        *shared(modes, labels, "the session's time"),
+        scale("duration", "s", 1e-3, 1e9, 3600.0, "of the longest session that was seen"),
+    )
+
+    def shares(self, signals: Signals, values: Values) -> Array:
+        assert signals.session_time is not None  # it is needed
+        unit = np.clip(2 * signals.session_time / values["duration"] - 1, -1.0, 1.0)
+        functions: Array = chebyshev.chebvander(unit, ORDERS)[:, 1:]
+        return functions

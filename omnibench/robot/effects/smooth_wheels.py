@@ -1,0 +1,119 @@
+"""Smooth functions of what wheels do, for what has no name: of their rates, their angles and the acceleration."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omnibench.registry import effects
+from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
+from omnibench.robot.effects.per_wheel import of_wheels, one_for_each_wheel
+from omnibench.robot.effects.smooth import NO_PHYSICS, NO_SOURCE, direction, scale
+from omnibench.robot.effects.wheel_angle import ripple
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.signals import STILL, Signals
+
+KNOTS = 8  # of wheel rates
+HARMONICS = (0.5, *(float(number) for number in range(1, 17)), 1.5, 2.5, 3.5)  # of a wheel's turn
+
+
+def tents(rates: Array, top: float) -> Array:
+    """Piecewise linear functions (..., 8) of rates between -top and top, rad/s, the outermost held beyond.
+
+    Zero for wheels that stand.
+    """
+    knots = np.linspace(-top, top, KNOTS)
+    found = np.maximum(0.0, 1 - np.abs(np.clip(rates, -top, top)[..., None] - knots) / (knots[1] - knots[0]))
+    moving: Array = found * (np.abs(rates) > STILL)[..., None]
+    return moving
+
+
+@effects.register("smooth_wheel_rate")
+class SmoothWheelRate(MotionEffect):
+    """Without a name: a piecewise linear function of each wheel's rate, which holds its value beyond the rates seen."""
+
+    stage = "wheel"
+    physics = NO_PHYSICS
+    source = NO_SOURCE
+    shows_in = "wheel rate"
+    in_catalogue = False
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        at_knots = [
+            one_for_each_wheel(robot, f"change_{knot}", "rad/s", -0.02, 0.02, f"change at knot {knot} of 0 to 7")
+            for knot in range(KNOTS)
+        ]
+        top = scale("top", "rad/s", 1e-6, 1e6, 6.0, "the fastest rate that was seen; knots are spread from -top to top")
+        return (*(each for knot in at_knots for each in knot), top)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        heights = np.array([of_wheels(signals.robot, f"change_{knot}", values) for knot in range(KNOTS)])
+        added: Array = np.einsum("fnk,kn->fn", tents(signals.rates, values["top"]), heights)
+        return added
+
+
+@effects.register("smooth_wheel_angle")
+class SmoothWheelAngle(MotionEffect):
+    """Without a name: a wave of each wheel's angle, so many times a turn."""
+
+    stage = "wheel"
+    physics = NO_PHYSICS
+    source = NO_SOURCE
+    shows_in = "wheel angle"
+    needs = frozenset({"wheel_angles"})
+    in_catalogue = False
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return (
+            *one_for_each_wheel(robot, "a", "1", -0.03, 0.03, "share of the radius, with the cosine"),
+            *one_for_each_wheel(robot, "b", "1", -0.03, 0.03, "share of the radius, with the sine"),
+            Parameter("harmonic", "1", 0.1, 256.0, "waves in a turn of the wheel", choices=HARMONICS),
+        )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return ripple(signals, values["harmonic"], values)
+
+
+_OF_ACCELERATION = (  # in the order of the functions below
+    Parameter("straight", "s", -0.1, 0.1, "change of the velocity, of the acceleration"),
+    Parameter("aside", "s", -0.1, 0.1, "change of the velocity to the left of the acceleration, of its size"),
+    Parameter("about_x", "rad s/m", -0.1, 0.1, "change of the rate of turn, of the acceleration forwards"),
+    Parameter("about_y", "rad s/m", -0.1, 0.1, "change of the rate of turn, of the acceleration to the left"),
+    Parameter("about_omega", "s", -0.1, 0.1, "change of the rate of turn, of its own rate of change"),
+    Parameter("about_size", "rad s/m", -0.1, 0.1, "change of the rate of turn, of the acceleration's size"),
+    Parameter("about_turning", "s", -0.1, 0.1, "change of the rate of turn, of the size of its rate of change"),
+    Parameter("along", "s2/m", -0.1, 0.1, "change along the way, of the speed times the acceleration's size"),
+    Parameter("across", "s2/m", -0.1, 0.1, "change across the way, of the speed times the acceleration's size"),
+    Parameter("rotation", "s2/m", -0.1, 0.1, "change of the rate of turn, of itself times the acceleration's size"),
+)
+
+
+@effects.register("smooth_acceleration")
+class SmoothAcceleration(MotionEffect):
+    """Without a name: changes that grow with the acceleration, up to the largest that was seen, and then no more."""
+
+    stage = "body"
+    physics = NO_PHYSICS
+    source = NO_SOURCE
+    shows_in = "acceleration"
+    in_catalogue = False
+    fixed_parameters = (
+        *_OF_ACCELERATION,
+        scale("top", "m/s2", 1e-9, 1e9, 10.0, "the largest acceleration that was seen"),
+        scale("top_turning", "rad/s2", 1e-9, 1e9, 50.0, "the largest change of the rate of turn that was seen"),
+    )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        forward, left, angular = signals.accelerations.T
+        size = np.hypot(forward, left)
+        held = np.minimum(1.0, values["top"] / np.maximum(size, 1e-300))
+        forward, left, size = held * forward, held * left, held * size
+        angular = np.clip(angular, -values["top_turning"], values["top_turning"])
+        nothing, own = np.zeros(len(size)), {each.name: values[each.name] for each in _OF_ACCELERATION}
+        turning = own["about_x"] * forward + own["about_y"] * left + own["about_omega"] * angular
+        turning = turning + own["about_size"] * size + own["about_turning"] * np.abs(angular)
+        added = own["straight"] * np.column_stack([forward, left, nothing])
+        added += own["aside"] * np.column_stack([-left, forward, nothing])
+        added[:, 2] += turning
+        for mode in ("along", "across", "rotation"):
+            added += own[mode] * size[:, None] * direction(mode, signals)
+        return added
