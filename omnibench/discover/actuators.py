@@ -47,6 +47,8 @@ def look_at_actuators(
     errors = [run.rates - _targets(run) for run in told]
     if not told or max(float(np.abs(each).max()) for each in errors) < _QUANTISED:
         return None
+    if max(float(np.abs(run.targets).max()) for run in told if run.targets is not None) < _QUANTISED:
+        return None  # a column that was never filled
     groups, columns = _groups(told, robot, without)
     noise = _noise_of(errors)
     residuals = tuple(each.ravel() / noise for each in errors)
@@ -92,9 +94,10 @@ def _groups(runs: Sequence[Trajectory], robot: Robot, without: Sequence[str]) ->
     named, places = [], []
     for effect in _candidates(without):
         parameters = effect.parameters(robot)
-        steps = {each.name: _STEP * each.high for each in parameters}
+        nothing = {each.name: 0.0 for each in parameters}
+        steps = {each.name: _STEP * each.largest for each in parameters}
         slopes = [
-            np.stack([_driven(effect, run, {name: step}) / step for name, step in steps.items()], axis=-1)
+            np.stack([_driven(effect, run, {**nothing, name: step}) / step for name, step in steps.items()], axis=-1)
             for run in runs
         ]
         named.append(Group("effect", effect.name, add(slopes), effect, parameters))
@@ -116,9 +119,8 @@ def _candidates(without: Sequence[str]) -> Iterator[ActuatorEffect]:
 
 def _driven(effect: ActuatorEffect, run: Trajectory, values: Mapping[str, float]) -> Array:
     """By how much an effect changes the rates (F, N)."""
-    everything = dict.fromkeys(values, 0.0) | dict(values)
     targets = _targets(run)
-    return effect.driven(np.diff(run.times, prepend=0.0), targets, everything) - targets
+    return effect.driven(np.diff(run.times, prepend=0.0), targets, values) - targets
 
 
 def _bases(runs: Sequence[Trajectory]) -> Iterator[tuple[str, str, list[Array]]]:
@@ -149,7 +151,7 @@ def _fitted(runs: Sequence[Trajectory], errors: Sequence[Array], chosen: Sequenc
     parameters = [each for group in chosen for each in group.parameters]
     if not parameters:
         return np.zeros(0), np.zeros((0, 0))
-    scale = np.array([_STEP * each.high for each in parameters])
+    scale = np.array([_STEP * each.largest for each in parameters])
 
     def left(scaled: Array) -> Array:
         values, first, changes = scaled * scale, 0, [np.zeros_like(each) for each in errors]

@@ -2,24 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.data.dataset import Dataset
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.extend import Extended
 from omnibench.discover.novelty import driven_motions
 from omnibench.environment import package_versions
+from omnibench.errors import DataError
 from omnibench.robot.calibration import Calibration, EffectTerm, Provenance, covariance_rows, matrix_rows
 from omnibench.robot.kinematics import Array
 
 
-def calibration_of(dataset: Dataset, extended: Extended, name: str, options: Mapping[str, object], seed: int,
-                   costs: tuple[float, float | None], reason: str) -> Calibration:  # fmt: skip
-    """The calibration of a fit, with its noise, its covariance (zero for shapes) and where it comes from.
+@dataclass(frozen=True)
+class Request:
+    """What was asked for."""
 
-    costs: Eq. (6) of training and validation.
-    """
+    without: tuple[str, ...]
+    unknown_term: bool
+    seed: int
+
+
+def calibration_of(
+    dataset: Dataset,
+    extended: Extended,
+    name: str,
+    request: Request,
+    reason: str,
+) -> Calibration:
+    """The calibration of a fit, with its noise, its covariance (zero for shapes) and where it comes from."""
     terms = tuple(
         EffectTerm(name=term.name, parameters={key: float(value) for key, value in term.values.items()})
         for term in extended.fit.model.terms
@@ -40,17 +53,27 @@ def calibration_of(dataset: Dataset, extended: Extended, name: str, options: Map
             dataset_hash=dataset.hash,
             simulated=dataset.simulated,
             calibrator="discover",
-            options=dict(options),
-            seed=seed,
+            options={"without": list(request.without), "unknown_term": request.unknown_term},
+            seed=request.seed,
             cost="final_pose",
             box="none",
             versions=package_versions(),
-            training_cost=costs[0],
-            validation_cost=costs[1],
+            training_cost=_cost(extended, dataset.split("train")),
+            validation_cost=_cost(extended, dataset.split("validation")),
             outcome="converged",
             reason=reason,
         ),
     )
+
+
+def _cost(extended: Extended, runs: Sequence[Trajectory]) -> float | None:
+    """Eq. (6) of runs as they were recorded; None without runs, or where they lack what an effect needs."""
+    try:
+        poses = extended.fit.model.reported([run.final_log for run in runs])
+    except DataError:
+        return None
+    errors = [np.linalg.norm(run.final_pose - own[-1]) for run, own in zip(runs, poses, strict=True)]
+    return float(np.mean(errors)) if errors else None
 
 
 def _with_shapes(extended: Extended) -> Array:

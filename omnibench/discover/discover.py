@@ -10,6 +10,7 @@ import numpy as np
 
 from omnibench.data.dataset import Dataset
 from omnibench.discover.actuators import look_at_actuators
+from omnibench.discover.calibrations import Request
 from omnibench.discover.extend import extend
 from omnibench.discover.groups import check_names
 from omnibench.discover.look import look_at
@@ -73,13 +74,19 @@ def discover_effects(
     tell.stage("looking at the motors")
     motors = look_at_actuators(runs, dataset.robot, without, rng)
     tell.stage("comparing on runs that were held out")
-    return told(dataset, plain, look, rivals, motors, seed, unknown_term, began)
+    return told(dataset, plain, look, rivals, motors, Request(tuple(without), unknown_term, seed), began)
 
 
 def _start(dataset: Dataset, calibration: Calibration | None) -> Array:
     """The matrix (3, N) to begin at."""
     if calibration is None:
         return dataset.robot.inverse_kinematic_matrix
+    if calibration.effects:
+        held = ", ".join(term.name for term in calibration.effects)
+        raise DataError(
+            f"the calibration {calibration.name!r} holds effects already ({held}), and discover begins at a plain "
+            "matrix; give one without effects, such as the plain.yaml beside it, or none"
+        )
     if calibration.robot.wheel_names != dataset.robot.wheel_names:
         ours, theirs = ", ".join(calibration.robot.wheel_names), ", ".join(dataset.robot.wheel_names)
         raise DataError(f"the calibration is for wheels {ours}, the data set {dataset.name} has {theirs}")

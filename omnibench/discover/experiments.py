@@ -37,7 +37,7 @@ def _config(dataset: Dataset, effect: NamedEffect, fit: Fit) -> str:
     noise = fit.noise.noise.model_dump()
     config = FlowerConfig.model_validate(
         {
-            "robot": dataset.robot.model_dump(),
+            "robot": dataset.robot.model_dump() | {"name": dataset.robot.name or "robot"},
             "sample_period": dataset.sample_period,
             "pose_period": max(0.2, dataset.sample_period),
             "commands": {
@@ -55,4 +55,11 @@ def _config(dataset: Dataset, effect: NamedEffect, fit: Fit) -> str:
             "train": {"seed": 1, "distance": max(6 * speed, 0.5)},
         }
     )
-    return to_yaml(config)
+    members = ", ".join((effect.name, *effect.confusable_with))
+    return to_yaml(
+        {
+            "name": f"{dataset.name}_experiment",
+            "description": f"Tells {members} apart; simulated with the first.",
+            "datasets": {"experiment": {"simulate": config.model_dump(mode="json", exclude_none=True)}},
+        }
+    )

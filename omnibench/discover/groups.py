@@ -108,6 +108,8 @@ def _lacks(effect: Effect, paths: Paths, sessions: tuple[str, ...]) -> str:
         return "the wheels' absolute angles were not recorded (columns phi_*)"
     if "session_time" in effect.needs and paths.signals.session_time is None:
         return "when the runs were driven was not recorded (column started_at)"
+    if "session" in effect.needs and any(log.session is None for log in paths.logs):
+        return "the session of some runs was not recorded (column session)"
     if not effect.parameters(paths.robot, sessions):
         return "all runs are of one session"
     return ""

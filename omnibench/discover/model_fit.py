@@ -9,7 +9,7 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.paths import Paths, make_paths
-from omnibench.discover.recording import Nuisances, deviation_of, log_of, without_jumps
+from omnibench.discover.recording import Nuisances, deviations_of, in_start_frames, log_of, without_jumps
 from omnibench.discover.whitened import Whitened, given, whitened
 from omnibench.fit.noise import NoiseEstimate, Whitener, estimate_noise
 from omnibench.robot.calibration import Noise
@@ -86,17 +86,13 @@ def fit_matrix(runs: Sequence[Trajectory], robot: Robot, sample_period: float, s
 def with_noise(fit: Fit) -> Fit:
     """The same with noise, nuisances and jumping poses estimated anew from its residuals."""
     near = fit.noise.noise if fit.noise is not _NOTHING_KNOWN else None
-    found = estimate_noise(fit.runs, fit.residuals, near)
+    found = estimate_noise(fit.runs, in_start_frames(fit.runs, fit.residuals), near)
     runs, jumps = without_jumps(fit.runs, fit.residuals, found.noise)
     if jumps:
         fit = _at(fit.model, runs, fit.nuisances, found, fit.jumps + jumps)
-        found = estimate_noise(fit.runs, fit.residuals, found.noise)
-    deviations = np.array(
-        [
-            deviation_of(fit.runs, fit.free_residuals, [slopes[..., kind] for slopes in fit.slopes], found.noise, kind)
-            for kind in range(3)
-        ]
-    )
+        found = estimate_noise(fit.runs, in_start_frames(fit.runs, fit.residuals), found.noise)
+    own, slopes = (in_start_frames(fit.runs, each) for each in (fit.free_residuals, fit.slopes))
+    deviations = deviations_of(fit.runs, own, slopes, found.noise)
     values = np.where(deviations > 0, fit.nuisances.values, 0.0)
     return _at(fit.model, fit.runs, Nuisances(values, deviations), found, fit.jumps)
 
@@ -131,6 +127,12 @@ def _coarser(log: WheelLog, together: int) -> WheelLog:
 def at_model(fit: Fit, model: OdometryModel) -> Fit:
     """The fit with another model; the nuisances follow: the most likely ones given the residuals that are left."""
     return _with_nuisances(_at(model, fit.runs, fit.nuisances, fit.noise, fit.jumps))
+
+
+def at_runs(fit: Fit, runs: Sequence[Trajectory]) -> Fit:
+    """The fit's model at other runs, of whose nuisances nothing is known but their size."""
+    nothing_known = Nuisances(np.zeros((len(runs), 3)), fit.nuisances.deviations)
+    return _at(fit.model, tuple(runs), nothing_known, fit.noise, 0)
 
 
 def _with_nuisances(fit: Fit) -> Fit:

@@ -30,10 +30,12 @@ ABSORBED = 1e-4  # share of its signature that an effect must keep beyond the ma
 _LEFT_RIGHT = 0.04  # share that right names leave, in the mean; wrong ones leave anything
 _BEYOND_RIGHT = 0.01  # likewise, when their forms may differ a little
 _MOST_ODDS = 10.0  # that another form may lend a name
-_CANCELLING = 0.35  # effects that undo each other to such a share imitate something else rather than being there all
+_CANCELLING = 0.45  # effects that undo each other to such a share imitate something else rather than being there all
+_SURELY = 3.0  # standard errors
 _IMITATION = 1.0  # odds, at most, that they are
-_WRONG = 0.1  # of what is missing is not in the catalogue
-_CREDIBLE = 0.3  # what is less likely to have a name in the catalogue gets none, and no model holds it
+_ODDS_OF_ONE = 9.0  # that what one name explains is in the catalogue; sums of several imitate what is not more often
+_ODDS_OF_TWO = 1.0
+_CREDIBLE = 0.55  # what is less likely to have a name in the catalogue gets none, and no model holds it
 _CONFUSABLE = 0.03
 
 
@@ -76,10 +78,12 @@ def name_effects(
     pool: list[Group] = []
     while len(chosen) < _MOST:
         others = [each for each in told if each.name not in _names(chosen)]
+        if not others or start.scores.shape[0] == 0:
+            break
         found = gains_of(data, [*groups.matrix.index, *_indices(chosen)], others, rng)
         steps.append(found)
         pool += [group for group in _best_shapes(found) if group not in pool]
-        if not others or found.p_value(found.best) > CHANCE:
+        if found.p_value(found.best) > CHANCE:
             break
         larger = _sets(start, pool, len(chosen) + 1)
         best = larger.best
@@ -200,10 +204,10 @@ def _known(sets: _Sets, start: Given, chosen: Sequence[Group], left: Gains, beyo
         (max(gain, of_forms), scatter, _LEFT_RIGHT),
         (*beyond.surplus_gain, _BEYOND_RIGHT),
     ]
-    odds = (1 - _WRONG) / _WRONG
+    odds = _ODDS_OF_ONE if len(chosen) == 1 else _ODDS_OF_TWO / (len(chosen) - 1)
     for (found, spread, usual), most in zip(shares, (np.inf, _MOST_ODDS), strict=True):
         odds *= min(_odds(found, float(np.sqrt(spread**2 + 4 * found)), energy, usual), most)
-    if len(chosen) > 1 and _cancelling(start, chosen) < _CANCELLING:
+    if (len(chosen) > 1 and _cancelling(start, chosen) < _CANCELLING) or _wrong_sign(start, chosen):
         odds = min(odds, _IMITATION)
     share = shares[0][0] / (shares[0][0] + energy)
     return share, odds / (1 + odds)
@@ -219,6 +223,17 @@ def _odds(left: float, spread: float, energy: float, usual: float) -> float:
         return float(np.exp(-(((left - expected) / spread) ** 2) / 2).mean())
 
     return likelihood(right) / max(likelihood(wrong), 1e-300)
+
+
+def _wrong_sign(start: Given, chosen: Sequence[Group]) -> bool:
+    """Whether a parameter is surely negative that physics allows to be positive only.
+
+    Euler steps in the recordings' making, for one, leave a centripetal slip of minus half a sample period.
+    """
+    values, covariance = start.estimate(_indices(chosen))
+    sure = values < -_SURELY * np.sqrt(np.diag(covariance))
+    parameters = [each for group in chosen for each in group.parameters]
+    return any(bool(wrong) and each.low == 0 for wrong, each in zip(sure, parameters, strict=True))
 
 
 def _cancelling(start: Given, chosen: Sequence[Group]) -> float:

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.actuators import Actuators
-from omnibench.discover.calibrations import calibration_of
+from omnibench.discover.calibrations import Request, calibration_of
 from omnibench.discover.experiments import experiments_for
 from omnibench.discover.extend import Extended, extend
 from omnibench.discover.groups import Group
-from omnibench.discover.held_out import compare_residuals, folds_of, held_out_residuals
+from omnibench.discover.held_out import compared, errors_of_repetitions, errors_on, floor_of
 from omnibench.discover.identify import absorbed_effects, classes_of, hidden_sizes, sums_of
 from omnibench.discover.look import Look
-from omnibench.discover.model_fit import Fit, at_model
+from omnibench.discover.model_fit import Fit, at_model, at_runs
 from omnibench.discover.naming import Named
 from omnibench.discover.novelty import novelties_of
 from omnibench.discover.recording import usable_runs, without_jumps
@@ -33,36 +34,51 @@ from omnibench.discover.result import (
 )
 from omnibench.discover.rivals import Rivals
 from omnibench.discover.significance import Gains
+from omnibench.discover.unknown_term import close_without_name, step_name, steps_of
 from omnibench.discover.verdict import headline_of, verdict_of
 from omnibench.fit.noise import Whitener
+from omnibench.report.numbers import plural
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 
+_FEW_RUNS, _FEW_COMMANDS = 10, 4
+_WORSE = 1.05  # times the plain matrix's error: more than chance makes of it
 _SHOWN = 0.01  # chance up to which a place is mentioned
 
 
 def told(
-    dataset: Dataset, plain: Fit, look: Look, rivals: Rivals, motors: Actuators | None, seed: int,
-    unknown_term: bool, began: float,
-) -> Discovery:  # fmt: skip
+    dataset: Dataset,
+    plain: Fit,
+    look: Look,
+    rivals: Rivals,
+    motors: Actuators | None,
+    request: Request,
+    began: float,
+) -> Discovery:
     """All that is said of a discovery."""
-    extended, fit = rivals.used, rivals.used.fit
-    bare = extend(at_model(fit, plain.model), ())
     effects, sure = _named_effects(rivals, motors)
-    where, left = places_of(look.places, "before"), places_of(look.named.left, "left")
+    where, left = places_of(look.places), places_of(look.named.left, left=True)
     if motors is not None:
-        where = where + places_of(motors.places, "before")
+        where, left = where + places_of(motors.places), left + places_of(motors.named.left, left=True)
     where = tuple(sorted(where, key=lambda place: (place.p_value, -place.excess)))
     verdict = verdict_of(effects, sure, left, where)
-    validation = _validation(dataset, fit)
+    notes: tuple[str, ...] = ()
+    if request.unknown_term and verdict in ("unknown", "incomplete"):
+        closed = close_without_name(plain, look, rivals)
+        rivals, notes = closed.rivals, (closed.note,)
+        effects, _ = _named_effects(rivals, motors)  # fitted anew, with the term
+    extended, fit = rivals.used, rivals.used.fit
+    bare = extend(at_model(fit, plain.model), ()) if extended.groups else extended
+    validation, doubts = _validation(dataset, fit)
     held_out = _held_out(extended, bare, validation)
-    steps = _steps(plain, bare, extended, validation)
-    options = {"without": [], "unknown_term": unknown_term}
-    headline = headline_of(verdict, effects, where, left)
+    steps = _steps(plain, bare, extended, validation.kept)
+    headline = " ".join([headline_of(verdict, effects, where, left), *_worse(held_out)])
+    of_session = any("session" in term.effect.needs for term in fit.model.terms)
     before, after = bare.fit.residuals, fit.residuals
     return Discovery(
-        dataset=replace(dataset, trajectories=(*fit.runs, *validation)),
+        dataset=replace(dataset, trajectories=(*fit.runs, *validation.kept)),
+        dataset_hash=dataset.hash,
         verdict=verdict,
         headline=headline,
         effects=effects,
@@ -73,17 +89,17 @@ def told(
         not_looked_for=look.groups.not_looked_for,
         classes=classes_of(look),
         hidden=hidden_sizes(look, rivals.named),
-        gap=held_out[-1].eq6,
+        gap=held_out[0 if of_session else -1].eq6,
         held_out=held_out,
         steps=steps,
-        novelties=novelties_of(validation, bare, rivals.models) if validation else (),
+        novelties=novelties_of(validation.kept, bare, rivals.models) if validation.kept else (),
         experiments=experiments_for(dataset, effects, classes_of(look), fit),
-        notes=_notes(look, fit),
+        notes=_notes(look, fit) + notes + doubts,
         noise=fit.noise,
         outliers=fit.jumps,
         poses=sum(len(own) for own in fit.residuals),
-        plain=calibration_of(dataset, bare, "plain", options, seed, _costs(steps[0]), headline),
-        extended=calibration_of(dataset, extended, "extended", options, seed, _costs(steps[-1]), headline),
+        plain=calibration_of(dataset, bare, "plain", request, headline),
+        extended=calibration_of(dataset, extended, "extended", request, headline),
         trajectories=tuple(run.id for run in fit.runs),
         before=before,
         after=after,
@@ -93,21 +109,19 @@ def told(
     )
 
 
-def places_of(gains: Gains, when: str) -> tuple[Place, ...]:
-    """The places that are no chance, the surest first; of each covariate one."""
-    best: dict[tuple[str, str], int] = {}
+def places_of(gains: Gains, *, left: bool = False) -> tuple[Place, ...]:
+    """The places that are no chance, the surest first; of each covariate one. left: after effects were added."""
+    best: dict[str, int] = {}
     for index in np.argsort(-gains.evidence, kind="stable"):
-        best.setdefault((gains.groups[index].name, "covariate"), int(index))
+        best.setdefault(gains.groups[index].name, int(index))
     found = []
     for index in sorted(best.values(), key=lambda each: -gains.evidence[each]):
         group, p_value = gains.groups[index], gains.p_value(index)
         assert group.basis is not None
         if p_value < _SHOWN:
-            share = float(gains.excess[index])
-            words = f"what is {when} depends on {group.basis.detail}" if when == "left" else (
-                f"the residual depends on {group.basis.detail}"
-            )  # fmt: skip
-            found.append(Place(group.name, group.basis.stage, p_value, share, int(gains.rank[index]), words))
+            words = f"the residual {'still ' if left else ''}depends on {group.basis.detail}"
+            excess, rank = float(gains.excess[index]), int(gains.rank[index])
+            found.append(Place(group.name, group.basis.stage, p_value, excess, rank, words))
     return tuple(found)
 
 
@@ -175,48 +189,98 @@ def _candidates(step: Gains, named: Named) -> tuple[Candidate, ...]:
     return tuple(sorted(best.values(), key=lambda each: -each.gain))
 
 
-def _validation(dataset: Dataset, fit: Fit) -> tuple[Trajectory, ...]:
-    """The validation runs without poses that jump."""
-    found = dataset.split("validation")
-    if not any(len(run.pose_times) > 1 for run in found):
-        return ()
-    runs = usable_runs(found)
-    kept, _ = without_jumps(runs, _residuals(fit.model, runs), fit.noise.noise)
-    return kept
+@dataclass(frozen=True, eq=False)
+class _HeldOutRuns:
+    """Runs of the validation split: all, and the same without poses that jump."""
+
+    runs: tuple[Trajectory, ...]
+    kept: tuple[Trajectory, ...]
 
 
-def _residuals(model: OdometryModel, runs: Sequence[Trajectory]) -> list[Array]:
-    """Reference minus model (K, 3) of each run."""
-    poses = model.reported([run.reference_log for run in runs])
-    return [run.poses[1:] - own for run, own in zip(runs, poses, strict=True)]
+def _validation(dataset: Dataset, fit: Fit) -> tuple[_HeldOutRuns, tuple[str, ...]]:
+    """The runs that the model can predict, and what is to be said of them."""
+    found = [run for run in dataset.split("validation") if len(run.pose_times) > 1]
+    able = [run for run in found if not _lacking(fit.model, run)]
+    doubts = list(_beyond_training(fit, able))
+    if len(able) < len(found):
+        doubts.append(f"{len(found) - len(able)} validation runs lack what an effect of the model needs: left out.")
+    if not able:
+        return _HeldOutRuns((), ()), tuple(doubts)
+    runs = usable_runs(able)
+    kept, jumps = without_jumps(runs, at_runs(fit, runs).residuals, fit.noise.noise)
+    if jumps:
+        doubts.append(f"{jumps} validation poses contradict their neighbours; chi2 is without them.")
+    return _HeldOutRuns(runs, kept), tuple(doubts)
 
 
-def _held_out(extended: Extended, bare: Extended, validation: Sequence[Trajectory]) -> tuple[HeldOut, ...]:
-    runs, noise = extended.fit.runs, extended.fit.noise.noise
-    folds = folds_of(runs)
-    before, after = (held_out_residuals(own, folds) for own in (bare, extended))
-    found = [compare_residuals("repetitions", runs, before, after, noise)]
-    if validation:
-        before, after = (_residuals(own.fit.model, validation) for own in (bare, extended))
-        found.append(compare_residuals("session", validation, before, after, noise))
+def _lacking(model: OdometryModel, run: Trajectory) -> bool:
+    needs = {need for term in model.terms for need in term.effect.needs}
+    missing = {
+        "wheel_angles": run.angles is None,
+        "session_time": run.started_at is None,
+        "session": run.session is None,
+    }
+    return any(missing.get(need, False) for need in needs)
+
+
+def _beyond_training(fit: Fit, runs: Sequence[Trajectory]) -> Iterator[str]:
+    """Sessions, and times in a session, of which the training runs say nothing."""
+    needs = {need: term.name for term in fit.model.terms for need in term.effect.needs}
+    known = {run.session for run in fit.runs}
+    if "session" in needs and (new := sorted({str(run.session) for run in runs} - {str(each) for each in known})):
+        yield f"{needs['session']} says nothing of sessions that were not trained on: {', '.join(new[:3])}."
+    latest = max((run.started_at or 0.0 for run in fit.runs), default=0.0)
+    late = [run.id for run in runs if (run.started_at or 0.0) > 1.1 * latest + 60]
+    if "session_time" in needs and late:
+        yield (
+            f"{needs['session_time']} was fitted to the first {latest:.0f} s of a session; {len(late)} validation runs "
+            "are later, where it is not known to hold."
+        )
+
+
+def _worse(held_out: Sequence[HeldOut]) -> Iterator[str]:
+    """A warning where the extended model predicts worse than the plain matrix."""
+    for each in held_out:
+        where = "the held-out session" if each.data == "session" else "repetitions that were held out"
+        sizes: list[tuple[str, float, float, str]] = [
+            ("in the cost of Eq. (6)", each.eq6.before, each.eq6.after, ""),
+            ("in position", 1e3 * each.position_m[0], 1e3 * each.position_m[1], " mm"),
+            ("in heading", math.degrees(each.heading_rad[0]), math.degrees(each.heading_rad[1]), " deg"),
+        ]
+        worse = [
+            f"{name} ({after:.3g}{unit}, {before:.3g}{unit} before)"
+            for name, before, after, unit in sizes
+            if after > _WORSE * before
+        ]
+        if worse:
+            yield f"Beware: on {where} the extended model is worse than the plain matrix {' and '.join(worse)}."
+
+
+def _held_out(extended: Extended, bare: Extended, validation: _HeldOutRuns) -> tuple[HeldOut, ...]:
+    floor = floor_of(extended.fit)
+    found = [compared("repetitions", errors_of_repetitions(bare), errors_of_repetitions(extended), floor)]
+    if validation.kept:
+        before, after = (errors_on(each, validation.runs, validation.kept) for each in (bare, extended))
+        own = floor_of(at_runs(extended.fit, validation.kept))
+        found.append(compared("session", before, after, own or floor))
     return tuple(found)
 
 
 def _steps(plain: Fit, bare: Extended, extended: Extended, validation: Sequence[Trajectory]) -> tuple[Step, ...]:
     fits = [("plain matrix", bare)]
-    for count in range(1, len(extended.groups) + 1):
+    for count in steps_of(extended.groups):
         partial = extended if count == len(extended.groups) else extend(plain, extended.groups[:count])
-        fits.append((f"+ {extended.groups[count - 1].name}", partial))
+        fits.append((f"+ {step_name(extended.groups[count - 1])}", partial))
     return tuple(_step(name, each.fit, extended.fit.noise.noise, validation) for name, each in fits)
 
 
 def _step(name: str, fit: Fit, noise: Noise, validation: Sequence[Trajectory]) -> Step:
-    held = _residuals(fit.model, validation) if validation else []
+    held = at_runs(fit, validation).residuals if validation else ()
     return Step(
         name,
         _chi2(noise, fit.runs, fit.residuals),
         _chi2(noise, validation, held) if held else None,
-        _eq6(fit.residuals),
+        _eq6(fit.free_residuals),
         _eq6(held) if held else None,
     )
 
@@ -230,10 +294,6 @@ def _eq6(residuals: Sequence[Array]) -> float:
     return float(np.mean([np.linalg.norm(own[-1]) for own in residuals]))
 
 
-def _costs(step: Step) -> tuple[float, float | None]:
-    return step.eq6_train, step.eq6_held_out
-
-
 def _white(fit: Fit, residuals: Sequence[Array]) -> tuple[Array, ...]:
     return tuple(
         Whitener(fit.noise.noise, run.pose_times[1:])(own) for run, own in zip(fit.runs, residuals, strict=True)
@@ -241,15 +301,26 @@ def _white(fit: Fit, residuals: Sequence[Array]) -> tuple[Array, ...]:
 
 
 def _notes(look: Look, fit: Fit) -> tuple[str, ...]:
-    notes = [f"Noise: {fit.noise.description}."]
+    notes = []
+    commands = len({run.command for run in fit.runs if run.command is not None})
+    if len(fit.runs) < _FEW_RUNS or 0 < commands < _FEW_COMMANDS:
+        few = f"{plural(len(fit.runs), 'run')}" + (f" of {plural(commands, 'command')}" if commands else "")
+        notes.append(f"These are {few}: so little can show hardly anything, and that nothing was found says little.")
+    notes.append(f"Noise: {fit.noise.description}.")
+    if fit.noise.source != "repetitions":
+        notes.append("Without repetitions of a command nothing says how small the errors could be: no gap is closed.")
     if fit.jumps:
-        poses = "pose that contradicts its" if fit.jumps == 1 else "poses that contradict their"
-        notes.append(f"{fit.jumps} reference {poses} neighbours left out.")
+        poses = (
+            "pose that contradicts its neighbours was"
+            if fit.jumps == 1
+            else "poses that contradict their neighbours were"
+        )
+        notes.append(f"{fit.jumps} reference {poses} left out.")
     heading, offset, slope = fit.nuisances.deviations
     for size, words in (
         (heading, f"start headings scatter from run to run by {np.degrees(heading):.2g} deg"),
         (offset, f"offsets of the reference's clock scatter from run to run by {1e3 * offset:.2g} ms"),
-        (slope, f"the reference's clock gains or loses {60e3 * slope:.2g} ms a minute, differently from run to run"),
+        (slope, f"the reference's clock gains or loses {60e3 * slope:.0f} ms a minute, differently from run to run"),
     ):
         if size:
             notes.append(f"{words[0].upper()}{words[1:]}; estimated for each run.")

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from omnibench.errors import PluginError
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
@@ -79,7 +80,7 @@ class Paths:
         """What an effect adds at its stage, of every sample."""
         parts = []
         for session, part in self.sessions:
-            parts.append(effect.correction(_part(self.signals, part, session), values))
+            parts.append(_corrected(effect, _part(self.signals, part, session), values))
         return np.concatenate(parts)
 
     def of_effect(self, effect: MotionEffect | ReferenceEffect, unit: str, values: Mapping[str, float]) -> Array:
@@ -92,7 +93,7 @@ class Paths:
         return self.of_velocity(change) if effect.stage == "world" else self.of_rates(change)
 
     def _of_reference(self, effect: ReferenceEffect, unit: str, values: Mapping[str, float]) -> Array:
-        step = _STEP * next(each.high for each in effect.parameters(self.robot) if each.name == unit)
+        step = _STEP * next(each.largest for each in effect.parameters(self.robot) if each.name == unit)
         after, before = (self.reported(effect, {**values, unit: sign * step}) for sign in (1, -1))
         return ((after - before) / (2 * step))[..., None]
 
@@ -231,6 +232,21 @@ def _sessions(logs: Sequence[WheelLog], counts: Sequence[int]) -> tuple[tuple[st
             found.append((log.session, slice(first, first + count)))
         first += count
     return tuple(found)
+
+
+def _corrected(effect: MotionEffect, signals: Signals, values: Mapping[str, float]) -> Array:
+    """An effect's correction. PluginError: it cannot be had, or is no such thing."""
+    width = {"body": 3, "world": 2}.get(effect.stage, signals.rates.shape[1])
+    way_out = f"try omnibench plugin check, or leave it out: --without {effect.name}"
+    try:
+        found = np.asarray(effect.correction(signals, values), dtype=float)
+    except Exception as error:  # a plug-in may raise anything
+        said = f"{type(error).__name__}: {error}"
+        raise PluginError(f"effect {effect.name!r}: its correction ended in {said}; {way_out}") from error
+    if found.shape != (len(signals.rates), width) or not np.isfinite(found).all():
+        expected = f"{(len(signals.rates), width)} finite values"
+        raise PluginError(f"effect {effect.name!r}: its correction is not {expected} but {found.shape}; {way_out}")
+    return found
 
 
 def _part(signals: Signals, part: slice, session: str | None) -> Signals:

@@ -16,10 +16,11 @@ from numpy.polynomial import chebyshev
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.paths import Paths
 from omnibench.robot.effects.effect import Stage
-from omnibench.robot.effects.smooth import ORDERS, lever, surfaces, waves
+from omnibench.robot.effects.smooth import lever, surfaces, waves
 from omnibench.robot.effects.smooth_wheels import HARMONICS, tents
 from omnibench.robot.kinematics import Array
 
+_ORDERS = 6  # of smooth functions of time
 _FREQUENCIES = 32  # of a clock's errors
 _GRID = 5  # places along each side of the area
 _NARROW = 0.02  # of the largest motion: how far from a motion another still counts as the same, at least
@@ -85,7 +86,7 @@ class _Modes:
 def _elapsed(paths: Paths, modes: _Modes) -> Iterator[Basis]:
     elapsed = paths.signals.elapsed
     longest = max(float(elapsed.max()), _SMALL)
-    columns = modes.all_of(paths, np.cos(np.pi * np.arange(ORDERS) * elapsed[:, None] / longest))
+    columns = modes.all_of(paths, np.cos(np.pi * np.arange(_ORDERS) * elapsed[:, None] / longest))
     yield Basis("elapsed time", "body", "the time since the start of a run", columns, term="smooth_elapsed_time",
                 shapes={"duration": longest})  # fmt: skip
 
@@ -136,7 +137,7 @@ def _order(paths: Paths, modes: _Modes, trajectories: Sequence[Trajectory]) -> I
     time = paths.signals.session_time
     if time is not None and len(paths.logs) > 3:
         longest = max(float(time.max()), _SMALL)
-        shares = chebyshev.chebvander(2 * time / longest - 1, ORDERS)[:, 1:]
+        shares = chebyshev.chebvander(2 * time / longest - 1, _ORDERS)[:, 1:]
         columns = [paths.of_twist(mode, shares) for mode in (modes.along, modes.rotation, modes.turn)]
         yield Basis("order of runs", "wheel", "the time since the start of the session",
                     np.concatenate(columns, axis=2), term="smooth_order_of_runs",
@@ -208,9 +209,12 @@ def _stamps(paths: Paths) -> Iterator[Basis]:
     shares = np.column_stack([np.ones(len(stamps)), stamps / stamps.max(), (-1.0) ** number])
     position, heading = velocity * [1.0, 1.0, 0.0], velocity * [0.0, 0.0, 1.0]
     columns = [each[:, :, None] * shares[:, None, :] for each in (position, heading)]
+    steps = [np.diff(log.stamps) for log in paths.logs if len(log.stamps) > 1]
+    finest = float(np.median(np.concatenate(steps)) if steps else stamps.max())
     yield Basis("stamps", "reference", "when the reference's poses are stamped", np.concatenate(columns, axis=2),
-                term="smooth_stamps", shapes={"duration": float(stamps.max())})  # fmt: skip
-    finest = float(np.median(np.concatenate([np.diff(log.stamps) for log in paths.logs if len(log.stamps) > 1])))
+                term="smooth_stamps", shapes={"duration": float(stamps.max()), "period": finest})  # fmt: skip
+    if not steps:
+        return
     frequencies = np.arange(1, _FREQUENCIES + 1) / (2 * finest * _FREQUENCIES)
     for frequency in frequencies:
         swings = waves(2 * np.pi * frequency * stamps, (1,))
@@ -224,8 +228,8 @@ def _command(paths: Paths, modes: _Modes, trajectories: Sequence[Trajectory]) ->
     if len(commands) < 4:
         return
     belongs = np.array([[run.command == command for command in commands] for run in trajectories], dtype=float)
-    numbers = belongs.argmax(axis=1)[paths.owner]
-    motions = np.array([np.median(paths.signals.twists[numbers == each], axis=0) for each in range(len(commands))])
+    twists, of_samples = paths.signals.twists, belongs[paths.owner] > 0
+    motions = np.array([np.median(twists[own], axis=0) for own in of_samples.T])
     columns = modes.each_of(paths, belongs[paths.owner])
     for command, own, shapes in zip(commands, columns, _near_motions(paths, motions), strict=True):
         yield Basis("command", "body", f"the command {command}", own, len(commands), "smooth_command", shapes)

@@ -159,13 +159,15 @@ class Experiment:
 class Discovery:
     """All that is said.
 
-    plain, extended: calibrations without and with the effects that were found. dataset: outliers taken out.
+    plain, extended: calibrations without and with the effects that were found. dataset: outliers taken out;
+    dataset_hash: of all of it.
     outliers: reference poses that were left out of the fits. before, after: residuals of the training runs, each
     (K, 3), reference minus odometry in m, m, rad, at pose_times[1:]; whitened_before, whitened_after: the same,
     independent and of unit variance under the noise.
     """
 
     dataset: Dataset
+    dataset_hash: str
     verdict: Verdict
     headline: str
     effects: tuple[NamedEffect, ...]

@@ -105,7 +105,7 @@ def _noise_scores(data: Whitened, fitted: list[int], groups: Sequence[Group]) ->
     """Scores (Z, p) of residuals without what is plainly there."""
     taken = list(fitted)
     now = given(data, taken)
-    for _ in range(_MOST_TAKEN):
+    for _ in range(_MOST_TAKEN if groups else 0):
         gain = np.array([now.gain(group.index) for group in groups])
         rank = np.array([now.rank(group.index) for group in groups], dtype=float)
         evidence = _evidence(gain[None], rank, np.ones(len(groups)), np.array([each.tries for each in groups]))[0]

@@ -15,16 +15,32 @@ def verdict_of(
 
     Motors are a stage of their own: naming what they do explains nothing that the odometry gets wrong.
     """
-    odometry = [effect for effect in effects if effect.stage != "actuator"]
-    unexplained = [place for place in where if place.p_value < CHANCE and not (odometry and place.stage != "actuator")]
-    if not effects:
-        return "unknown" if unexplained else "none"
-    if not odometry and any(place.stage != "actuator" for place in unexplained):
-        return "unknown"
-    something_left = any(place.p_value < CHANCE for place in left)
-    if all(effect.weight >= SURE for effect in effects):
-        return "incomplete" if something_left else "named"
-    return "class" if all(weight >= SURE for weight in sure_of_class) else "unknown"
+    of_odometry = _of_stage(effects, sure_of_class, left, where, motors=False)
+    return of_odometry if of_odometry != "none" else _of_stage(effects, sure_of_class, left, where, motors=True)
+
+
+def _of_stage(
+    effects: Sequence[NamedEffect],
+    sure_of_class: Sequence[float],
+    left: Sequence[Place],
+    where: Sequence[Place],
+    *,
+    motors: bool,
+) -> Verdict:
+    """The verdict on the motors alone, or on all that is behind them."""
+    pairs = zip(effects, sure_of_class, strict=True)
+    own = [(effect, sure) for effect, sure in pairs if (effect.stage == "actuator") == motors]
+    here, after = (
+        any(place.p_value < CHANCE and (place.stage == "actuator") == motors for place in places)
+        for places in (where, left)
+    )
+    if not own:
+        return "unknown" if here else "none"
+    if all(effect.weight >= SURE for effect, _ in own):
+        return "incomplete" if after else "named"
+    if all(sure >= SURE for _, sure in own):
+        return "class"
+    return "incomplete" if any(effect.weight >= SURE for effect, _ in own) else "unknown"
 
 
 def headline_of(verdict: Verdict, effects: Sequence[NamedEffect], where: Sequence[Place], left: Sequence[Place]) -> str:
@@ -35,12 +51,15 @@ def headline_of(verdict: Verdict, effects: Sequence[NamedEffect], where: Sequenc
     place = (odometry or list(where))[0].description if where else ""
     if verdict == "none":
         return "Nothing is missing that these recordings could show: what the matrix leaves looks like its noise."
+    remains = f" Something else is left: {left[0].description}." if left and left[0].p_value < CHANCE else ""
+    if verdict == "named" and all(effect.stage == "actuator" for effect in effects):
+        return f"Of the motors: {with_weights}. Nothing is missing in the odometry that these recordings could show."
     if verdict == "named":
-        return f"Missing: {with_weights}. With it the model predicts these recordings to within their noise."
+        return f"Missing: {with_weights}. With it the model predicts the training runs to within their noise."
     if verdict == "incomplete":
-        return f"Missing: {with_weights}. Something else is left: {left[0].description}."
+        return f"Missing: {with_weights}.{remains}"
     if verdict == "class":
-        return f"Missing: {names}. These recordings cannot tell which."
+        return f"Missing: {names}. These recordings cannot tell which.{remains}"
     if effects and all(effect.stage == "actuator" for effect in effects):
         return f"Something is missing that has no name: {place}. Of the motors: {with_weights}."
     if effects:

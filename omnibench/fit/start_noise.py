@@ -49,9 +49,9 @@ def separate_start_noise(
         rest = np.sqrt(max(constant**2 - deviation**2, 0.0))
         return noise.model_copy(update={"bias_heading": float(rest)})
 
-    before = surprise(groups, noise, 0.0)
+    before = _surprise(groups, noise, 0.0)
     first = minimize_scalar(
-        lambda deviation: surprise(groups, apart(deviation), deviation),
+        lambda deviation: _surprise(groups, apart(deviation), deviation),
         bounds=(0.0, min(max(2 * constant, 4 * noise.pose_heading, 1e-6), _LARGEST)),
         method="bounded",
         options={"xatol": 1e-6},
@@ -76,7 +76,7 @@ def by_stamps(differences: Sequence[Difference]) -> list[tuple[Array, Array]]:
     ]
 
 
-def surprise(groups: list[tuple[Array, Array]], noise: Noise, deviation: float) -> float:
+def _surprise(groups: list[tuple[Array, Array]], noise: Noise, deviation: float) -> float:
     """Minus twice the log-likelihood, less a constant."""
     total = 0.0
     for stamps, everything in groups:
@@ -104,11 +104,11 @@ def _polished(groups: list[tuple[Array, Array]], noise: Noise, deviation: float)
 
     count = sum(everything[..., 0].size for _, everything in groups)
     answer = minimize(
-        lambda logarithms: surprise(groups, *described(logarithms)) / count,
+        lambda logarithms: _surprise(groups, *described(logarithms)) / count,
         np.zeros(7),
         method="L-BFGS-B",
         bounds=[(-5.0, 5.0)] * 7,
         options={"eps": 1e-5, "ftol": 1e-10},
     )
     found, deviation = described(answer.x)
-    return found, deviation, surprise(groups, found, deviation)
+    return found, deviation, _surprise(groups, found, deviation)

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from discovery_samples import COUPLING, simulated
 
-from omnibench.config import parse_yaml
 from omnibench.data.importer import import_dataset
-from omnibench.data.simulate.config import FlowerConfig
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.source import read_simulation
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.result import Discovery
 from omnibench.errors import UnknownNameError
@@ -126,9 +124,9 @@ def test_squares_are_told_to_hold_motions_that_circles_had_not(omni3: Discovery)
     assert any("turning on the spot" in each.description for each in omni3.novelties)
 
 
-def test_the_experiment_that_tells_a_class_apart_does_so_when_it_is_simulated(omni3: Discovery) -> None:
+def test_the_experiment_that_tells_a_class_apart_does_so_when_it_is_simulated(omni3: Discovery, tmp_path: Path) -> None:
     assert omni3.experiments
-    config = FlowerConfig.model_validate(parse_yaml(omni3.experiments[0].config, "experiment"))
-    found = discover_effects(simulate_dataset(config).dataset)
+    (tmp_path / "experiment.yaml").write_text(omni3.experiments[0].config)
+    found = discover_effects(read_simulation(tmp_path / "experiment.yaml").simulate().dataset)
     assert found.effects[0].name == omni3.effects[0].name
     assert found.effects[0].weight >= 0.95

@@ -34,11 +34,13 @@ ROBOTS = {"three": APR_02, "four": MECANUM}
 
 
 def built_in(*kinds: type[Effect]) -> list[str]:
-    """Names of the built-in effects of some kinds."""
+    """Names of the built-in effects of some kinds that the catalogue holds."""
     return [
         entry.name
         for entry in effects.entries()
-        if entry.origin == "built in" and isinstance(effects.create(entry.name), kinds)
+        if entry.origin == "built in"
+        and isinstance(effect := effects.create(entry.name), kinds)
+        and effect.in_catalogue
     ]
 
 

@@ -32,6 +32,11 @@ class Parameter:
     description: str
     choices: tuple[float, ...] = ()
 
+    @property
+    def largest(self) -> float:
+        """The largest plausible size."""
+        return max(abs(self.low), abs(self.high))
+
 
 class Effect(ABC):
     """A term that can be added to the odometry model. Derive from one of the three kinds below.

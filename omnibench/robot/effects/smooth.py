@@ -19,11 +19,11 @@ from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals
 
-ORDERS = 6  # of functions of time
 NO_PHYSICS = "None: a function that was fitted to what the model left, without a cause."
 NO_SOURCE = "fitted to data"
 SURFACES = ("x", "y", "xx", "xy", "yy", "xxx", "xxy", "xyy", "yyy")
 _LARGEST = 0.1  # of a share
+_SLOW = 1e-3  # m/s
 _MODES = {
     "along": "along the way",
     "across": "across the way, to the left",
@@ -113,7 +113,7 @@ class SmoothEffect(MotionEffect):
         return added
 
 
-_TIMES = tuple(str(order) for order in range(ORDERS))
+_TIMES = tuple(str(order) for order in range(16))
 
 
 @effects.register("smooth_elapsed_time")
@@ -129,7 +129,7 @@ class SmoothElapsedTime(SmoothEffect):
 
     def shares(self, signals: Signals, values: Values) -> Array:
         part = np.clip(signals.elapsed / values["duration"], 0.0, 1.0)
-        return np.cos(np.pi * np.arange(ORDERS) * part[:, None])
+        return np.cos(np.pi * np.arange(len(_TIMES)) * part[:, None])
 
 
 _TURNS = ("cos1", "sin1", "cos2", "sin2", "cos3", "sin3")
@@ -151,7 +151,10 @@ class SmoothHeading(SmoothEffect):
 
 @effects.register("smooth_course")
 class SmoothCourse(SmoothEffect):
-    """Without a name: a steady push along the way in the world, and two harmonics of the direction of travel there."""
+    """Without a name: a steady push along the way in the world, and two harmonics of the direction of travel there.
+
+    The harmonics fade to zero below 1 mm/s, where there is no direction of travel.
+    """
 
     shows_in = "heading"
     needs = frozenset({"poses"})
@@ -164,7 +167,9 @@ class SmoothCourse(SmoothEffect):
 
     def shares(self, signals: Signals, values: Values) -> Array:  # noqa: ARG002
         assert signals.poses is not None  # they are needed
-        return waves(signals.poses[:, 2] + np.arctan2(signals.twists[:, 1], signals.twists[:, 0]), (1, 2))
+        forward, left, _ = signals.twists.T
+        driving = np.minimum(1.0, np.hypot(forward, left) / _SLOW)
+        return driving[:, None] * waves(signals.poses[:, 2] + np.arctan2(left, forward), (1, 2))
 
     def correction(self, signals: Signals, values: Values) -> Array:
         assert signals.poses is not None
@@ -236,7 +241,7 @@ class SmoothOrderOfRuns(SmoothEffect):
     shows_in = "order of runs"
     needs = frozenset({"session_time"})
     modes = ("along", "rotation", "turn")
-    labels = tuple(str(order) for order in range(1, ORDERS + 1))
+    labels = tuple(str(order) for order in range(1, 13))
     fixed_parameters = (
         *shared(modes, labels, "the session's time"),
         scale("duration", "s", 1e-3, 1e9, 3600.0, "of the longest session that was seen"),
@@ -245,5 +250,5 @@ class SmoothOrderOfRuns(SmoothEffect):
     def shares(self, signals: Signals, values: Values) -> Array:
         assert signals.session_time is not None  # it is needed
         unit = np.clip(2 * signals.session_time / values["duration"] - 1, -1.0, 1.0)
-        functions: Array = chebyshev.chebvander(unit, ORDERS)[:, 1:]
+        functions: Array = chebyshev.chebvander(unit, len(self.labels))[:, 1:]
         return functions

@@ -67,14 +67,15 @@ class SmoothStamps(ReferenceEffect):
             for kind, words in (
                 ("always", "always"),
                 ("late", "at the last stamp, more than at 0"),
-                ("alternating", "the first, third, ... pose, and later the second, fourth, ..."),
+                ("alternating", "every other pose, and later those between"),
             )
         ),
         scale("duration", "s", 1e-3, 1e6, 30.0, "the last stamp that was seen"),
+        scale("period", "s", 1e-6, 1e6, 0.25, "from one pose to the next"),
     )
 
     def delays(self, stamps: Array, values: Values) -> tuple[Array, Array]:
-        late, turns = np.clip(stamps / values["duration"], 0.0, 1.0), (-1.0) ** np.arange(len(stamps))
+        late, turns = np.clip(stamps / values["duration"], 0.0, 1.0), (-1.0) ** np.rint(stamps / values["period"])
         position, heading = (
             values[f"{what}_always"] + values[f"{what}_late"] * late + values[f"{what}_alternating"] * turns
             for what in ("position", "heading")

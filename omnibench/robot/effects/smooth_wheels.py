@@ -12,16 +12,19 @@ from omnibench.robot.effects.wheel_angle import ripple
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import STILL, Signals
 
-KNOTS = 8  # of wheel rates
+KNOTS = 8  # of each wheel's rate
+_COMMON_KNOTS = 33
 HARMONICS = (0.5, *(float(number) for number in range(1, 17)), 1.5, 2.5, 3.5)  # of a wheel's turn
 
+_TOP = scale("top", "rad/s", 1e-6, 1e6, 6.0, "the fastest rate that was seen; knots are spread from -top to top")
 
-def tents(rates: Array, top: float) -> Array:
-    """Piecewise linear functions (..., 8) of rates between -top and top, rad/s, the outermost held beyond.
+
+def tents(rates: Array, top: float, knots_between: int = KNOTS) -> Array:
+    """Piecewise linear functions (..., K) of rates between -top and top, rad/s, the outermost held beyond.
 
     Zero for wheels that stand.
     """
-    knots = np.linspace(-top, top, KNOTS)
+    knots = np.linspace(-top, top, knots_between)
     found = np.maximum(0.0, 1 - np.abs(np.clip(rates, -top, top)[..., None] - knots) / (knots[1] - knots[0]))
     moving: Array = found * (np.abs(rates) > STILL)[..., None]
     return moving
@@ -42,12 +45,34 @@ class SmoothWheelRate(MotionEffect):
             one_for_each_wheel(robot, f"change_{knot}", "rad/s", -0.02, 0.02, f"change at knot {knot} of 0 to 7")
             for knot in range(KNOTS)
         ]
-        top = scale("top", "rad/s", 1e-6, 1e6, 6.0, "the fastest rate that was seen; knots are spread from -top to top")
-        return (*(each for knot in at_knots for each in knot), top)
+        return (*(each for knot in at_knots for each in knot), _TOP)
 
     def correction(self, signals: Signals, values: Values) -> Array:
         heights = np.array([of_wheels(signals.robot, f"change_{knot}", values) for knot in range(KNOTS)])
         added: Array = np.einsum("fnk,kn->fn", tents(signals.rates, values["top"]), heights)
+        return added
+
+
+@effects.register("smooth_common_rate")
+class SmoothCommonRate(MotionEffect):
+    """Without a name: a finer function of the wheel rate, the same for all wheels, held beyond the rates seen."""
+
+    stage = "wheel"
+    physics = NO_PHYSICS
+    source = NO_SOURCE
+    shows_in = "wheel rate"
+    in_catalogue = False
+    fixed_parameters = (
+        *(
+            Parameter(f"change_{knot}", "rad/s", -0.02, 0.02, f"change at knot {knot} of 0 to {_COMMON_KNOTS - 1}")
+            for knot in range(_COMMON_KNOTS)
+        ),
+        _TOP,
+    )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        heights = np.array([values[f"change_{knot}"] for knot in range(_COMMON_KNOTS)])
+        added: Array = tents(signals.rates, values["top"], _COMMON_KNOTS) @ heights
         return added
 
 

@@ -1,0 +1,270 @@
+"""Smooth functions without a name: what they add, where they end, and the same in a stream as in a batch."""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from unittest import SkipTest
+
+import numpy as np
+import pytest
+from effect_samples import APR_02, PERIOD, ROBOTS, SESSIONS, a_drive, a_term, at_every_sample, model, streamed
+from hypothesis import given
+from hypothesis import strategies as st
+
+from omnibench.registry import effects
+from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows, read_calibration, write_calibration
+from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
+from omnibench.robot.effects.term import make_term
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import Integration, advance
+from omnibench.robot.signals import Signals, signals_of
+from omnibench.testing import EffectConformance
+
+MOTION = (
+    *("smooth_elapsed_time", "smooth_heading", "smooth_course", "smooth_place", "smooth_patch", "smooth_command"),
+    *("smooth_order_of_runs", "smooth_wheel_rate", "smooth_common_rate", "smooth_wheel_angle", "smooth_acceleration"),
+)
+REFERENCE = ("smooth_map", "smooth_stamps", "smooth_stamp_wave")
+seeds = st.integers(0, 2**32 - 1)
+
+
+def signals(**changes: Array) -> Signals:
+    """One sample of an APR-02, standing at the origin but for what is said."""
+    log = replace(a_drive(1, 1), rates=np.zeros((1, 3)), start=np.zeros(3))
+    return replace(signals_of(log, APR_02, APR_02.inverse_kinematic_matrix, PERIOD, with_poses=True), **changes)
+
+
+def added(name: str, given_signals: Signals, **values: float) -> Array:
+    """The correction of a sample; all that is not said is 0, or as usual if it shapes the function."""
+    effect = effects.create(name)
+    assert isinstance(effect, MotionEffect)
+    usual = {each.name: each.choices[0] if each.choices else 0.0 for each in effect.parameters(APR_02, SESSIONS)}
+    return effect.correction(given_signals, usual | values)[0]
+
+
+def driving(vx: float, vy: float, omega: float) -> Array:
+    return np.array([[vx, vy, omega]])
+
+
+def at(x: float, y: float, heading: float = 0.0) -> Array:
+    return np.array([[x, y, heading]])
+
+
+@pytest.mark.parametrize("name", [*MOTION, *REFERENCE])
+def test_a_smooth_term_conforms(name: str) -> None:
+    suite = type("Suite", (EffectConformance,), {"name": name})()
+    for case in dir(suite):
+        if case.startswith("test_"):
+            with suppress(SkipTest):  # a case for effects of another kind
+                getattr(suite, case)()
+
+
+@pytest.mark.parametrize("name", [*MOTION, *REFERENCE])
+def test_a_smooth_term_is_no_name(name: str) -> None:
+    assert not effects.create(name).in_catalogue
+
+
+def test_all_that_is_no_name_is_tested_here() -> None:
+    nameless = {entry.name for entry in effects.entries() if not effects.create(entry.name).in_catalogue}
+    assert nameless == {*MOTION, *REFERENCE}
+
+
+@pytest.mark.parametrize("integration", ["euler", "arc"])
+@pytest.mark.parametrize("name", MOTION)
+@given(seed=seeds, robot=st.sampled_from(sorted(ROBOTS)), samples=st.integers(1, 60))
+def test_a_stream_equals_a_batch_with_every_smooth_term(
+    name: str, integration: Integration, seed: int, robot: str, samples: int
+) -> None:
+    log = at_every_sample(a_drive(seed, samples, ROBOTS[robot]))
+    chosen = model(a_term(name, ROBOTS[robot], seed), robot=ROBOTS[robot], integration=integration)
+    stream = chosen.stream(log.start, log.session, log.started_at or 0.0)
+    np.testing.assert_allclose(streamed(stream, log), chosen.poses([log])[0], rtol=0, atol=1e-12)
+
+
+@given(seed=seeds, samples=st.integers(1, 60))
+def test_poses_are_those_of_the_uncorrected_path_in_the_middle_of_the_samples(seed: int, samples: int) -> None:
+    log, pose = a_drive(seed, samples), np.zeros(3)
+    found = signals_of(log, APR_02, APR_02.inverse_kinematic_matrix, PERIOD, with_poses=True)
+    assert found.poses is not None
+    pose = log.start
+    for twist, duration, expected in zip(found.twists, found.durations, found.poses, strict=True):
+        after = advance(pose, twist * duration, "arc")
+        np.testing.assert_allclose((pose + after) / 2, expected, rtol=0, atol=1e-12)
+        pose = after
+
+
+def test_poses_are_not_computed_for_those_who_do_not_ask() -> None:
+    assert signals_of(a_drive(1), APR_02, APR_02.inverse_kinematic_matrix, PERIOD).poses is None
+
+
+def test_a_stream_that_is_put_elsewhere_has_its_poses_from_there_on() -> None:
+    log = at_every_sample(a_drive(3))
+    chosen = model(a_term("smooth_place", APR_02, 3))
+    stream = chosen.stream(np.zeros(3), log.session, log.started_at or 0.0)
+    stream.step(np.ones(3), 0.1)
+    stream.pose = log.start.copy()
+    np.testing.assert_allclose(streamed(stream, log), chosen.poses([log])[0], rtol=0, atol=1e-12)
+
+
+def test_a_motion_that_takes_no_time_moves_the_uncorrected_path_as_well() -> None:
+    chosen = model(make_term("smooth_heading", usual("smooth_heading") | {"along_sin1": 0.1}, APR_02))
+    stream, quarter = chosen.stream(), np.linalg.solve(chosen.matrix, [0.0, 0.0, math.pi / 2])
+    stream.drive(quarter, 0.0)
+    stream.step(np.linalg.solve(chosen.matrix, [0.5, 0.0, 0.0]), 0.1)
+    np.testing.assert_allclose(stream.moved, [0.055, 0.0, 0.0], atol=1e-12)
+
+
+def usual(name: str) -> dict[str, float]:
+    return {
+        each.name: each.choices[0] if each.choices else 0.0
+        for each in effects.create(name).parameters(APR_02, SESSIONS)
+    }
+
+
+def test_the_heading_is_the_references_in_a_stream_whose_frame_is_turned() -> None:
+    chosen = model(make_term("smooth_heading", usual("smooth_heading") | {"along_sin1": 0.1}, APR_02))
+    stream = chosen.stream()
+    stream.frame_heading = math.pi / 2
+    stream.step(np.linalg.solve(chosen.matrix, [0.5, 0.0, 0.0]), 0.1)
+    np.testing.assert_allclose(stream.moved, [0.055, 0.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("mode", "expected"),
+    [("along", [0.03, 0.04, 0.0]), ("across", [-0.04, 0.03, 0.0]), ("turn", [0.0, 0.0, 0.1 * (0.6 + 0.5 / 0.195)])],
+)
+def test_a_share_changes_the_motion_along_across_and_in_turning(mode: str, expected: list[float]) -> None:
+    found = added("smooth_elapsed_time", signals(twists=driving(0.3, 0.4, -0.6)), **{f"{mode}_0": 0.1})
+    np.testing.assert_allclose(found, expected, atol=1e-15)
+
+
+def test_cosines_of_the_elapsed_time_end_with_the_longest_run_and_are_held() -> None:
+    def after(elapsed: float) -> float:
+        one = signals(elapsed=np.array([elapsed]), twists=driving(1.0, 0.0, 0.0))
+        return float(added("smooth_elapsed_time", one, along_3=0.1, duration=2.0)[0])
+
+    assert after(0.5) == pytest.approx(0.1 * math.cos(3 * math.pi / 4))
+    assert after(2.0) == pytest.approx(-0.1)
+    assert after(1000.0) == after(2.0)
+
+
+def test_polynomials_of_the_sessions_time_are_held_after_the_longest_session() -> None:
+    def after(time: float) -> float:
+        one = signals(session_time=np.array([time]), twists=driving(0.0, 0.0, 1.0))
+        return float(added("smooth_order_of_runs", one, rotation_2=0.1, duration=100.0)[2])
+
+    assert after(75.0) == pytest.approx(0.1 * (2 * 0.5**2 - 1))
+    assert after(1e6) == after(100.0) == pytest.approx(0.1)
+
+
+def test_polynomials_of_the_place_are_held_beyond_the_places_that_were_seen() -> None:
+    area = {"centre_x": 1.0, "centre_y": -1.0, "reach": 2.0}
+
+    def here(x: float, y: float) -> float:
+        return float(added("smooth_place", signals(poses=at(x, y), twists=driving(1.0, 0.0, 0.0)), along_xxy=0.1,
+                           **area)[0])  # fmt: skip
+
+    assert here(2.0, 0.0) == pytest.approx(0.1 * 0.5**3)
+    assert here(101.0, 99.0) == pytest.approx(0.1 * math.sqrt(0.5) ** 3)
+
+
+@pytest.mark.parametrize("away", [0.0, 0.5, 5.0])
+def test_a_patch_fades_to_zero(away: float) -> None:
+    one = signals(poses=at(1.0, away - 2.0), twists=driving(1.0, 0.0, 0.0))
+    found = added("smooth_patch", one, along_bump=0.1, centre_x=1.0, centre_y=-2.0, radius=0.5)
+    assert found[0] == pytest.approx(0.1 * math.exp(-((away / 0.5) ** 2)))
+
+
+def test_other_motions_than_the_commands_are_hardly_changed() -> None:
+    near = {"along_bump": 0.1, "vx": 0.3, "vy": 0.0, "omega": 1.0, "width": 0.05}
+    assert added("smooth_command", signals(twists=driving(0.3, 0.0, 1.0)), **near)[0] == pytest.approx(0.03)
+    turned = added("smooth_command", signals(twists=driving(0.3, 0.0, 2.0)), **near)[0]
+    assert turned == pytest.approx(0.03 * math.exp(-((0.195 / 0.05) ** 2) / 2))
+
+
+def test_a_push_in_the_world_turns_with_the_robot() -> None:
+    one = signals(poses=at(0.0, 0.0, math.pi / 2), twists=driving(0.3, 0.4, 0.0))
+    np.testing.assert_allclose(added("smooth_course", one, east=0.1), [0.0, -0.05, 0.0], atol=1e-15)
+
+
+def test_the_course_is_heading_and_direction_of_travel() -> None:
+    one = signals(poses=at(0.0, 0.0, 0.4), twists=driving(0.0, 0.5, 0.0))
+    found = added("smooth_course", one, along_sin2=0.1)
+    np.testing.assert_allclose(found, [0.0, 0.05 * math.sin(2 * (0.4 + math.pi / 2)), 0.0], atol=1e-15)
+
+
+@pytest.mark.parametrize(("name", "knots"), [("smooth_wheel_rate", 8), ("smooth_common_rate", 33)])
+def test_a_function_of_the_wheel_rate_is_linear_between_knots_held_beyond_and_nothing_at_rest(
+    name: str, knots: int
+) -> None:
+    each = ("_a", "_b", "_c") if name == "smooth_wheel_rate" else ("",)
+    spread = {f"change_{knot}{wheel}": 0.01 * (2 * knot / (knots - 1) - 1) for knot in range(knots) for wheel in each}
+    found = added(name, signals(rates=np.array([[1.3, -50.0, 5e-4]])), top=2.0, **spread)
+    np.testing.assert_allclose(found, [0.01 * 1.3 / 2, -0.01, 0.0], atol=1e-15)
+
+
+def test_a_wave_of_the_wheel_angle_is_its_mean_over_the_sample() -> None:
+    found = added("smooth_wheel_angle", signals(rates=np.array([[2.0, 0.0, 0.0]]), durations=np.array([0.1]),
+                  wheel_angles=np.array([[0.3, 0.0, 0.0]])), b_a=0.02, harmonic=2.5)  # fmt: skip
+    begin, end = 0.3 - 0.1, 0.3 + 0.1
+    np.testing.assert_allclose(found, [0.02 * (math.cos(2.5 * begin) - math.cos(2.5 * end)) / 2.5 / 0.1, 0, 0])
+
+
+def test_changes_by_acceleration_end_with_the_largest_that_was_seen() -> None:
+    fast, twist = np.array([[6.0, 8.0, -9.0]]), driving(0.3, 0.4, 2.0)
+    one = signals(accelerations=fast, twists=twist)
+    seen = {"top": 5.0, "top_turning": 4.0}
+    np.testing.assert_allclose(added("smooth_acceleration", one, straight=0.1, **seen), [0.3, 0.4, 0.0])
+    np.testing.assert_allclose(added("smooth_acceleration", one, aside=0.1, **seen), [-0.4, 0.3, 0.0])
+    turning = added("smooth_acceleration", one, about_x=0.1, about_omega=0.01, about_size=0.2, **seen)
+    np.testing.assert_allclose(turning, [0.0, 0.0, 0.3 - 0.04 + 1.0])
+    np.testing.assert_allclose(added("smooth_acceleration", one, rotation=0.1, **seen), [0.0, 0.0, 1.0])
+
+
+def test_a_bent_map_agrees_at_the_start_and_is_held_beyond_the_places_that_were_seen() -> None:
+    effect = effects.create("smooth_map")
+    assert isinstance(effect, ReferenceEffect)
+    values = usual("smooth_map") | {"y_xx": 0.01, "centre_x": 0.0, "centre_y": 0.0, "reach": 2.0}
+    poses = np.array([[1.0, 0.0, 0.3], [2.0, 0.0, 0.4], [9.0, 0.0, 0.5]])
+    shift = effect.reported(poses, poses[0], values) - poses
+    np.testing.assert_allclose(shift, [[0, 0, 0], [0, 0.0075, 0], [0, 0.0075, 0]], atol=1e-15)
+
+
+def test_delays_alternate_grow_and_swing_with_the_stamps() -> None:
+    stamps = np.array([0.25, 0.5, 8.0])
+    stamped, wave = effects.create("smooth_stamps"), effects.create("smooth_stamp_wave")
+    assert isinstance(stamped, ReferenceEffect)
+    assert isinstance(wave, ReferenceEffect)
+    values = usual("smooth_stamps") | {
+        "position_late": 0.1,
+        "heading_alternating": 0.05,
+        "duration": 1.0,
+        "period": 0.25,
+    }
+    position, heading = stamped.delays(stamps, values)
+    np.testing.assert_allclose(position, [0.025, 0.05, 0.1])
+    np.testing.assert_allclose(heading, [-0.05, 0.05, 0.05])
+    position, heading = wave.delays(stamps, {"cos": 0.0, "sin": 0.01, "frequency": 1.0})
+    np.testing.assert_allclose(position, [0.01, 0.0, 0.0], atol=1e-15)
+    np.testing.assert_array_equal(position, heading)
+
+
+@pytest.mark.parametrize("name", [*MOTION, *REFERENCE])
+def test_a_calibration_file_holds_all_that_a_smooth_term_needs(name: str, tmp_path: Path) -> None:
+    chosen = a_term(name, APR_02, 5)
+    written = Calibration(
+        name="smooth",
+        robot=APR_02,
+        sample_period=PERIOD,
+        matrix=matrix_rows(APR_02.inverse_kinematic_matrix),
+        integration="arc",
+        effects=(EffectTerm(name=name, parameters=dict(chosen.values)),),
+    )
+    write_calibration(written, tmp_path / "smooth.yaml")
+    log = replace(a_drive(5), start=np.zeros(3))
+    found = read_calibration(tmp_path / "smooth.yaml").model.reported([log])[0]
+    np.testing.assert_array_equal(found, model(chosen).reported([log])[0])
+    assert np.abs(found - model().reported([log])[0]).max() > 1e-6
