@@ -68,12 +68,14 @@ def calibration_of(
 
 def _cost(extended: Extended, runs: Sequence[Trajectory]) -> float | None:
     """Eq. (6) of runs as they were recorded; None without runs, or where they lack what an effect needs."""
+    if not runs:
+        return None
     try:
         poses = extended.fit.model.reported([run.final_log for run in runs])
     except DataError:
         return None
     errors = [np.linalg.norm(run.final_pose - own[-1]) for run, own in zip(runs, poses, strict=True)]
-    return float(np.mean(errors)) if errors else None
+    return float(np.mean(errors))
 
 
 def _with_shapes(extended: Extended) -> Array:

@@ -4,8 +4,9 @@ Every set A of at most m effects lowers the whitened chi2 by Q(A) and costs what
 the data say: Liang et al. 2008) and its choice among the catalogue are worth. The form that the catalogue gives an
 effect is an idealisation, off by a share ``DISCREPANCY`` of its size: with an effect of non-centrality N that moves
 differences in Q by DISCREPANCY^2 N times as much as noise does, so that evidence counts that much less. A name's
-weight is the sum over the sets that hold it, times the probability that what is there is in the catalogue at all:
-what generic bases still find after the effects, in their own forms or slightly different ones, says how likely that is.
+weight is its probability against all others in its place, the other names given, times the probability that what is
+there is in the catalogue at all: what generic bases still find after the effects, in their own forms or slightly
+different ones, says how likely that is.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ _BEYOND_RIGHT = 0.01  # likewise, when their forms may differ a little
 _MOST_ODDS = 10.0  # that another form may lend a name
 _CANCELLING = 0.45  # effects that undo each other to such a share imitate something else rather than being there all
 _SURELY = 3.0  # standard errors
+_MOSTLY = 0.3  # what is left of what was left
 _IMITATION = 1.0  # odds, at most, that they are
 _ODDS_OF_ONE = 9.0  # that what one name explains is in the catalogue; sums of several imitate what is not more often
 _ODDS_OF_TWO = 1.0
@@ -88,7 +90,9 @@ def name_effects(
         larger = _sets(start, pool, len(chosen) + 1)
         best = larger.best
         if len(best) <= len(chosen):
-            break
+            best = (*chosen, found.groups[found.best])
+            if not _explains_what_is_left(data, groups, chosen, best, rng):
+                break
         if not all(
             confirmed([*groups.matrix.index, *_indices([other for other in best if other is not each])], each.index)
             for each in best
@@ -102,20 +106,68 @@ def name_effects(
     if chosen:
         forms = [index for group in chosen for index in group.forms]
         share, known = _known(sets, start, chosen, left, gains_of(data, [*fitted, *forms], groups.places, rng))
-    weights = {name: known * weight for name, weight in sets.weights(chosen).items()}
-    if known < _CREDIBLE:
+    if chosen and known < _CREDIBLE:
         chosen, left = (), gains_of(data, groups.matrix.index, groups.places, rng)
     ordered = tuple(sorted(chosen, key=lambda group: -start.gain(group.index)))
+    rivals = [_rivals(start, pool, ordered, place) for place in range(len(ordered))]
+    weights: dict[str, float] = {}
+    for own in rivals:
+        for group, weight in own:
+            weights[group.name] = max(weights.get(group.name, 0.0), known * weight)
+    stand_ins = tuple(
+        tuple(other for other, weight in own if other.name != group.name and weight > _CONFUSABLE)
+        for group, own in zip(ordered, rivals, strict=True)
+    )
     return Named(
         ordered,
         weights,
         known,
-        tuple(tuple(each.name for each in sets.stand_ins(group, chosen)) for group in ordered),
-        tuple(sets.stand_ins(group, chosen) for group in ordered),
+        tuple(tuple(each.name for each in own) for own in stand_ins),
+        stand_ins,
         tuple(steps),
         left,
         share,
     )
+
+
+def _rivals(start: Given, pool: Sequence[Group], chosen: Sequence[Group], place: int) -> list[tuple[Group, float]]:
+    """What could stand in one place among the chosen effects, the others given, with its probability there."""
+    others = [group for index, group in enumerate(chosen) if index != place]
+    now = start.given(_indices(others))
+    best: dict[str, Group] = {chosen[place].name: chosen[place]}
+    for group in pool:
+        taken = best.get(group.name)
+        if group.name not in _names(chosen) and (taken is None or now.gain(group.index) > now.gain(taken.index)):
+            best[group.name] = group
+    groups = list(best.values())
+    gain = np.array([now.gain(group.index) for group in groups])
+    rank = np.array([now.rank(group.index) for group in groups])
+    evidence = _evidence_of(gain, rank, float(max((gain - rank).max(), 0.0)))
+    evidence -= [np.log(group.tries) for group in groups]
+    likely = np.exp(evidence - evidence.max())
+    ordered = sorted(zip(groups, likely / likely.sum(), strict=True), key=lambda pair: -pair[1])
+    return [(group, float(weight)) for group, weight in ordered]
+
+
+def _evidence_of(gain: Array, rank: Array, energy: float) -> Array:
+    """Logarithms of the evidence of gains; what other forms of effects of such an energy could do is none."""
+    trusted = gain / (1 + DISCREPANCY**2 * energy)
+    found: Array = (trusted - rank - rank * np.log(np.maximum(trusted / np.maximum(rank, 1), 1.0))) / 2
+    return found
+
+
+def _explains_what_is_left(
+    data: Whitened, groups: Groups, chosen: Sequence[Group], larger: Sequence[Group], rng: np.random.Generator
+) -> bool:
+    """Whether a larger set makes most of what generic bases find after the smaller one go away.
+
+    An idealised form leaves something, too, but hardly just what another effect makes.
+    """
+    before, after = (
+        gains_of(data, [*groups.matrix.index, *_indices(each)], groups.places, rng).surplus_gain
+        for each in (chosen, larger)
+    )
+    return bool(chosen) and before[0] > _SURELY * before[1] and after[0] < _MOSTLY * before[0]
 
 
 def _indices(chosen: Sequence[Group]) -> list[int]:
@@ -148,36 +200,6 @@ class _Sets:
     def best(self) -> tuple[Group, ...]:
         return self.sets[int(self.evidence.argmax())]
 
-    @property
-    def probabilities(self) -> Array:
-        likely = np.exp(self.evidence - self.evidence.max())
-        return np.asarray(likely / likely.sum())
-
-    def weights(self, chosen: Sequence[Group]) -> dict[str, float]:
-        """Of every name, the sum over the sets that hold it; where some were chosen, something is known to be there."""
-        found: dict[str, float] = {}
-        likely = self.probabilities
-        if chosen:
-            likely = np.where([bool(each) for each in self.sets], likely, 0.0)
-            likely = likely / likely.sum()
-        for each, probability in zip(self.sets, likely, strict=True):
-            for name in _names(each):
-                found[name] = found.get(name, 0.0) + float(probability)
-        return found
-
-    def stand_ins(self, group: Group, chosen: Sequence[Group]) -> tuple[Group, ...]:
-        """Effects that could stand in a group's place among those that were chosen, the likeliest first."""
-        others = _names(chosen) - {group.name}
-        found: dict[str, tuple[float, Group]] = {}
-        for each, probability in zip(self.sets, self.probabilities, strict=True):
-            names = _names(each)
-            if group.name not in names and others <= names and len(each) == len(chosen):
-                (other,) = (own for own in each if own.name not in others)
-                before, best = found.get(other.name, (0.0, other))
-                found[other.name] = before + float(probability), best
-        likely = sorted(found.values(), key=lambda item: -item[0])
-        return tuple(other for weight, other in likely if weight > _CONFUSABLE)
-
 
 def _sets(start: Given, pool: Sequence[Group], most: int) -> _Sets:
     sets = [each for size in range(most + 1) for each in combinations(pool, size) if len(_names(each)) == size]
@@ -185,8 +207,7 @@ def _sets(start: Given, pool: Sequence[Group], most: int) -> _Sets:
     rank = np.array([start.rank(_indices(each)) if each else 0 for each in sets])
     choices = np.array([sum(_PRIOR + np.log(group.tries) for group in each) for each in sets])
     energy = float(max((gain - rank).max(), 0.0))
-    trusted = gain / (1 + DISCREPANCY**2 * energy)
-    evidence = (trusted - rank - rank * np.log(np.maximum(trusted / np.maximum(rank, 1), 1.0))) / 2 - choices
+    evidence = _evidence_of(gain, rank, energy) - choices
     return _Sets(tuple(sets), evidence, gain, energy)
 
 

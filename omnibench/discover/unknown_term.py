@@ -21,9 +21,11 @@ from omnibench.discover.whitened import given
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Array, Robot
 
+_GRID = 6  # patches of the map along each side of the area
 _MOST = 5  # bases that are put together
 _PRICE = 2.0  # chi2 that a direction of a further basis must gain; single functions are chosen more strictly
 _DETERMINED = 0.01  # share of a function that must be left beyond the others, so that coefficients stay small
+_LARGEST = 3.0  # times the plausible range: a value beyond stands for something else
 _HELD_OUT = 2.0  # standard errors by which runs that are held out must gain
 
 
@@ -35,28 +37,46 @@ class Closed:
     note: str
 
 
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A model with functions, and by how much these lower the chi2 of each run (Z,) when it is held out."""
+
+    terms: tuple[Group, ...]
+    used: Extended
+    gains: Array
+
+
 def close_without_name(plain: Fit, look: Look, rivals: Rivals) -> Closed:
     """Add smooth functions of the surest place's covariate to all models: of what effects leave, if there are any.
 
-    Matrix, named effects and functions are fitted together. They stay only if runs that are held out gain.
+    Matrix, named effects and functions are fitted together. They stay only if runs that are held out gain. All are of
+    one stage, of several the one that gains most: what happens at one can be imitated at another, badly.
     """
-    bases = surest_bases(look)
-    if not bases:
+    found = surest_bases(look)
+    if not found:
         return Closed(rivals, "No smooth term was tried: nothing that is left depends on what a model could use.")
-    details = dict.fromkeys(basis.detail for basis in bases)
-    what = f"a smooth term over {bases[0].covariate} ({'; '.join(details)})"
-    terms = chosen_functions(rivals.used, list(_groups_of(bases, plain.model.robot)))
-    if not terms:
-        return Closed(rivals, f"{_capital(what)} was left out: no function of it is plainly there beyond the matrix.")
-    used = extend(plain, [*rivals.used.groups, *terms])
-    per_run = _gains(used, len(rivals.used.groups))
-    mean, error = float(per_run.mean()), float(per_run.std()) / np.sqrt(len(per_run))
-    found = f"{mean:.2g} +- {error:.1g} of whitened chi2 a run"
+    covariate = found[0][0].covariate
+    trials = [trial for bases in found for trial in _tried(plain, rivals.used, bases)]
+    if not trials:
+        return Closed(rivals, f"No smooth term was added: no function of the {covariate} is plainly there by itself.")
+    best = max(trials, key=lambda trial: float(trial.gains.mean()))
+    details = dict.fromkeys(term.basis.detail for term in best.terms if term.basis is not None)
+    what = f"a smooth term over {covariate} ({'; '.join(details)})"
+    mean, error = float(best.gains.mean()), float(best.gains.std()) / np.sqrt(len(best.gains))
+    gained = f"{mean:.2g} +- {error:.1g} of whitened chi2 a run"
     if not mean > _HELD_OUT * error:
-        return Closed(rivals, f"{_capital(what)} was tried and left out: on runs held out it gains {found}.")
-    others = tuple((weight, extend(plain, [*each.groups, *terms])) for weight, each in rivals.models[1:])
-    note = f"The extended model holds {what}, which is no name: on runs held out it gains {found}."
-    return Closed(replace(rivals, used=used, models=((rivals.models[0][0], used), *others)), note)
+        return Closed(rivals, f"{_capital(what)} was tried and left out: on runs held out it gains {gained}.")
+    others = tuple((weight, extend(plain, [*each.groups, *best.terms])) for weight, each in rivals.models[1:])
+    note = f"The extended model holds {what}, which is no name: on runs held out it gains {gained}."
+    return Closed(replace(rivals, used=best.used, models=((rivals.models[0][0], best.used), *others)), note)
+
+
+def _tried(plain: Fit, base: Extended, bases: Sequence[Basis]) -> Iterator[_Trial]:
+    """The model with functions of some bases, if any of them is plainly there."""
+    terms = chosen_functions(base, list(_groups_of(bases, plain.model.robot)))
+    if terms:
+        used = extend(plain, [*base.groups, *terms])
+        yield _Trial(tuple(terms), used, _gains(used, len(base.groups)))
 
 
 def step_name(group: Group) -> str:
@@ -70,20 +90,32 @@ def steps_of(groups: Sequence[Group]) -> list[int]:
     return [*range(1, named + 1), *([len(groups)] if len(groups) > named else [])]
 
 
-def surest_bases(look: Look) -> list[Basis]:
-    """Bases of the surest place's covariate that a model can use, each of which gains beyond those before it."""
+def surest_bases(look: Look) -> list[list[Basis]]:
+    """Bases of the surest place's covariate that a model can use, those of each stage apart.
+
+    Each gains beyond those before it.
+    """
     gains = look.named.left if look.named.chosen else look.places
     groups = _of_surest_covariate(gains)
-    fitted = [*look.groups.matrix.index, *(index for group in look.named.chosen for index in group.index)]
-    price, found = _PRICE * max(float(np.median(gains.spread)), 1.0), list[Basis]()
+    before = [*look.groups.matrix.index, *(index for group in look.named.chosen for index in group.index)]
+    price = _PRICE * max(float(np.median(gains.spread)), 1.0)
+    stages = dict.fromkeys(group.basis.stage for group in groups if group.basis is not None)
+    of_stages = [[each for each in groups if each.basis and each.basis.stage == stage] for stage in stages]
+    return [
+        [group.basis for group in _together(look, own, before, price) if group.basis is not None] for own in of_stages
+    ]
+
+
+def _together(look: Look, groups: Sequence[Group], before: Sequence[int], price: float) -> list[Group]:
+    """Groups that gain more than a price for each direction, one beyond the other; at least the best one."""
+    groups, fitted, found = list(groups), list(before), list[Group]()
     while groups and len(found) < _MOST:
         now = given(look.data, fitted)
         beyond = [now.gain(group.index) - price * now.rank(group.index) for group in groups]
         best = groups.pop(int(np.argmax(beyond)))
         if found and max(beyond) <= 0:
             break
-        assert best.basis is not None
-        found.append(best.basis)
+        found.append(best)
         fitted += best.index
     return found
 
@@ -113,6 +145,13 @@ def _terms_of(basis: Basis) -> Iterator[tuple[str, Mapping[str, float]]]:
     yield basis.term, basis.shapes
     if basis.term == "smooth_wheel_rate":
         yield "smooth_common_rate", basis.shapes
+    if basis.term == "smooth_map":
+        x, y, reach = (basis.shapes[name] for name in ("centre_x", "centre_y", "reach"))
+        for east, north in product(np.linspace(-1, 1, _GRID).tolist(), repeat=2):
+            if np.hypot(east, north) < 1 + 1 / _GRID:
+                yield "smooth_map_patch", {
+                    "centre_x": x + east * reach, "centre_y": y + north * reach, "radius": 2 * reach / (_GRID - 1)
+                }  # fmt: skip
     if basis.term == "smooth_patch":
         x, y, radius = (basis.shapes[name] for name in ("centre_x", "centre_y", "radius"))
         for east, north in product((-0.5, 0.5), repeat=2):
@@ -125,11 +164,13 @@ def chosen_functions(base: Extended, groups: Sequence[Group]) -> list[Group]:
     """Groups with those parameters alone that gain more than ln(runs) beyond matrix, effects and the others; 0 for all
     others, and no group that has none.
 
-    One after another, those that gain most first; what the data hardly determine beyond them is no choice.
+    One after another, those that gain most first. What the data hardly determine beyond these is no choice, nor is what
+    would need a coefficient far outside of its plausible range.
     """
     data = base.fit.whitened(columns_of(base.fit, [*base.groups, *groups]))
     owner = np.repeat(np.arange(len(groups)), [len(group.parameters) for group in groups])
     names = [each.name for group in groups for each in group.parameters]
+    limits = _LARGEST * np.array([each.high for group in groups for each in group.parameters])
     first = data.information.shape[0] - len(owner)
     left = given(data, range(first))
     scale = 1 / np.sqrt(np.maximum(left.total[first:], 1e-300))
@@ -138,7 +179,8 @@ def chosen_functions(base: Extended, groups: Sequence[Group]) -> list[Group]:
     kept: set[int] = set()
     while len(kept) < len(owner):
         size = np.diag(information)
-        gain = np.where(size > _DETERMINED, np.square(score) / np.maximum(size, 1e-300), 0.0)
+        allowed = (size > _DETERMINED) & (np.abs(score) * scale < limits * size)
+        gain = np.where(allowed, np.square(score) / np.maximum(size, 1e-300), 0.0)
         best = int(gain.argmax())
         if gain[best] <= np.log(len(data.scores)):
             break

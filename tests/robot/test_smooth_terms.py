@@ -27,7 +27,7 @@ MOTION = (
     *("smooth_elapsed_time", "smooth_heading", "smooth_course", "smooth_place", "smooth_patch", "smooth_command"),
     *("smooth_order_of_runs", "smooth_wheel_rate", "smooth_common_rate", "smooth_wheel_angle", "smooth_acceleration"),
 )
-REFERENCE = ("smooth_map", "smooth_stamps", "smooth_stamp_wave")
+REFERENCE = ("smooth_map", "smooth_map_patch", "smooth_stamps", "smooth_stamp_wave")
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -231,6 +231,15 @@ def test_a_bent_map_agrees_at_the_start_and_is_held_beyond_the_places_that_were_
     poses = np.array([[1.0, 0.0, 0.3], [2.0, 0.0, 0.4], [9.0, 0.0, 0.5]])
     shift = effect.reported(poses, poses[0], values) - poses
     np.testing.assert_allclose(shift, [[0, 0, 0], [0, 0.0075, 0], [0, 0.0075, 0]], atol=1e-15)
+
+
+def test_a_shifted_patch_of_the_map_fades_to_zero() -> None:
+    effect = effects.create("smooth_map_patch")
+    assert isinstance(effect, ReferenceEffect)
+    values = usual("smooth_map_patch") | {"x_bump": 0.01, "centre_x": 1.0, "centre_y": 0.0, "radius": 0.5}
+    poses = np.array([[9.0, 0.0, 0.0], [1.0, 0.0, 0.1], [1.5, 0.0, 0.2]])
+    shift = effect.reported(poses, poses[0], values) - poses
+    np.testing.assert_allclose(shift, [[0, 0, 0], [0.01, 0, 0], [0.01 / math.e, 0, 0]], atol=1e-15)
 
 
 def test_delays_alternate_grow_and_swing_with_the_stamps() -> None:

@@ -83,10 +83,20 @@ def inside_of(places: Array, values: Values) -> Array:
     return away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1.0)
 
 
+def bump(places: Array, values: Values) -> Array:
+    """A Gaussian bell (F, 1) about the centre, of places (F, 2)."""
+    away = (places - [values["centre_x"], values["centre_y"]]) / values["radius"]
+    return np.exp(-np.square(away).sum(axis=1, keepdims=True))
+
+
 AREA = (
     scale("centre_x", "m", -1e6, 1e6, 0.0, "middle of the places that were seen"),
     scale("centre_y", "m", -1e6, 1e6, 0.0, "middle of the places that were seen"),
     scale("reach", "m", 1e-6, 1e6, 2.0, "how far from there places were seen"),
+)
+PATCH = (
+    *AREA[:2],
+    scale("radius", "m", 1e-6, 1e6, 2.0, "from the centre, where 1/e of the change is left"),
 )
 
 
@@ -202,16 +212,11 @@ class SmoothPatch(SmoothEffect):
     shows_in = "place"
     needs = frozenset({"poses"})
     labels = ("bump",)
-    fixed_parameters = (
-        *shared(SmoothEffect.modes, labels, "the place"),
-        *AREA[:2],
-        scale("radius", "m", 1e-6, 1e6, 0.5, "from the centre, where 1/e of the change is left"),
-    )
+    fixed_parameters = (*shared(SmoothEffect.modes, labels, "the place"), *PATCH)
 
     def shares(self, signals: Signals, values: Values) -> Array:
         assert signals.poses is not None  # they are needed
-        away = (signals.poses[:, :2] - [values["centre_x"], values["centre_y"]]) / values["radius"]
-        return np.exp(-np.square(away).sum(axis=1, keepdims=True))
+        return bump(signals.poses[:, :2], values)
 
 
 @effects.register("smooth_command")

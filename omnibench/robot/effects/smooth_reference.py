@@ -2,36 +2,48 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar
+
 import numpy as np
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import Parameter, ReferenceEffect, Values
-from omnibench.robot.effects.smooth import AREA, NO_PHYSICS, NO_SOURCE, SURFACES, inside_of, scale, surfaces, waves
+from omnibench.robot.effects.smooth import (
+    AREA,
+    NO_PHYSICS,
+    NO_SOURCE,
+    PATCH,
+    SURFACES,
+    bump,
+    inside_of,
+    scale,
+    surfaces,
+    waves,
+)
 from omnibench.robot.kinematics import Array
 
+_AXES = {"x": "m", "y": "m", "theta": "rad"}
 _ROUNDS = 200
 _SAME = 1e-13  # m, rad
 
 
-@effects.register("smooth_map")
-class SmoothMap(ReferenceEffect):
-    """Without a name: a bent map, by polynomials of degree 3 in the place; beyond the places seen the value is held.
+class BentMap(ReferenceEffect):
+    """Poses are reported beside, by functions of the place; at the run's start they agree.
 
-    Poses agree at the run's start. ``corrected`` supposes that the map is not folded.
+    ``corrected`` supposes that the map is not folded.
     """
 
     physics = NO_PHYSICS
     source = NO_SOURCE
     shows_in = "place"
     in_catalogue = False
-    fixed_parameters = (
-        *(
-            Parameter(f"{axis}_{label}", unit, -0.01, 0.01, f"shift of {words}, with {label} of the place")
-            for axis, unit, words in (("x", "m", "x"), ("y", "m", "y"), ("theta", "rad", "the heading"))
-            for label in SURFACES
-        ),
-        *AREA,
-    )
+    labels: ClassVar[tuple[str, ...]]
+
+    @abstractmethod
+    def functions(self, places: Array, values: Values) -> Array:
+        """Of places (K, 2), m: (K, J)."""
 
     def reported(self, poses: Array, start: Array, values: Values) -> Array:
         return poses + self._shift(poses, start, values)
@@ -46,10 +58,41 @@ class SmoothMap(ReferenceEffect):
 
     def _shift(self, poses: Array, start: Array, values: Values) -> Array:
         """By how much poses (K, 3) are reported beside, more than the start is."""
-        factors = np.array([[values[f"{axis}_{label}"] for label in SURFACES] for axis in ("x", "y", "theta")])
-        there = surfaces(inside_of(poses[:, :2], values)) - surfaces(inside_of(start[None, :2], values))
+        factors = np.array([[values[f"{axis}_{label}"] for label in self.labels] for axis in _AXES])
+        there = self.functions(poses[:, :2], values) - self.functions(start[None, :2], values)
         shift: Array = there @ factors.T
         return shift
+
+
+def _shifts(labels: Sequence[str]) -> tuple[Parameter, ...]:
+    """Coefficients ``axis_label``."""
+    return tuple(
+        Parameter(f"{axis}_{label}", unit, -0.01, 0.01, f"shift of {axis}, with {label} of the place")
+        for axis, unit in _AXES.items()
+        for label in labels
+    )
+
+
+@effects.register("smooth_map")
+class SmoothMap(BentMap):
+    """Without a name: a bent map, by polynomials of degree 3 in the place; beyond the places seen the value is held."""
+
+    labels = SURFACES
+    fixed_parameters = (*_shifts(SURFACES), *AREA)
+
+    def functions(self, places: Array, values: Values) -> Array:
+        return surfaces(inside_of(places, values))
+
+
+@effects.register("smooth_map_patch")
+class SmoothMapPatch(BentMap):
+    """Without a name: a round patch of the map that is shifted, outside of which the shift fades to zero."""
+
+    labels = ("bump",)
+    fixed_parameters = (*_shifts(labels), *PATCH)
+
+    def functions(self, places: Array, values: Values) -> Array:
+        return bump(places, values)
 
 
 @effects.register("smooth_stamps")

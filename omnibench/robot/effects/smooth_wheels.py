@@ -19,15 +19,18 @@ HARMONICS = (0.5, *(float(number) for number in range(1, 17)), 1.5, 2.5, 3.5)  #
 _TOP = scale("top", "rad/s", 1e-6, 1e6, 6.0, "the fastest rate that was seen; knots are spread from -top to top")
 
 
-def tents(rates: Array, top: float, knots_between: int = KNOTS) -> Array:
-    """Piecewise linear functions (..., K) of rates between -top and top, rad/s, the outermost held beyond.
+def tents(rates: Array, top: float) -> Array:
+    """Piecewise linear functions (..., 8) of rates between -top and top, rad/s, the outermost held beyond.
 
     Zero for wheels that stand.
     """
-    knots = np.linspace(-top, top, knots_between)
-    found = np.maximum(0.0, 1 - np.abs(np.clip(rates, -top, top)[..., None] - knots) / (knots[1] - knots[0]))
-    moving: Array = found * (np.abs(rates) > STILL)[..., None]
-    return moving
+    return np.stack([_between_knots(rates, top, heights) for heights in np.eye(KNOTS)], axis=-1)
+
+
+def _between_knots(rates: Array, top: float, heights: Array) -> Array:
+    """The sum (...) of such functions, as many as there are heights."""
+    found: Array = np.interp(rates, np.linspace(-top, top, len(heights)), heights)
+    return np.where(np.abs(rates) > STILL, found, 0.0)
 
 
 @effects.register("smooth_wheel_rate")
@@ -49,8 +52,8 @@ class SmoothWheelRate(MotionEffect):
 
     def correction(self, signals: Signals, values: Values) -> Array:
         heights = np.array([of_wheels(signals.robot, f"change_{knot}", values) for knot in range(KNOTS)])
-        added: Array = np.einsum("fnk,kn->fn", tents(signals.rates, values["top"]), heights)
-        return added
+        each = zip(signals.rates.T, heights.T, strict=True)
+        return np.column_stack([_between_knots(rates, values["top"], own) for rates, own in each])
 
 
 @effects.register("smooth_common_rate")
@@ -72,8 +75,7 @@ class SmoothCommonRate(MotionEffect):
 
     def correction(self, signals: Signals, values: Values) -> Array:
         heights = np.array([values[f"change_{knot}"] for knot in range(_COMMON_KNOTS)])
-        added: Array = tents(signals.rates, values["top"], _COMMON_KNOTS) @ heights
-        return added
+        return _between_knots(signals.rates, values["top"], heights)
 
 
 @effects.register("smooth_wheel_angle")
