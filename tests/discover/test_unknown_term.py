@@ -13,10 +13,12 @@ from hidden.sets import Kind, Truth, make_set
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.extend import Extended, extend
 from omnibench.discover.groups import Group
+from omnibench.discover.look import Look, look_at
 from omnibench.discover.model_fit import fit_matrix
 from omnibench.discover.places import Basis
 from omnibench.discover.recording import usable_runs
-from omnibench.discover.unknown_term import chosen_functions, step_name, steps_of
+from omnibench.discover.rivals import Rivals
+from omnibench.discover.unknown_term import chosen_functions, close_without_name, step_name, steps_of
 from omnibench.fit.noise import Whitener
 from omnibench.registry import effects
 from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
@@ -133,6 +135,29 @@ def test_a_function_that_the_matrix_explains_is_not_chosen(grooved: tuple[Datase
     assert chosen_functions(plain(grooved[0]), [group("smooth_elapsed_time", duration=1e6)]) == []  # cosines of 0
 
 
+def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
+    grooved: tuple[Dataset, Truth, Discovery],
+) -> None:
+    bare, look = looked_at(grooved[0])
+    closed = close_without_name(bare.fit, look, with_names(bare, look, group("heading_drift")))
+    used = closed.rivals.used
+    assert used.groups[0].name == "heading_drift"
+    assert {each.name for each in used.groups[1:]} <= {"smooth_heading", "smooth_course"}
+    assert closed.rivals.models[0][1] is used
+    assert "no name" in closed.note
+    calibrated = calibration_terms(used)
+    assert calibrated["heading_drift"]["b"] == used.values[0]
+
+
+def test_nothing_is_added_to_a_model_that_leaves_nothing_of_it(grooved: tuple[Dataset, Truth, Discovery]) -> None:
+    bare, look = looked_at(grooved[0])
+    rivals = with_names(bare, look, group("smooth_heading"), group("smooth_course"))
+    closed = close_without_name(bare.fit, look, rivals)
+    assert closed.rivals is rivals
+    assert "smooth term" in closed.note
+    assert "was added" in closed.note or "left out" in closed.note
+
+
 def test_named_effects_come_one_by_one_and_what_has_no_name_at_once() -> None:
     basis = Basis("place", "body", "where on the floor the robot is", np.zeros((0, 3, 0)))
     named, nameless = group("heading_drift"), replace(group("smooth_place"), basis=basis)
@@ -146,6 +171,21 @@ def plain(dataset: Dataset) -> Extended:
     runs = usable_runs(dataset.split("train"))
     start = dataset.robot.inverse_kinematic_matrix
     return extend(fit_matrix(runs, dataset.robot, dataset.sample_period, start), ())
+
+
+def looked_at(dataset: Dataset) -> tuple[Extended, Look]:
+    bare = plain(dataset)
+    return bare, look_at(bare.fit, None, None, (), np.random.default_rng(0))
+
+
+def with_names(bare: Extended, look: Look, *groups: Group) -> Rivals:
+    """A model with these effects, whatever was found."""
+    used = extend(bare.fit, groups)
+    return Rivals(used, look.named, ((1.0, used),), ())
+
+
+def calibration_terms(extended: Extended) -> dict[str, dict[str, float]]:
+    return {term.name: dict(term.values) for term in extended.fit.model.terms}
 
 
 def group(name: str, **shapes: float) -> Group:
