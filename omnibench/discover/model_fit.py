@@ -86,8 +86,9 @@ def fit_matrix(runs: Sequence[Trajectory], robot: Robot, sample_period: float, s
 def with_noise(fit: Fit) -> Fit:
     """The same with noise, nuisances and jumping poses estimated anew from its residuals."""
     near = fit.noise.noise if fit.noise is not _NOTHING_KNOWN else None
-    found = estimate_noise(fit.runs, in_start_frames(fit.runs, fit.residuals), near)
-    runs, jumps = without_jumps(fit.runs, fit.residuals, found.noise)
+    seen = in_start_frames(fit.runs, fit.residuals)
+    found = estimate_noise(fit.runs, seen, near)
+    runs, jumps = without_jumps(fit.runs, seen, found.noise)
     if jumps:
         fit = _at(fit.model, runs, fit.nuisances, found, fit.jumps + jumps)
         found = estimate_noise(fit.runs, in_start_frames(fit.runs, fit.residuals), found.noise)

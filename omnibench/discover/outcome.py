@@ -22,7 +22,7 @@ from omnibench.discover.look import Look
 from omnibench.discover.model_fit import Fit, at_model, at_runs
 from omnibench.discover.naming import Named
 from omnibench.discover.novelty import novelties_of
-from omnibench.discover.recording import usable_runs, without_jumps
+from omnibench.discover.recording import in_start_frames, usable_runs, without_jumps
 from omnibench.discover.result import (
     Candidate,
     Discovery,
@@ -207,7 +207,7 @@ def _validation(dataset: Dataset, fit: Fit) -> tuple[_HeldOutRuns, tuple[str, ..
     if not able:
         return _HeldOutRuns((), ()), tuple(doubts)
     runs = usable_runs(able)
-    kept, jumps = without_jumps(runs, at_runs(fit, runs).residuals, fit.noise.noise)
+    kept, jumps = without_jumps(runs, in_start_frames(runs, at_runs(fit, runs).residuals), fit.noise.noise)
     if jumps:
         doubts.append(f"{jumps} validation poses contradict their neighbours; chi2 is without them.")
     return _HeldOutRuns(runs, kept), tuple(doubts)
