@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.groups import Group, Groups
-from omnibench.discover.held_out import folds_of, gains_on_held_out
+from omnibench.discover.held_out import confirmation, folds_of
 from omnibench.discover.naming import Named, name_effects
 from omnibench.discover.places import Basis
 from omnibench.discover.significance import Gains, gains_of
@@ -22,7 +22,6 @@ from omnibench.robot.kinematics import Array, Robot
 _STEP = 0.2  # of the plausible range: by so much a parameter is moved to see what it does
 _KNOTS = 7  # of target rates
 _ORDERS = 5  # of functions of time
-_HELD_OUT = 2.0
 _QUANTISED = 1e-9  # rad/s
 
 
@@ -58,12 +57,7 @@ def look_at_actuators(
         np.array([each.T @ own for each, own in zip(scaled, residuals, strict=True)]),
     )  # fmt: skip
     folds = folds_of(told)
-
-    def confirmed(before: Sequence[int], new: Sequence[int]) -> bool:
-        gains = gains_on_held_out(data, before, [*before, *new], folds)
-        return float(gains.mean()) > _HELD_OUT * float(gains.std()) / np.sqrt(len(gains))
-
-    named = name_effects(data, groups, confirmed, rng)
+    named = name_effects(data, groups, confirmation(data, folds), rng)
     places = gains_of(data, (), groups.places, rng)
     values, covariance = _fitted(told, errors, named.chosen)
     return Actuators(named, places, values, covariance)

@@ -12,11 +12,8 @@ from omnibench.discover.result import Experiment, NamedEffect
 from omnibench.robot.calibration import matrix_rows
 
 
-def experiments_for(
-    dataset: Dataset, effects: Sequence[NamedEffect], classes: Sequence[tuple[str, ...]], fit: Fit
-) -> tuple[Experiment, ...]:
+def experiments_for(dataset: Dataset, effects: Sequence[NamedEffect], fit: Fit) -> tuple[Experiment, ...]:
     """One experiment for each effect that is confusable with others."""
-    del classes
     found = []
     for effect in effects:
         if effect.confusable_with:

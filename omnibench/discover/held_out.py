@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,6 +19,7 @@ from omnibench.fit.repetitions import differences_between_repetitions, grouped
 from omnibench.robot.kinematics import Array
 
 _FOLDS = 5
+HELD_OUT = 2.0  # standard errors by which runs that are held out must gain
 
 
 def folds_of(runs: Sequence[Trajectory]) -> NDArray[np.intp]:
@@ -82,6 +83,16 @@ def _values_of_others(extended: Extended, folds: NDArray[np.intp]) -> Array:
 def gains_on_held_out(data: Whitened, before: Sequence[int], after: Sequence[int], folds: NDArray[np.intp]) -> Array:
     """By how much further columns lower each run's chi2 (Z,) when its fold is predicted from the others."""
     return _chi2(data, before, folds) - _chi2(data, after, folds)
+
+
+def confirmation(data: Whitened, folds: NDArray[np.intp]) -> Callable[[Sequence[int], Sequence[int]], bool]:
+    """Whether runs that are held out gain by columns (second) beyond others (first), by two standard errors."""
+
+    def confirmed(before: Sequence[int], new: Sequence[int]) -> bool:
+        gains = gains_on_held_out(data, before, [*before, *new], folds)
+        return float(gains.mean()) > HELD_OUT * float(gains.std()) / np.sqrt(len(gains))
+
+    return confirmed
 
 
 def _chi2(data: Whitened, index: Sequence[int], folds: NDArray[np.intp]) -> Array:

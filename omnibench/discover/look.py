@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from omnibench.discover.extend import Extended
 from omnibench.discover.groups import Groups, make_groups
-from omnibench.discover.held_out import folds_of, gains_on_held_out
+from omnibench.discover.held_out import confirmation, folds_of
 from omnibench.discover.model_fit import Fit, paths_of, split_runs
 from omnibench.discover.naming import Named, name_effects
 from omnibench.discover.significance import Gains, gains_of
@@ -18,7 +18,6 @@ from omnibench.discover.whitened import Whitened
 from omnibench.robot.kinematics import Array
 
 _COARSE = 0.03  # s; what is looked for varies more slowly, and the fit itself takes every sample
-_HELD_OUT = 2.0  # standard errors by which runs that are held out must gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +54,5 @@ def look_at(
         ]
     columns = tuple(split_runs(groups.columns, fit.runs))
     data, folds = fit.whitened(columns, residuals), folds_of(fit.runs)
-
-    def confirmed(before: Sequence[int], new: Sequence[int]) -> bool:
-        gains = gains_on_held_out(data, before, [*before, *new], folds)
-        return float(gains.mean()) > _HELD_OUT * float(gains.std()) / np.sqrt(len(gains))
-
-    named = name_effects(data, groups, confirmed, rng)
+    named = name_effects(data, groups, confirmation(data, folds), rng)
     return Look(groups, columns, data, folds, named, gains_of(data, groups.matrix.index, groups.places, rng))

@@ -93,7 +93,7 @@ def told(
         held_out=held_out,
         steps=steps,
         novelties=novelties_of(validation.kept, bare, rivals.models) if validation.kept else (),
-        experiments=experiments_for(dataset, effects, classes_of(look), fit),
+        experiments=experiments_for(dataset, effects, fit),
         notes=_notes(look, fit) + notes + doubts,
         noise=fit.noise,
         outliers=fit.jumps,

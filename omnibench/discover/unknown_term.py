@@ -10,7 +10,7 @@ import numpy as np
 
 from omnibench.discover.extend import Extended, columns_of, extend
 from omnibench.discover.groups import Group
-from omnibench.discover.held_out import folds_by_lot, gains_on_held_out
+from omnibench.discover.held_out import HELD_OUT, folds_by_lot, gains_on_held_out
 from omnibench.discover.look import Look
 from omnibench.discover.model_fit import Fit
 from omnibench.discover.naming import CHANCE
@@ -26,7 +26,6 @@ _MOST = 5  # bases that are put together
 _PRICE = 2.0  # chi2 that a direction of a further basis must gain; single functions are chosen more strictly
 _DETERMINED = 0.01  # share of a function that must be left beyond the others, so that coefficients stay small
 _LARGEST = 3.0  # times the plausible range: a value beyond stands for something else
-_HELD_OUT = 2.0  # standard errors by which runs that are held out must gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +63,7 @@ def close_without_name(plain: Fit, look: Look, rivals: Rivals) -> Closed:
     what = f"a smooth term over {covariate} ({'; '.join(details)})"
     mean, error = float(best.gains.mean()), float(best.gains.std()) / np.sqrt(len(best.gains))
     gained = f"{mean:.2g} +- {error:.1g} of whitened chi2 a run"
-    if not mean > _HELD_OUT * error:
+    if not mean > HELD_OUT * error:
         return Closed(rivals, f"{_capital(what)} was tried and left out: on runs held out it gains {gained}.")
     others = tuple((weight, extend(plain, [*each.groups, *best.terms])) for weight, each in rivals.models[1:])
     note = f"The extended model holds {what}, which is no name: on runs held out it gains {gained}."

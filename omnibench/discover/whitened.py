@@ -27,31 +27,9 @@ class Whitened:
     information: Array
     scores: Array
 
-    def of_runs(self, chosen: Sequence[int]) -> Whitened:
-        """The same of some runs."""
-        columns = tuple(self.columns[run] for run in chosen)
-        return Whitened(
-            tuple(self.residuals[run] for run in chosen), columns, _products(columns), self.scores[list(chosen)]
-        )
-
-    def of_columns(self, chosen: Sequence[int]) -> Whitened:
-        """The same with some columns."""
-        index = list(chosen)
-        return Whitened(
-            self.residuals,
-            tuple(each[:, index] for each in self.columns),
-            self.information[np.ix_(index, index)],
-            self.scores[:, index],
-        )
-
     def with_residuals(self, residuals: Sequence[Array]) -> Whitened:
         """The same columns against other whitened residuals."""
         return Whitened(tuple(residuals), self.columns, self.information, _scores(self.columns, residuals))
-
-    @property
-    def chi2(self) -> Array:
-        """Of each run (Z,)."""
-        return np.array([float(each @ each) for each in self.residuals])
 
 
 def whitened(
