@@ -61,10 +61,16 @@ def write_table(path: Path, table: pl.DataFrame) -> None:
     write_files({path: encode_table(table, "csv" if path.suffix == ".csv" else "parquet")})
 
 
-def encode_table(table: pl.DataFrame, table_format: TableFormat) -> bytes:
-    """The content of a table's file; polars itself would tell of a full disk in errors of its own."""
+def encode_table(table: pl.DataFrame, table_format: TableFormat, row_group: int | None = None) -> bytes:
+    """The content of a table's file; polars itself would tell of a full disk in errors of its own.
+
+    row_group: rows of a Parquet file that are read at once; None leaves it to polars.
+    """
     content = BytesIO()
-    table.write_parquet(content) if table_format == "parquet" else table.write_csv(content)
+    if table_format == "parquet":
+        table.write_parquet(content, row_group_size=row_group)
+    else:
+        table.write_csv(content)
     return content.getvalue()
 
 

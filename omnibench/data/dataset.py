@@ -12,6 +12,7 @@ import numpy as np
 
 from omnibench.data.checks import implausible
 from omnibench.data.headings import unwrap
+from omnibench.data.scans import Scans
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
@@ -76,7 +77,10 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Recordings of one robot. Make it with :func:`make_dataset`, which unwraps headings and looks for wrong units."""
+    """Recordings of one robot. Make it with :func:`make_dataset`, which unwraps headings and looks for wrong units.
+
+    scans: of its laser scanner, if it has one and they were recorded.
+    """
 
     name: str
     robot: Robot
@@ -87,6 +91,7 @@ class Dataset:
     licence: str = ""
     simulated: bool = False
     warnings: tuple[str, ...] = field(default=())
+    scans: Scans | None = None
 
     def split(self, name: Split) -> tuple[Trajectory, ...]:
         """The trajectories of one split; may be empty."""
@@ -117,6 +122,7 @@ def make_dataset(
     source: str = "",
     licence: str = "",
     simulated: bool = False,
+    scans: Scans | None = None,
 ) -> Dataset:
     """A data set with unwrapped headings and with warnings about values that cannot be right.
 
@@ -143,7 +149,7 @@ def make_dataset(
         for trajectory, heading in zip(raw, headings, strict=True)
     )
     return Dataset(
-        name, robot, sample_period, tuple(unwrapped), description, source, licence, simulated, tuple(warnings)
+        name, robot, sample_period, tuple(unwrapped), description, source, licence, simulated, tuple(warnings), scans
     )
 
 

@@ -12,6 +12,8 @@ from pydantic import Field, model_validator
 
 from omnibench.config import Model, read_yaml, to_yaml, validate
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, make_dataset
+from omnibench.data.scan_files import ScansOnDisk, encode_scans, scans_file
+from omnibench.data.scans import Scanner
 from omnibench.data.table import Table, read_table
 from omnibench.errors import ConfigError, DataError, nearest
 from omnibench.files import TableFormat, encode_table, remove, write_files
@@ -34,6 +36,7 @@ class Header(Model):
     robot: Robot
     sample_period: float = Field(gt=0, allow_inf_nan=False, description="s")
     wheels: tuple[str, ...] = Field(description="column names: omega_<wheel>")
+    scanner: Scanner | None = Field(None, description="what measured the scans, if there are any")
 
     @model_validator(mode="after")
     def _wheels_are_the_robots(self) -> Header:
@@ -76,6 +79,7 @@ def load_dataset(path: Path | str) -> Dataset:
         source=header.source,
         licence=header.licence,
         simulated=header.simulated,
+        scans=_scans(folder, header, [trajectory.id for trajectory in trajectories]),
     )
 
 
@@ -99,8 +103,12 @@ def save_dataset(dataset: Dataset, path: Path | str, table_format: TableFormat =
         allowed = len(frame) - 1 if name == "trajectories" else 0
         kept = frame.select(column for column in frame.iter_columns() if column.null_count() <= allowed)
         contents[folder / f"{name}.{table_format}"] = encode_table(kept, table_format)
+    if dataset.scans is not None:
+        contents[folder / f"scans.{table_format}"] = encode_scans(dataset.scans, table_format)
     write_files(contents)
-    for name in tables:  # of a data set in the other format that was there before
+    if dataset.scans is None:
+        remove(folder / f"scans.{table_format}")
+    for name in (*tables, "scans"):  # of a data set in the other format that was there before
         remove(folder / f"{name}.{'csv' if table_format == 'parquet' else 'parquet'}")
 
 
@@ -115,6 +123,7 @@ def header_of(dataset: Dataset) -> Header:
         robot=dataset.robot,
         sample_period=dataset.sample_period,
         wheels=dataset.robot.wheel_names,
+        scanner=None if dataset.scans is None else dataset.scans.scanner,
     )
 
 
@@ -148,6 +157,18 @@ def _read_header(folder: Path) -> Header:
         return validate(Header, content, str(file))
     except ConfigError as error:
         raise DataError(str(error)) from None
+
+
+def _scans(folder: Path, header: Header, trajectories: Sequence[str]) -> ScansOnDisk | None:
+    file = scans_file(folder)
+    if file is None:
+        return None
+    if header.scanner is None:
+        raise DataError(
+            f"{folder / 'dataset.yaml'}: scanner is missing, which {file.name} needs: rays, angle_min, "
+            "angle_increment, range_max (rad, m)"
+        )
+    return ScansOnDisk(file, header.scanner, trajectories)
 
 
 def _check_runs(runs: Table) -> None:

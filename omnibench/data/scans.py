@@ -1,0 +1,110 @@
+"""Scans of a planar laser scanner: what the scanner is, and the scans of one trajectory at a time."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, FiniteFloat, model_validator
+
+from omnibench.config import Model
+from omnibench.robot.kinematics import Array
+
+Ranges = NDArray[np.float32]
+
+
+class Mount(Model):
+    """Where the scanner sits: its pose in the robot's frame."""
+
+    x: FiniteFloat = Field(0.0, description="m, forward")
+    y: FiniteFloat = Field(0.0, description="m, left")
+    yaw: FiniteFloat = Field(0.0, description="rad, counter-clockwise")
+
+
+class Scanner(Model):
+    """A planar scanner: ray i points to angle_min + i angle_increment and is measured i time_increment late."""
+
+    name: str = ""
+    rays: int = Field(gt=0, le=100_000, description="ranges of a scan")
+    angle_min: FiniteFloat = Field(description="rad, in the scanner's frame, counter-clockwise")
+    angle_increment: FiniteFloat = Field(description="rad from ray to ray; negative for clockwise")
+    time_increment: float = Field(0.0, ge=0, allow_inf_nan=False, description="s from ray to ray")
+    range_min: float = Field(0.0, ge=0, allow_inf_nan=False, description="m; shorter ranges are none")
+    range_max: float = Field(gt=0, allow_inf_nan=False, description="m; longer ranges are none")
+    noise: float = Field(0.01, gt=0, allow_inf_nan=False, description="standard deviation of a range, m")
+    far_noise: float = Field(0.03, gt=0, allow_inf_nan=False, description="the same beyond far, m")
+    far: float = Field(10.0, gt=0, allow_inf_nan=False, description="m")
+    mount: Mount = Mount()
+
+    @model_validator(mode="after")
+    def _measures_something(self) -> Scanner:
+        if self.range_min >= self.range_max:
+            raise ValueError(f"range_min {self.range_min:g} m is not below range_max {self.range_max:g} m")
+        if self.angle_increment == 0 and self.rays > 1:
+            raise ValueError("angle_increment is 0; all rays would point the same way")
+        if abs(self.angle_increment) * (self.rays - 1) > 2 * math.pi + 1e-3:
+            raise ValueError(f"{self.rays} rays, {self.angle_increment:g} rad apart, are more than a whole turn")
+        return self
+
+    @property
+    def angles(self) -> Array:
+        """Directions of the rays (R,) in the scanner's frame, rad."""
+        return self.angle_min + self.angle_increment * np.arange(self.rays)
+
+    @property
+    def delays(self) -> Array:
+        """By how much later than the scan's stamp each ray is measured (R,), s."""
+        return self.time_increment * np.arange(self.rays)
+
+    def valid(self, ranges: Ranges) -> NDArray[np.bool_]:
+        """Which ranges, of any shape, are measurements."""
+        return np.isfinite(ranges) & (ranges >= self.range_min) & (ranges <= self.range_max)
+
+    def deviations(self, ranges: Ranges | Array) -> Array:
+        """Standard deviations of ranges, m, of their shape."""
+        return np.where(np.asarray(ranges) > self.far, self.far_noise, self.noise)
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryScans:
+    """Scans of one trajectory. times (S,): of each scan's first ray, s. ranges (S, R), m; inf: nothing was seen."""
+
+    times: Array
+    ranges: Ranges
+
+
+class Scans(ABC):
+    """The scans of a data set, one trajectory at a time, so that no more than that is in memory."""
+
+    scanner: Scanner
+
+    @property
+    @abstractmethod
+    def trajectories(self) -> tuple[str, ...]:
+        """Ids of the trajectories that have scans."""
+
+    @abstractmethod
+    def of(self, trajectory: str) -> TrajectoryScans:
+        """The scans of a trajectory. DataError in one line: there are none, or they are broken."""
+
+    def __iter__(self) -> Iterator[tuple[str, TrajectoryScans]]:
+        return ((trajectory, self.of(trajectory)) for trajectory in self.trajectories)
+
+
+class ScansInMemory(Scans):
+    """Scans that were just made."""
+
+    def __init__(self, scanner: Scanner, scans: Mapping[str, TrajectoryScans]) -> None:
+        self.scanner = scanner
+        self._scans = dict(scans)
+
+    @property
+    def trajectories(self) -> tuple[str, ...]:
+        return tuple(self._scans)
+
+    def of(self, trajectory: str) -> TrajectoryScans:
+        return self._scans[trajectory]

@@ -1,0 +1,54 @@
+"""True poses of simulated runs: written to the truth's folder, read only to judge a reference."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from omnibench.data.table import read_table
+from omnibench.errors import DataError
+from omnibench.files import write_table
+from omnibench.robot.kinematics import Array
+
+_NAME = "poses"
+
+
+@dataclass(frozen=True, eq=False)
+class TruePath:
+    """Where a run's robot really was. times (S,): s, stamps of its scans. poses (S, 3): m, m, rad, from its start on."""
+
+    times: Array
+    poses: Array
+
+
+def write_true_poses(folder: Path, paths: Mapping[str, TruePath]) -> None:
+    """Write ``poses.parquet`` of the truth. DataError when the disk refuses."""
+    frames = [
+        pl.DataFrame(
+            {"trajectory": [name] * len(path.times), "t": path.times}
+            | {column: path.poses[:, index] for index, column in enumerate(("x", "y", "theta"))}
+        )
+        for name, path in paths.items()
+    ]
+    write_table(folder / f"{_NAME}.parquet", pl.concat(frames))
+
+
+def read_true_poses(folder: Path | str) -> dict[str, TruePath]:
+    """The true poses of every run of a truth folder. DataError in one line: there are none, or they are broken."""
+    folder = Path(folder)
+    if not (folder / f"{_NAME}.parquet").is_file():
+        raise DataError(
+            f"{folder}: no {_NAME}.parquet; name the folder that `simulate --truth` wrote for a robot's chain"
+        )
+    table = read_table(folder, _NAME, ("trajectory", "t", "x", "y", "theta"))
+    columns = np.column_stack([table.numbers(name) for name in ("t", "x", "y", "theta")])
+    names = table.frame["trajectory"].to_numpy()
+    return {
+        str(name): TruePath(columns[rows, 0], columns[rows, 1:])
+        for name in table.frame["trajectory"].unique(maintain_order=True)
+        for rows in [np.flatnonzero(names == name)]
+    }
