@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from omnibench.compare.run import run_comparison
     from omnibench.data.dataset import Dataset, Trajectory, make_dataset
     from omnibench.data.importer import import_dataset
-    from omnibench.data.simulate.flower import simulate_dataset
+    from omnibench.data.simulate.simulate import simulate_dataset
     from omnibench.data.storage import load_dataset, save_dataset
     from omnibench.discover.discover import discover_effects
     from omnibench.errors import OmnibenchError
@@ -52,7 +52,7 @@ _HOMES = {
     "compare.run": ("run_comparison",),
     "data.dataset": ("Dataset", "Trajectory", "make_dataset"),
     "data.importer": ("import_dataset",),
-    "data.simulate.flower": ("simulate_dataset",),
+    "data.simulate.simulate": ("simulate_dataset",),
     "data.storage": ("load_dataset", "save_dataset"),
     "discover.discover": ("discover_effects",),
     "errors": ("OmnibenchError",),

@@ -14,7 +14,7 @@ import typer
 from pydantic import BaseModel
 
 from omnibench import terminal
-from omnibench.config import parse_settings, to_json
+from omnibench.config import parse_settings, to_json, validate
 from omnibench.errors import ConfigError
 from omnibench.live_cli import live_app
 from omnibench.plugin_option import Plugins, load_given_plugins
@@ -315,19 +315,98 @@ def simulate(
     table_format: Annotated[
         Literal["parquet", "csv"], typer.Option("--format", help="Format of the tables.")
     ] = "parquet",
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="Pictures of the recording and of what is hidden in it.")
+    ] = None,
     plugins: Plugins = None,
 ) -> None:
     """Simulate the data set of a config, or a recording's own wheels; the truth goes to another folder, or nowhere."""
     from omnibench.data.simulate.request import SimulationRequest
+    from omnibench.report.recording.section import write_recording_report
+    from omnibench.slam_terminal import print_slam_accuracy
 
     hidden = tuple(effects or ())
     request = SimulationRequest(output, config, truth, dataset, hidden, like, model, noise, seed)
     load_given_plugins([*(plugins or []), *request.plugins] or None)
-    made = request.write(table_format)
-    _warn(made.warnings)
+    with terminal.Steps(terminal.make_console(error=True)) as watch:
+        made = request.write(table_format, watch)
+        if report is not None:
+            watch("writing the report", 0, 1)
+            shown = made.simulation
+            write_recording_report(
+                made.dataset,
+                report,
+                truth=shown.paths or None if shown else None,
+                plan=shown.plan if shown else None,
+                starts=shown.starts if shown else None,
+                accuracy=made.accuracy,
+            )
+    _warn(made.dataset.warnings)
+    if made.accuracy is not None:
+        print_slam_accuracy(terminal.make_console(), made.accuracy)
     if truth is not None:
         typer.echo(f"truth: {truth / 'truth.yaml'}")
-    typer.echo(f"{len(made.trajectories)} simulated trajectories: {output}")
+    if report is not None:
+        typer.echo(f"report: {report}")
+    typer.echo(f"{len(made.dataset.trajectories)} simulated trajectories: {output}")
+
+
+@app.command()
+def slam(
+    dataset: Annotated[Path, typer.Argument(help="A data set folder with scans.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="The data set folder to write, with the new poses.")
+    ] = None,
+    start: Annotated[
+        Literal["odometry", "last_pose"] | None, typer.Option(help="Where the search begins. Default: odometry.")
+    ] = None,
+    no_deskew: Annotated[
+        bool, typer.Option("--no-deskew", help="Take each scan as seen from one pose, as if the robot stood.")
+    ] = False,
+    model: Annotated[
+        Path | None, typer.Option(metavar="CALIBRATION", help="Odometry to start from. Default: the design values.")
+    ] = None,
+    truth: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="What simulate --truth wrote: judge the poses by it.")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="Pictures of the scans, the paths and the wheels.")
+    ] = None,
+    settings: Settings = None,
+    table_format: Annotated[
+        Literal["parquet", "csv"], typer.Option("--format", help="Format of the tables.")
+    ] = "parquet",
+    plugins: Plugins = None,
+    as_json: Json = False,
+) -> None:
+    """Reference poses from the recorded scans of a data set, by scan matching against a growing map."""
+    from omnibench.data.slam.options import SlamOptions
+    from omnibench.data.slam.request import SlamRequest
+    from omnibench.report.recording.section import write_recording_report
+    from omnibench.slam_terminal import print_slam
+
+    load_given_plugins(plugins)
+    given: dict[str, Any] = {} if start is None else {"start": start}
+    given |= {"deskew": False} if no_deskew else {}
+    request = SlamRequest(
+        dataset, output, validate(SlamOptions, parse_settings(settings) | given, "slam --set"), model, truth
+    )
+    if output is None and report is None and not as_json:
+        raise ConfigError("say where the poses go: -o DATASET; or ask for figures alone: --json, --report FILE.html")
+    with terminal.Steps(terminal.make_console(error=True)) as watch:
+        found = request.run(watch, table_format)
+        if report is not None:
+            watch("writing the report", 0, 1)
+            write_recording_report(found.dataset, report, truth=found.truth, accuracy=found.accuracy)
+            watch("writing the report", 1, 1)
+    _warn(found.summary.warnings)
+    if as_json:
+        return _print_json(found.summary)
+    print_slam(terminal.make_console(), found.summary)
+    for what, file in (("report", report), (f"{found.summary.runs} trajectories", output)):
+        if file is not None:
+            typer.echo(f"{what}: {file}")
+    return None
 
 
 @app.command("import")

@@ -17,6 +17,9 @@ from omnibench.errors import ConfigError, nearest
 M = TypeVar("M", bound=BaseModel)
 
 
+CHOSEN = "@"  # before the class of a union's member, in the tag of one that the data choose: no key of theirs
+
+
 class Model(BaseModel):
     """Base of every document that omnibench reads: unknown keys are refused, values do not change."""
 
@@ -118,10 +121,11 @@ def _describe(model: type[BaseModel], error: ValidationError) -> str:
 
 
 def _describe_one(model: type[BaseModel], detail: ErrorDetails) -> str:
-    location = detail["loc"]
+    whole = detail["loc"]
+    location = tuple(part for part in whole if not str(part).startswith(CHOSEN))
     place = ".".join(str(part) for part in location)
     if detail["type"] == "extra_forbidden":
-        known = _keys_at(model, location[:-1])
+        known = _keys_at(model, whole[:-1])
         return f"unknown key {place!r}; {nearest(str(location[-1]), known)}known: {', '.join(known) or 'none'}"
     if detail["type"] == "missing":
         return f"key {place!r} is missing"
@@ -137,6 +141,9 @@ def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[st
     definitions = schema.get("$defs", {})
     nodes = [schema]
     for part in location:
+        if str(part).startswith(CHOSEN):
+            nodes = [definitions[str(part).removeprefix(CHOSEN)]]
+            continue
         reached = [child for node in _expand(nodes, definitions) for child in _children(node, part)]
         if reached:  # names of union members in the location are not keys: stay where we are
             nodes = reached

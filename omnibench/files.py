@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
@@ -14,6 +14,8 @@ import polars as pl
 from omnibench.errors import DataError
 
 TableFormat = Literal["parquet", "csv"]
+# What a file will hold, or what writes it to a path and raises OSError when the disk refuses.
+FileContent = bytes | Callable[[Path], None]
 
 
 @contextmanager
@@ -30,6 +32,7 @@ def replacing(path: Path) -> Iterator[Path]:
             raise _refused(path, error) from None
         return
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    made = [folder for folder in path.parents if not folder.exists()]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
@@ -44,6 +47,8 @@ def replacing(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
+            for folder in made:  # they stay unless empty
+                folder.rmdir()
 
 
 def _refused(path: Path, error: OSError) -> DataError:
@@ -61,24 +66,25 @@ def write_table(path: Path, table: pl.DataFrame) -> None:
     write_files({path: encode_table(table, "csv" if path.suffix == ".csv" else "parquet")})
 
 
-def encode_table(table: pl.DataFrame, table_format: TableFormat, row_group: int | None = None) -> bytes:
-    """The content of a table's file; polars itself would tell of a full disk in errors of its own.
-
-    row_group: rows of a Parquet file that are read at once; None leaves it to polars.
-    """
+def encode_table(table: pl.DataFrame, table_format: TableFormat) -> bytes:
+    """The content of a table's file; polars itself would tell of a full disk in errors of its own."""
     content = BytesIO()
     if table_format == "parquet":
-        table.write_parquet(content, row_group_size=row_group)
+        table.write_parquet(content)
     else:
         table.write_csv(content)
     return content.getvalue()
 
 
-def write_files(contents: Mapping[Path, bytes]) -> None:
+def write_files(contents: Mapping[Path, FileContent]) -> None:
     """Write files that belong together: when the disk refuses one (DataError), all are as they were."""
     with ExitStack() as files:
         for path, content in contents.items():
-            files.enter_context(replacing(path)).write_bytes(content)
+            partial = files.enter_context(replacing(path))
+            if isinstance(content, bytes):
+                partial.write_bytes(content)
+            else:
+                content(partial)
 
 
 def remove(path: Path) -> None:

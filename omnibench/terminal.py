@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from omnibench.fit.bootstrap import ElementIntervals
@@ -15,7 +15,7 @@ from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.certify import CertifiedCalibration, Proof
 from omnibench.fit.evaluate import Evaluation
 from omnibench.fit.identifiability import ROWS, Identifiability
-from omnibench.fit.inspect import Inspection
+from omnibench.fit.inspect import Inspection, ScansContent
 from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.fit.physical import ParameterEstimate
 from omnibench.registry import REGISTRIES, Entry, PluginFailure
@@ -57,6 +57,37 @@ class EvaluationsBar:
 
     def __call__(self, evaluations: int, best: float) -> None:
         self._progress.update(self._task, completed=evaluations, note=f"{evaluations} evaluations, best {best:.6f}")
+
+
+class Steps:
+    """What is under way and how far it is: a bar for each stage on a terminal, a line for each where it is piped."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._progress = Progress(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._tasks: dict[str, TaskID] = {}
+
+    def __enter__(self) -> Steps:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        if what not in self._tasks:
+            self._progress.start()  # only now is there something to show
+            self._tasks[what] = self._progress.add_task(what, total=total)
+            if not self._console.is_terminal:
+                self._console.print(f"{what}: {total}", soft_wrap=True)
+        self._progress.update(self._tasks[what], completed=done)
 
 
 class ProofLine:
@@ -208,6 +239,8 @@ def print_inspection(console: Console, found: Inspection) -> None:
         f"poses every {1000 * found.pose_period_s:.3g} ms",
         soft_wrap=True,
     )
+    if found.scans is not None:
+        _print_scans(console, found.scans)
     table = Table()
     for heading in ("split", "runs", "commands", "repetitions", "sessions", "duration", "distance", "turned"):
         table.add_column(heading, justify="left" if heading == "split" else "right")
@@ -231,6 +264,16 @@ def print_inspection(console: Console, found: Inspection) -> None:
     _print_identifiability(console, found.identifiability)
     for finding in found.findings:
         console.print(f"- {finding}", soft_wrap=True)
+
+
+def _print_scans(console: Console, scans: ScansContent) -> None:
+    every = "" if scans.scan_period_s is None else f" every {1000 * scans.scan_period_s:.3g} ms"
+    console.print(
+        f"{scans.scans} scans{every} in {scans.trajectories} runs; {scans.rays} rays over "
+        f"{math.degrees(scans.field_of_view_rad):.0f} deg up to {scans.range_max_m:g} m, of which "
+        f"{scans.seen_share:.0%} measured something",
+        soft_wrap=True,
+    )
 
 
 def _print_identifiability(console: Console, told: Identifiability) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from omnibench.config import Model
-from omnibench.data.simulate.config import FlowerConfig
+from omnibench.data.simulate.simulate import SimulatedConfig
 from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
 from omnibench.fit.problem import Budget
 from omnibench.fit.span import Unidentified
@@ -29,7 +29,7 @@ class DatasetSource(Model):
     model_config = ConfigDict(extra="forbid", frozen=True, validate_by_name=True, validate_by_alias=True)
 
     path: Path | None = Field(None, description="a data set folder; relative to the config file")
-    simulate: FlowerConfig | None = None
+    simulate: SimulatedConfig | None = None
     import_: ImportSource | None = Field(default=None, alias="import")
 
     @model_validator(mode="after")

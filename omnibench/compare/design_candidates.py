@@ -15,6 +15,7 @@ from omnibench.config import read_model, read_yaml
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.simulate.config import FlowerConfig
 from omnibench.data.simulate.flower import commanded_rates, commands_of, duration_of, stamps_of_run
+from omnibench.data.simulate.robot_config import RobotConfig
 from omnibench.data.storage import load_dataset
 from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError
 from omnibench.fit.design import Counts
@@ -218,6 +219,11 @@ def _candidates_of_comparison(
     name = name or next(iter(config.datasets))
     found: DatasetSource = config.datasets[name]
     chosen = integration or config.integration
+    if isinstance(found.simulate, RobotConfig):
+        raise ConfigError(
+            f"{place}: data set {name} is a simulated robot, whose noise is not stated beforehand; `omnibench simulate` "
+            "it, and design from its folder"
+        )
     if found.simulate is None:
         return candidates_of_dataset(load_source(name, found), chosen, f"{place}: data set {name}")
     return candidates_of_simulation(name, found.simulate, chosen, place, config.notes)

@@ -11,7 +11,7 @@ import plotly.graph_objects as go
 from omnibench.compare.view import REFERENCE_LOOK, SPLIT_NAMES, THEORETICAL_LOOK, DatasetView, Look
 from omnibench.data.dataset import Trajectory
 from omnibench.report.blocks import Figure, FigureGrid
-from omnibench.report.numbers import fixed
+from omnibench.report.recording.runs import describe
 from omnibench.report.style import INK, equal_aspect, plot, text
 from omnibench.robot.kinematics import Array
 
@@ -70,16 +70,6 @@ def chosen_trajectories(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
     pool = distinct if len(distinct) >= _SHOWN else list(trajectories)
     picks = np.unique(np.linspace(0, len(pool) - 1, min(_SHOWN, len(pool))).round().astype(int))
     return [pool[index] for index in picks]
-
-
-def describe(trajectory: Trajectory) -> str:
-    """A trajectory's command as the paper writes it, else its name."""
-    if trajectory.alpha is None or trajectory.omega is None:
-        command = "" if trajectory.command is None else f"{trajectory.command}, "
-        return f"{command}{trajectory.id}"
-    speed = "" if trajectory.v is None else f"{trajectory.v:.3g} m/s, "
-    turn = fixed(trajectory.omega, 2)
-    return f"({speed}{math.degrees(trajectory.alpha):.0f}°, {turn} rad/s), {trajectory.id}"
 
 
 def _with_command(trajectories: Sequence[Trajectory], degrees: float) -> Trajectory | None:

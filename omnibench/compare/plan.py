@@ -18,7 +18,8 @@ from omnibench.compare.config import CalibratorEntry, CompareConfig, DatasetSour
 from omnibench.config import read_model, validate
 from omnibench.data.dataset import Dataset
 from omnibench.data.importer import import_dataset
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
+from omnibench.data.simulate.simulation import Watch, unwatched
 from omnibench.data.storage import load_dataset
 from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
 from omnibench.fit.calibrator import unloadable
@@ -97,19 +98,19 @@ def _names_in(plugin: Path) -> set[str]:
     return {plugin.stem, *re.findall(r"""calibrators\s*\.\s*register\(\s*["']([^"']+)["']""", text)}
 
 
-def load_datasets(config: CompareConfig) -> dict[str, Dataset]:
+def load_datasets(config: CompareConfig, watch: Watch = unwatched) -> dict[str, Dataset]:
     """Read, import or simulate every data set. DataError when one has no training data."""
     loaded = {}
     for name, source in config.datasets.items():
-        loaded[name] = load_source(name, source, config.description)
+        loaded[name] = load_source(name, source, config.description, watch)
         training_split(loaded[name])
     return loaded
 
 
-def load_source(name: str, source: DatasetSource, description: str = "") -> Dataset:
+def load_source(name: str, source: DatasetSource, description: str = "", watch: Watch = unwatched) -> Dataset:
     """One data set from its source."""
     if source.simulate is not None:
-        return simulate_dataset(source.simulate, name, description).dataset
+        return simulate_dataset(source.simulate, name, description, watch).dataset
     if source.import_ is not None:
         return import_dataset(source.import_.format, source.import_.source, source.import_.options)
     assert source.path is not None  # one of the three is given

@@ -11,6 +11,7 @@ from omnibench.compare.error_figures import error_blocks
 from omnibench.compare.headline import headline
 from omnibench.compare.matrices import matrix_blocks
 from omnibench.compare.path_figures import path_grid
+from omnibench.compare.published import published_blocks
 from omnibench.compare.results import ComparisonResult
 from omnibench.compare.search_figures import search_blocks
 from omnibench.compare.tables import (
@@ -25,6 +26,7 @@ from omnibench.compare.view import SPLIT_NAMES, DatasetView, views
 from omnibench.compare.wording import cost, cost_decimals, improvement_in_words, level_in_words
 from omnibench.config import to_yaml
 from omnibench.data.dataset import SPLITS
+from omnibench.errors import DataError
 from omnibench.report.blocks import (
     Badge,
     Block,
@@ -42,6 +44,7 @@ from omnibench.report.blocks import (
     Table,
 )
 from omnibench.report.numbers import NOTHING, count, fixed, listing, plural, significant
+from omnibench.report.recording.section import has_recording, recording_section
 from omnibench.report.render import write_document
 from omnibench.robot.kinematics import Array
 
@@ -100,18 +103,29 @@ def _parts(result: ComparisonResult, view: DatasetView, prefix: str) -> tuple[Se
     )
     return (
         Section(f"{prefix}result", "Result", headline(view)),
-        Section(f"{prefix}costs", "Costs", tuple(cost_table(view, split) for split in splits)),
+        Section(f"{prefix}costs", "Costs", (*(cost_table(view, split) for split in splits), *published_blocks(view))),
         Section(
             f"{prefix}errors",
             "Final errors",
             (final_error_table(view, view.scored), *error_blocks(view), *others),
         ),
         Section(f"{prefix}paths", "Paths", (path_grid(view),)),
+        *_recording(view, prefix),
         Section(f"{prefix}searches", "Searches", search_blocks(view)),
         Section(f"{prefix}outcomes", "Outcomes", (entry_table(view), *_proofs(result, view), runs)),
         Section(f"{prefix}matrices", "Matrices", matrix_blocks(view)),
         Section(f"{prefix}data", "Data", _data_blocks(result, view)),
     )
+
+
+def _recording(view: DatasetView, prefix: str) -> tuple[Section, ...]:
+    """Pictures of the recording; scans that cannot be read are no reason to lose the comparison."""
+    if not has_recording(view.dataset):
+        return ()
+    try:
+        return (recording_section(view.dataset, prefix),)
+    except DataError as error:
+        return (Section(f"{prefix}recording", "Recording", (Callout("No pictures", (str(error),), "warning"),)),)
 
 
 def _proofs(result: ComparisonResult, view: DatasetView) -> tuple[Block, ...]:

@@ -28,6 +28,7 @@ from omnibench.registry import PluginFailure
 class Silent:
     """Progress that nobody watches."""
 
+    def prepared(self, what: str, done: int, total: int) -> None: ...
     def planned(self, runs: int) -> None: ...
     def began(self, run: PlannedRun) -> None: ...
     def moved(self, run: PlannedRun, evaluations: int, best: float) -> None: ...
@@ -42,15 +43,16 @@ def run_comparison(
     ``output``: a folder; runs that are there already are not run again. Raises ConfigError or DataError for what the
     user can put right, and Interrupted on Ctrl-C, when everything that had ended is kept.
     """
+    progress = progress or Silent()
     failures = load_calibrators(config)
     with _blaming(failures):
         config = effective_config(config)
-        datasets = load_datasets(config)
+        datasets = load_datasets(config, progress.prepared)
     plan = make_plan(config, datasets)
     folder = prepare_output(config, output)
     store = RunStore(folder / "runs")
     with _resumable(plan, store, folder):
-        results = execute(plan, store, progress or Silent(), config.workers or os.cpu_count() or 1)
+        results = execute(plan, store, progress, config.workers or os.cpu_count() or 1)
         runs, certificates = certify(plan, score(plan, results, datasets))
         statistics = entry_statistics(runs, config.bootstrap)
         result = ComparisonResult(

@@ -14,6 +14,7 @@ from omnibench.compare.plan import PlannedRun
 from omnibench.compare.results import ComparisonResult, EntryStatistics, Interval
 from omnibench.data.dataset import SPLITS, Split
 from omnibench.fit.calibrator import RunResult
+from omnibench.terminal import Steps
 
 
 class Bars:
@@ -30,15 +31,22 @@ class Bars:
         )
         self._all = self._progress.add_task("runs", total=None, note="")
         self._tasks: dict[str, TaskID] = {}
+        self._preparation = Steps(console)
 
     def __enter__(self) -> Bars:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._preparation.__exit__()
         self._progress.stop()
+
+    def prepared(self, what: str, done: int, total: int) -> None:
+        """A bar for each stage in which data sets are made."""
+        self._preparation(what, done, total)
 
     def planned(self, runs: int) -> None:
         """How many runs there will be; only now is there something to show."""
+        self._preparation.__exit__()
         self._progress.update(self._all, total=runs)
         self._progress.start()
 
@@ -65,6 +73,7 @@ class Lines:
 
     def __init__(self, console: Console) -> None:
         self._console = console
+        self._preparation = Steps(console)
         self._runs = 0
         self._ended = 0
 
@@ -72,6 +81,10 @@ class Lines:
         return self
 
     def __exit__(self, *_: object) -> None: ...
+
+    def prepared(self, what: str, done: int, total: int) -> None:
+        """A line for each stage in which data sets are made."""
+        self._preparation(what, done, total)
 
     def planned(self, runs: int) -> None:
         """How many runs there will be."""

@@ -1,19 +1,30 @@
-"""Scans on disk: ``scans.parquet`` (or CSV) of a data set, read one trajectory at a time."""
+"""Scans on disk: ``scans.parquet`` (or CSV) of a data set, read and written a trajectory at a time."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import errno
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
+from polars.io.plugins import register_io_source
 
-from omnibench.data.scans import Scanner, Scans, TrajectoryScans
+from omnibench.data.scans import Ranges, Scanner, Scans, TrajectoryScans
+from omnibench.data.table import Table
 from omnibench.errors import DataError, nearest
-from omnibench.files import TableFormat, encode_table
+from omnibench.files import TableFormat
+from omnibench.robot.kinematics import Array
 
 _COLUMNS = ("trajectory", "t", "ranges")
-_ROW_GROUP = 256  # rows that are read at once; about 1 MB
+_SCHEMA = {"trajectory": pl.String(), "t": pl.Float64(), "ranges": pl.List(pl.Float32)}
+_ROW_GROUP = 256  # rows of a Parquet file that are read at once; about 1 MB
+_MOST_ROWS = 4096  # that are held besides the result of reading, about 20 MB
+_ROWS_OF_CSV = 65536  # reading them begins at the file's first line every time
+
+Rows = NDArray[np.intp]
 
 
 def scans_file(folder: Path) -> Path | None:
@@ -32,105 +43,166 @@ class ScansOnDisk(Scans):
 
     def __init__(self, file: Path, scanner: Scanner, trajectories: Iterable[str]) -> None:
         self.file, self.scanner = file, scanner
+        self._state = self._file_state()
         self._index = self._read_index(set(trajectories))
 
     @property
     def trajectories(self) -> tuple[str, ...]:
         return tuple(self._index)
 
+    def times(self, trajectory: str) -> Array:
+        return self._indexed(trajectory)[1]
+
     def of(self, trajectory: str) -> TrajectoryScans:
+        rows, times = self._indexed(trajectory)
+        if self._file_state() != self._state:
+            raise DataError(f"{self.file}: the file has changed since it was opened; load the data set again")
+        ranges = np.empty((len(rows), self.scanner.rays), np.float32)
+        for part in _parts(rows, _MOST_ROWS if self.file.suffix == ".parquet" else _ROWS_OF_CSV):
+            ranges[part] = self._read(rows[part], f"trajectory {trajectory}", times[part])
+        return TrajectoryScans(times, ranges)
+
+    def _indexed(self, trajectory: str) -> tuple[Rows, Array]:
         if trajectory not in self._index:
             raise DataError(f"{self.file}: trajectory {trajectory} has no scans")
-        rows = self._index[trajectory]
+        return self._index[trajectory]
+
+    def _file_state(self) -> tuple[int, int]:
         try:
-            chosen = self._lazy().filter(pl.col("trajectory").cast(pl.String) == trajectory).collect()
-        except pl.exceptions.PolarsError as error:
+            status = self.file.stat()
+        except OSError as error:
+            raise DataError(f"{self.file}: cannot be read: {error.strerror}") from None
+        return status.st_mtime_ns, status.st_size
+
+    def _collect(self, table: pl.LazyFrame) -> pl.DataFrame:
+        try:
+            return table.collect()
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
             raise DataError(f"{self.file}: cannot be read: {error}") from None
-        column = self._numbers(chosen["ranges"], rows)
-        lengths = column.list.len().fill_null(0).to_numpy()
-        for row in np.flatnonzero(lengths != self.scanner.rays)[:1]:
-            raise self._fail(
-                int(rows[row]), f"the scan has {lengths[row]} ranges, but scanner.rays is {self.scanner.rays}"
-            )
-        values = column.explode().cast(pl.Float32).fill_null(np.nan).to_numpy()
-        ranges = values.reshape(len(rows), self.scanner.rays)
-        for row in np.flatnonzero(np.isnan(ranges).any(axis=1))[:1]:
-            raise self._fail(int(rows[row]), "a range is missing or NaN; inf says that nothing was seen")
-        for row in np.flatnonzero(~self.scanner.valid(ranges).any(axis=1))[:1]:
-            raise self._fail(
-                int(rows[row]),
-                f"the scan of trajectory {trajectory} at {chosen['t'][int(row)]:g} s is empty: no range from "
-                f"{self.scanner.range_min:g} to {self.scanner.range_max:g} m; remove the row",
-            )
-        return TrajectoryScans(chosen["t"].cast(pl.Float64).to_numpy(), ranges)
 
     def _lazy(self) -> pl.LazyFrame:
         if self.file.suffix == ".parquet":
             return pl.scan_parquet(self.file)
-        return pl.scan_csv(self.file, schema_overrides={"trajectory": pl.String, "ranges": pl.String})
+        return pl.scan_csv(self.file, infer_schema=False)  # texts: what is a number is told with the row
 
-    def _read_index(self, known: set[str]) -> dict[str, np.ndarray]:
-        """Rows of every trajectory, in its order."""
-        try:
-            columns = self._lazy().collect_schema().names()
-            for column in _COLUMNS:
-                if column not in columns:
-                    raise DataError(
-                        f"{self.file}: column {column!r} is missing; {nearest(column, columns)}"
-                        f"found: {', '.join(columns)}"
-                    )
-            frame = self._lazy().select(pl.col("trajectory").cast(pl.String), pl.col("t")).collect()
-        except (pl.exceptions.PolarsError, OSError) as error:
-            raise DataError(f"{self.file}: cannot be read: {error}") from None
-        if frame.is_empty():
-            raise DataError(f"{self.file}: it has no rows; remove it, or record scans")
-        if not frame["t"].dtype.is_numeric():
-            raise DataError(f"{self.file}: column 't' holds {frame['t'].dtype}, expected numbers")
-        times = frame["t"].cast(pl.Float64).fill_null(np.nan).to_numpy()
-        for row in np.flatnonzero(~np.isfinite(times))[:1]:
-            raise self._fail(int(row), f"t is {frame['t'][int(row)]}; remove or repair the row")
-        index = {}
-        grouped = frame.with_row_index("row").group_by("trajectory", maintain_order=True).agg(pl.col("row"))
-        for trajectory, rows in grouped.iter_rows():
-            if trajectory not in known:
-                raise self._fail(rows[0], f"trajectory {trajectory} is not in the table of trajectories")
-            found = np.array(rows)
-            for bad in np.flatnonzero(np.diff(times[found]) <= 0)[:1]:
-                row, before = int(found[bad + 1]), int(found[bad])
-                raise self._fail(row, f"t goes backwards or is repeated: {times[row]:g} after {times[before]:g}")
-            index[trajectory] = found
-        return index
+    def _read(self, rows: Rows, whose: str, times: Array) -> Ranges:
+        """The ranges of some rows (n, R), checked."""
+        first, last = int(rows[0]), int(rows[-1])
+        column = self._collect(self._lazy().select("ranges").slice(first, last - first + 1))["ranges"]
+        column = self._numbers(column[rows - first] if len(rows) < len(column) else column, rows)
+        lengths = column.list.len().fill_null(0).to_numpy()
+        for index in np.flatnonzero(lengths != self.scanner.rays)[:1]:
+            told = f"the scan has {lengths[index]} ranges, but scanner.rays is {self.scanner.rays}"
+            raise self._fail(int(rows[index]), told)
+        ranges = column.explode().cast(pl.Float32).fill_null(np.nan).to_numpy().reshape(len(rows), -1)
+        for index in np.flatnonzero(np.isnan(ranges).any(axis=1))[:1]:
+            raise self._fail(int(rows[index]), "a range is missing or NaN; inf says that nothing was seen")
+        for index in np.flatnonzero(~self.scanner.valid(ranges).any(axis=1))[:1]:
+            raise self._fail(
+                int(rows[index]),
+                f"the scan of {whose} at {times[index]:g} s is empty: no range from "
+                f"{self.scanner.range_min:g} to {self.scanner.range_max:g} m; remove the row",
+            )
+        return ranges
 
-    def _numbers(self, column: pl.Series, rows: np.ndarray) -> pl.Series:
+    def _numbers(self, column: pl.Series, rows: Rows) -> pl.Series:
         """The ranges as lists of numbers; in CSV they are a text with blanks between them."""
         if isinstance(column.dtype, pl.Array):
             column = column.arr.to_list()
         if column.dtype == pl.String:
             texts = column.str.strip_chars().str.split(" ")
             values = texts.list.eval(pl.element().cast(pl.Float32, strict=False))
-            broken = texts.list.eval(pl.element().is_not_null()).list.sum() != values.list.drop_nulls().list.len()
-            for row in broken.arg_true()[:1]:
-                raise self._fail(int(rows[row]), "ranges must be numbers with a blank between them")
+            broken = texts.list.len() != values.list.drop_nulls().list.len()
+            for index in broken.arg_true()[:1]:
+                raise self._fail(int(rows[index]), "ranges must be numbers with a blank between them")
             return values
         if not isinstance(column.dtype, pl.List) or not column.dtype.inner.is_numeric():
             raise DataError(f"{self.file}: column 'ranges' holds {column.dtype}, expected lists of numbers")
         return column
 
+    def _read_index(self, known: set[str]) -> dict[str, tuple[Rows, Array]]:
+        """Rows and stamps of every trajectory, in its order."""
+        table = self._names_and_stamps()
+        times = table.numbers("t")
+        for row in np.flatnonzero(times < 0)[:1]:
+            raise table.fail(int(row), f"t is {times[row]:g}; it must not be negative")
+        index = {}
+        grouped = table.frame.with_row_index("row").group_by("trajectory", maintain_order=True).agg(pl.col("row"))
+        for trajectory, rows in zip(grouped["trajectory"], grouped["row"], strict=True):
+            found: Rows = rows.to_numpy().astype(np.intp)
+            if trajectory not in known:
+                told = f"trajectory {trajectory} is not in the table of trajectories; {nearest(trajectory, known)}"
+                raise table.fail(int(found[0]), told.rstrip("; "))
+            stamps = times[found]
+            for bad in np.flatnonzero(np.diff(stamps) <= 0)[:1]:
+                what = "goes backwards" if stamps[bad + 1] < stamps[bad] else "is repeated"
+                raise table.fail(int(found[bad + 1]), f"t {what}: {stamps[bad + 1]:g} after {stamps[bad]:g}")
+            index[str(trajectory)] = found, stamps
+        return index
+
+    def _names_and_stamps(self) -> Table:
+        """The two small columns; their names and types checked."""
+        try:
+            schema = self._lazy().collect_schema()
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
+            raise DataError(f"{self.file}: cannot be read: {error}") from None
+        for column in _COLUMNS:
+            if column not in schema:
+                found = ", ".join(schema)
+                raise DataError(f"{self.file}: column {column!r} is missing; {nearest(column, schema)}found: {found}")
+        if schema["trajectory"].is_nested():
+            raise DataError(f"{self.file}: column 'trajectory' holds {schema['trajectory']}, expected names or numbers")
+        frame = self._collect(self._lazy().select(pl.col("trajectory").cast(pl.String), pl.col("t")))
+        if frame.is_empty():
+            raise DataError(f"{self.file}: it has no rows; remove it, or record scans")
+        table = Table(self.file, frame)
+        for row in frame["trajectory"].is_null().arg_true()[:1]:
+            raise table.fail(int(row), "trajectory is missing")
+        return table
+
     def _fail(self, row: int, what: str) -> DataError:
         return DataError(f"{self.file}, row {row + 1}: {what}")
 
 
-def encode_scans(scans: Scans, table_format: TableFormat) -> bytes:
-    """The content of the table's file, every range to the scanner's float precision."""
-    frames = [
-        pl.DataFrame(
-            {"trajectory": [trajectory] * len(found.times), "t": found.times, "ranges": found.ranges},
-            schema={"trajectory": pl.String, "t": pl.Float64, "ranges": pl.Array(pl.Float32, scans.scanner.rays)},
+def write_scans(scans: Scans, table_format: TableFormat, trajectories: Iterable[str], file: Path) -> None:
+    """Write the table of those of ``trajectories`` that have scans; no more than one's are in memory at a time.
+
+    Ranges are written to the float's precision. DataError: scans that cannot be read. OSError: a disk that refuses.
+    """
+    recorded = set(scans.trajectories)
+    chosen = [trajectory for trajectory in trajectories if trajectory in recorded]
+    as_text = table_format == "csv"
+
+    def frames(*_: Any) -> Iterator[pl.DataFrame]:
+        for trajectory in chosen:
+            yield from _frames(trajectory, scans.of(trajectory), as_text)
+
+    table = register_io_source(frames, schema=_SCHEMA | ({"ranges": pl.String()} if as_text else {}))
+    try:
+        if as_text:
+            table.sink_csv(file, maintain_order=True)
+        else:
+            table.sink_parquet(file, row_group_size=_ROW_GROUP, maintain_order=True)
+    except pl.exceptions.PolarsError as error:
+        raise OSError(errno.EIO, str(error)) from None
+
+
+def _frames(trajectory: str, scans: TrajectoryScans, as_text: bool) -> Iterator[pl.DataFrame]:
+    rays = scans.ranges.shape[1]
+    for first in range(0, len(scans.times), _ROW_GROUP):
+        part = slice(first, first + _ROW_GROUP)
+        times, ranges = scans.times[part], np.asarray(scans.ranges[part], dtype=np.float32)
+        frame = pl.DataFrame(
+            {"trajectory": [trajectory] * len(times), "t": times, "ranges": ranges},
+            schema={"trajectory": pl.String, "t": pl.Float64, "ranges": pl.Array(pl.Float32, rays)},
         ).with_columns(pl.col("ranges").arr.to_list())
-        for trajectory, found in scans
-    ]
-    table = pl.concat(frames)
-    if table_format == "csv":
-        table = table.with_columns(pl.col("ranges").cast(pl.List(pl.String)).list.join(" "))
-        return encode_table(table, "csv")
-    return encode_table(table, "parquet", _ROW_GROUP)
+        yield frame.with_columns(pl.col("ranges").cast(pl.List(pl.String)).list.join(" ")) if as_text else frame
+
+
+def _parts(rows: Rows, most: int) -> Iterator[slice]:
+    """Parts of increasing ``rows`` that span no more than ``most`` rows of the file each."""
+    begin = 0
+    while begin < len(rows):
+        end = int(np.searchsorted(rows, rows[begin] + most))
+        yield slice(begin, end)
+        begin = end

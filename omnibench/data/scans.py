@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, model_validator
 
 from omnibench.config import Model
+from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
 Ranges = NDArray[np.float32]
@@ -91,6 +92,10 @@ class Scans(ABC):
     def of(self, trajectory: str) -> TrajectoryScans:
         """The scans of a trajectory. DataError in one line: there are none, or they are broken."""
 
+    def times(self, trajectory: str) -> Array:
+        """The stamps of a trajectory's scans (S,), s. DataError as for ``of``."""
+        return self.of(trajectory).times
+
     def __iter__(self) -> Iterator[tuple[str, TrajectoryScans]]:
         return ((trajectory, self.of(trajectory)) for trajectory in self.trajectories)
 
@@ -107,4 +112,6 @@ class ScansInMemory(Scans):
         return tuple(self._scans)
 
     def of(self, trajectory: str) -> TrajectoryScans:
+        if trajectory not in self._scans:
+            raise DataError(f"trajectory {trajectory} has no scans")
         return self._scans[trajectory]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, cast
 
@@ -12,11 +13,11 @@ from pydantic import Field, model_validator
 
 from omnibench.config import Model, read_yaml, to_yaml, validate
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, make_dataset
-from omnibench.data.scan_files import ScansOnDisk, encode_scans, scans_file
-from omnibench.data.scans import Scanner
+from omnibench.data.scan_files import ScansOnDisk, scans_file, write_scans
+from omnibench.data.scans import Scanner, Scans
 from omnibench.data.table import Table, read_table
 from omnibench.errors import ConfigError, DataError, nearest
-from omnibench.files import TableFormat, encode_table, remove, write_files
+from omnibench.files import FileContent, TableFormat, encode_table, remove, write_files
 from omnibench.robot.kinematics import Array, Robot
 
 FORMAT: Final = "omnibench-dataset/1"
@@ -86,10 +87,7 @@ def load_dataset(path: Path | str) -> Dataset:
 def save_dataset(dataset: Dataset, path: Path | str, table_format: TableFormat = "parquet") -> None:
     """Write a data set folder. DataError when the disk refuses, or when the folder holds something else."""
     folder = Path(path)
-    if folder.is_file():
-        raise DataError(f"{folder}: is a file; name a folder for the data set")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / "dataset.yaml").is_file():
-        raise DataError(f"{folder}: holds other files; name an empty or new folder for the data set")
+    check_folder(folder)
     tables = {
         "trajectories": pl.DataFrame(
             [_run_row(trajectory) for trajectory in dataset.trajectories], infer_schema_length=None
@@ -97,23 +95,34 @@ def save_dataset(dataset: Dataset, path: Path | str, table_format: TableFormat =
         "wheels": pl.concat([_wheel_frame(trajectory, dataset.robot) for trajectory in dataset.trajectories]),
         "poses": pl.concat([_pose_frame(trajectory) for trajectory in dataset.trajectories]),
     }
-    contents = {folder / "dataset.yaml": to_yaml(header_of(dataset)).encode()}
+    contents: dict[Path, FileContent] = {folder / "dataset.yaml": to_yaml(header_of(dataset)).encode()}
     for name, frame in tables.items():
         # What only some trajectories have is left out of the sample tables, which may have no gaps.
         allowed = len(frame) - 1 if name == "trajectories" else 0
         kept = frame.select(column for column in frame.iter_columns() if column.null_count() <= allowed)
         contents[folder / f"{name}.{table_format}"] = encode_table(kept, table_format)
-    if dataset.scans is not None:
-        contents[folder / f"scans.{table_format}"] = encode_scans(dataset.scans, table_format)
+    scans = _recorded_scans(dataset)
+    if scans is not None:
+        ids = [trajectory.id for trajectory in dataset.trajectories]
+        contents[folder / f"scans.{table_format}"] = partial(write_scans, scans, table_format, ids)
     write_files(contents)
-    if dataset.scans is None:
+    if scans is None:
         remove(folder / f"scans.{table_format}")
     for name in (*tables, "scans"):  # of a data set in the other format that was there before
         remove(folder / f"{name}.{'csv' if table_format == 'parquet' else 'parquet'}")
 
 
+def check_folder(folder: Path) -> None:
+    """DataError in one line when a data set cannot be written there, because something else is."""
+    if folder.is_file():
+        raise DataError(f"{folder}: is a file; name a folder for the data set")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "dataset.yaml").is_file():
+        raise DataError(f"{folder}: holds other files; name an empty or new folder for the data set")
+
+
 def header_of(dataset: Dataset) -> Header:
     """What dataset.yaml says of a data set."""
+    scans = _recorded_scans(dataset)
     return Header(
         name=dataset.name,
         description=dataset.description,
@@ -123,8 +132,16 @@ def header_of(dataset: Dataset) -> Header:
         robot=dataset.robot,
         sample_period=dataset.sample_period,
         wheels=dataset.robot.wheel_names,
-        scanner=None if dataset.scans is None else dataset.scans.scanner,
+        scanner=None if scans is None else scans.scanner,
     )
+
+
+def _recorded_scans(dataset: Dataset) -> Scans | None:
+    """The scans, if any trajectory has some: the data set may be a part of the one that they were recorded for."""
+    if dataset.scans is None:
+        return None
+    recorded = set(dataset.scans.trajectories)
+    return dataset.scans if any(trajectory.id in recorded for trajectory in dataset.trajectories) else None
 
 
 class _WheelColumns:

@@ -6,6 +6,7 @@ import numpy as np
 
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Split
+from omnibench.data.scans import Scans
 from omnibench.fit.identifiability import Identifiability, identifiability
 from omnibench.fit.span import direction_in_words, driven_span
 
@@ -21,6 +22,18 @@ class SplitContent(Model):
     duration_s: float
     distance_m: float
     turned_rad: float
+
+
+class ScansContent(Model):
+    """The scans of a data set. seen_share: of the rays, that measured something; the period is the median."""
+
+    trajectories: int
+    scans: int
+    scan_period_s: float | None
+    rays: int
+    field_of_view_rad: float
+    range_max_m: float
+    seen_share: float
 
 
 class Inspection(Model):
@@ -44,6 +57,7 @@ class Inspection(Model):
     reference_poses: int
     has_angles: bool
     has_targets: bool
+    scans: ScansContent | None
     splits: dict[str, SplitContent]
     driven_directions: int
     driven_shares: tuple[float, ...]
@@ -54,7 +68,10 @@ class Inspection(Model):
 
 
 def inspect_dataset(dataset: Dataset) -> Inspection:
-    """Count, measure, and predict what the training runs can tell of the robot, and what they leave open."""
+    """Count, measure, and predict what the training runs can tell of the robot, and what they leave open.
+
+    Every scan is read. DataError in one line: one is broken.
+    """
     trajectories = dataset.trajectories
     periods = np.concatenate([np.diff(t.times, prepend=0.0) for t in trajectories])
     pose_periods = np.concatenate([np.diff(t.pose_times) for t in trajectories])
@@ -78,6 +95,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
         reference_poses=len(pose_periods) + len(trajectories),
         has_angles=all(t.angles is not None for t in trajectories),
         has_targets=all(t.targets is not None for t in trajectories),
+        scans=None if dataset.scans is None else _scans(dataset.scans),
         splits={split: _content(dataset, split) for split in SPLITS if dataset.split(split)},
         driven_directions=len(span.driven),
         driven_shares=tuple(span.shares.tolist()),
@@ -104,6 +122,25 @@ def _content(dataset: Dataset, split: Split) -> SplitContent:
     )
 
 
+def _scans(scans: Scans) -> ScansContent:
+    scanner = scans.scanner
+    periods, count, seen = [np.zeros(0)], 0, 0
+    for _, found in scans:
+        periods.append(np.diff(found.times))
+        count += len(found.times)
+        seen += sum(int(scanner.valid(ranges).sum()) for ranges in found.ranges)
+    steps = np.concatenate(periods)
+    return ScansContent(
+        trajectories=len(scans.trajectories),
+        scans=count,
+        scan_period_s=float(np.median(steps)) if len(steps) else None,
+        rays=scanner.rays,
+        field_of_view_rad=abs(scanner.angle_increment) * (scanner.rays - 1),
+        range_max_m=scanner.range_max,
+        seen_share=seen / max(count * scanner.rays, 1),
+    )
+
+
 def _findings(dataset: Dataset, told: Identifiability) -> list[str]:
     findings = list(told.sentences)
     if not dataset.split("train"):
@@ -113,4 +150,9 @@ def _findings(dataset: Dataset, told: Identifiability) -> list[str]:
     training = dataset.split("train")
     if training and all(t.command is None for t in training):
         findings.append("no commands are named: repetitions are unknown")
+    if dataset.scans is not None:
+        recorded = set(dataset.scans.trajectories)
+        bare = [run.id for run in dataset.trajectories if run.id not in recorded]
+        if bare:
+            findings.append(f"{len(bare)} trajectories have no scans, e.g. {', '.join(bare[:3])}: SLAM needs them")
     return findings

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Dataset, Split, Trajectory
-from omnibench.data.simulate.truth import TrueRobot
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.recording import Recording
 from omnibench.robot.kinematics import Array, Robot
@@ -116,8 +115,8 @@ def true_anchors(recording: Recording, split: Split | None = None) -> Array:
 
     The reference poses of a chain then err about the truth and do not drift away from it.
     """
-    truth, runs = _truth(recording), _ordered(recording.dataset, split)
-    moves = [relative(each.start, _true_poses(truth, each, each.times[-1:])[0]) for each in runs]
+    truth, runs = _TruthOfRuns(recording), _ordered(recording.dataset, split)
+    moves = [relative(each.start, truth.poses(each, each.times[-1:])[0]) for each in runs]
     return _composed(runs[0].start, np.array(moves))
 
 
@@ -127,7 +126,7 @@ def chained_truth(chain: Chain, recording: Recording) -> Array:
     Continuous on true anchors; else it leaps from run to run by what the reference was wrong. DataError without a
     truth.
     """
-    truth = _truth(recording)
+    truth = _TruthOfRuns(recording)
     known = {each.id: each for each in recording.dataset.trajectories}
     bounds = np.searchsorted(chain.run, np.arange(1, len(chain.ids)))
     poses = []
@@ -135,7 +134,7 @@ def chained_truth(chain: Chain, recording: Recording) -> Array:
         if chain.ids[index] not in known:
             raise DataError(f"run {chain.ids[index]} is not in data set {recording.dataset.name}; chain that one")
         run = _trimmed(known[chain.ids[index]])
-        driven = _true_poses(truth, run, np.append(0.0, times - chain.begins[index]))
+        driven = truth.poses(run, np.append(0.0, times - chain.begins[index]))
         poses.append(moved_to(chain.starts[index], driven)[1:])
     return np.concatenate(poses)
 
@@ -247,19 +246,24 @@ def _anchored(dataset: Dataset, anchors: Array, moves: Array) -> Array:
     return np.column_stack([anchors[:, :2], anchors[:, 2] - TURN * turns])
 
 
-def _truth(recording: Recording) -> TrueRobot:
-    if recording.truth is None:
-        raise DataError(
-            f"data set {recording.dataset.name}: its truth is not known; simulate it from a comparison's config"
-        )
-    return recording.truth.true_robot()
+class _TruthOfRuns:
+    """Where a simulated robot truly was. DataError without a truth."""
 
+    def __init__(self, recording: Recording) -> None:
+        if recording.truth is None:
+            raise DataError(
+                f"data set {recording.dataset.name}: its truth is not known; simulate it from a comparison's config"
+            )
+        self._paths = recording.paths
+        self._robot = recording.truth.true_robot()
 
-def _true_poses(truth: TrueRobot, run: Trajectory, stamps: Array) -> Array:
-    """Where a simulated robot truly was (K, 3) at stamps (K,) s of a run."""
-    if run.targets is None or run.angles is None:
-        raise DataError(f"run {run.id}: what the motors were told is not recorded, so its truth is not known")
-    rates = truth.driven(run.times, run.targets)
-    angles = run.angles[0] - run.rates[0] * run.times[0]  # before its first sample
-    log = truth.log(run.times, rates, run.start, stamps, angles, run.started_at, run.session)
-    return truth.model.poses([log])[0]
+    def poses(self, run: Trajectory, stamps: Array) -> Array:
+        """Its poses (K, 3) at stamps (K,) s of a run."""
+        if run.id in self._paths:
+            return moved_to(run.start, self._paths[run.id].at(np.append(0.0, stamps)))[1:]
+        if run.targets is None or run.angles is None:
+            raise DataError(f"run {run.id}: what the motors were told is not recorded, so its truth is not known")
+        rates = self._robot.driven(run.times, run.targets)
+        angles = run.angles[0] - run.rates[0] * run.times[0]  # before its first sample
+        log = self._robot.log(run.times, rates, run.start, stamps, angles, run.started_at, run.session)
+        return self._robot.model.poses([log])[0]

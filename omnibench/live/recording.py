@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from omnibench.data.dataset import Dataset
 from omnibench.data.simulate.source import read_simulation
 from omnibench.data.simulate.truth import TruthRecord
+from omnibench.data.simulate.truth_poses import TruePath
 from omnibench.data.storage import load_dataset
 from omnibench.errors import ConfigError
 from omnibench.registry import load_plugins
@@ -15,10 +17,14 @@ from omnibench.registry import load_plugins
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A data set and, where it was simulated on the spot, what is hidden from it."""
+    """A data set and, where it was simulated on the spot, what is hidden from it.
+
+    paths: where the robot truly was in each run, if that is no matter of its targets alone.
+    """
 
     dataset: Dataset
     truth: TruthRecord | None = None
+    paths: Mapping[str, TruePath] = field(default_factory=dict)
 
 
 def load_recording(path: Path, dataset: str | None = None) -> Recording:
@@ -33,7 +39,7 @@ def load_recording(path: Path, dataset: str | None = None) -> Recording:
         source = read_simulation(path, dataset)
         load_plugins(source.effect_plugins, installed=False)
         simulation = source.simulate()
-        return Recording(simulation.dataset, simulation.truth)
+        return Recording(simulation.dataset, simulation.truth, simulation.paths)
     if dataset is not None:
         raise ConfigError(f"--dataset {dataset}: {path} is a folder with one data set; leave --dataset out")
     return Recording(load_dataset(path))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import plotly.graph_objects as go
 
@@ -143,7 +144,29 @@ class Details:
     open: bool = False
 
 
-Block = Paragraph | Callout | Facts | Table | FigureGrid | Code | Details
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """Blocks of which one option's are shown; a menu called ``label`` chooses. Without JavaScript all are."""
+
+    kind: ClassVar[str] = "choice"
+    label: str
+    options: Mapping[str, tuple[Block, ...]]
+
+
+@dataclass(frozen=True, eq=False)
+class Player:
+    """Runs of a robot to be gone through step by step. ``runs``: by name, JSON as player.js reads it.
+
+    ``description`` says in words what is drawn, for readers who cannot see it.
+    """
+
+    kind: ClassVar[str] = "player"
+    runs: Mapping[str, Any]
+    description: str
+    caption: str = ""
+
+
+Block = Paragraph | Callout | Facts | Table | FigureGrid | Code | Details | Choice | Player
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,6 +46,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["plot_json"] = _plot_json
+    environment.filters["script_json"] = _json
     environment.globals["plotly_js"] = Markup(get_plotlyjs())
     environment.globals["source"] = lambda name: Markup(_source(environment, name))
     return environment

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import binom
 
 from omnibench.compare.plan import read_compare_config
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.data.simulate.source import read_simulation
 from omnibench.fit.bootstrap import bootstrap_intervals
 from omnibench.fit.calibrator import run_calibrator

@@ -18,7 +18,7 @@ import numpy as np
 from scipy import stats
 
 from omnibench.data.simulate.config import Commands, EncoderNoise, FlowerConfig, Session, Truth
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.data.simulate.truth import true_matrix
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation

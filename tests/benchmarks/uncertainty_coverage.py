@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binomtest
 
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.data.simulate.source import read_simulation
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.physical import geometry_of

@@ -21,7 +21,7 @@ from omnibench.compare.design_result import Design, SetDesign
 from omnibench.config import to_json, validate
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.data.simulate.config import FlowerConfig
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.data.storage import save_dataset
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.fit.information import information_of_runs

@@ -20,7 +20,7 @@ from omnibench.compare.design_report import write_design_report
 from omnibench.compare.design_result import Design
 from omnibench.compare.design_terminal import print_design
 from omnibench.data.simulate.config import FlowerConfig
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
 
 STAR = {"speeds": [0.2], "directions_deg": [0, 90, 180, 270], "turn_rates": [-0.35, 0, 0.35], "distance": 1}
 SPOT = {"speed": 0, "turn_rate": 1.0, "duration": 6}

@@ -17,7 +17,7 @@ from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import PlannedRun
 from omnibench.compare.run import run_comparison
 from omnibench.data.simulate.config import FlowerConfig
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.data.storage import save_dataset
 from omnibench.fit.calibrator import RunResult
 
@@ -170,6 +170,7 @@ class Watch:
         self.ran: list[str] = []
         self.kept: list[str] = []
 
+    def prepared(self, what: str, done: int, total: int) -> None: ...
     def planned(self, runs: int) -> None: ...
     def began(self, run: PlannedRun) -> None: ...
     def moved(self, run: PlannedRun, evaluations: int, best: float) -> None: ...

@@ -18,7 +18,7 @@ from omnibench.compare.report import write_report
 from omnibench.compare.results import ComparisonResult
 from omnibench.data.dataset import make_dataset
 from omnibench.data.simulate.config import FlowerConfig
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.errors import DataError
 from omnibench.fit.problem import Improvement
 from omnibench.report.numbers import fixed

@@ -10,11 +10,12 @@ from hypothesis.extra import numpy as hnp
 from report_samples import APR02, config, flower, run
 
 from omnibench.compare.matrices import differences
-from omnibench.compare.path_figures import chosen_trajectories, describe
+from omnibench.compare.path_figures import chosen_trajectories
 from omnibench.compare.search_figures import TARGETS, courses, targets_reached, thinned
 from omnibench.compare.view import views
 from omnibench.data.simulate.config import FlowerConfig
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
+from omnibench.report.recording.runs import describe
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.published import published_matrix
 

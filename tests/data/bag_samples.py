@@ -16,7 +16,7 @@ from mcap_ros2.writer import Writer as McapRos2Writer
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from omnibench.data.dataset import Dataset
 from omnibench.data.importer import import_dataset
@@ -27,6 +27,7 @@ from omnibench.testing.synthetic import synthetic_robot, true_robot
 
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
+ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 ROBOT = synthetic_robot()
 TRUTH = true_robot(ROBOT).inverse_kinematic_matrix
 EPOCH = 1_700_000_000_000_000_000  # ns
@@ -150,8 +151,10 @@ def _made(store: Any, kind: str, content: dict[str, Any]) -> Any:
         given = 7 if name == "seq" else content.get(name)
         if sort.name == "NAME":
             given = _made(store, detail, given or {})
+        elif sort.name in ("ARRAY", "SEQUENCE") and detail[0][0].name == "NAME":
+            given = [_made(store, detail[0][1], each) for each in given or ()]
         elif sort.name in ("ARRAY", "SEQUENCE") and detail[0][1][0] != "string":
-            given = np.array(given if given is not None else np.zeros(detail[1]), dtype=np.float64)
+            given = np.array(given if given is not None else np.zeros(detail[1]), dtype=detail[0][1][0])
         elif given is None:
             given = "" if detail[0] == "string" else 0.0
         values[name] = given

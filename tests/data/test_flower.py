@@ -17,7 +17,9 @@ import yaml
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Split
 from omnibench.data.simulate.config import EncoderNoise, FlowerConfig
-from omnibench.data.simulate.flower import Simulation, commands_of, simulate_dataset
+from omnibench.data.simulate.flower import commands_of
+from omnibench.data.simulate.simulate import simulate_dataset
+from omnibench.data.simulate.simulation import Simulation
 from omnibench.data.simulate.truth import true_matrix
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.simulate.config import Commands, EncoderNoise, FlowerConfig
-from omnibench.data.simulate.flower import Command, commanded_rates, commands_of, simulate_dataset
+from omnibench.data.simulate.flower import Command, commanded_rates, commands_of
+from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.fit.evaluate import final_errors
 from omnibench.robot.calibration import EffectTerm

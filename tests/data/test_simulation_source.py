@@ -9,7 +9,7 @@ import pytest
 import yaml
 from commands import CONFIGS, Command, Prepared, assert_refused, flower, omnibench, small
 
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.data.simulate.source import read_simulation
 from omnibench.data.storage import load_dataset
 from omnibench.errors import ConfigError, OmnibenchError

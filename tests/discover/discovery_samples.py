@@ -9,7 +9,7 @@ from typing import Any
 
 from omnibench.data.dataset import Dataset
 from omnibench.data.simulate.config import FlowerConfig
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.result import Discovery, Experiment, HeldOut, Novelty, Place
 

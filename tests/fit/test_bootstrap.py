@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.data.simulate.source import read_simulation
 from omnibench.errors import ConfigError
 from omnibench.fit.bootstrap import bootstrap_intervals

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from omnibench.data.dataset import Trajectory
 from omnibench.data.simulate.config import FlowerConfig
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.errors import DataError
 from omnibench.fit.noise import Whitener, estimate_noise
 from omnibench.robot.calibration import Noise

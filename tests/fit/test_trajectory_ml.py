@@ -10,7 +10,7 @@ from fit_samples import make_problem, noisy_trajectories
 
 from omnibench.data.dataset import Trajectory
 from omnibench.data.simulate.config import FlowerConfig
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
 from omnibench.fit.calibrators.trajectory_ml import TrajectoryML, TrajectoryMLOptions

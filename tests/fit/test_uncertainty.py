@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from motions import FLOWER, RING, driven
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.data.simulate.source import read_simulation
 from omnibench.errors import DataError
 from omnibench.fit.bootstrap import bootstrap_intervals

@@ -9,7 +9,7 @@ import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.simulate.config import Commands, EncoderNoise, FlowerConfig, Session, Tolerances, Truth
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.live.recording import Recording
 from omnibench.robot.calibration import EffectTerm
 from omnibench.robot.kinematics import Array

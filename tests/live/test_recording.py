@@ -11,7 +11,7 @@ from recordings import ROBOT, random_dataset
 
 from omnibench.config import to_yaml
 from omnibench.data.simulate.config import Commands, FlowerConfig, Session, Truth
-from omnibench.data.simulate.flower import simulate_dataset
+from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.data.storage import save_dataset
 from omnibench.errors import OmnibenchError
 from omnibench.live.recording import load_recording

@@ -65,8 +65,11 @@ class Bag:
             raise DataError(f"{self.path}: {key}: topic {chosen.name} has no messages; record it, or name another one")
         return chosen
 
-    def records(self, topic: Topic) -> Iterator[Record]:
-        """The messages of a topic in the order in which they were recorded. DataError: the bag is damaged."""
+    def records(self, topic: Topic, first: int | None = None, last: int | None = None) -> Iterator[Record]:
+        """The messages of a topic in the order in which they were recorded. DataError: the bag is damaged.
+
+        first, last: only those that were recorded from then to then, ns; numbers then count from the first of these.
+        """
         connections = [
             each
             for each in self._reader.connections
@@ -74,9 +77,10 @@ class Bag:
         ]
         number = 0
         with _damage_told(self.path):
-            for number, (connection, logged, data) in enumerate(self._reader.messages(connections), 1):
+            stop = None if last is None else last + 1
+            for number, (connection, logged, data) in enumerate(self._reader.messages(connections, first, stop), 1):
                 yield Record(number, logged, self._decoded(data, _full_type(connection.msgtype)))
-        if number < topic.messages:  # an MCAP without its message indexes
+        if first is None and last is None and number < topic.messages:  # an MCAP without its message indexes
             raise DataError(
                 f"{self.path}: only {number} of {topic.messages} messages on {topic.name} can be found; "
                 f"its index is damaged; {_repair(self.path)}"

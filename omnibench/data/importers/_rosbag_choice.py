@@ -1,4 +1,4 @@
-"""Which topics of a bag hold the wheels and the reference poses, and which joints are the robot's wheels."""
+"""Which topics of a bag hold wheels, reference poses and scans, and which joints are the robot's wheels."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ POSE_TYPES = (
     "geometry_msgs/msg/PoseStamped",
     "nav_msgs/msg/Odometry",
 )
+SCAN_TYPES = ("sensor_msgs/msg/LaserScan",)
 # What a joint is called besides the wheel that it turns: front_left_wheel_joint, drive/wheel_a.
 _USUAL = {"wheel", "wheels", "joint", "motor", "drive", "link", "axle", "hub"}
 
@@ -27,16 +28,32 @@ def wheel_topic(bag: Bag, name: str | None) -> Topic:
     return _only(bag, "wheel_topic", candidates, "joint_states", WHEEL_TYPES)
 
 
-def pose_topic(bag: Bag, name: str | None, wheels: Topic) -> Topic:
+def scan_topic(bag: Bag, name: str | None, wheels: Topic) -> Topic | None:
+    """The topic of the scans: the one named, the only one, or the only one that ends in /scan; None: there is none.
+
+    Among several that do, the one of the wheels' namespace.
+    """
+    if name is not None:
+        return _named(bag, name, "scan_topic", SCAN_TYPES)
+    candidates = [topic for topic in bag.topics if topic.type in SCAN_TYPES and topic.messages]
+    beside = [topic for topic in candidates if _ends_in(topic, "/scan") and _space(topic) == _space(wheels)]
+    if len(beside) == 1:
+        return beside[0]
+    return _only(bag, "scan_topic", candidates, "/scan", SCAN_TYPES) if candidates else None
+
+
+def pose_topic(bag: Bag, name: str | None, wheels: Topic, scans: Topic | None = None) -> Topic | None:
     """The topic of the reference poses: the one named, the only one, or the only one that ends in slam_pose.
 
     Among several that do, the one of the wheels' namespace. Odometry is never taken unasked: a calibration against
-    the robot's own odometry would find nothing wrong.
+    the robot's own odometry would find nothing wrong. None: there is none, but ``scans``, from which they can be made.
     """
     if name is not None:
         return _named(bag, name, "pose_topic", POSE_TYPES)
     candidates = [topic for topic in bag.topics if topic.type in POSE_TYPES]
     references = [topic for topic in candidates if topic.messages and not _is_odometry(topic)]
+    if not references and scans is not None:
+        return None
     if not references and any(topic.messages for topic in candidates):
         raise ConfigError(
             f"{bag.path}: the only poses are {_listed(candidates)}, by name the robot's own odometry and not a "

@@ -8,6 +8,8 @@ from pydantic import Field, model_validator
 
 from omnibench.data.importers._rosbag_streams import Use
 from omnibench.data.robot_option import RobotOption
+from omnibench.data.scans import Mount
+from omnibench.data.slam.options import SlamOptions
 from omnibench.data.splits import Names
 from omnibench.registry import Options
 
@@ -27,6 +29,14 @@ class RosbagOptions(Options):
         description="PoseWithCovarianceStamped, PoseStamped or Odometry; default: the only one, or the one ending in "
         "slam_pose",
     )
+    scan_topic: str | None = Field(
+        None, min_length=1, description="sensor_msgs/LaserScan; default: the only one, or the one ending in /scan"
+    )
+    scans: bool = Field(True, description="false: leave the scans out")
+    scanner_mount: Mount | None = Field(
+        None, description="x, y, yaw of the scanner on the robot; default: what /tf_static says, else the middle"
+    )
+    slam: SlamOptions = Field(SlamOptions(), description="how bags without reference poses get them from their scans")
     joints: Names = Field((), description="in the robot's wheel order; default: those called like the wheels")
     joint_signs: tuple[Literal[1, -1], ...] = Field((), description="-1 for joints that count the other way round")
     wheel_wrap: float | None = Field(
@@ -62,6 +72,8 @@ class RosbagOptions(Options):
             given = len(getattr(self, key))
             if given not in (0, wheels):
                 raise ValueError(f"{key} has {given} values, expected {wheels}, one for each wheel")
+        if not self.scans and (self.scan_topic is not None or self.scanner_mount is not None):
+            raise ValueError("scans=false leaves the scans out; leave scan_topic and scanner_mount out, too")
         if len(set(self.joints)) < len(self.joints):
             raise ValueError("joints names one joint twice; name another one for each wheel")
         if self.wheel_wrap is not None and self.use == "velocities":

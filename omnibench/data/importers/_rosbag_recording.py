@@ -10,11 +10,19 @@ import numpy as np
 from omnibench.data.alignment import align
 from omnibench.data.dataset import Trajectory
 from omnibench.data.importers._rosbag_bag import Bag, Topic, open_bag
-from omnibench.data.importers._rosbag_choice import pose_topic, wheel_topic
+from omnibench.data.importers._rosbag_choice import pose_topic, scan_topic, wheel_topic
 from omnibench.data.importers._rosbag_cut import Cut, Piece, between_rests, find_rests, from_cuts, windows
 from omnibench.data.importers._rosbag_options import RosbagOptions
 from omnibench.data.importers._rosbag_samples import FASTEST, Losses, WheelSamples, seconds, wheel_samples
-from omnibench.data.importers._rosbag_streams import PoseStream, WheelStream, header_stamp, read_poses, read_wheels
+from omnibench.data.importers._rosbag_scans import RunScans, ScanStream, read_scans
+from omnibench.data.importers._rosbag_streams import (
+    PoseStream,
+    Stamps,
+    WheelStream,
+    header_stamp,
+    read_poses,
+    read_wheels,
+)
 from omnibench.errors import DataError, one_line
 from omnibench.robot.kinematics import Array
 
@@ -23,7 +31,10 @@ _SAME_TIME = 1e-9  # s, that of the stamps
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What a bag holds, in s since the first wheel message. place: bag and wheel topic, for messages."""
+    """What a bag holds, in s since the first wheel message. place: bag and wheel topic, for messages.
+
+    referenced: it holds reference poses; without, the poses are zeros at the stamps of the scans.
+    """
 
     name: str
     place: str
@@ -32,34 +43,52 @@ class Recording:
     poses: Array
     covariances: Array | None
     cuts: tuple[Cut, ...]
+    scans: ScanStream | None
+    referenced: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run and its scans, where there are any."""
+
+    trajectory: Trajectory
+    scans: RunScans | None
 
 
 def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list[str]) -> Recording:
     """Read one bag; ``warnings`` is told what had to be left out. DataError, ConfigError."""
     with open_bag(path) as bag:
         topic = wheel_topic(bag, options.wheel_topic)
-        reference = pose_topic(bag, options.pose_topic, topic)
+        scan = scan_topic(bag, options.scan_topic, topic) if options.scans else None
+        reference = pose_topic(bag, options.pose_topic, topic, scan)
         commands = bag.topic(options.cut_topic, "cut_topic") if options.cut_topic else None
         wheels = read_wheels(bag, topic, options.robot, options.joints, options.use, warnings)
-        poses = read_poses(bag, reference, warnings)
+        poses = read_poses(bag, reference, warnings) if reference else None
         cuts = _read_cuts(bag, commands, wheels) if commands else []
-    _check_clocks(path, topic, wheels, reference, poses)
+        scans = read_scans(bag, scan, options.scanner_mount, warnings) if scan else None
+    if reference and poses:
+        _check_clocks(path, topic, wheels, "poses", reference, poses.stamps)
+    if scan and scans:
+        _check_clocks(path, topic, wheels, "scans", scan, scans.stamps)
+    if poses is None:
+        assert scans is not None  # else a topic of poses is asked for
+        poses = PoseStream(scans.stamps, np.zeros((len(scans.stamps), 3)), None)
     place = f"{path}: topic {topic.name}"
     signs = np.array(options.joint_signs or [1] * len(options.robot.wheels), dtype=float)
     samples, losses = wheel_samples(wheels, signs, options.wheel_wrap, options.still, place)
     warnings.extend(f"{place}: {told}; runs end there" for told in _told(losses, options))
     pose_times = seconds(poses.stamps, samples.origin)
-    return Recording(name, place, samples, pose_times, poses.poses, poses.covariances, tuple(cuts))
+    return Recording(
+        name, place, samples, pose_times, poses.poses, poses.covariances, tuple(cuts), scans, reference is not None
+    )
 
 
-def cut_into_runs(
-    recording: Recording, options: RosbagOptions, *, alone: bool = True
-) -> tuple[list[Trajectory], list[str]]:
+def cut_into_runs(recording: Recording, options: RosbagOptions, *, alone: bool = True) -> tuple[list[Run], list[str]]:
     """The runs of a recording, named by their number, all of them training; and warnings of what is left out.
 
     alone: it is the only one, so that a recording without any rest deserves a warning, too.
     """
-    runs: list[Trajectory] = []
+    runs: list[Run] = []
     pieces = short = bare = uncut = 0
     for number, part in enumerate(recording.samples.stretches(), 1):
         session = recording.name if number == 1 or recording.samples.angles is None else f"{recording.name}#{number}"
@@ -78,7 +107,7 @@ def cut_into_runs(
     if short:
         reasons.append(f"{short} are shorter than {options.least_run:g} s (least_run)")
     if bare:
-        reasons.append(f"{bare} hold fewer than two reference poses")
+        reasons.append(f"{bare} hold fewer than two {'reference poses' if recording.referenced else 'scans'}")
     if reasons:
         return runs, [f"{recording.place}: of {pieces} drives {' and '.join(reasons)}, and are left out"]
     if not runs:
@@ -106,7 +135,7 @@ def _pieces(recording: Recording, part: slice, options: RosbagOptions) -> list[P
     return windows(span, options.window or span[1] - span[0])
 
 
-def _run(recording: Recording, part: slice, piece: Piece, number: str, session: str) -> Trajectory | None:
+def _run(recording: Recording, part: slice, piece: Piece, number: str, session: str) -> Run | None:
     samples, times = recording.samples, recording.pose_times
     within = (samples.begins[part] < piece.end - _SAME_TIME) & (samples.ends[part] > piece.begin + _SAME_TIME)
     chosen = part.start + np.flatnonzero(within)
@@ -120,7 +149,8 @@ def _run(recording: Recording, part: slice, piece: Piece, number: str, session: 
     kept = chosen[aligned.kept]
     ends = samples.ends[kept] - aligned.zero
     shown = np.searchsorted(times, aligned.pose_times + (aligned.zero - _SAME_TIME / 2))
-    return Trajectory(
+    scans = recording.scans
+    trajectory = Trajectory(
         id=number if piece.command is None else f"{number}-{piece.command}",
         split="train",
         times=ends,
@@ -134,6 +164,8 @@ def _run(recording: Recording, part: slice, piece: Piece, number: str, session: 
         angles=None if samples.angles is None else samples.angles[kept],
         pose_covariances=None if recording.covariances is None else recording.covariances[shown],
     )
+    seen_by = None if scans is None else scans.between(aligned.zero, aligned.zero + float(ends[-1]), samples.origin)
+    return Run(trajectory, seen_by)
 
 
 def _read_cuts(bag: Bag, topic: Topic, wheels: WheelStream) -> list[Cut]:
@@ -156,14 +188,14 @@ def _read_cuts(bag: Bag, topic: Topic, wheels: WheelStream) -> list[Cut]:
     return sorted(cuts, key=lambda cut: cut.time)
 
 
-def _check_clocks(path: Path, topic: Topic, wheels: WheelStream, reference: Topic, poses: PoseStream) -> None:
-    inside = (poses.stamps >= wheels.stamps[0]) & (poses.stamps <= wheels.stamps[-1])
+def _check_clocks(path: Path, topic: Topic, wheels: WheelStream, what: str, other: Topic, stamps: Stamps) -> None:
+    inside = (stamps >= wheels.stamps[0]) & (stamps <= wheels.stamps[-1])
     if inside.sum() >= 2:
         return
-    spans = (f"{stamps[0] / 1e9:.3f} to {stamps[-1] / 1e9:.3f} s" for stamps in (poses.stamps, wheels.stamps))
-    shown = " and ".join(f"{each.name} {span}" for each, span in zip((reference, topic), spans, strict=True))
+    spans = (f"{each[0] / 1e9:.3f} to {each[-1] / 1e9:.3f} s" for each in (stamps, wheels.stamps))
+    shown = " and ".join(f"{each.name} {span}" for each, span in zip((other, topic), spans, strict=True))
     raise DataError(
-        f"{path}: no two poses while the wheels were recorded, by the stamps of their headers ({shown}); both must be "
+        f"{path}: no two {what} while the wheels were recorded, by the stamps of their headers ({shown}); both must be "
         "stamped by one clock"
     )
 

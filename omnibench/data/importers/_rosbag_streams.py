@@ -52,7 +52,7 @@ def read_wheels(
     bag: Bag, topic: Topic, robot: Robot, joints: Sequence[str], use: Use, warnings: list[str]
 ) -> WheelStream:
     """The wheels in the robot's order; ``warnings`` is told what is left out. DataError, ConfigError."""
-    sieve = _Sieve(bag, topic)
+    sieve = Sieve(bag, topic)
     places: dict[tuple[str, ...], tuple[int, ...] | None] = {}
     rows: list[tuple[Any, ...]] = []
     for record, stamp, (names, position, velocity) in sieve.sifted(_joint_state):
@@ -80,7 +80,7 @@ def read_wheels(
 
 def read_poses(bag: Bag, topic: Topic, warnings: list[str]) -> PoseStream:
     """Planar reference poses; ``warnings`` is told what is left out. DataError."""
-    sieve = _Sieve(bag, topic)
+    sieve = Sieve(bag, topic)
     rows, covariances, numbers, stamps = [], [], [], []
     for record, stamp, (pose, covariance) in sieve.sifted(_pose):
         rows.append(pose)
@@ -108,7 +108,7 @@ def header_stamp(message: Any) -> int:
     return 0 if stamp is None else int(stamp.sec) * _SECOND + int(stamp.nanosec)
 
 
-class _Sieve:
+class Sieve:
     """Leaves out the messages of a topic that are of no use, and remembers how many and why."""
 
     def __init__(self, bag: Bag, topic: Topic) -> None:

@@ -50,6 +50,14 @@ class Truth(Model):
                 raise ValueError(f"effects: {name} is given twice; add the parameters up, or leave one out")
         return self
 
+    def check_wheels(self, robot: Robot) -> None:
+        """ValueError: the matrix is for another number of wheels than the robot's."""
+        wheels = len(robot.wheels)
+        if self.matrix is not None and [len(row) for row in self.matrix] != [wheels] * 3:
+            raise ValueError(f"truth.matrix must have 3 rows of {wheels} values")
+        if self.published is not None and wheels != 3:
+            raise ValueError("truth.published matrices are for three wheels")
+
 
 class Session(Model):
     """One session of recordings: every command, repeated."""
@@ -102,6 +110,13 @@ class FlowerConfig(Model):
     start: Literal["fixed", "random"] = Field("fixed", description="at the origin, or anywhere with any heading")
     start_area: Positive = Field(4.0, description="side of the square about the origin for random starts, m")
 
+    @field_validator("generator", mode="before")
+    @classmethod
+    def _known(cls, generator: object) -> object:
+        if generator != "flower":
+            raise ValueError(str(UnknownNameError("generator", str(generator), ("flower", "robot"))))
+        return generator
+
     @field_validator("robot")
     @classmethod
     def _named(cls, robot: Robot) -> Robot:
@@ -113,10 +128,7 @@ class FlowerConfig(Model):
     def _something_moves(self) -> FlowerConfig:
         if not any(self.commands.speeds) and not any(self.commands.turn_rates):
             raise ValueError("commands: no command moves the robot")
-        if self.truth.matrix is not None and [len(row) for row in self.truth.matrix] != [len(self.robot.wheels)] * 3:
-            raise ValueError(f"truth.matrix must have 3 rows of {len(self.robot.wheels)} values")
-        if self.truth.published is not None and len(self.robot.wheels) != 3:
-            raise ValueError("truth.published matrices are for three wheels")
+        self.truth.check_wheels(self.robot)
         shortest = min(session.distance for session in self._sessions()) / max(*self.commands.speeds, 1e-9)
         if math.isfinite(shortest) and shortest < self.sample_period:
             raise ValueError("runs are shorter than one sample; raise distance or lower sample_period")

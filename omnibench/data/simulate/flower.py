@@ -9,22 +9,14 @@ from itertools import product
 
 import numpy as np
 
-from omnibench.data.dataset import Dataset, Split, Trajectory, make_dataset
+from omnibench.data.dataset import Split, Trajectory, make_dataset
 from omnibench.data.simulate.config import Commands, FlowerConfig, MotionGrid, Session
 from omnibench.data.simulate.noise import reference_noise
-from omnibench.data.simulate.truth import TrueRobot, TruthRecord, complete_effects, true_matrix
-from omnibench.robot.calibration import matrix_rows
+from omnibench.data.simulate.simulation import Simulation
+from omnibench.data.simulate.truth import TrueRobot, true_record
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 
 _PAUSE = 10.0  # s between runs
-
-
-@dataclass(frozen=True)
-class Simulation:
-    """A simulated data set and, apart from it, the truth behind it."""
-
-    dataset: Dataset
-    truth: TruthRecord
 
 
 @dataclass(frozen=True)
@@ -46,7 +38,7 @@ class Command:
         return np.array([x, y, self.turn_rate])
 
 
-def simulate_dataset(config: FlowerConfig, name: str = "flower", description: str = "") -> Simulation:
+def simulate_flower(config: FlowerConfig, name: str = "flower", description: str = "") -> Simulation:
     """Simulate the training session and, if there is one, the validation session.
 
     ConfigError or DataError in one line: an effect of the truth, or a parameter of one, is not known or is missing.
@@ -54,14 +46,14 @@ def simulate_dataset(config: FlowerConfig, name: str = "flower", description: st
     sessions: dict[Split, Session] = {"train": config.train}
     if config.validation is not None:
         sessions["validation"] = config.validation
-    truth = TruthRecord(
-        dataset=name,
-        robot=config.robot,
-        sample_period=config.sample_period,
-        matrix=matrix_rows(true_matrix(config.truth, config.robot)),
+    truth = true_record(
+        config.truth,
+        config.robot,
+        config.sample_period,
+        tuple(sessions),
+        name,
         integration=config.integration,
         noise=config.noise,
-        effects=complete_effects(config.truth, config.robot, tuple(sessions), name),
     )
     robot = truth.true_robot()
     trajectories = [run for split, session in sessions.items() for run in _session(config, robot, split, session)]

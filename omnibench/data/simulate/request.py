@@ -7,16 +7,29 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from omnibench.config import to_yaml
+from omnibench.config import to_json, to_yaml
 from omnibench.data.dataset import Dataset
 from omnibench.data.simulate.like import simulate_like
+from omnibench.data.simulate.simulation import Simulation, Watch, unwatched
 from omnibench.data.simulate.source import SimulationSource, read_simulation
+from omnibench.data.simulate.truth_poses import write_true_poses
+from omnibench.data.slam.accuracy import SlamAccuracy, slam_accuracy
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError
 from omnibench.files import TableFormat, write_text
 from omnibench.robot.calibration import read_calibration
 
 TRUTH_FILE = "truth.yaml"
+ACCURACY_FILE = "slam_accuracy.json"
+
+
+@dataclass(frozen=True)
+class Made:
+    """A data set that was written. simulation: with what is hidden in it, if a config said that. accuracy: of SLAM."""
+
+    dataset: Dataset
+    simulation: Simulation | None = None
+    accuracy: SlamAccuracy | None = None
 
 
 @dataclass(frozen=True)
@@ -65,7 +78,7 @@ class SimulationRequest:
         """Folders of plug-ins that the config names for its effects."""
         return () if self.config is None else self.source.effect_plugins
 
-    def write(self, table_format: TableFormat = "parquet") -> Dataset:
+    def write(self, table_format: TableFormat = "parquet", watch: Watch = unwatched) -> Made:
         """Simulate, and write the data set, and the truth to its own folder if one is named.
 
         OmnibenchError in one line: the config, the recording or the calibration is wrong, or the disk refuses.
@@ -76,12 +89,20 @@ class SimulationRequest:
             calibration = read_calibration(self.model)
             made = simulate_like(load_dataset(self.like), calibration, (self.seed or 0) if self.noise else None)
             save_dataset(made, self.output, table_format)
-            return made
-        simulation = self.source.simulate()
+            return Made(made)
+        simulation = self.source.simulate(watch)
         save_dataset(simulation.dataset, self.output, table_format)
+        accuracy = slam_accuracy(simulation.dataset, simulation.paths) if simulation.paths else None
         if self.truth is not None:
-            write_text(self.truth / TRUTH_FILE, to_yaml(simulation.truth))
-        return simulation.dataset
+            self._write_truth(self.truth, simulation, accuracy)
+        return Made(simulation.dataset, simulation, accuracy)
+
+    def _write_truth(self, folder: Path, simulation: Simulation, accuracy: SlamAccuracy | None) -> None:
+        write_text(folder / TRUTH_FILE, to_yaml(simulation.truth))
+        if accuracy is None:
+            return
+        write_true_poses(folder, simulation.paths)
+        write_text(folder / ACCURACY_FILE, to_json(accuracy) + "\n")
 
     def _check_like(self) -> None:
         assert self.like is not None

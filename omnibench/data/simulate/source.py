@@ -11,7 +11,9 @@ from pydantic import ConfigDict, Field
 
 from omnibench.config import Model, parse_yaml, read_yaml, validate
 from omnibench.data.simulate.config import FlowerConfig, Truth
-from omnibench.data.simulate.flower import Simulation, simulate_dataset
+from omnibench.data.simulate.robot_config import RobotConfig
+from omnibench.data.simulate.simulate import SimulatedConfig, simulate_dataset
+from omnibench.data.simulate.simulation import Simulation, Watch, unwatched
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.robot.calibration import EffectTerm
 
@@ -20,7 +22,7 @@ class _Source(Model):
     """What a config says of one data set; only ``simulate`` is used here."""
 
     path: Any = None
-    simulate: FlowerConfig | None = None
+    simulate: SimulatedConfig | None = None
     import_: Any = Field(default=None, alias="import")
 
 
@@ -45,7 +47,7 @@ class SimulationSource:
     """A simulated data set of a config. plugins: folders that its effects may come from."""
 
     name: str
-    config: FlowerConfig
+    config: FlowerConfig | RobotConfig
     description: str = ""
     plugins: tuple[Path, ...] = ()
 
@@ -63,9 +65,9 @@ class SimulationSource:
         changed = validate(Truth, {**truth.model_dump(), "effects": effects}, "--effect")
         return replace(self, config=self.config.model_copy(update={"truth": changed}))
 
-    def simulate(self) -> Simulation:
+    def simulate(self, watch: Watch = unwatched) -> Simulation:
         """Simulate it. ConfigError or DataError as for ``simulate_dataset``."""
-        return simulate_dataset(self.config, self.name, self.description)
+        return simulate_dataset(self.config, self.name, self.description, watch)
 
 
 def read_simulation(path: Path | str, dataset: str | None = None) -> SimulationSource:
@@ -86,7 +88,9 @@ def read_simulation(path: Path | str, dataset: str | None = None) -> SimulationS
     return SimulationSource(name, chosen, config.description, plugins)
 
 
-def _chosen(sources: Mapping[str, FlowerConfig | None], name: str | None, place: str) -> tuple[str, FlowerConfig]:
+def _chosen(
+    sources: Mapping[str, FlowerConfig | RobotConfig | None], name: str | None, place: str
+) -> tuple[str, FlowerConfig | RobotConfig]:
     simulated = {key: config for key, config in sources.items() if config is not None}
     if name is not None and name in sources and name not in simulated:
         raise ConfigError(f"{place}: data set {name!r} is not simulated; name its folder in place of the config")

@@ -6,15 +6,16 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import Field
 
 from omnibench.config import Model
 from omnibench.data.simulate.config import EncoderNoise, Truth
 from omnibench.errors import UnknownNameError
 from omnibench.registry import effects
-from omnibench.robot.calibration import EffectTerm, Row
+from omnibench.robot.calibration import EffectTerm, Row, matrix_rows
 from omnibench.robot.effects.effect import ActuatorEffect
 from omnibench.robot.effects.term import make_term
-from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrices
+from omnibench.robot.kinematics import Array, Robot, Wheel, inverse_kinematic_matrix
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, WheelLog
 from omnibench.robot.published import published_matrix
@@ -59,12 +60,41 @@ class TruthRecord(Model):
     integration: Integration
     noise: EncoderNoise
     effects: tuple[EffectTerm, ...] = ()
+    wheels: tuple[Wheel, ...] | None = Field(None, description="as they truly are, if they were drawn about the design")
 
-    def true_robot(self) -> TrueRobot:
-        """The robot. OmnibenchError in one line: an effect of it or a parameter is not known, or one is missing."""
+    def true_robot(self, step: float | None = None) -> TrueRobot:
+        """The robot, moving in steps of so many s (default: the sample period).
+
+        OmnibenchError in one line: an effect of it or a parameter is not known, or one is missing.
+        """
         where = _place(self.dataset)
         terms = tuple(make_term(each.name, each.parameters, self.robot, where) for each in self.effects)
-        return TrueRobot(OdometryModel(self.robot, np.array(self.matrix), self.integration, terms, self.sample_period))
+        return TrueRobot(
+            OdometryModel(self.robot, np.array(self.matrix), self.integration, terms, step or self.sample_period)
+        )
+
+
+def true_record(
+    truth: Truth,
+    robot: Robot,
+    sample_period: float,
+    sessions: tuple[str, ...],
+    dataset: str,
+    *,
+    integration: Integration = "arc",
+    noise: EncoderNoise | None = None,
+) -> TruthRecord:
+    """What is hidden in a data set. UnknownNameError as for ``complete_effects``."""
+    return TruthRecord(
+        dataset=dataset,
+        robot=robot,
+        sample_period=sample_period,
+        matrix=matrix_rows(true_matrix(truth, robot)),
+        integration=integration,
+        noise=noise or EncoderNoise(),
+        effects=complete_effects(truth, robot, sessions, dataset),
+        wheels=true_wheels(truth, robot),
+    )
 
 
 def complete_effects(truth: Truth, robot: Robot, sessions: tuple[str, ...], dataset: str) -> tuple[EffectTerm, ...]:
@@ -75,21 +105,32 @@ def complete_effects(truth: Truth, robot: Robot, sessions: tuple[str, ...], data
     return tuple(_complete(term, robot, sessions, _place(dataset)) for term in truth.effects)
 
 
+def true_wheels(truth: Truth, robot: Robot) -> tuple[Wheel, ...] | None:
+    """The wheels drawn about the design, if the truth says so."""
+    if truth.tolerances is None:
+        return None
+    rng = np.random.default_rng(truth.tolerances.seed)
+    draws = rng.standard_normal((3, len(robot.wheels)))
+    drawn = []
+    for wheel, (radius, distance, angle) in zip(robot.wheels, draws.T.tolist(), strict=True):
+        changes = {
+            "radius": wheel.radius * (1 + truth.tolerances.radius * radius),
+            "distance": wheel.distance * (1 + truth.tolerances.distance * distance),
+            "angle": wheel.angle + math.radians(truth.tolerances.angle_deg) * angle,
+        }
+        drawn.append(wheel.model_copy(update=changes))
+    return tuple(drawn)
+
+
 def true_matrix(truth: Truth, robot: Robot) -> Array:
     """The hidden inverse kinematic matrix (3, N)."""
     if truth.published is not None:
         return published_matrix(truth.published)
     if truth.matrix is not None:
         return np.array(truth.matrix)
-    assert truth.tolerances is not None  # one of the three is given
-    rng = np.random.default_rng(truth.tolerances.seed)
-    draws = rng.standard_normal((3, len(robot.wheels)))
-    wheels = robot.wheels
-    radius = np.array([wheel.radius for wheel in wheels]) * (1 + truth.tolerances.radius * draws[0])
-    distance = np.array([wheel.distance for wheel in wheels]) * (1 + truth.tolerances.distance * draws[1])
-    angle = np.array([wheel.angle for wheel in wheels]) + math.radians(truth.tolerances.angle_deg) * draws[2]
-    rollers = np.array([wheel.roller_angle for wheel in wheels])
-    return inverse_kinematic_matrices(radius[None], distance[None], angle[None], rollers)[0]
+    wheels = true_wheels(truth, robot)
+    assert wheels is not None  # one of the three is given
+    return inverse_kinematic_matrix(wheels)
 
 
 def _complete(term: EffectTerm, robot: Robot, sessions: tuple[str, ...], where: str) -> EffectTerm:

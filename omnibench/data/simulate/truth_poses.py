@@ -19,10 +19,14 @@ _NAME = "poses"
 
 @dataclass(frozen=True, eq=False)
 class TruePath:
-    """Where a run's robot really was. times (S,): s, stamps of its scans. poses (S, 3): m, m, rad, from its start on."""
+    """Where a run's robot truly was, from its start on. times (M,): s, from 0 on, dense. poses (M, 3): m, m, rad."""
 
     times: Array
     poses: Array
+
+    def at(self, stamps: Array) -> Array:
+        """Poses (K, 3) at stamps (K,), s, between the times by straight lines; after the last the robot stays."""
+        return np.column_stack([np.interp(stamps, self.times, column) for column in self.poses.T])
 
 
 def write_true_poses(folder: Path, paths: Mapping[str, TruePath]) -> None:
@@ -41,9 +45,7 @@ def read_true_poses(folder: Path | str) -> dict[str, TruePath]:
     """The true poses of every run of a truth folder. DataError in one line: there are none, or they are broken."""
     folder = Path(folder)
     if not (folder / f"{_NAME}.parquet").is_file():
-        raise DataError(
-            f"{folder}: no {_NAME}.parquet; name the folder that `simulate --truth` wrote for a robot's chain"
-        )
+        raise DataError(f"{folder}: no {_NAME}.parquet; name the truth of a simulated robot with scans")
     table = read_table(folder, _NAME, ("trajectory", "t", "x", "y", "theta"))
     columns = np.column_stack([table.numbers(name) for name in ("t", "x", "y", "theta")])
     names = table.frame["trajectory"].to_numpy()

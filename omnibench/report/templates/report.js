@@ -21,6 +21,19 @@ function toggle(button) {
   }
 }
 
+// One option of a choice is shown; its plots were drawn without knowing their width.
+function choose(choice) {
+  const chosen = choice.querySelector("select").selectedIndex;
+  [...choice.querySelectorAll(":scope > .option")].forEach((option, index) => (option.hidden = index !== chosen));
+  fitPlots(choice);
+}
+
+function fitPlots(part) {
+  for (const canvas of part.querySelectorAll(".canvas")) {
+    if (canvas.data && canvas.offsetParent) Plotly.Plots.resize(canvas);
+  }
+}
+
 function copy(button) {
   const code = button.parentElement.querySelector("code");
   const selection = window.getSelection();
@@ -59,5 +72,10 @@ window.addEventListener("afterprint", () => {
 
 for (const button of document.querySelectorAll(".legend button")) button.addEventListener("click", () => toggle(button));
 for (const button of document.querySelectorAll(".copy")) button.addEventListener("click", () => copy(button));
+for (const choice of document.querySelectorAll(".choice")) {
+  choice.querySelector("select").addEventListener("change", () => choose(choice));
+  choose(choice);
+}
+for (const player of document.querySelectorAll(".player")) startPlayer(player);
 markCurrentSection();
 drawPlots();

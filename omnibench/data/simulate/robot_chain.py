@@ -1,0 +1,173 @@
+"""A robot from command to SLAM: target wheel rates, motors, encoders, true motion, LIDAR in a room, reference poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from omnibench.data.dataset import Split, Trajectory, make_dataset
+from omnibench.data.scans import ScansInMemory, TrajectoryScans
+from omnibench.data.simulate.floor_plan import FloorPlan, make_plan
+from omnibench.data.simulate.flower import Command, grid_of
+from omnibench.data.simulate.lidar import PoseTrack, measure_scans, scan_stamps
+from omnibench.data.simulate.motion import CommandedMotion, command_motion, target_rates
+from omnibench.data.simulate.motors import DrivenRun, check_reach, drive_session
+from omnibench.data.simulate.robot_config import TRUE_STEP, Placement, RobotConfig, RobotSession
+from omnibench.data.simulate.simulation import Simulation, Watch, unwatched
+from omnibench.data.simulate.truth import TrueRobot, true_record
+from omnibench.data.simulate.truth_poses import TruePath
+from omnibench.data.slam.dataset import slam_dataset
+from omnibench.errors import DataError
+from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import WheelLog
+
+_PAUSE = 10.0  # s between runs
+
+
+def simulate_robot(
+    config: RobotConfig, name: str = "robot", description: str = "", watch: Watch = unwatched
+) -> Simulation:
+    """Simulate the training session and, if there is one, the validation session.
+
+    ConfigError or DataError in one line: an effect of the truth is not known or lacks a parameter, a polygon of the
+    room is none, a command is faster than the motors, or leads out of the room.
+    """
+    plan = make_plan(config.room, f"data set {name}: room")
+    commands = grid_of(config.commands)
+    check_reach(config.robot, commands, config.motor)
+    sessions: dict[Split, RobotSession] = {"train": config.train}
+    if config.validation is not None:
+        sessions["validation"] = config.validation
+    truth = true_record(config.truth, config.robot, config.sample_period, tuple(sessions), name)
+    chain = _Chain(config, truth.true_robot(TRUE_STEP), plan, commands)
+    runs: list[_Recorded] = []
+    for split, session in sessions.items():
+        for run in chain.session(split, session):
+            runs.append(run)
+            watch("driving and scanning", len(runs), len(sessions) * len(commands) * config.repetitions)
+    recorded = make_dataset(
+        name,
+        config.robot,
+        config.sample_period,
+        [run.trajectory for run in runs],
+        description=description,
+        source="simulated by omnibench from command to SLAM",
+        simulated=True,
+        scans=ScansInMemory(config.lidar.scanner, {run.trajectory.id: run.scans for run in runs}),
+    )
+    found = slam_dataset(recorded, config.slam, watch=watch)
+    paths = {run.trajectory.id: run.path for run in runs}
+    return Simulation(found, truth, paths, plan, {run.trajectory.id: run.start for run in runs})
+
+
+@dataclass(frozen=True, eq=False)
+class _Recorded:
+    """A run as it was recorded, but for its reference poses, and where the robot truly was, from its start (3,) on."""
+
+    trajectory: Trajectory
+    scans: TrajectoryScans
+    path: TruePath
+    start: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Chain:
+    """The robot, its room and its commands."""
+
+    config: RobotConfig
+    robot: TrueRobot
+    plan: FloorPlan
+    commands: Sequence[Command]
+
+    def session(self, split: Split, session: RobotSession) -> Iterator[_Recorded]:
+        """The runs of a session one after the other; the wheels go on turning from where they were."""
+        config, rng = self.config, np.random.default_rng(session.seed)
+        runs = [(command, number) for command in self.commands for number in range(1, config.repetitions + 1)]
+        if config.order == "shuffled":
+            runs = [runs[index] for index in rng.permutation(len(runs))]
+        motions = [self._motion(command, session, rng) for command, _ in runs]
+        targets = [target_rates(config.robot, motion) for motion in motions]
+        told = [self.robot.driven(motion.times, each) for motion, each in zip(motions, targets, strict=True)]
+        driven = drive_session(
+            config.motor,
+            config.controller,
+            config.encoder,
+            told,
+            config.sample_period,
+            np.zeros(len(config.robot.wheels)),
+        )
+        started_at = 0.0
+        for number, ((command, repetition), motion, target, wheels) in enumerate(
+            zip(runs, motions, targets, driven, strict=True), 1
+        ):
+            run = Trajectory(
+                id=f"{split}-{number:03d}",
+                split=split,
+                command=command.name,
+                repetition=repetition,
+                session=split,
+                started_at=started_at,
+                v=command.speed,
+                alpha=command.direction,
+                omega=command.turn_rate,
+                duration=float(motion.times[-1]),
+                distance=session.distance if command.speed else 0.0,
+                times=motion.times,
+                rates=wheels.rates,
+                pose_times=np.zeros(1),
+                poses=np.zeros((1, 3)),
+                angles=wheels.angles,
+                targets=target,
+            )
+            yield self._scanned(run, wheels, rng)
+            started_at += float(motion.times[-1]) + _PAUSE
+
+    def _motion(self, command: Command, session: RobotSession, rng: np.random.Generator) -> CommandedMotion:
+        config = self.config
+        way = session.distance if command.speed else None
+        return command_motion(
+            command, way, config.commands.turn_duration, config.profile, config.link, config.sample_period,
+            config.settle, rng,
+        )  # fmt: skip
+
+    def _scanned(self, run: Trajectory, wheels: DrivenRun, rng: np.random.Generator) -> _Recorded:
+        """The run with its scans; its poses are the design odometry's until SLAM has found better ones."""
+        config, plan = self.config, self.plan
+        log = _true_log(run, wheels.wheel_angles)
+        (path,) = self.robot.model.poses([log])
+        (seen,) = self.robot.model.reported([log])  # the LIDAR sees the room from where the reference is to report
+        start = _placed(plan.start, config.placement, rng)
+        plan.check_path(_in_room(start, path)[:, :2], log.stamps, config.radius, f"run {run.id}")
+        stamps = scan_stamps(config.lidar, float(run.times[-1]), rng)
+        try:
+            scans = measure_scans(plan, config.lidar, PoseTrack(log.stamps, _in_room(start, seen)), stamps, rng)
+        except DataError as error:
+            raise DataError(f"run {run.id}: {error}") from None
+        every = round(config.sample_period / TRUE_STEP)
+        design = OdometryModel.of_design(config.robot, "arc")
+        (odometry,) = design.poses([replace(run.log(stamps), start=np.zeros(3))])
+        true = TruePath(log.stamps[::every], path[::every])
+        return _Recorded(replace(run, pose_times=stamps, poses=odometry), scans, true, start)
+
+
+def _true_log(run: Trajectory, wheel_angles: Array) -> WheelLog:
+    """What the true wheels did, from absolute angles (M + 1, N) every millisecond, with a stamp at each of these."""
+    stamps = TRUE_STEP * np.arange(len(wheel_angles))
+    rates = np.diff(wheel_angles, axis=0) / TRUE_STEP
+    return WheelLog(stamps[1:], rates, np.zeros(3), stamps, wheel_angles[1:], run.started_at, run.session)
+
+
+def _placed(mark: Array, placement: Placement, rng: np.random.Generator) -> Array:
+    """Where the robot really stands (3,) when it was put on its mark."""
+    spread = [placement.position, placement.position, math.radians(placement.heading_deg)]
+    return mark + spread * rng.standard_normal(3)
+
+
+def _in_room(start: Array, poses: Array) -> Array:
+    """Poses (K, 3) of the frame that has the pose ``start`` in the room."""
+    path = (poses[:, 0] + 1j * poses[:, 1]) * np.exp(1j * start[2])
+    return np.column_stack([start[0] + path.real, start[1] + path.imag, start[2] + poses[:, 2]])

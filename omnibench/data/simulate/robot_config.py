@@ -1,0 +1,79 @@
+"""What a config says of a simulated robot: each link of the chain from command to SLAM."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, FiniteFloat, field_validator, model_validator
+
+from omnibench.config import Model
+from omnibench.data.simulate.config import MotionGrid, Positive, Truth
+from omnibench.data.simulate.floor_plan import RoomPlan
+from omnibench.data.simulate.lidar import Lidar
+from omnibench.data.simulate.motion import CommandLink, MotionProfile
+from omnibench.data.simulate.motors import Controller, Encoder, Motor
+from omnibench.data.slam.options import SlamOptions
+from omnibench.robot.kinematics import Robot
+
+TRUE_STEP = 0.001  # s: the true robot moves in steps of a millisecond
+
+
+class Placement(Model):
+    """How well the robot is put back on its mark before each run; standard deviations."""
+
+    position: float = Field(0.02, ge=0, le=1, description="m, in x and y")
+    heading_deg: float = Field(2.0, ge=0, le=180, description="degrees")
+
+
+class RobotSession(Model):
+    """One session of recordings: every command, repeated."""
+
+    seed: int = Field(ge=0)
+    distance: Positive = Field(description="commanded length of each run, m")
+
+
+class RobotConfig(Model):
+    """A simulated robot: commands, motors under PID, encoders, true motion, LIDAR in a room, SLAM."""
+
+    generator: Literal["robot"]
+    robot: Robot
+    sample_period: Positive = Field(0.01, description="of the PID controllers and of the encoders, s")
+    commands: MotionGrid
+    profile: MotionProfile = MotionProfile()
+    link: CommandLink = CommandLink()
+    settle: float = Field(0.6, ge=0, le=60, description="rest that is recorded after the motion, s")
+    repetitions: int = Field(5, gt=0)
+    order: Literal["shuffled", "sorted"] = "shuffled"
+    truth: Truth
+    motor: Motor = Motor()
+    controller: Controller = Controller()
+    encoder: Encoder = Encoder()
+    room: RoomPlan
+    radius: Positive = Field(0.25, description="of the robot, for collisions, m")
+    placement: Placement = Placement()
+    lidar: Lidar = Lidar()
+    slam: SlamOptions = SlamOptions()
+    train: RobotSession
+    validation: RobotSession | None = None
+
+    @field_validator("robot")
+    @classmethod
+    def _named(cls, robot: Robot) -> Robot:
+        if not robot.name:
+            raise ValueError("give the robot a name")
+        return robot
+
+    @field_validator("sample_period")
+    @classmethod
+    def _whole_milliseconds(cls, period: FiniteFloat) -> FiniteFloat:
+        steps = period / TRUE_STEP
+        if abs(steps - round(steps)) > 1e-6 or not 1 <= round(steps) <= 100:
+            raise ValueError("must be a whole number of milliseconds, 0.001 to 0.1 s")
+        return period
+
+    @model_validator(mode="after")
+    def _something_moves(self) -> RobotConfig:
+        if not any(self.commands.speeds) and not any(self.commands.turn_rates):
+            raise ValueError("commands: no command moves the robot")
+        self.truth.check_wheels(self.robot)
+        return self

@@ -1,0 +1,43 @@
+"""Simulated data sets of every kind that a config can ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from pydantic import Discriminator, Tag
+
+from omnibench.config import CHOSEN
+from omnibench.data.simulate.config import FlowerConfig
+from omnibench.data.simulate.flower import simulate_flower
+from omnibench.data.simulate.robot_config import RobotConfig
+from omnibench.data.simulate.simulation import Simulation, Watch, unwatched
+
+_FLOWER, _ROBOT = CHOSEN + FlowerConfig.__name__, CHOSEN + RobotConfig.__name__
+
+
+def _generator(config: Any) -> str:
+    """Which config is meant; what is neither is refused by the flower's in its own words."""
+    found = config.get("generator") if isinstance(config, Mapping) else getattr(config, "generator", None)
+    return _ROBOT if found == "robot" else _FLOWER
+
+
+SimulatedConfig = Annotated[
+    Annotated[FlowerConfig, Tag(_FLOWER)] | Annotated[RobotConfig, Tag(_ROBOT)],
+    Discriminator(_generator),
+]
+
+
+def simulate_dataset(
+    config: FlowerConfig | RobotConfig, name: str = "flower", description: str = "", watch: Watch = unwatched
+) -> Simulation:
+    """Simulate the training session and, if there is one, the validation session.
+
+    ConfigError or DataError in one line: an effect of the truth, or a parameter of one, is not known or is missing; a
+    command is faster than the motors, or leads out of the room.
+    """
+    if isinstance(config, FlowerConfig):
+        return simulate_flower(config, name, description)
+    from omnibench.data.simulate.robot_chain import simulate_robot  # and what it takes a second to load
+
+    return simulate_robot(config, name, description, watch)

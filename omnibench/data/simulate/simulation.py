@@ -1,0 +1,38 @@
+"""What a simulation makes: a data set and, apart from it, what is hidden in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from omnibench.data.dataset import Dataset
+from omnibench.data.simulate.floor_plan import FloorPlan
+from omnibench.data.simulate.truth import TruthRecord
+from omnibench.data.simulate.truth_poses import TruePath
+from omnibench.robot.kinematics import Array
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A simulated data set and, apart from it, the truth behind it.
+
+    Of a robot that was simulated from command to SLAM also: paths: where it truly was in each run. plan: its room.
+    starts: its true start pose (3,) in the room for each run, m, m, rad.
+    """
+
+    dataset: Dataset
+    truth: TruthRecord
+    paths: Mapping[str, TruePath] = field(default_factory=dict)
+    plan: FloorPlan | None = None
+    starts: Mapping[str, Array] = field(default_factory=dict)
+
+
+class Watch(Protocol):
+    """Told how long work gets on: what is being done, and how many of how many steps are done."""
+
+    def __call__(self, what: str, done: int, total: int) -> None: ...
+
+
+def unwatched(what: str, done: int, total: int) -> None:
+    """Nobody watches."""

@@ -1,0 +1,1 @@
+"""Reference poses from laser scans alone: scan matching against a growing map."""

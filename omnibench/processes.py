@@ -1,0 +1,145 @@
+"""The same work on many things, in processes with one thread each: results in order, Ctrl-C and crashes end cleanly."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection, wait
+from types import ModuleType
+from typing import Any, TypeVar
+
+from omnibench.threads import one_thread
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
+_PATIENCE = 2.0  # s for a process to go by itself
+
+
+def in_processes(
+    work: Callable[[Job], Result], jobs: Iterable[Job], workers: int, preload: str | None = None
+) -> Generator[Result, None, None]:
+    """``work`` of every job, in the jobs' order; jobs are taken as they are needed.
+
+    work: a function of a module; it, jobs and results are sent between processes. preload: the module that holds it.
+    One worker: in this process. What ``work`` raises is raised here; RuntimeError when a process dies.
+    """
+    if workers <= 1:
+        with one_thread():
+            yield from map(work, jobs)
+        return
+    waiting = enumerate(jobs)
+    done: dict[int, Result] = {}
+    following = 0
+    with _workers(work, workers, preload) as connections:
+        busy = {connection: index for connection in connections if (index := _send(connection, waiting)) is not None}
+        while busy:
+            for connection in wait(list(busy)):
+                assert isinstance(connection, Connection)
+                index = busy.pop(connection)
+                done[index] = _receive(connection)
+                sent = _send(connection, waiting)
+                if sent is not None:
+                    busy[connection] = sent
+            while following in done:
+                yield done.pop(following)
+                following += 1
+
+
+def _send(connection: Connection, waiting: Iterator[tuple[int, Job]]) -> int | None:
+    """Give a worker the next job; its number, None if there is no more."""
+    for index, job in waiting:
+        connection.send(job)
+        return index
+    return None
+
+
+def _receive(connection: Connection) -> Any:
+    try:
+        good, answer = connection.recv()
+    except (EOFError, OSError):
+        raise RuntimeError("a worker process died; was there too little memory?") from None
+    if not good:
+        raise answer
+    return answer
+
+
+@contextmanager
+def _workers(work: Callable[[Any], Any], count: int, preload: str | None) -> Iterator[list[Connection]]:
+    context = multiprocessing.get_context("forkserver")
+    if preload is not None:
+        context.set_forkserver_preload([__name__, preload])
+    processes, connections = [], []
+    try:
+        with _one_thread_each(), _main_module_hidden():
+            for _ in range(count):
+                ours, theirs = context.Pipe()
+                process = context.Process(target=_serve, args=(theirs, work), daemon=True)
+                process.start()
+                theirs.close()
+                processes.append(process)
+                connections.append(ours)
+        yield connections
+        for connection in connections:
+            connection.close()
+        for process in processes:
+            process.join(_PATIENCE)
+    finally:
+        for process in processes:
+            process.kill()
+            process.join()
+        for connection in connections:
+            connection.close()
+
+
+def _serve(connection: Connection, work: Callable[[Any], Any]) -> None:
+    """The worker process: jobs come, results go, until the parent closes or dies."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with suppress(EOFError, OSError), one_thread():
+        while True:
+            job = connection.recv()
+            try:
+                answer = (True, work(job))
+            except Exception as error:
+                answer = (False, error)
+            connection.send(answer)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # this is a worker
+    with suppress(OSError):
+        wait([parent.sentinel])
+        os._exit(1)
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _main_module_hidden() -> Iterator[None]:
+    """A process started here does not run the user's script once more, which so needs no guard against that."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main

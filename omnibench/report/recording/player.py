@@ -1,0 +1,155 @@
+"""A run step by step, as templates/player.js reads it: poses, wheel rates and scans, with few digits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.simulate.truth_poses import TruePath
+from omnibench.report.blocks import LegendItem, Player
+from omnibench.report.numbers import listing
+from omnibench.report.recording.drawing import (
+    ODOMETRY_ITEM,
+    PLAN_ITEM,
+    REFERENCE_ITEM,
+    SCANS,
+    SCANS_ITEM,
+    TRUTH_ITEM,
+)
+from omnibench.report.recording.room_figures import in_frame_of
+from omnibench.report.recording.scan_points import evenly, poses_at, scan_points, scanner_poses
+from omnibench.report.style import INK
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.model import OdometryModel
+
+_FRAMES = 240
+_MEAN_OVER = 0.1  # s, before each frame
+_SCANS = 60  # of a run
+_RAYS = 270  # of a scan
+_MARGIN = 0.4  # m about what is drawn
+_SEEN = LegendItem("scan", "this moment's scan", "#d97706")
+
+
+def player(
+    dataset: Dataset,
+    runs: Mapping[str, Trajectory],
+    odometry: OdometryModel,
+    truth: Mapping[str, TruePath],
+    outlines: Mapping[str, Sequence[Array]],
+) -> Player:
+    """Runs, by the name that the menu has for them, to be gone through with a slider.
+
+    outlines: of the floor plan by run, in the frame of its reference.
+    """
+    shown = ["the robot"]
+    shown += ["its last scan, and what it saw before"] if dataset.scans is not None else []
+    shown += ["the path so far and its wheel rates"]
+    return Player(
+        {name: _run(dataset, run, odometry, truth.get(run.id), outlines.get(run.id, ())) for name, run in runs.items()},
+        f"A plan of the room with {listing(shown)}, at the time that the slider names",
+        "Between reference poses the robot is drawn on a straight line; wheel rates are means over the 100 ms before. "
+        "With the slider in focus the arrow keys go step by step.",
+    )
+
+
+def _run(
+    dataset: Dataset, run: Trajectory, odometry: OdometryModel, truth: TruePath | None, outlines: Sequence[Array]
+) -> dict[str, Any]:
+    end = float(run.pose_times[-1])
+    times = np.linspace(0.0, end, min(_FRAMES, max(2, round(end / 0.02) + 1)))
+    poses = poses_at(run, times)
+    (driven,) = odometry.poses([run.log(times)])
+    true_poses = None if truth is None else in_frame_of(run.start, truth.at(times))
+    scans = _scans(dataset, run)
+    rates = _means(run, run.rates, times)
+    targets = None if run.targets is None else _means(run, run.targets, times)
+    everything = [rates] if targets is None else [rates, targets]
+    drawn = [poses[:, :2], driven[:, :2], *outlines, *(np.reshape(scan["points"], (-1, 2)) for scan in scans)]
+    return {
+        "times": _rounded(times),
+        "poses": _rounded(poses, 4),
+        "odometry": _rounded(driven[:, :2]),
+        "truth": None if true_poses is None else _rounded(true_poses),
+        "rates": _rounded(rates),
+        "targets": None if targets is None else _rounded(targets),
+        "rate_limit": _limit(np.vstack(everything)),
+        "scans": scans,
+        "plan": [_rounded(outline) for outline in outlines],
+        "window": _window(np.vstack(drawn)),
+        "wheels": _wheels(dataset.robot),
+        "radius": max(math.hypot(wheel.distance, wheel.radius) for wheel in dataset.robot.wheels),
+        "colours": _colours(),
+        "key": _key(bool(scans), truth is not None, bool(outlines)),
+    }
+
+
+def _scans(dataset: Dataset, run: Trajectory) -> list[dict[str, Any]]:
+    """Some scans of a run: their stamps, where the scanner was, points as x, y, x, y, ..., m."""
+    if dataset.scans is None or run.id not in dataset.scans.trajectories:
+        return []
+    scanner, scans = dataset.scans.scanner, dataset.scans.of(run.id)
+    stride = -(-scanner.rays // _RAYS)
+    found = []
+    for scan in evenly(len(scans.times), _SCANS):
+        stamp = scans.times[scan]
+        place = scanner_poses(poses_at(run, stamp), scanner)
+        points = scan_points(run, scanner, scans, int(scan), stride)
+        found.append({"t": round(float(stamp), 4), "from": _rounded(place[:2]), "points": _rounded(points.ravel())})
+    return found
+
+
+def _means(run: Trajectory, values: Array, times: Array) -> Array:
+    """Means (n, N) over the time before each of ``times``, of rates (F, N) that hold over their samples."""
+    ends = np.append(0.0, run.times)
+    durations = np.diff(ends)[:, None]
+    angles = np.vstack([np.zeros(values.shape[1]), np.cumsum(values * durations, axis=0)])
+    late = np.clip(times, _MEAN_OVER / 2, ends[-1])
+    early = np.maximum(late - _MEAN_OVER, 0.0)
+    driven = [np.interp(late, ends, column) - np.interp(early, ends, column) for column in angles.T]
+    means: Array = np.column_stack(driven) / (late - early)[:, None]
+    return means
+
+
+def _limit(rates: Array) -> float:
+    """The rate at which a bar is full, rad/s."""
+    return round(1.05 * max(float(np.abs(rates).max()), 1e-3), 3)
+
+
+def _window(points: Array) -> list[float]:
+    """Left, bottom, right and top of what is drawn, but for the few farthest points."""
+    low, high = np.quantile(points, 0.005, axis=0) - _MARGIN, np.quantile(points, 0.995, axis=0) + _MARGIN
+    return _rounded(np.concatenate([low, high]))
+
+
+def _wheels(robot: Robot) -> list[dict[str, Any]]:
+    """Wheels as they stand; those of a mecanum robot are not where their axle's direction points."""
+    return [wheel.model_dump() | {"drawn": wheel.roller_angle == 0} for wheel in robot.wheels]
+
+
+def _colours() -> dict[str, str]:
+    return {
+        "reference": REFERENCE_ITEM.colour,
+        "odometry": ODOMETRY_ITEM.colour,
+        "truth": TRUTH_ITEM.colour,
+        "plan": PLAN_ITEM.colour,
+        "map": SCANS + "66",
+        "scan": _SEEN.colour,
+        "ray": _SEEN.colour + "44",
+        "whole": REFERENCE_ITEM.colour + "55",
+        "robot": INK,
+    }
+
+
+def _key(scans: bool, truth: bool, plan: bool) -> list[dict[str, Any]]:
+    items = [REFERENCE_ITEM, ODOMETRY_ITEM] + [TRUTH_ITEM] * truth + [PLAN_ITEM] * plan
+    points = [_SEEN, LegendItem("map", "earlier scans", SCANS_ITEM.colour)] * scans
+    entries: list[dict[str, Any]] = [{"label": item.label, "colour": item.colour, "points": False} for item in items]
+    return entries + [{"label": item.label, "colour": item.colour, "points": True} for item in points]
+
+
+def _rounded(values: Array, decimals: int = 3) -> Any:
+    return np.round(values, decimals).tolist()

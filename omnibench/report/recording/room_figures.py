@@ -1,0 +1,196 @@
+"""The room as scans, reference, odometry and truth have it: all runs at once, and one run with its covariances."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import plotly.graph_objects as go
+
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.simulate.truth_poses import TruePath
+from omnibench.report.blocks import Figure, FigureGrid, LegendItem
+from omnibench.report.numbers import count, plural
+from omnibench.report.recording.drawing import (
+    COVARIANCE_ITEM,
+    ODOMETRY_ITEM,
+    PLAN_ITEM,
+    REFERENCE_ITEM,
+    SCANS_ITEM,
+    TRUTH_ITEM,
+    joined,
+    path_line,
+    scatter,
+)
+from omnibench.report.recording.scan_points import evenly, scan_points, thinned
+from omnibench.report.style import INK, equal_aspect, plot
+from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
+
+_POINTS = 3500  # of the scans, in one picture
+_SCANS = 120  # of a run, in one picture
+_RUNS = 400  # in the picture of all
+_PATH = 300  # poses of a drawn path
+_ELLIPSES = 6
+_QUANTILE = math.sqrt(5.991)  # 95 % of two normal coordinates
+_SHOWN_AS = 0.07  # the largest ellipse's half axis, as a share of the picture
+
+
+def all_runs(dataset: Dataset, shown: Trajectory, outlines: Sequence[Array]) -> FigureGrid:
+    """The reference paths of all runs from one start, in the room as one of them (``shown``) has seen it.
+
+    outlines: of the floor plan as seen from that start, each (n, 2) and closed; empty where it is not known.
+    """
+    runs = [dataset.trajectories[index] for index in evenly(len(dataset.trajectories), _RUNS)]
+    flower = joined([_from_start(run, _thin(run.poses)) for run in runs])
+    plain = {"hoverinfo": "skip", "hovertemplate": None}
+    paths = [path_line(REFERENCE_ITEM, flower, 1.0, opacity=0.75, **plain), _start(np.zeros(2))]
+    number = plural(len(dataset.trajectories), "run")
+    close = Figure(f"{number} from one start", _map(paths), "Reference paths of all runs from one start, close up", 500)
+    words = "Each run is moved to begin at the origin along x."
+    if len(runs) < len(dataset.trajectories):
+        words += f" {count(len(runs))} of them are drawn."
+    items = [REFERENCE_ITEM, *_room_items(dataset, outlines)]
+    if dataset.scans is None:
+        return FigureGrid((close,), tuple(items), 1, words)
+    points = _from_start(shown, thinned(run_points(dataset, shown), _POINTS))
+    room = Figure(
+        f"The same in the room that {shown.id} saw",
+        _map([*_plan(outlines), scatter(SCANS_ITEM, points, 2.5, opacity=0.6), *paths]),
+        "Reference paths of all runs with the points that the scans of one have seen, x and y in metres",
+        500,
+    )
+    return FigureGrid((close, room), tuple(items), 2, words)
+
+
+def one_run(
+    dataset: Dataset, trajectory: Trajectory, odometry: OdometryModel, truth: TruePath | None, outlines: Sequence[Array]
+) -> FigureGrid:
+    """A run in its room, and close up with the covariances of some reference poses.
+
+    outlines: of the floor plan in the frame of the run's reference, each (n, 2) and closed.
+    """
+    end = trajectory.pose_times[-1]
+    (driven,) = odometry.poses([trajectory.log(np.linspace(0.0, end, _PATH))])
+    lines = [
+        path_line(REFERENCE_ITEM, _thin(trajectory.poses), 2.6),
+        path_line(ODOMETRY_ITEM, driven, 1.8),
+    ]
+    items = [REFERENCE_ITEM, ODOMETRY_ITEM]
+    if truth is not None:
+        true_poses = in_frame_of(trajectory.start, truth.poses)
+        lines.append(path_line(TRUTH_ITEM, _thin(true_poses), 1.6))
+        items.append(TRUTH_ITEM)
+    ellipses, words = _ellipses(trajectory, driven)
+    items += [COVARIANCE_ITEM] if ellipses else []
+    figures = []
+    if dataset.scans is not None and trajectory.id in dataset.scans.trajectories:
+        points = thinned(run_points(dataset, trajectory), _POINTS)
+        room = _plan(outlines)
+        room += [scatter(SCANS_ITEM, points, 2.5, opacity=0.7), *lines, _start(trajectory.start)]
+        description = "Scan points of the run placed at its reference poses, with its paths, x and y in metres"
+        figures.append(Figure("In its room", _map(room), description, 460))
+    poses = [
+        scatter(REFERENCE_ITEM, trajectory.poses[evenly(len(trajectory.poses), 100)], 5),
+        *ellipses,
+        _start(trajectory.start),
+    ]
+    figures.append(
+        Figure("Close up", _map([*lines, *poses]), "The run's paths close up, with covariance ellipses", 460)
+    )
+    items += _room_items(dataset, outlines)
+    said = "Scan points are placed at the reference poses, each ray where the robot was when it was measured." * (
+        len(figures) > 1
+    )
+    return FigureGrid(tuple(figures), tuple(items), 2, f"{said} {words}".strip())
+
+
+def run_points(dataset: Dataset, trajectory: Trajectory) -> Array:
+    """What the scans of a run saw (n, 2), m, in the frame of its reference; not more than a picture needs."""
+    if dataset.scans is None:
+        return np.empty((0, 2))
+    scanner, scans = dataset.scans.scanner, dataset.scans.of(trajectory.id)
+    picks = evenly(len(scans.times), _SCANS)
+    return np.vstack([scan_points(trajectory, scanner, scans, int(scan)) for scan in picks])
+
+
+def in_frame_of(start: Array, points: Array) -> Array:
+    """Points (n, 2 or more) given as seen from a start pose (3,), in the frame of that pose (n, 2)."""
+    cosine, sine = math.cos(start[2]), math.sin(start[2])
+    seen: Array = points[:, :2] @ np.array([[cosine, sine], [-sine, cosine]]) + start[:2]
+    return seen
+
+
+def _ellipses(trajectory: Trajectory, driven: Array) -> tuple[list[go.Scatter], str]:
+    """95 % ellipses of a few positions, scaled so that they can be seen, and the words for it."""
+    covariances = trajectory.pose_covariances
+    if covariances is None:
+        return [], ""
+    picks = evenly(len(trajectory.poses), _ELLIPSES)
+    values, vectors = np.linalg.eigh(covariances[picks, :2, :2])
+    half_axes = _QUANTILE * np.sqrt(np.maximum(values, 0.0))
+    largest = float(half_axes.max())
+    if not largest > 0 or not math.isfinite(largest):
+        return [], ""
+    extent = float(np.ptp(np.vstack([trajectory.poses[:, :2], driven[:, :2]]), axis=0).max())
+    factor = _round_below(_SHOWN_AS * max(extent, 0.1) / largest)
+    angle = np.linspace(0.0, 2 * math.pi, 41)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    shapes = [
+        trajectory.poses[index, :2] + factor * (circle * axes) @ frame.T
+        for index, axes, frame in zip(picks, half_axes, vectors, strict=True)
+    ]
+    trace = path_line(COVARIANCE_ITEM, joined(shapes), 1.4, hoverinfo="skip", hovertemplate=None)
+    size = "as they are" if factor == 1 else f"drawn {count(factor)} times as large"
+    return [trace], (
+        f"Ellipses: 95 % of the position by the reference's covariance, {size}; the largest half axis is "
+        f"{1e3 * largest:.3g} mm."
+    )
+
+
+def _round_below(factor: float) -> float:
+    """1, 2 or 5 times a power of ten, not above ``factor`` and not below 1."""
+    if factor <= 1:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(factor))
+    return max(step for step in (1, 2, 5) if step * power <= factor * (1 + 1e-9)) * power
+
+
+def _from_start(trajectory: Trajectory, points: Array) -> Array:
+    """Points (n, 2 or more) as seen from the run's start pose (n, 2)."""
+    x, y, heading = trajectory.start
+    cosine, sine = math.cos(heading), math.sin(heading)
+    seen: Array = (points[:, :2] - (x, y)) @ np.array([[cosine, -sine], [sine, cosine]])
+    return seen
+
+
+def _thin(poses: Array) -> Array:
+    kept: Array = poses[evenly(len(poses), _PATH)]
+    return kept
+
+
+def _plan(outlines: Sequence[Array]) -> list[go.Scatter]:
+    if not outlines:
+        return []
+    return [path_line(PLAN_ITEM, joined(list(outlines)), 1.5, hoverinfo="skip", hovertemplate=None)]
+
+
+def _room_items(dataset: Dataset, outlines: Sequence[Array]) -> list[LegendItem]:
+    return [SCANS_ITEM] * (dataset.scans is not None) + [PLAN_ITEM] * bool(outlines)
+
+
+def _start(position: Array) -> go.Scatter:
+    return go.Scatter(
+        x=[float(position[0])],
+        y=[float(position[1])],
+        mode="markers",
+        marker={"symbol": "circle-open", "size": 9, "color": INK, "line": {"width": 2}},
+        hovertemplate="start<extra></extra>",
+    )
+
+
+def _map(traces: Sequence[go.Scatter]) -> go.Figure:
+    figure = plot(*traces, xaxis_title_text="x (m)", yaxis_title_text="y (m)")
+    equal_aspect(figure)
+    return figure

@@ -1,0 +1,71 @@
+"""Which runs of a recording are shown, and what they are called."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.report.numbers import fixed
+from omnibench.robot.model import OdometryModel
+
+_SHOWN = 4
+_STRAIGHT = 1e-3  # rad/s
+
+
+def describe(trajectory: Trajectory) -> str:
+    """A trajectory's command as the paper writes it, else its name."""
+    if trajectory.alpha is None or trajectory.omega is None:
+        command = "" if trajectory.command is None else f"{trajectory.command}, "
+        return f"{command}{trajectory.id}"
+    speed = "" if trajectory.v is None else f"{trajectory.v:.3g} m/s, "
+    turn = fixed(trajectory.omega, 2)
+    return f"({speed}{math.degrees(trajectory.alpha):.0f}°, {turn} rad/s), {trajectory.id}"
+
+
+def representative_runs(dataset: Dataset) -> dict[str, Trajectory]:
+    """A few runs that differ, by a name that says how: straight, turning left and right, on the spot.
+
+    Of each kind the run at whose end the odometry of the design values is wrong by the median. Runs with scans where
+    the data set has any. Where commands are not known: a spread over the recording.
+    """
+    runs: Sequence[Trajectory] = dataset.trajectories
+    if dataset.scans is not None:
+        scanned = set(dataset.scans.trajectories)
+        runs = [run for run in runs if run.id in scanned]
+    found = {
+        f"{kind}: {describe(run)}": run
+        for kind, like in _kinds(runs).items()
+        for run in [_of_median_error(like, OdometryModel.of_design(dataset.robot, "arc"))]
+    }
+    if found:
+        return found
+    picks = np.unique(np.linspace(0, len(runs) - 1, min(_SHOWN, len(runs))).round().astype(int))
+    return {describe(runs[index]): runs[index] for index in picks}
+
+
+def _kinds(runs: Sequence[Trajectory]) -> dict[str, list[Trajectory]]:
+    """The runs of each kind of motion that was commanded; of turns those at the highest rate."""
+    kinds: dict[str, list[Trajectory]] = {"straight": [], "turning left": [], "turning right": [], "on the spot": []}
+    for run in runs:
+        if run.omega is None or run.alpha is None:
+            continue
+        turns = abs(run.omega) >= _STRAIGHT
+        if run.v == 0 and turns:
+            kinds["on the spot"].append(run)
+        elif run.v != 0:
+            kinds["straight" if not turns else "turning left" if run.omega > 0 else "turning right"].append(run)
+    fastest = {kind: max((abs(run.omega or 0.0) for run in like), default=0.0) for kind, like in kinds.items()}
+    return {
+        kind: [run for run in like if kind == "straight" or math.isclose(abs(run.omega or 0.0), fastest[kind])]
+        for kind, like in kinds.items()
+        if like
+    }
+
+
+def _of_median_error(runs: Sequence[Trajectory], odometry: OdometryModel) -> Trajectory:
+    ends = odometry.poses([run.final_log for run in runs])
+    errors = [math.hypot(*(end[-1, :2] - run.final_pose[:2])) for end, run in zip(ends, runs, strict=True)]
+    return runs[int(np.argsort(errors)[(len(errors) - 1) // 2])]

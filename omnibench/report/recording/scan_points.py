@@ -1,0 +1,59 @@
+"""Where the scans of a run saw something: points in the frame of its reference poses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omnibench.data.dataset import Trajectory
+from omnibench.data.scans import Scanner, TrajectoryScans
+from omnibench.robot.kinematics import Array
+
+_GOES_ON = 0.1  # s, longer than a scan takes
+
+
+def poses_at(trajectory: Trajectory, times: Array) -> Array:
+    """Reference poses (..., 3) at times (...), s, on straight lines between those recorded.
+
+    Before the first the robot rests; after the last it goes on for a scan's time as it came.
+    """
+    stamps, poses = trajectory.pose_times, trajectory.poses
+    if len(stamps) > 1:
+        velocity = (poses[-1] - poses[-2]) / (stamps[-1] - stamps[-2])
+        stamps, poses = np.append(stamps, stamps[-1] + _GOES_ON), np.vstack([poses, poses[-1] + velocity * _GOES_ON])
+    return np.stack([np.interp(times, stamps, column) for column in poses.T], axis=-1)
+
+
+def scanner_poses(poses: Array, scanner: Scanner) -> Array:
+    """Poses (..., 3) of the scanner on a robot at ``poses`` (..., 3)."""
+    mount = scanner.mount
+    x, y, heading = np.moveaxis(poses, -1, 0)
+    cosine, sine = np.cos(heading), np.sin(heading)
+    return np.stack(
+        [x + mount.x * cosine - mount.y * sine, y + mount.x * sine + mount.y * cosine, heading + mount.yaw], axis=-1
+    )
+
+
+def scan_points(trajectory: Trajectory, scanner: Scanner, scans: TrajectoryScans, scan: int, stride: int = 1) -> Array:
+    """Points (n, 2), m, of one scan; every ray from where the reference has the robot when that ray is measured."""
+    ranges = scans.ranges[scan, ::stride].astype(float)
+    seen = scanner.valid(scans.ranges[scan, ::stride])
+    poses = scanner_poses(poses_at(trajectory, scans.times[scan] + scanner.delays[::stride][seen]), scanner)
+    directions = poses[:, 2] + scanner.angles[::stride][seen]
+    found: Array = poses[:, :2] + ranges[seen, None] * np.column_stack([np.cos(directions), np.sin(directions)])
+    return found
+
+
+def evenly(count: int, limit: int) -> Array:
+    """Up to ``limit`` of ``count`` indices, the first and the last among them."""
+    picks: Array = np.unique(np.linspace(0, count - 1, min(limit, count)).round().astype(int))
+    return picks
+
+
+def thinned(points: Array, limit: int, cell: float = 0.01) -> Array:
+    """One point for every square of a grid that sees one; the grid (``cell`` m) is widened until ``limit`` do."""
+    while True:
+        _, first = np.unique(np.round(points / cell).astype(np.int64), axis=0, return_index=True)
+        if len(first) <= limit:
+            kept: Array = points[np.sort(first)]
+            return kept
+        cell *= 1.25

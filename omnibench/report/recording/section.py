@@ -1,0 +1,161 @@
+"""The report on a recording, and the section that other reports take from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.simulate.truth_poses import TruePath
+from omnibench.data.slam.accuracy import SlamAccuracy, slam_accuracy
+from omnibench.errors import DataError
+from omnibench.report.blocks import Badge, Block, Callout, Choice, Document, Fact, Facts, Section
+from omnibench.report.numbers import fixed
+from omnibench.report.recording.contents import contents_table
+from omnibench.report.recording.player import player
+from omnibench.report.recording.room_figures import all_runs, in_frame_of, one_run
+from omnibench.report.recording.runs import representative_runs
+from omnibench.report.recording.slam_figures import error_figures
+from omnibench.report.recording.slam_tables import accuracy_blocks
+from omnibench.report.recording.wheel_figures import wheel_rates
+from omnibench.report.render import write_document
+from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
+
+if TYPE_CHECKING:  # shapely takes its time, and most recordings have no plan
+    from omnibench.data.simulate.floor_plan import FloorPlan
+
+_SIMULATED = Badge("SIMULATED DATA", "warning")
+
+
+def write_recording_report(
+    dataset: Dataset,
+    file: Path,
+    *,
+    truth: Mapping[str, TruePath] | None = None,
+    plan: FloorPlan | None = None,
+    starts: Mapping[str, Array] | None = None,
+    accuracy: SlamAccuracy | None = None,
+    notes: Sequence[str] = (),
+) -> None:
+    """Write one HTML file on a recording, which opens offline: what was recorded, its room, its wheels, a run to play.
+
+    Of simulated data also: truth: true poses by run, against which the reference poses are judged. plan: the room.
+    starts: true start pose (3,) of each run in that room, m, m, rad; else runs are drawn from the plan's own start.
+    accuracy: of the reference poses; by default from the truth. notes: what a reader must know first.
+
+    DataError in one line: the scans are broken, the truth is of other runs, or the disk refuses.
+    """
+    write_document(recording_document(dataset, truth, plan, starts, accuracy, notes), file)
+
+
+def recording_document(
+    dataset: Dataset,
+    truth: Mapping[str, TruePath] | None = None,
+    plan: FloorPlan | None = None,
+    starts: Mapping[str, Array] | None = None,
+    accuracy: SlamAccuracy | None = None,
+    notes: Sequence[str] = (),
+) -> Document:
+    """The report on a recording as blocks; arguments and errors as for :func:`write_recording_report`."""
+    known = truth or {}
+    for run in dataset.trajectories if known else ():
+        if run.id not in known:
+            raise DataError(f"data set {dataset.name}: run {run.id} is not in the truth; is that of others?")
+    sections = [Section("recorded", "What was recorded", (*_about(dataset, notes), contents_table(dataset)))]
+    if known and accuracy is None:
+        accuracy = slam_accuracy(dataset, known)
+    if accuracy is not None:
+        errors = error_figures(dataset, known) if known else ()
+        sections.append(Section("slam", "SLAM against the truth", (*accuracy_blocks(accuracy), *errors)))
+    sections += _pictures(dataset, "", known, plan, starts or {})
+    return Document(
+        title=f"Recording: {dataset.name}",
+        subtitle=dataset.description,
+        sections=tuple(sections),
+        badges=(_SIMULATED,) if dataset.simulated else (),
+        footer=f"omnibench {version('omnibench')}, written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+    )
+
+
+def has_recording(dataset: Dataset) -> bool:
+    """Whether there is more to show of a data set than wheel rates and poses: scans, or targets of the wheels."""
+    return dataset.scans is not None or any(run.targets is not None for run in dataset.trajectories)
+
+
+def recording_section(dataset: Dataset, prefix: str = "") -> Section:
+    """A recording's section in the report of something else; ``prefix`` of the keys of its parts.
+
+    DataError in one line: the scans on disk are broken.
+    """
+    parts = _pictures(dataset, f"{prefix}recording-", {}, None, {})
+    return Section(f"{prefix}recording", "Recording", (contents_table(dataset),), tuple(parts))
+
+
+def _about(dataset: Dataset, notes: Sequence[str]) -> tuple[Block, ...]:
+    durations = np.array([run.pose_times[-1] for run in dataset.trajectories])
+    facts = [
+        Fact("Data set", dataset.name, "simulated" if dataset.simulated else ""),
+        Fact("Source", dataset.source),
+        Fact("Licence", dataset.licence),
+        Fact("Robot", dataset.robot.name),
+        Fact("Runs", str(len(dataset.trajectories)), f"{fixed(float(durations.sum()) / 60, 1)} min in all"),
+    ]
+    return (
+        Callout("Before you read on", tuple(notes)),
+        Callout("Warnings on reading the data", dataset.warnings, "warning"),
+        Facts(tuple(fact for fact in facts if fact.value)),
+    )
+
+
+def _pictures(
+    dataset: Dataset,
+    prefix: str,
+    truth: Mapping[str, TruePath],
+    plan: FloorPlan | None,
+    starts: Mapping[str, Array],
+) -> list[Section]:
+    """The room, the wheels, and runs to be gone through."""
+    runs = representative_runs(dataset)
+    odometry = OdometryModel.of_design(dataset.robot, "arc")
+    from_start = {run.id: _outlines(plan, starts.get(run.id)) for run in runs.values()}
+    placed = {run.id: [in_frame_of(run.start, outline) for outline in from_start[run.id]] for run in runs.values()}
+    first = next(iter(runs.values()))
+    rooms: dict[str, tuple[Block, ...]] = {
+        name: (one_run(dataset, run, odometry, truth.get(run.id), placed[run.id]),) for name, run in runs.items()
+    }
+    wheels: dict[str, tuple[Block, ...]] = {name: (wheel_rates(run, dataset.robot),) for name, run in runs.items()}
+    exactness: tuple[str, ...] = ()
+    if plan is not None and not _all_known(runs, starts):
+        exactness = (
+            f"The floor plan ({plan.name}) is drawn from the robot's mark; a run that begins beside it is off by that.",
+        )
+    return [
+        Section(
+            f"{prefix}room",
+            "The room" if dataset.scans is not None else "Paths",
+            (Callout("Floor plan", exactness), all_runs(dataset, first, from_start[first.id]), Choice("Run", rooms)),
+        ),
+        Section(f"{prefix}wheels", "Wheels", (Choice("Run", wheels),)),
+        Section(f"{prefix}player", "Step by step", (player(dataset, runs, odometry, truth, placed),)),
+    ]
+
+
+def _all_known(runs: Mapping[str, Trajectory], starts: Mapping[str, Array]) -> bool:
+    return all(run.id in starts for run in runs.values())
+
+
+def _outlines(plan: FloorPlan | None, start: Array | None) -> list[Array]:
+    """The walls of a floor plan as seen from a start pose in it (its own, if that is not known): closed (n, 2) each."""
+    if plan is None:
+        return []
+    x, y, heading = plan.start if start is None else start
+    cosine, sine = np.cos(heading), np.sin(heading)
+    turn = np.array([[cosine, -sine], [sine, cosine]])
+    corners = [np.array(shape.exterior.coords) for shape in (plan.boundary, *plan.obstacles)]
+    return [(outline - (x, y)) @ turn for outline in corners]

@@ -1,0 +1,189 @@
+"""Reference poses of simulated runs against the truth: errors over time and way, at the ends, and their covariances."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import plotly.graph_objects as go
+
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.simulate.truth_poses import TruePath
+from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem
+from omnibench.report.numbers import count, plural, significant
+from omnibench.report.recording.drawing import joined, short
+from omnibench.report.recording.scan_points import evenly
+from omnibench.report.style import INK, PALETTE, QUIET, plot
+from omnibench.robot.kinematics import Array
+
+_RUNS = 150  # drawn one by one
+_BINS = 16  # of time or way
+_LEAST = 5  # poses in a bin that has a mean
+
+_RUN = LegendItem("run", "a run", "#c3c9d0")
+_MEAN = LegendItem("mean", "mean", PALETTE[0])
+_HIGH = LegendItem("high", "95th percentile", PALETTE[2], "dash")
+
+
+@dataclass(frozen=True, eq=False)
+class RunErrors:
+    """Errors of a run's reference poses: times (K,), s; driven (K,): true way until then, m; position (K,), m, and
+    heading (K,), rad, both as magnitudes; nees (K,): normalised squared errors, None without covariances."""
+
+    times: Array
+    driven: Array
+    position: Array
+    heading: Array
+    nees: Array | None
+
+
+def run_errors(trajectory: Trajectory, truth: TruePath) -> RunErrors:
+    """Errors of a run's reference poses after the first, at their stamps."""
+    times = trajectory.pose_times[1:]
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth.poses[:, :2], axis=0).T))])
+    error = _from_start(trajectory, trajectory.poses[1:]) - truth.at(times)
+    error[:, 2] -= 2 * np.pi * np.round(error[:, 2] / (2 * np.pi))
+    nees = None
+    if trajectory.pose_covariances is not None:
+        turned = _turned(trajectory, trajectory.pose_covariances[1:])
+        nees = np.einsum("ki,ki->k", error, np.linalg.solve(turned, error[..., None])[..., 0])
+    position = np.hypot(error[:, 0], error[:, 1])
+    return RunErrors(times, np.interp(times, truth.times, way), position, np.abs(error[:, 2]), nees)
+
+
+def error_figures(dataset: Dataset, truth: Mapping[str, TruePath]) -> tuple[Block, ...]:
+    """Errors of the reference poses of every run, whose true paths are all known."""
+    errors = [run_errors(run, truth[run.id]) for run in dataset.trajectories]
+    figures = [
+        _curves(errors, lambda e: e.times, lambda e: 1e3 * e.position, "t (s)", "position error (mm)"),
+        _curves(errors, lambda e: e.times, lambda e: np.degrees(e.heading), "t (s)", "heading error (°)"),
+        _curves(errors, lambda e: e.driven, lambda e: 1e3 * e.position, "way (m)", "position error (mm)"),
+        _curves(errors, lambda e: e.driven, lambda e: np.degrees(e.heading), "way (m)", "heading error (°)"),
+        _histogram([1e3 * e.position[-1] for e in errors], "mm", "Final position errors"),
+        _histogram([float(np.degrees(e.heading[-1])) for e in errors], "°", "Final heading errors"),
+    ]
+    drawn = f", of which {count(_RUNS)} are drawn one by one" if len(errors) > _RUNS else ""
+    caption = (
+        f"Of {plural(len(errors), 'run')}{drawn}; mean and percentile are of bins of time or way. Errors are "
+        "magnitudes, at the stamps of the reference poses, the start left out."
+    )
+    curves = FigureGrid(tuple(figures), (_RUN, _MEAN, _HIGH), 2, caption)
+    return (curves, *_nees_figures(errors))
+
+
+def _nees_figures(errors: Sequence[RunErrors]) -> tuple[Block, ...]:
+    """Whether errors are as large as the covariances say."""
+    known = [each for each in errors if each.nees is not None]
+    if not known:
+        return ()
+    values = np.concatenate([each.nees for each in known if each.nees is not None])
+    limit = max(12.0, 1.2 * float(np.quantile(values, 0.98)))
+    edges = np.linspace(0.0, limit, 40)
+    heights, _ = np.histogram(values, edges)
+    share = heights / len(values) / np.diff(edges)
+    x = np.linspace(0.0, limit, 200)
+    bars = go.Bar(
+        x=short((edges[:-1] + edges[1:]) / 2, 3),
+        y=short(share, 4),
+        width=float(edges[1] - edges[0]),
+        marker={"color": PALETTE[0], "opacity": 0.6},
+        hovertemplate="%{y:.3f} at %{x:.1f}<extra></extra>",
+    )
+    line = {"color": INK, "width": 2}
+    density = np.sqrt(x / (2 * np.pi)) * np.exp(-x / 2)  # chi-squared with three degrees of freedom
+    expected = go.Scatter(x=short(x, 3), y=short(density, 4), mode="lines", line=line, hoverinfo="skip")
+    distribution = Figure(
+        f"NEES of all poses: mean {significant(float(values.mean()), 3)}",
+        plot(bars, expected, xaxis_title_text="NEES", yaxis_title_text="density"),
+        "Histogram of the normalised squared errors with the density that honest covariances give",
+        340,
+    )
+    time = _curves(known, lambda e: e.times, lambda e: _squares(e), "t (s)", "NEES", level=3.0)
+    caption = (
+        "NEES: the squared error, weighted by the inverse covariance; 3 on average (line) where covariances are "
+        f"honest, larger where they promise too much. {_beyond(values, limit)}"
+    )
+    return (FigureGrid((distribution, time), (_RUN, _MEAN, _HIGH), 2, caption.strip()),)
+
+
+def _beyond(values: Array, limit: float) -> str:
+    beyond = int((values > limit).sum())
+    return f"{count(beyond)} of {count(len(values))} lie beyond the histogram." if beyond else ""
+
+
+def _squares(errors: RunErrors) -> Array:
+    assert errors.nees is not None  # only such are drawn
+    return errors.nees
+
+
+def _curves(
+    errors: Sequence[RunErrors],
+    along: Callable[[RunErrors], Array],
+    value: Callable[[RunErrors], Array],
+    x_title: str,
+    y_title: str,
+    level: float | None = None,
+) -> Figure:
+    """Thin lines of runs, with mean and 95th percentile of bins."""
+    drawn = [errors[index] for index in evenly(len(errors), _RUNS)]
+    lines = joined([np.column_stack([along(each), value(each)]) for each in drawn])
+    x, y = (np.concatenate([of(each) for each in errors]) for of in (along, value))
+    edges = np.linspace(0.0, float(x.max()) * (1 + 1e-9) or 1.0, _BINS + 1)
+    places = np.digitize(x, edges) - 1
+    bins = [index for index in range(_BINS) if (places == index).sum() >= _LEAST]
+    middles = np.array([float(x[places == index].mean()) for index in bins])
+    traces = [_trace(_RUN, lines[:, 0], lines[:, 1], 0.8, 0.6)]
+    for item, of in ((_MEAN, np.mean), (_HIGH, lambda v: np.quantile(v, 0.95))):
+        traces.append(_trace(item, middles, np.array([float(of(y[places == index])) for index in bins]), 2.4, 1.0))
+    figure = plot(*traces, xaxis_title_text=x_title, yaxis_title_text=y_title)
+    figure.update_yaxes(rangemode="tozero")
+    if level is not None:
+        figure.add_hline(level, line={"color": QUIET, "width": 1})
+    name, by = y_title.split(" (")[0], "time" if x_title.startswith("t ") else "way driven"
+    title = f"{name[:1].upper()}{name[1:]} over {by}"
+    return Figure(title, figure, f"{title} of every run, with its mean and 95th percentile", 340)
+
+
+def _trace(item: LegendItem, x: Array, y: Array, width: float, opacity: float) -> go.Scatter:
+    return go.Scatter(
+        x=short(x, 3),
+        y=short(y, 3),
+        mode="lines",
+        opacity=opacity,
+        line={"color": item.colour, "width": width, "dash": item.dash},
+        legendgroup=item.key,
+        hoverinfo="skip" if item is _RUN else "all",
+        hovertemplate=None if item is _RUN else f"{item.label} %{{y:.3g}} at %{{x:.2f}}<extra></extra>",
+    )
+
+
+def _histogram(values: Sequence[float], unit: str, title: str) -> Figure:
+    heights, edges = np.histogram(values, bins=min(40, max(8, len(values) // 8)))
+    bars = go.Bar(
+        x=short((edges[:-1] + edges[1:]) / 2, 4),
+        y=heights.tolist(),
+        width=float(edges[1] - edges[0]),
+        marker={"color": PALETTE[0], "opacity": 0.75},
+        hovertemplate=f"%{{y}} runs about %{{x:.3g}} {unit}<extra></extra>",
+    )
+    mean, high = float(np.mean(values)), float(np.quantile(values, 0.95))
+    gap = "" if unit == "°" else " "
+    told = f"{title}: mean {significant(mean, 2)}{gap}{unit}, 95 % below {significant(high, 2)}{gap}{unit}"
+    figure = plot(bars, xaxis_title_text=f"error ({unit})", yaxis_title_text="runs", bargap=0)
+    return Figure(told, figure, f"Histogram of {title.lower()} in {unit}", 320)
+
+
+def _from_start(trajectory: Trajectory, poses: Array) -> Array:
+    """Poses (K, 3) as seen from the run's start pose; true paths begin at (0, 0, 0)."""
+    moved = poses - trajectory.start
+    cosine, sine = np.cos(trajectory.start[2]), np.sin(trajectory.start[2])
+    return np.column_stack([moved[:, :2] @ np.array([[cosine, -sine], [sine, cosine]]), moved[:, 2]])
+
+
+def _turned(trajectory: Trajectory, covariances: Array) -> Array:
+    """Covariances (K, 3, 3) along the axes of the run's start pose."""
+    cosine, sine = np.cos(trajectory.start[2]), np.sin(trajectory.start[2])
+    turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    turned: Array = turn @ covariances @ turn.T
+    return turned

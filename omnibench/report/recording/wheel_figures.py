@@ -1,0 +1,147 @@
+"""Wheel rates of a run: what was measured, its mean over 100 ms, the target, and how far they are apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import plotly.graph_objects as go
+
+from omnibench.data.dataset import Trajectory
+from omnibench.report.blocks import Figure, FigureGrid, LegendItem
+from omnibench.report.numbers import significant
+from omnibench.report.recording.drawing import short
+from omnibench.report.style import INK, PALETTE, plot
+from omnibench.robot.kinematics import Array, Robot
+
+_MEAN_OVER = 0.1  # s
+_DRAWN = 2000  # samples, at most
+_ROW = 150  # px
+_GAP = 0.05  # between rows, as a share of the plot
+
+_MEASURED = LegendItem("measured", "measured", "#a9c9e8")
+_MEAN = LegendItem("mean", "measured, mean over 100 ms", PALETTE[0])
+_TARGET = LegendItem("target", "target", INK, "dash")
+_ERROR = LegendItem("error", "measured − target, mean over 100 ms", PALETTE[2])
+
+
+@dataclass(frozen=True, eq=False)
+class _Series:
+    """Values (n, N) that hold from one of ``edges`` (n + 1,), s, to the next."""
+
+    edges: Array
+    values: Array
+
+    @property
+    def middles(self) -> Array:
+        middles: Array = (self.edges[:-1] + self.edges[1:]) / 2
+        return middles
+
+
+def wheel_rates(trajectory: Trajectory, robot: Robot) -> FigureGrid:
+    """One row a wheel: measured rates and targets over time; beside it their difference, where there are targets."""
+    measured = _blocks(trajectory.times, trajectory.rates, max(1, -(-len(trajectory.times) // _DRAWN)))
+    period = float(np.median(np.diff(trajectory.times, prepend=0.0)))
+    size = max(1, round(_MEAN_OVER / period), -(-len(trajectory.times) // _DRAWN))
+    mean = _blocks(trajectory.times, trajectory.rates, size)
+    rows = [[_steps(_MEASURED, measured, w, 1.0), _line(_MEAN, mean, w, 1.8)] for w in range(len(robot.wheels))]
+    items = [_MEASURED, _MEAN]
+    words = []
+    if len(measured.values) < len(trajectory.times):
+        words.append(f"Samples are drawn as means over {significant(1e3 * size * period, 2)} ms.")
+    step = rate_step(trajectory)
+    if step is not None:
+        words.append(
+            f"The encoder's steps are {significant(step, 3)} rad/s, one tick a sample; a mean over 100 ms is finer."
+        )
+    titles = [f"{name} (rad/s)" for name in robot.wheel_names]
+    end = float(trajectory.times[-1])
+    figures = []
+    if trajectory.targets is not None:
+        target = _blocks(trajectory.times, trajectory.targets, max(1, -(-len(trajectory.times) // _DRAWN)))
+        for wheel, row in enumerate(rows):
+            row.append(_steps(_TARGET, target, wheel, 1.6))
+        error = _blocks(trajectory.times, trajectory.rates - trajectory.targets, size)
+        errors = [[_line(_ERROR, error, wheel, 1.6)] for wheel in range(len(robot.wheels))]
+        items += [_TARGET, _ERROR]
+        figures.append(
+            Figure(
+                f"Measured − target: {_error_in_words(trajectory)}",
+                _stacked(errors, titles, end, with_zero=True),
+                "Difference of measured wheel rates and targets over time, one row a wheel",
+                _ROW * len(rows) + 60,
+            )
+        )
+    description = "Wheel rates over time, one row a wheel" + (", with their targets" if figures else "")
+    rates = Figure("Wheel rates", _stacked(rows, titles, end), description, _ROW * len(rows) + 60)
+    return FigureGrid((rates, *figures), tuple(items), 2, " ".join(words))
+
+
+def rate_step(trajectory: Trajectory) -> float | None:
+    """The step (rad/s) in which measured wheel rates come, if an encoder's ticks can be seen in them."""
+    values = np.unique(np.round(trajectory.rates, 7))
+    if not 2 <= len(values) <= trajectory.rates.size / 4:
+        return None
+    step = float(np.diff(values).min())
+    multiples = values / step
+    # Ticks counted over periods that vary would not be multiples.
+    return step if np.abs(multiples - np.round(multiples)).max() < 0.02 else None
+
+
+def _error_in_words(trajectory: Trajectory) -> str:
+    assert trajectory.targets is not None
+    error = (trajectory.rates - trajectory.targets).ravel()
+    return f"mean {significant(float(error.mean()), 2)}, RMS {significant(float(np.sqrt((error**2).mean())), 2)} rad/s"
+
+
+def _blocks(times: Array, values: Array, size: int) -> _Series:
+    """Means over ``size`` samples each, weighted by how long these last; the last block may be shorter."""
+    starts = np.arange(0, len(times), size)
+    durations = np.diff(times, prepend=0.0)[:, None]
+    weights = np.add.reduceat(durations, starts)
+    means = np.add.reduceat(values * durations, starts) / weights
+    ends = times[np.minimum(starts + size, len(times)) - 1]
+    return _Series(np.append(0.0, ends), means)
+
+
+def _steps(item: LegendItem, series: _Series, wheel: int, width: float) -> go.Scatter:
+    values = np.append(series.values[:, wheel], series.values[-1, wheel])
+    return _trace(item, series.edges, values, width, "hv")
+
+
+def _line(item: LegendItem, series: _Series, wheel: int, width: float) -> go.Scatter:
+    return _trace(item, series.middles, series.values[:, wheel], width, "linear")
+
+
+def _trace(item: LegendItem, times: Array, values: Array, width: float, shape: str) -> go.Scatter:
+    return go.Scatter(
+        x=short(times, 4),
+        y=short(values, 4),
+        mode="lines",
+        line={"color": item.colour, "width": width, "dash": item.dash, "shape": shape},
+        legendgroup=item.key,
+        hovertemplate=f"{item.label}<br>%{{y:.3f}} rad/s at %{{x:.2f}} s<extra></extra>",
+    )
+
+
+def _stacked(
+    rows: Sequence[Sequence[go.Scatter]], titles: Sequence[str], end: float, with_zero: bool = False
+) -> go.Figure:
+    """Plots one above the other with one axis of time, to ``end`` s."""
+    height = (1 + _GAP) / len(rows) - _GAP
+    layout: dict[str, object] = {}
+    traces = []
+    for index, (row, title) in enumerate(zip(rows, titles, strict=True)):
+        number = "" if index == 0 else str(index + 1)
+        top = 1 - index * (height + _GAP)
+        layout[f"yaxis{number}"] = {
+            "domain": [max(0.0, top - height), top],
+            "title": {"text": title},
+            "zeroline": with_zero,
+            "zerolinecolor": INK,
+            "zerolinewidth": 1,
+        }
+        traces += [trace.update(yaxis=f"y{number}") for trace in row]
+    last = "y" if len(rows) == 1 else f"y{len(rows)}"
+    return plot(*traces, xaxis={"title": {"text": "t (s)"}, "anchor": last, "range": [0.0, end]}, **layout)

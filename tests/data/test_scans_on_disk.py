@@ -1,0 +1,362 @@
+"""Scans on disk: what is read comes back, a trajectory at a time, and a broken table is refused in one line."""
+
+from __future__ import annotations
+
+import math
+import random
+import resource
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+import yaml
+from test_storage import FORMATS, Format, everything_known, read_frame, table_file, write_frame
+
+from omnibench.data.dataset import Dataset
+from omnibench.data.scan_files import ScansOnDisk
+from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
+from omnibench.data.storage import load_dataset, save_dataset
+from omnibench.errors import DataError, OmnibenchError
+
+SCANNER = Scanner(
+    name="hokuyo",
+    rays=7,
+    angle_min=-1.5,
+    angle_increment=0.5,
+    time_increment=1e-4,
+    range_min=0.1,
+    range_max=30.0,
+    mount=Mount(x=0.12, y=-0.01, yaw=0.02),
+)
+
+
+def some_scans(count: int, seed: int, start: float = 0.0) -> TrajectoryScans:
+    """Ranges of every magnitude, among them nothing seen, too near and too far."""
+    ranges = np.random.default_rng(seed).uniform(0.1, 30.0, (count, SCANNER.rays)).astype(np.float32)
+    ranges[0, :3] = np.inf, 0.0, 31.0
+    return TrajectoryScans(start + 0.1 * np.arange(count), ranges)
+
+
+def scanned() -> Dataset:
+    return replace(
+        everything_known(), scans=ScansInMemory(SCANNER, {"run-1": some_scans(4, 1), "run-2": some_scans(3, 2, 0.05)})
+    )
+
+
+@pytest.fixture(params=FORMATS)
+def folder(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """A data set with scans, as Parquet and as CSV."""
+    save_dataset(scanned(), tmp_path / "data", request.param)
+    return tmp_path / "data"
+
+
+def scans_of(folder: Path) -> ScansOnDisk:
+    scans = load_dataset(folder).scans
+    assert isinstance(scans, ScansOnDisk)
+    return scans
+
+
+def assert_same(found: TrajectoryScans, expected: TrajectoryScans) -> None:
+    np.testing.assert_array_equal(found.times, expected.times)
+    np.testing.assert_array_equal(found.ranges, expected.ranges)
+    assert (found.times.dtype, found.ranges.dtype) == (np.float64, np.float32)
+
+
+def test_scans_come_back_to_the_bit_with_their_scanner(folder: Path) -> None:
+    made, found = scanned().scans, scans_of(folder)
+    assert made is not None
+    assert found.scanner == SCANNER
+    assert found.trajectories == ("run-1", "run-2")
+    for trajectory in found.trajectories:
+        assert_same(found.of(trajectory), made.of(trajectory))
+        np.testing.assert_array_equal(found.times(trajectory), made.of(trajectory).times)
+
+
+def test_scans_of_trajectories_in_turns_are_told_apart(folder: Path) -> None:
+    made = dict(scans_of(folder))
+    frame = read_frame(folder, "scans")
+    write_frame(folder, "scans", frame[[4, 0, 5, 1, 2, 6, 3]])
+    for trajectory, expected in made.items():
+        assert_same(scans_of(folder).of(trajectory), expected)
+
+
+def test_scans_that_are_many_row_groups_long_come_back(tmp_path: Path) -> None:
+    long = {"run-1": some_scans(9_000, 1), "run-2": some_scans(700, 2)}
+    save_dataset(replace(everything_known(), scans=ScansInMemory(SCANNER, long)), tmp_path / "data")
+    for trajectory, expected in long.items():
+        assert_same(scans_of(tmp_path / "data").of(trajectory), expected)
+
+
+def test_a_trajectory_may_have_no_scans(folder: Path) -> None:
+    frame = read_frame(folder, "scans")
+    write_frame(folder, "scans", frame.filter(pl.col("trajectory") == "run-2"))
+    assert scans_of(folder).trajectories == ("run-2",)
+    with pytest.raises(DataError, match=r"scans\.\w+: trajectory run-1 has no scans"):
+        scans_of(folder).of("run-1")
+
+
+def test_a_part_of_a_data_set_is_saved_with_its_own_scans(folder: Path, tmp_path: Path) -> None:
+    data = load_dataset(folder)
+    save_dataset(replace(data, trajectories=data.trajectories[1:]), tmp_path / "part")
+    assert scans_of(tmp_path / "part").trajectories == ("run-2",)
+
+
+def test_a_part_without_scans_is_saved_without_a_scanner(folder: Path, tmp_path: Path) -> None:
+    frame = read_frame(folder, "scans")
+    write_frame(folder, "scans", frame.filter(pl.col("trajectory") == "run-2"))
+    data = load_dataset(folder)
+    save_dataset(replace(data, trajectories=data.trajectories[:1]), tmp_path / "part")
+    assert load_dataset(tmp_path / "part").scans is None
+    assert yaml.safe_load((tmp_path / "part" / "dataset.yaml").read_text())["scanner"] is None
+
+
+@pytest.mark.parametrize("table_format", FORMATS)
+def test_a_data_set_is_saved_over_itself(folder: Path, table_format: Format) -> None:
+    before = dict(scans_of(folder))
+    save_dataset(load_dataset(folder), folder, table_format)
+    assert [file.name for file in folder.iterdir() if file.stem == "scans"] == [f"scans.{table_format}"]
+    for trajectory, expected in before.items():
+        assert_same(scans_of(folder).of(trajectory), expected)
+
+
+def test_a_file_that_changes_under_an_open_data_set_is_refused(folder: Path) -> None:
+    scans = scans_of(folder)
+    write_frame(folder, "scans", read_frame(folder, "scans")[1:])
+    with pytest.raises(DataError, match="the file has changed since it was opened; load the data set again"):
+        scans.of("run-1")
+    table_file(folder, "scans").unlink()
+    with pytest.raises(DataError, match="cannot be read: No such file"):
+        scans.of("run-1")
+
+
+def test_scans_that_break_off_while_saving_leave_the_folder_as_it_was(folder: Path) -> None:
+    frame = read_frame(folder, "scans")
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+
+    class Broken(ScansInMemory):
+        def of(self, trajectory: str) -> TrajectoryScans:
+            if trajectory == "run-2":
+                raise KeyboardInterrupt
+            return super().of(trajectory)
+
+    made = scanned().scans
+    assert made is not None
+    broken = Broken(SCANNER, dict(made))
+    with pytest.raises(KeyboardInterrupt):
+        save_dataset(replace(scanned(), scans=broken), folder)
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+    assert len(frame) == 7
+
+
+def test_a_save_that_breaks_off_leaves_no_new_folder(tmp_path: Path) -> None:
+    class Broken(ScansInMemory):
+        def of(self, _: str) -> TrajectoryScans:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        save_dataset(
+            replace(everything_known(), scans=Broken(SCANNER, {"run-1": some_scans(2, 1)})), tmp_path / "a" / "b"
+        )
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_is_told_in_one_line(tmp_path: Path) -> None:
+    save_dataset(scanned(), tmp_path / "data")
+    (tmp_path / "data" / "scans.parquet").unlink()
+    (tmp_path / "data" / "scans.parquet").symlink_to("/dev/full")
+    with pytest.raises(
+        DataError, match=r"cannot be written: .*No space left on device.*; free space or choose"
+    ) as told:
+        save_dataset(scanned(), tmp_path / "data")
+    assert "\n" not in str(told.value)
+
+
+def with_cell(row: int, column: str, value: Any) -> Callable[[pl.DataFrame], pl.DataFrame]:
+    """Another value in a row, counted from 1; in CSV and in Parquet."""
+
+    def change(frame: pl.DataFrame) -> pl.DataFrame:
+        values = frame[column].to_list()
+        as_text = frame[column].dtype == pl.String
+        values[row - 1] = " ".join(map(str, value)) if as_text and isinstance(value, list) else value
+        if not as_text and isinstance(value, str):
+            values = list(map(str, values))
+        return frame.with_columns(pl.Series(column, values))
+
+    return change
+
+
+RANGES = [1.0] * 7
+BROKEN: dict[str, tuple[Callable[[pl.DataFrame], pl.DataFrame], str]] = {
+    "no column": (lambda frame: frame.rename({"ranges": "range"}), r"column 'ranges' is missing; did you mean 'range'"),
+    "no rows": (lambda frame: frame.clear(), "it has no rows"),
+    "no stamp": (with_cell(2, "t", None), "row 2: t is missing; remove or repair the row"),
+    "stamp not finite": (with_cell(2, "t", math.nan), "row 2: t is (nan|NaN); remove or repair the row"),
+    "stamp a word": (with_cell(2, "t", "soon"), "row 2: t is 'soon', expected a number"),
+    "stamp of unix time in ns": (with_cell(4, "t", 1.7e18), r"row 4: t is 1\.7e\+18, .*; check the units"),
+    "stamp before the run": (with_cell(1, "t", -0.5), r"row 1: t is -0\.5; it must not be negative"),
+    "stamp repeated": (with_cell(3, "t", 0.1), r"row 3: t is repeated: 0\.1 after 0\.1"),
+    "time goes back": (with_cell(3, "t", 0.05), r"row 3: t goes backwards: 0\.05 after 0\.1"),
+    "no trajectory": (with_cell(2, "trajectory", None), "row 2: trajectory is missing"),
+    "stranger": (
+        with_cell(5, "trajectory", "run-3"),
+        "row 5: trajectory run-3 is not in the table of trajectories; did you mean",
+    ),
+    "too few ranges": (with_cell(6, "ranges", RANGES[1:]), r"row 6: the scan has 6 ranges, but scanner\.rays is 7"),
+    "too many ranges": (with_cell(2, "ranges", [*RANGES, 1.0]), "row 2: the scan has 8 ranges, but"),
+    "no ranges": (with_cell(7, "ranges", None), "row 7: the scan has 0 ranges, but"),
+    "NaN": (with_cell(6, "ranges", [*RANGES[1:], math.nan]), "row 6: a range is missing or NaN; inf says that"),
+    "empty scan": (
+        with_cell(6, "ranges", [math.inf] * 6 + [0.01]),
+        r"row 6: the scan of trajectory run-2 at 0\.15 s is empty: no range from 0\.1 to 30 m; remove the row",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), BROKEN.values(), ids=BROKEN)
+def test_a_broken_table_is_refused_in_one_line(
+    folder: Path, change: Callable[[pl.DataFrame], pl.DataFrame], message: str
+) -> None:
+    write_frame(folder, "scans", change(read_frame(folder, "scans")))
+    with pytest.raises(DataError, match=rf"scans\.\w+[:,] {message}") as told:
+        list(scans_of(folder))
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda frame: frame.with_columns(ranges=pl.lit("1 2 3 4 five 6 7")), "row 1: ranges must be numbers"),
+        (lambda frame: frame.with_columns(ranges=pl.lit(3.0)), "column 'ranges' holds Float64, expected lists"),
+        (lambda frame: frame.with_columns(ranges=pl.col("ranges").cast(pl.List(pl.String))), "column 'ranges' holds"),
+        (lambda frame: frame.with_columns(ranges=pl.concat_list([pl.struct("t")] * 7)), "column 'ranges' holds"),
+        (lambda frame: frame.with_columns(t=pl.lit(True)), "column 't' holds Boolean, expected numbers"),
+        (lambda frame: frame.with_columns(trajectory=pl.col("ranges")), "column 'trajectory' holds List"),
+        (
+            lambda frame: frame.with_columns(ranges=pl.lit([1.0, None, *RANGES[2:]], pl.List(pl.Float64))),
+            "row 1: a range is missing or NaN",
+        ),
+    ],
+)  # fmt: skip
+def test_another_type_in_parquet_is_refused(
+    tmp_path: Path, change: Callable[[pl.DataFrame], pl.DataFrame], message: str
+) -> None:
+    save_dataset(scanned(), tmp_path)
+    write_frame(tmp_path, "scans", change(read_frame(tmp_path, "scans")))
+    with pytest.raises(DataError, match=rf"scans\.parquet[:,] {message}"):
+        list(scans_of(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "dtype", [pl.List(pl.Float64), pl.List(pl.Int16), pl.Array(pl.Float32, 7), pl.Array(pl.UInt8, 7)]
+)
+def test_lists_and_arrays_of_any_numbers_are_read(tmp_path: Path, dtype: pl.DataType) -> None:
+    save_dataset(scanned(), tmp_path)
+    whole = read_frame(tmp_path, "scans").with_columns(
+        ranges=pl.lit([1, 2, 3, 4, 5, 6, 7], pl.List(pl.Int64)).cast(dtype)
+    )
+    write_frame(tmp_path, "scans", whole)
+    np.testing.assert_array_equal(scans_of(tmp_path).of("run-2").ranges, np.tile(np.arange(1.0, 8.0), (3, 1)))
+
+
+def test_names_that_are_numbers_stay_names(tmp_path: Path) -> None:
+    data = everything_known()
+    runs = [replace(run, id=name) for run, name in zip(data.trajectories, ("007", "7"), strict=True)]
+    scans = ScansInMemory(SCANNER, {"007": some_scans(2, 1), "7": some_scans(3, 2)})
+    for table_format in FORMATS:
+        save_dataset(replace(data, trajectories=tuple(runs), scans=scans), tmp_path, table_format)
+        assert {name: len(found.times) for name, found in scans_of(tmp_path)} == {"007": 2, "7": 3}
+
+
+def test_scans_without_a_scanner_are_refused(folder: Path) -> None:
+    header = yaml.safe_load((folder / "dataset.yaml").read_text())
+    del header["scanner"]
+    (folder / "dataset.yaml").write_text(yaml.safe_dump(header))
+    with pytest.raises(DataError, match=r"dataset\.yaml: scanner is missing, which scans\.\w+ needs: rays"):
+        load_dataset(folder)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("rays", 0, r"scanner\.rays: .*greater than 0 \(given: 0\)"),
+        ("range_max", 0.05, r"scanner: range_min 0\.1 m is not below range_max 0\.05 m"),
+        ("angle_increment", 0.0, "scanner: angle_increment is 0"),
+        ("angle_increment", 30.0, r"scanner: 7 rays, 30 rad apart, are more than a whole turn"),
+        ("angle_minimum", -1.0, r"unknown key 'scanner\.angle_minimum'; did you mean 'angle_min'"),
+    ],
+)
+def test_a_scanner_that_cannot_be_is_refused(folder: Path, key: str, value: float, message: str) -> None:
+    header = yaml.safe_load((folder / "dataset.yaml").read_text())
+    header["scanner"][key] = value
+    (folder / "dataset.yaml").write_text(yaml.safe_dump(header))
+    with pytest.raises(DataError, match=message):
+        load_dataset(folder)
+
+
+def test_two_tables_of_scans_are_refused(tmp_path: Path) -> None:
+    save_dataset(scanned(), tmp_path)
+    (tmp_path / "scans.csv").write_text("trajectory,t,ranges\n")
+    with pytest.raises(DataError, match=r"both scans\.parquet and scans\.csv are there"):
+        load_dataset(tmp_path)
+
+
+def test_damage_never_shows_as_a_traceback(folder: Path) -> None:
+    file = table_file(folder, "scans")
+    content, rng, refused = file.read_bytes(), random.Random(3), 0
+    for length in (0, 4, len(content) // 2, len(content) - 3):
+        file.write_bytes(content[:length])
+        refused += _refused(folder)
+    for _ in range(60):
+        damaged = bytearray(content)
+        for _ in range(3):
+            damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+        file.write_bytes(damaged)
+        refused += _refused(folder)
+    assert refused > 5
+
+
+def _refused(folder: Path) -> bool:
+    try:
+        list(scans_of(folder))
+    except OmnibenchError:
+        return True
+    return False
+
+
+_LONG = """
+import resource, sys
+from dataclasses import replace
+import numpy as np
+from omnibench.data.scans import Scanner, Scans, TrajectoryScans
+from omnibench.data.storage import load_dataset, save_dataset
+from omnibench.testing.synthetic import synthetic_dataset
+
+class Made(Scans):
+    scanner = Scanner(rays=1080, angle_min=-2.356, angle_increment=0.00436, range_max=30.0)
+    trajectories = tuple(run.id for run in synthetic_dataset().trajectories)
+    def of(self, trajectory):
+        ranges = np.random.default_rng(0).uniform(0.1, 30, (1500, 1080)).astype(np.float32)
+        return TrajectoryScans(0.025 * np.arange(1500), ranges)
+
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+save_dataset(replace(synthetic_dataset(), scans=Made()), sys.argv[1])
+scans = load_dataset(sys.argv[1]).scans
+total = sum(found.ranges.nbytes for _, found in scans)
+print(total // 1000, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+
+
+@pytest.mark.skipif(not hasattr(resource, "RUSAGE_SELF"), reason="the system does not tell a process's memory")
+def test_scans_are_saved_and_read_without_being_in_memory_at_once(tmp_path: Path) -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", _LONG, str(tmp_path)], capture_output=True, text=True, check=True, timeout=120
+    )
+    total, grown = map(int, ended.stdout.split())  # kB
+    assert total > 60_000
+    assert grown < 0.5 * total + 60_000

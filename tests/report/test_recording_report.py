@@ -1,0 +1,404 @@
+"""The report on a recording: what it tells, where it draws things, and that a browser can play it."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from recording_samples import COMMANDS, NOISE, PERIOD, TICK, Sample, sample
+from report_page import Page
+
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
+from omnibench.data.slam.accuracy import slam_accuracy
+from omnibench.data.storage import load_dataset, save_dataset
+from omnibench.errors import DataError
+from omnibench.report.recording.runs import representative_runs
+from omnibench.report.recording.scan_points import scan_points, thinned
+from omnibench.report.recording.section import has_recording, recording_section, write_recording_report
+from omnibench.report.recording.slam_figures import run_errors
+from omnibench.report.recording.wheel_figures import rate_step, wheel_rates
+
+CONTENTS = "What was recorded"
+PLOTLY = 4.9e6  # bytes, at most
+
+
+@pytest.fixture(scope="module")
+def made() -> Sample:
+    return sample()
+
+
+@pytest.fixture(scope="module")
+def report(made: Sample, tmp_path_factory: pytest.TempPathFactory) -> Page:
+    file = tmp_path_factory.mktemp("recording") / "report.html"
+    write_recording_report(
+        made.dataset, file, truth=made.truth, plan=made.plan, starts=made.starts, notes=("Made for a test.",)
+    )
+    return Page(file.read_text(encoding="utf-8"))
+
+
+def page(dataset: Dataset, folder: Path, **options: Any) -> Page:
+    """The report on a data set as its reader sees it."""
+    write_recording_report(dataset, folder / "report.html", **options)
+    return Page((folder / "report.html").read_text(encoding="utf-8"))
+
+
+def played(told: Page) -> dict[str, Any]:
+    """What the player reads, by run."""
+    found = re.search(r'<script type="application/json" id="[^"]*-runs">(.*?)</script>', told.html, re.DOTALL)
+    assert found is not None
+    return json.loads(found[1])
+
+
+def bare(dataset: Dataset) -> Dataset:
+    """The data set without scans, targets, commands and covariances."""
+    unknown = {"targets": None, "omega": None, "alpha": None, "v": None, "command": None, "pose_covariances": None}
+    runs = tuple(replace(run, **unknown) for run in dataset.trajectories)
+    return replace(dataset, trajectories=runs, scans=None)
+
+
+def test_every_link_of_table_1_has_its_number_and_rate(made: Sample, report: Page) -> None:
+    samples = f"{sum(len(run.times) for run in made.dataset.trajectories):,} samples"
+    scans = sum(len(run.pose_times) for run in made.dataset.trajectories)
+    assert report.row(CONTENTS, "Motion command")[1:3] == ["8 runs", "–"]
+    assert report.row(CONTENTS, "Target wheel rates")[1:3] == [samples, "10.0 ms"]
+    assert report.row(CONTENTS, "Measured wheel rates")[1:] == [
+        samples,
+        "10.0 ms",
+        f"by encoders, in steps of {TICK:.3f} rad/s",
+    ]
+    assert report.row(CONTENTS, "LIDAR scans")[1] == f"{scans} scans"
+    assert report.row(CONTENTS, "LIDAR scans")[3] == "Hokuyo UTM-30LX: 90 ranges over 267°, to 30 m"
+    assert report.row(CONTENTS, "Reference poses")[1::2] == [f"{scans} poses", "with covariances"]
+
+
+def test_scans_between_200_and_300_ms_are_told_so(report: Page) -> None:
+    median, low, high = map(float, re.findall(r"\d+", report.row(CONTENTS, "LIDAR scans")[2]))
+    assert 200 <= low < median < high <= 300
+
+
+def test_what_was_not_recorded_is_told_so(made: Sample, tmp_path: Path) -> None:
+    told = page(bare(made.dataset), tmp_path)
+    for name in ("Motion command", "Target wheel rates", "Wheel angles", "LIDAR scans"):
+        assert told.row(CONTENTS, name)[1] == "not recorded"
+    assert told.row(CONTENTS, "Reference poses")[3] == "without covariances"
+
+
+def test_a_recording_without_scans_targets_and_commands_still_has_its_pictures(made: Sample, tmp_path: Path) -> None:
+    told = page(bare(made.dataset), tmp_path)
+    assert {"room", "wheels", "player"} <= set(told.sections)
+    assert all(run["scans"] == [] and run["targets"] is None for run in played(told).values())
+
+
+def test_simulated_data_wear_a_badge(report: Page) -> None:
+    assert "SIMULATED DATA" in report.text
+
+
+def test_recorded_data_wear_no_badge(made: Sample, tmp_path: Path) -> None:
+    assert "SIMULATED" not in page(replace(made.dataset, simulated=False), tmp_path).text
+
+
+def test_notes_and_warnings_are_told(made: Sample, report: Page, tmp_path: Path) -> None:
+    assert "Made for a test." in report.text
+    assert "something odd" in page(replace(made.dataset, warnings=("something odd",)), tmp_path).text
+
+
+def test_one_run_of_each_kind_of_motion_is_shown(made: Sample) -> None:
+    chosen = representative_runs(made.dataset)
+    assert [name.split(":")[0] for name in chosen] == ["straight", "turning left", "turning right", "on the spot"]
+    assert [run.command for run in chosen.values()] == list(COMMANDS)
+
+
+def test_of_each_kind_the_run_of_median_odometry_error_is_shown() -> None:
+    runs = sample(repetitions=3, duration=1.0).dataset
+    wrong = {"left-0": 0.5, "left-1": 0.3, "left-2": -0.4}  # m that the reference is moved by at the end
+    moved = [
+        replace(run, poses=run.poses + np.outer(run.pose_times == run.pose_times[-1], [wrong.get(run.id, 0), 0, 0]))
+        for run in runs.trajectories
+    ]
+    chosen = representative_runs(replace(runs, trajectories=tuple(moved)))
+    assert [run.id for name, run in chosen.items() if name.startswith("turning left")] == ["left-2"]
+
+
+def test_runs_without_scans_are_not_shown_where_others_have_them(made: Sample) -> None:
+    scans = made.dataset.scans
+    assert scans is not None
+    only = ScansInMemory(scans.scanner, {"left-1": scans.of("left-1")})
+    assert [run.id for run in representative_runs(replace(made.dataset, scans=only)).values()] == ["left-1"]
+
+
+@given(
+    x=st.floats(-2, 2),
+    y=st.floats(-5, 5),
+    heading=st.floats(-0.5, 0.5),
+    turn=st.floats(-0.3, 0.3),
+    speed=st.floats(-0.5, 0.5),
+    mount=st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)),
+)
+def test_points_of_a_wall_lie_on_it_however_the_robot_moves(
+    x: float, y: float, heading: float, turn: float, speed: float, mount: tuple[float, float, float]
+) -> None:
+    scanner = Scanner(
+        rays=31,
+        angle_min=-0.4,
+        angle_increment=0.8 / 30,
+        time_increment=0.02,
+        range_max=1e3,
+        mount=Mount(x=mount[0], y=mount[1], yaw=mount[2]),
+    )
+    begin, velocity = np.array([x, y, heading]), np.array([speed, -speed, turn])
+    stamp, wall = 0.2, 10.0
+    poses = begin + np.outer(stamp + scanner.delays, velocity)
+    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    place = poses[:, 0] + cosine * mount[0] - sine * mount[1]
+    ranges = (wall - place) / np.cos(poses[:, 2] + mount[2] + scanner.angles)
+    reference = np.array([begin, begin + velocity])
+    run = replace(sample().dataset.trajectories[0], pose_times=np.array([0.0, 1.0]), poses=reference)
+    scans = TrajectoryScans(np.array([stamp]), ranges[None].astype(np.float32))
+    points = scan_points(run, scanner, scans, 0)
+    assert len(points) == 31
+    np.testing.assert_allclose(points[:, 0], wall, atol=1e-4)
+
+
+def test_rays_that_saw_nothing_make_no_points(made: Sample) -> None:
+    scans, run = made.dataset.scans, made.dataset.trajectories[0]
+    assert scans is not None
+    found = scans.of(run.id)
+    ranges = found.ranges.copy()
+    ranges[0, ::2] = np.inf
+    assert len(scan_points(run, scans.scanner, TrajectoryScans(found.times, ranges), 0)) == 45
+
+
+def distance_to_walls(points: np.ndarray, outlines: list[list[list[float]]]) -> np.ndarray:
+    """How far points (n, 2) are from the nearest wall."""
+    nearest = np.full(len(points), np.inf)
+    for outline in outlines:
+        for a, b in zip(np.array(outline)[:-1], np.array(outline)[1:], strict=True):
+            share = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+            nearest = np.minimum(nearest, np.hypot(*(points - a - share[:, None] * (b - a)).T))
+    return nearest
+
+
+def test_the_floor_plan_lies_where_the_scans_see_walls(made: Sample, tmp_path: Path) -> None:
+    exact = tuple(replace(run, poses=made.truth[run.id].at(run.pose_times)) for run in made.dataset.trajectories)
+    told = page(replace(made.dataset, trajectories=exact), tmp_path, plan=made.plan, starts=made.starts)
+    for run in played(told).values():
+        assert len(run["plan"]) == 2
+        points = np.concatenate([np.reshape(scan["points"], (-1, 2)) for scan in run["scans"]])
+        # Ranges have a noise of 1 mm, and the robot goes on straight lines between its poses; starts are 5 cm off.
+        assert np.quantile(distance_to_walls(points, run["plan"]), 0.99) < 0.005
+
+
+def test_a_plan_drawn_from_the_mark_is_said_to_be_inexact(made: Sample, tmp_path: Path) -> None:
+    told = page(made.dataset, tmp_path, plan=made.plan)
+    assert "is drawn from the robot's mark" in told.text
+
+
+def test_a_plan_with_known_starts_is_exact(report: Page) -> None:
+    assert "is drawn from the robot's mark" not in report.text
+
+
+def test_thinning_keeps_points_far_apart_and_below_the_limit() -> None:
+    points = np.random.default_rng(1).uniform(0, 1, (5000, 2))
+    kept = thinned(points, 300)
+    assert 150 < len(kept) <= 300
+    assert {tuple(point) for point in kept} <= {tuple(point) for point in points}
+
+
+def test_frames_of_the_player_follow_reference_odometry_and_truth(made: Sample, report: Page) -> None:
+    runs = played(report)
+    assert [name.split(":")[0] for name in runs] == ["straight", "turning left", "turning right", "on the spot"]
+    for run, name in zip(runs.values(), COMMANDS, strict=True):
+        trajectory = next(t for t in made.dataset.trajectories if t.id.startswith(name) and t.id in str(list(runs)))
+        lists = [run[key] for key in ("times", "poses", "odometry", "truth", "rates", "targets")]
+        assert {len(each) for each in lists} == {len(run["times"])}
+        np.testing.assert_allclose(run["poses"][-1], trajectory.final_pose, atol=1e-3)
+        end = made.truth[trajectory.id].at(trajectory.pose_times[-1:])[0]
+        np.testing.assert_allclose(run["truth"][-1], end[:2], atol=1e-3)
+        assert [scan["t"] for scan in run["scans"]] == [round(t, 4) for t in trajectory.pose_times.tolist()]
+
+
+def test_rates_of_the_player_are_the_mean_over_the_100_ms_before(made: Sample, report: Page) -> None:
+    run = played(report)["straight: (0.2 m/s, 29°, 0.00 rad/s), straight-0"]
+    trajectory = next(t for t in made.dataset.trajectories if t.id == "straight-0")
+    frame = next(index for index, time in enumerate(run["times"]) if time > 1)
+    # Sample k ends at k periods; a frame's time has three digits, so that the mean may be off by a tick's share.
+    last = round(run["times"][frame] / PERIOD)
+    mean = trajectory.rates[last - 10 : last].mean(axis=0)
+    np.testing.assert_allclose(run["rates"][frame], mean, atol=0.11 * TICK)
+
+
+def test_encoder_ticks_are_found_in_quantised_rates(made: Sample) -> None:
+    assert rate_step(made.dataset.trajectories[0]) == pytest.approx(TICK)
+
+
+def test_rates_that_are_not_quantised_have_no_step(made: Sample) -> None:
+    run = made.dataset.trajectories[0]
+    noisy = run.rates + np.random.default_rng(2).normal(0, 1e-3, run.rates.shape)
+    assert rate_step(replace(run, rates=noisy)) is None
+
+
+def test_the_mean_over_100_ms_is_that_of_the_samples(made: Sample) -> None:
+    run = made.dataset.trajectories[0]
+    figure = wheel_rates(run, made.dataset.robot).figures[0].plot
+    mean = next(trace for trace in figure.data if trace.legendgroup == "mean")
+    np.testing.assert_allclose(mean.y[:5], run.rates[:50, 0].reshape(5, 10).mean(axis=1), atol=1e-4)
+    np.testing.assert_allclose(mean.x[:5], 0.05 + 0.1 * np.arange(5), atol=1e-9)
+
+
+def test_the_error_is_measured_minus_target(made: Sample) -> None:
+    run = made.dataset.trajectories[0]
+    slow = replace(run, rates=np.asarray(run.targets) - 0.25)
+    _, error = wheel_rates(slow, made.dataset.robot).figures
+    assert error.title == "Measured − target: mean −0.25, RMS 0.25 rad/s"
+    assert all(np.allclose(trace.y, -0.25) for trace in error.plot.data)
+
+
+def test_wheels_without_targets_have_no_error(made: Sample) -> None:
+    assert len(wheel_rates(replace(made.dataset.trajectories[0], targets=None), made.dataset.robot).figures) == 1
+
+
+def test_errors_against_the_truth_are_those_of_the_accuracy(made: Sample, report: Page) -> None:
+    accuracy = slam_accuracy(made.dataset, made.truth)
+    cells = report.row("Errors of the reference poses against the truth", "all after the first")
+    assert float(cells[1]) == pytest.approx(1e3 * accuracy.every.position_mean_m, rel=0.05)
+    assert float(cells[4]) == pytest.approx(math.degrees(accuracy.every.heading_mean_rad), rel=0.05)
+    assert 2 < float(cells[7]) < 4
+    errors = [run_errors(run, made.truth[run.id]) for run in made.dataset.trajectories]
+    assert np.concatenate([e.position for e in errors]).mean() == pytest.approx(accuracy.every.position_mean_m)
+
+
+def test_errors_do_not_depend_on_where_the_reference_has_its_origin(made: Sample) -> None:
+    run = made.dataset.trajectories[2]
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    moved = run.poses @ turn.T + [3.0, -1.0, math.pi / 2]
+    narrow = np.tile(np.diag(NOISE**2 * [1, 9, 1]), (len(run.poses), 1, 1))
+    here = run_errors(replace(run, pose_covariances=narrow), made.truth[run.id])
+    there = run_errors(replace(run, poses=moved, pose_covariances=turn @ narrow @ turn.T), made.truth[run.id])
+    np.testing.assert_allclose(there.position, here.position, atol=1e-12)
+    np.testing.assert_allclose(there.nees, here.nees, rtol=1e-9)
+
+
+def test_a_recording_without_truth_has_no_errors(made: Sample, tmp_path: Path) -> None:
+    told = page(made.dataset, tmp_path)
+    assert "slam" not in told.sections
+    assert "true path" not in told.text
+
+
+@pytest.mark.parametrize("with_accuracy", [False, True])
+def test_the_truth_of_other_runs_is_one_line(made: Sample, tmp_path: Path, with_accuracy: bool) -> None:
+    accuracy = slam_accuracy(made.dataset, made.truth) if with_accuracy else None
+    with pytest.raises(DataError, match="run straight-0 is not in the truth"):
+        page(made.dataset, tmp_path, truth={"another": made.truth["left-0"]}, accuracy=accuracy)
+
+
+def test_ellipses_say_how_much_larger_they_are_drawn(report: Page) -> None:
+    largest = math.sqrt(5.991) * 2  # mm
+    assert re.search(rf"drawn \d+ times as large; the largest half axis is {largest:.3g} mm", report.text)
+
+
+def test_broken_scans_are_one_line(made: Sample, tmp_path: Path) -> None:
+    save_dataset(made.dataset, tmp_path / "data")
+    dataset = load_dataset(tmp_path / "data")
+    (tmp_path / "data" / "scans.parquet").write_bytes(b"broken")
+    with pytest.raises(DataError, match=r"scans\.parquet"):
+        page(dataset, tmp_path)
+
+
+def test_a_report_that_cannot_be_written_is_one_line(made: Sample, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(DataError, match="cannot be written"):
+        write_recording_report(made.dataset, tmp_path / "file" / "report.html")
+
+
+def test_long_runs_with_many_scans_stay_below_six_megabytes(tmp_path: Path) -> None:
+    long = sample(repetitions=1, duration=30.0, rays=1080)
+    many = tuple(replace(run, id=f"{run.id}-{number}") for number in range(100) for run in long.dataset.trajectories)
+    scans = long.dataset.scans
+    assert scans is not None
+    found = ScansInMemory(scans.scanner, {run.id: scans.of(run.id.rsplit("-", 1)[0]) for run in many})
+    truth = {run.id: long.truth[run.id.rsplit("-", 1)[0]] for run in many}
+    told = page(replace(long.dataset, trajectories=many, scans=found), tmp_path, truth=truth)
+    assert len(told.html) < PLOTLY + 6e6
+
+
+def test_more_than_wheels_and_poses_makes_a_section_for_other_reports(made: Sample) -> None:
+    assert has_recording(made.dataset)
+    assert not has_recording(bare(made.dataset))
+    section = recording_section(made.dataset, "data-2-")
+    assert section.key == "data-2-recording"
+    assert [part.key for part in section.sections] == [
+        f"data-2-recording-{part}" for part in ("room", "wheels", "player")
+    ]
+
+
+def hostile(run: Trajectory) -> Trajectory:
+    return replace(run, id=f"</script><script>alert('{run.id}')</script>")
+
+
+def test_hostile_names_of_runs_stay_words(made: Sample, tmp_path: Path) -> None:
+    scans = made.dataset.scans
+    assert scans is not None
+    runs = tuple(map(hostile, made.dataset.trajectories))
+    again = ScansInMemory(scans.scanner, {hostile(run).id: scans.of(run.id) for run in made.dataset.trajectories})
+    told = page(replace(made.dataset, trajectories=runs, scans=again), tmp_path)
+    assert "<script>alert" not in told.html
+    assert "<script>alert('left-0')</script>" in told.text
+
+
+DRIVE = """<script>
+for (const [name, frame] of [["first", 0], ["last", 1e6]]) {
+  const player = document.querySelector(".player"), slider = player.querySelector("input");
+  player.querySelector("[name=run]").selectedIndex = 1;
+  player.querySelector("[name=run]").dispatchEvent(new Event("change"));
+  slider.value = frame;
+  slider.dispatchEvent(new Event("input"));
+  const ink = player.querySelector("canvas"), copy = new OffscreenCanvas(ink.width, ink.height).getContext("2d");
+  copy.drawImage(ink, 0, 0);
+  const pixels = new Uint32Array(copy.getImageData(0, 0, ink.width, ink.height).data.buffer);
+  document.body.dataset[name] = player.querySelector("output").textContent;
+  document.body.dataset[name + "Ink"] = pixels.filter((pixel) => pixel !== 0).length;
+}
+for (const select of document.querySelectorAll(".choice select")) {
+  select.selectedIndex = 2;
+  select.dispatchEvent(new Event("change"));
+}
+</script>"""
+
+
+def test_a_browser_draws_every_plot_and_plays_the_runs(made: Sample, tmp_path: Path) -> None:
+    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if browser is None:
+        pytest.skip("no Chromium on this machine to draw the report with")
+    told = page(made.dataset, tmp_path, truth=made.truth, plan=made.plan, starts=made.starts)
+    (tmp_path / "driven.html").write_text(told.html.replace("</body>", f"{DRIVE}</body>"), encoding="utf-8")
+    flags = [
+        *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
+        *("--disable-background-networking", "--disable-component-update", "--enable-logging=stderr"),
+        *(f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=20000", "--dump-dom"),
+    ]
+    done = subprocess.run(
+        [browser, *flags, (tmp_path / "driven.html").as_uri()], capture_output=True, text=True, timeout=120, check=False
+    )
+    body = dict(re.findall(r'data-([a-z-]+)="([^"]*)"', re.findall(r"<body[^>]*>", done.stdout)[0]))
+    left = next(run for run in representative_runs(made.dataset).values() if run.omega and run.omega > 0)
+    x, y, heading = left.final_pose
+    assert body["plots"] == "drawn"
+    assert body["first"] == "t = 0.00 s: x 0.000 m, y 0.000 m, heading 0.0°"
+    assert body["last"].replace("−", "-") == (
+        f"t = {left.pose_times[-1]:.2f} s: x {x:.3f} m, y {y:.3f} m, heading {math.degrees(heading):.1f}°"
+    )
+    assert min(int(body["first-ink"]), int(body["last-ink"])) > 2000
+    options = re.findall(r'<div class="option"( hidden="")?>', done.stdout)
+    assert [hidden == "" for hidden in options] == [False, False, True, False] * 2
+    assert "CONSOLE" not in done.stderr
