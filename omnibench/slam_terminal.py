@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -22,7 +23,7 @@ def print_slam(console: Console, found: SlamSummary) -> None:
         (found.position_deviation_mean_m, None, found.position_deviation_max_m),
         (found.heading_deviation_mean_rad, None, found.heading_deviation_max_rad),
     )
-    table.add_row("standard deviation stated at the end of a run", *_cells(*deviations))
+    table.add_row("deviation stated at the end of a run", *_cells(*deviations))
     if found.recorded is not None:
         apart = found.recorded
         distances = (
@@ -38,7 +39,7 @@ def print_slam(console: Console, found: SlamSummary) -> None:
 def print_slam_accuracy(console: Console, found: SlamAccuracy) -> None:
     """Errors against the truth of a simulation."""
     table = _table("errors of the reference poses against the simulated truth")
-    table.add_column("NEES (honest: 3)", justify="right")
+    table.add_column("NEES\n(ideal 3)", justify="right")
     for what, errors in (("at the end of a run", found.final), ("at every scan", found.every)):
         positions = (errors.position_mean_m, errors.position_p95_m, errors.position_max_m)
         headings = (errors.heading_mean_rad, errors.heading_p95_rad, errors.heading_max_rad)
@@ -57,11 +58,11 @@ def print_slam_accuracy(console: Console, found: SlamAccuracy) -> None:
 
 def _table(title: str) -> Table:
     """Positions in mm and headings in deg: their mean, 95th percentile and largest."""
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
     table.add_column("")
     for unit in ("mm", "deg"):
         for figure in ("mean", "95 %", "max"):
-            table.add_column(f"{figure}, {unit}", justify="right")
+            table.add_column(f"{figure}\n{unit}", justify="right")
     return table
 
 

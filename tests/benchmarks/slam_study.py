@@ -87,9 +87,9 @@ def study(room: str, options: SlamOptions, runs: int, seed: int = 0) -> dict[str
     for number in range(runs):
         rng = np.random.default_rng([seed, number])
         run = drive(plan, lidar, flower_command(number), rng)
-        began = time.perf_counter()
+        began = time.process_time()
         paths.append(run_slam(run.scans, lidar.scanner, options, np.zeros(3), run.odometry))
-        seconds += time.perf_counter() - began
+        seconds += time.process_time() - began
         driven.append(run)
     errors = [path.poses - run.true for path, run in zip(paths, driven, strict=True)]
     nees = [_nees(error, path.covariances) for error, path in zip(errors, paths, strict=True)]

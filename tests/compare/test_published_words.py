@@ -120,14 +120,8 @@ def test_the_scatter_of_repetitions_is_what_noise_alone_makes() -> None:
 
 
 def test_data_without_repetitions_say_that_their_noise_cannot_be_told() -> None:
-    result = run(
-        config(
-            datasets={"f": {"simulate": flower(repetitions=1)}},
-            calibrators=["closed_form"],
-            seeds=[1],
-            certificate=None,
-        )
-    )
+    once = {"f": {"simulate": flower(repetitions=1)}}
+    result = run(config(datasets=once, calibrators=["closed_form"], seeds=[1], certificate=None))
     assert "cannot be told from the data" in reasons(with_published(result, scaled(result, 1, 1)))
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recording_samples import sample
 from report_page import Page
 from report_samples import config, flower, page, run, statistics
 
@@ -19,6 +20,7 @@ from omnibench.compare.results import ComparisonResult
 from omnibench.data.dataset import make_dataset
 from omnibench.data.simulate.config import FlowerConfig
 from omnibench.data.simulate.simulate import simulate_dataset
+from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError
 from omnibench.fit.problem import Improvement
 from omnibench.report.numbers import fixed
@@ -217,6 +219,25 @@ def test_long_histories_and_long_runs_make_a_file_below_eight_megabytes(
     told = page(replace(small, runs=(*small.runs, *many)), tmp_path)
     assert len(told.html) < 8e6
     assert told.row("Every run", "random_search")
+
+
+def test_recordings_with_scans_or_targets_have_their_pictures(tmp_path: Path) -> None:
+    told = page(run(config(datasets={"room": {"path": "x"}}, seeds=[1]), {"room": sample().dataset}), tmp_path)
+    assert {"recording", "recording-room", "recording-wheels", "recording-player"} <= set(told.sections)
+    assert told.row("What was recorded", "LIDAR scans")[1].endswith(" scans")
+    made = sample().dataset
+    plain = replace(made, scans=None, trajectories=tuple(replace(t, targets=None) for t in made.trajectories))
+    told = page(run(config(datasets={"room": {"path": "x"}}, seeds=[1]), {"room": plain}), tmp_path)
+    assert "recording" not in told.sections
+
+
+def test_scans_that_cannot_be_read_cost_the_pictures_and_not_the_report(tmp_path: Path) -> None:
+    save_dataset(sample().dataset, tmp_path / "data")
+    dataset = load_dataset(tmp_path / "data")
+    (tmp_path / "data" / "scans.parquet").write_bytes(b"broken")
+    told = page(run(config(datasets={"room": {"path": "x"}}, seeds=[1]), {"room": dataset}), tmp_path)
+    assert "scans.parquet: " in told.text
+    assert told.row("Every run", "closed_form")
 
 
 def test_a_report_that_cannot_be_written_is_one_line(result: ComparisonResult, tmp_path: Path) -> None:

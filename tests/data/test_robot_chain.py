@@ -86,7 +86,7 @@ class TestWhatIsRecorded:
             np.testing.assert_allclose(after.angles[0] - 0.01 * after.rates[0], before.angles[-1], atol=1e-9)
 
     def test_measured_rates_are_whole_ticks_and_follow_the_targets(self, simulation: Simulation) -> None:
-        tick = 2 * np.pi / 3200
+        tick = 2 * np.pi / 12800
         for run in simulation.dataset.trajectories:
             ticks = run.rates * 0.01 / tick
             np.testing.assert_allclose(ticks, np.round(ticks), atol=1e-6)

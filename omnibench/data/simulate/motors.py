@@ -87,9 +87,9 @@ class Controller(Model):
 
 
 class Encoder(Model):
-    """An incremental encoder. The default is a magnetic one with 16 pulses, x 4, at the motor, before a gear of 50."""
+    """An incremental encoder. The default is a magnetic one with 64 pulses, x 4, at the motor, before a gear of 50."""
 
-    ticks: int = Field(3200, gt=0, le=10**9, description="quadrature counts per turn of the wheel")
+    ticks: int = Field(12_800, gt=0, le=10**9, description="quadrature counts per turn of the wheel")
 
     @property
     def tick(self) -> float:

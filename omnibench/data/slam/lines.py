@@ -15,7 +15,7 @@ from omnibench.data.scans import Scanner
 from omnibench.robot.kinematics import Array
 
 _SIZES = (128, 64, 32, 16, 8)  # rays of a piece, tried in this order
-_FULL = 0.75  # of them at least this share has to return
+_FULL, _FEWEST = 0.5, 6  # of them at least this share and number has to return
 _LONGEST = 3.0  # m
 _TILT = 0.05  # rad; a line whose direction is less certain is none
 _STEPS = 2  # of Gauss-Newton, from an algebraic fit
@@ -41,32 +41,49 @@ _FIELDS = tuple(field.name for field in fields(Lines))
 
 
 def fit_lines(
-    ranges: Array, valid: NDArray[np.bool_], deviations: Array, scanner: Scanner
+    ranges: Array, valid: NDArray[np.bool_], deviations: Array, scanner: Scanner, velocity: Array
 ) -> tuple[Lines, NDArray[np.int_]]:
-    """Straight pieces in the scanner's frame, and for each ray (R,) the index of the piece it is part of, or -1.
+    """Straight pieces, and for each ray (R,) the index of the piece it is part of, or -1.
 
-    ranges, valid, deviations: (R,) of one scan, m.
+    ranges, valid, deviations: (R,) of one scan, m. velocity (2,): of the scanner, in its frame, m/s. Each piece is in
+    the frame of the scanner as it stood when the middle of the piece was measured.
     """
     part_of = np.where(valid, -1, -2)  # -2: nothing returned
     found: list[Lines] = []
+    approach = np.cos(scanner.angles) * velocity[0] + np.sin(scanner.angles) * velocity[1]
     for size in _SIZES:
-        found.append(_fit_blocks(size, ranges, part_of, deviations, scanner, sum(len(lines.rays) for lines in found)))
+        known = sum(len(lines.rays) for lines in found)
+        found.append(_fit_blocks(size, ranges, approach, part_of, deviations, scanner, known))
     return Lines(*(np.concatenate([getattr(each, name) for each in found]) for name in _FIELDS)), np.maximum(
         part_of, -1
     )
 
 
 def _fit_blocks(
-    size: int, ranges: Array, part_of: NDArray[np.int_], deviations: Array, scanner: Scanner, known: int
+    size: int,
+    ranges: Array,
+    approach: Array,
+    part_of: NDArray[np.int_],
+    deviations: Array,
+    scanner: Scanner,
+    known: int,
 ) -> Lines:
-    """Lines through blocks of neighbouring rays that are part of none; numbers their rays from ``known`` on."""
+    """Lines through blocks of neighbouring rays that are part of none; numbers their rays from ``known`` on.
+
+    approach (R,): speed of the scanner along each ray, m/s.
+    """
     blocks = len(ranges) // size
-    r, part, deviation = (array[: blocks * size].reshape(blocks, size) for array in (ranges, part_of, deviations))
-    chosen = np.flatnonzero((part == -1).sum(axis=1) >= _FULL * size)
-    r, mask = r[chosen], part[chosen] == -1
-    angles = scanner.angle_increment * (np.arange(size) - (size - 1) / 2)  # from the block's middle
+    part = part_of[: blocks * size].reshape(blocks, size)
+    chosen = np.flatnonzero((part == -1).sum(axis=1) >= max(_FULL * size, _FEWEST))
+    mask = part[chosen] == -1
+    r, speed, deviation = (
+        array[: blocks * size].reshape(blocks, size)[chosen] for array in (ranges, approach, deviations)
+    )
+    from_middle = np.arange(size) - (size - 1) / 2
+    r = r + speed * scanner.time_increment * from_middle
+    angles = scanner.angle_increment * from_middle
     basis = np.stack([np.cos(angles), np.sin(angles)])
-    roots = mask / deviation[chosen]  # of the weights
+    roots = mask / deviation  # of the weights
     slopes = (r * r * roots)[:, None] * basis  # of the range by its inverse
     line = _solve(slopes, r * roots)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

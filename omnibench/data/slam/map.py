@@ -78,6 +78,8 @@ class ScanMap:
 
     def nearest(self, points: Array) -> tuple[NDArray[np.int_], Array]:
         """For points (n, 2) the nearest of the map: index (n,) and distance (n,), m."""
+        if not len(points):
+            return np.zeros(0, dtype=int), np.zeros(0)
         found, squared = self._tree.batch_knn_search(_upright(points), 1)
         return (found[:, 0] // 5).astype(int), np.sqrt(squared[:, 0])
 

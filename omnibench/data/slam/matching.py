@@ -13,6 +13,7 @@ from omnibench.data.slam.points import ScanPoints
 from omnibench.robot.kinematics import Array
 
 _COARSE = 4  # of so many points one, until the pose is roughly known
+_FEWEST = 30  # points that small_gicp is asked to match
 _ROUGHLY = 1e-3  # m and rad
 LOST = 0.2  # of the points: when fewer match, the scan tells nothing
 _OUTLIER = 4.0  # standard deviations
@@ -43,7 +44,10 @@ class Match:
 
 def search(surroundings: ScanMap, scan: ScanPoints, start: Array, options: SlamOptions) -> Array:
     """The pose (3,) of a scan by small_gicp, first with few points from afar, then with all."""
-    rough = surroundings.align(scan.points[::_COARSE], start, options.search_distance, _ROUGHLY)
+    if len(scan.points) < _FEWEST or not len(surroundings):
+        return start
+    coarse = scan.points[:: min(_COARSE, len(scan.points) // _FEWEST)]
+    rough = surroundings.align(coarse, start, options.search_distance, _ROUGHLY)
     return surroundings.align(scan.points, rough, options.match_distance)
 
 
@@ -86,7 +90,7 @@ class _Pairs:
     def __init__(self, surroundings: ScanMap, scan: ScanPoints, pose: Array, spacing: float) -> None:
         cosine, sine = np.cos(pose[2]), np.sin(pose[2])
         turn = np.array([[cosine, sine], [-sine, cosine]])
-        straight = np.flatnonzero(scan.line >= 0)  # what is not straight misleads at corners and edges
+        straight = np.flatnonzero((scan.line >= 0) & (len(surroundings) > 0))  # what is not straight misleads at corners and edges
         seen = scan.points[straight] @ turn  # from the robot, along the axes of the run's frame
         index, _ = surroundings.nearest(pose[:2] + seen)
         surface = surroundings.surface.at(index)

@@ -28,11 +28,6 @@ class ScanPoints:
     lines: Lines
     line: NDArray[np.int_]
 
-    @property
-    def duration(self) -> float:
-        """From the stamp to the last point, s."""
-        return float(self.delays[-1])
-
     def deskewed(self, twist: Array) -> ScanPoints:
         """The scan as it would look from where the robot was at the scan's stamp.
 
@@ -44,13 +39,17 @@ class ScanPoints:
         return replace(self, points=points, rays=rays, lines=replace(lines, centres=centres, normals=normals))
 
 
-def scan_points(ranges: Ranges, scanner: Scanner, noise_factor: float = 1.0) -> ScanPoints:
-    """Points and lines of a scan (R,). noise_factor: by which ranges are noisier than the scanner says."""
+def scan_points(ranges: Ranges, scanner: Scanner, noise_factor: float, twist: Array) -> ScanPoints:
+    """Points and lines of a scan (R,).
+
+    noise_factor: by which ranges are noisier than the scanner says. twist (3,): of the robot, roughly, m/s, m/s, rad/s.
+    """
     valid: NDArray[np.bool_] = scanner.valid(ranges)
     distances = np.where(valid, ranges, 1.0).astype(float)
     deviations = noise_factor * scanner.deviations(distances)
-    lines, part_of = fit_lines(distances, valid, deviations, scanner)
     mount = scanner.mount
+    of_scanner = twist[:2] + twist[2] * np.array([-mount.y, mount.x])
+    lines, part_of = fit_lines(distances, valid, deviations, scanner, turned(of_scanner[None], -mount.yaw)[0])
     angles = scanner.angles[valid] + mount.yaw
     rays = np.column_stack([np.cos(angles), np.sin(angles)])
     offset = np.array([mount.x, mount.y])

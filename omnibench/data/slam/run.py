@@ -73,6 +73,7 @@ class _Slam:
 
     def __init__(self, scanner: Scanner, noise: float, options: SlamOptions, motion: Motion, start: Array) -> None:
         self._scanner, self._noise, self._options, self._motion = scanner, noise, options, motion
+        self._duration = float(scanner.delays[-1])
         self._map = ScanMap(options.spacing)
         self._errors = PoseErrors(start)
         self._pose = self._keyframe = start
@@ -80,8 +81,8 @@ class _Slam:
 
     def begin(self, ranges: Ranges, time: float) -> tuple[Match, Array]:
         """The first scan, with which the map begins, at the start pose; its covariance (3, 3)."""
-        scan = scan_points(ranges, self._scanner, self._noise)
-        scan = self._deskewed(scan, self._motion.twist(time, scan.duration))
+        twist = self._motion.twist(time, self._duration)
+        scan = self._deskewed(scan_points(ranges, self._scanner, self._noise, twist), twist)
         self._add(scan)
         match = replace(refine(self._map, scan, self._pose, self._pose, self._options), pose=self._pose)
         self._time = time
@@ -92,19 +93,19 @@ class _Slam:
     def go_on(self, ranges: Ranges, time: float) -> tuple[Match, Array]:
         """The next scan: its match and the covariance of its pose (3, 3)."""
         options, motion, last, before = self._options, self._motion, self._pose, self._time
-        scan = scan_points(ranges, self._scanner, self._noise)
-        start, twist = motion.predicted(last, before, time), motion.twist(time, scan.duration)
+        start, twist = motion.predicted(last, before, time), motion.twist(time, self._duration)
+        scan = scan_points(ranges, self._scanner, self._noise, twist)
         still = self._deskewed(scan, twist)
         found = search(self._map, still, start, options)
         found = refine(self._map, still, found, start, options, steps=1).pose
         twist, doubt = motion.corrected(twist, last, found, before, time)
         still = self._deskewed(scan, twist)
         match = refine(self._map, still, found, start, options)
-        covariance = self._errors.step(match, motion.deviations(before, time), doubt * scan.duration / 2)
+        covariance = self._errors.step(match, motion.deviations(before, time), doubt * self._duration / 2)
         motion.went(last, match.pose, before, time)
         self._pose, self._time = match.pose, time
-        moved = self._pose - self._keyframe
-        if np.hypot(moved[0], moved[1]) > options.keyframe_distance or abs(moved[2]) > options.keyframe_angle:
+        x, y, turned = self._pose - self._keyframe
+        if np.hypot(x, y) > options.keyframe_distance or abs(turned) > options.keyframe_angle or not len(self._map):
             self._add(still)
         return match, covariance
 

@@ -103,7 +103,7 @@ def one_run(
     said = "Scan points are placed at the reference poses, each ray where the robot was when it was measured." * (
         len(figures) > 1
     )
-    return FigureGrid(tuple(figures), tuple(items), 2, f"{said} {words}".strip())
+    return FigureGrid(tuple(figures), tuple(items), 2 if len(figures) > 1 else 1, f"{said} {words}".strip())
 
 
 def run_points(dataset: Dataset, trajectory: Trajectory) -> Array:

@@ -29,7 +29,7 @@ def representative_runs(dataset: Dataset) -> dict[str, Trajectory]:
     """A few runs that differ, by a name that says how: straight, turning left and right, on the spot.
 
     Of each kind the run at whose end the odometry of the design values is wrong by the median. Runs with scans where
-    the data set has any. Where commands are not known: a spread over the recording.
+    the data set has any. Where commands are not known, or are of one kind: a spread over the recording.
     """
     runs: Sequence[Trajectory] = dataset.trajectories
     if dataset.scans is not None:
@@ -40,7 +40,7 @@ def representative_runs(dataset: Dataset) -> dict[str, Trajectory]:
         for kind, like in _kinds(runs).items()
         for run in [_of_median_error(like, OdometryModel.of_design(dataset.robot, "arc"))]
     }
-    if found:
+    if len(found) > 1:
         return found
     picks = np.unique(np.linspace(0, len(runs) - 1, min(_SHOWN, len(runs))).round().astype(int))
     return {describe(runs[index]): runs[index] for index in picks}

@@ -10,7 +10,7 @@ import plotly.graph_objects as go
 
 from omnibench.data.dataset import Trajectory
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
-from omnibench.report.numbers import significant
+from omnibench.report.numbers import decimals_for, fixed, significant
 from omnibench.report.recording.drawing import short
 from omnibench.report.style import INK, PALETTE, plot
 from omnibench.robot.kinematics import Array, Robot
@@ -75,7 +75,7 @@ def wheel_rates(trajectory: Trajectory, robot: Robot) -> FigureGrid:
         )
     description = "Wheel rates over time, one row a wheel" + (", with their targets" if figures else "")
     rates = Figure("Wheel rates", _stacked(rows, titles, end), description, _ROW * len(rows) + 60)
-    return FigureGrid((rates, *figures), tuple(items), 2, " ".join(words))
+    return FigureGrid((rates, *figures), tuple(items), 2 if figures else 1, " ".join(words))
 
 
 def rate_step(trajectory: Trajectory) -> float | None:
@@ -92,7 +92,9 @@ def rate_step(trajectory: Trajectory) -> float | None:
 def _error_in_words(trajectory: Trajectory) -> str:
     assert trajectory.targets is not None
     error = (trajectory.rates - trajectory.targets).ravel()
-    return f"mean {significant(float(error.mean()), 2)}, RMS {significant(float(np.sqrt((error**2).mean())), 2)} rad/s"
+    rms = float(np.sqrt((error**2).mean()))
+    decimals = decimals_for(rms, 2)
+    return f"mean {fixed(float(error.mean()), decimals)}, RMS {fixed(rms, decimals)} rad/s"
 
 
 def _blocks(times: Array, values: Array, size: int) -> _Series:
