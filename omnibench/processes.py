@@ -13,6 +13,7 @@ from multiprocessing.connection import Connection, wait
 from types import ModuleType
 from typing import Any, TypeVar
 
+from omnibench.errors import OmnibenchError
 from omnibench.threads import one_thread
 
 Job = TypeVar("Job")
@@ -28,11 +29,13 @@ def in_processes(
     """``work`` of every job, in the jobs' order; jobs are taken as they are needed.
 
     work: a function of a module; it, jobs and results are sent between processes. preload: the module that holds it.
-    One worker: in this process. What ``work`` raises is raised here; RuntimeError when a process dies.
+    One worker: in this process. What ``work`` raises is raised here; OmnibenchError in one line when a process dies.
     """
     if workers <= 1:
-        with one_thread():
-            yield from map(work, jobs)
+        for job in jobs:
+            with one_thread():
+                result = work(job)
+            yield result
         return
     waiting = enumerate(jobs)
     done: dict[int, Result] = {}
@@ -55,19 +58,26 @@ def in_processes(
 def _send(connection: Connection, waiting: Iterator[tuple[int, Job]]) -> int | None:
     """Give a worker the next job; its number, None if there is no more."""
     for index, job in waiting:
-        connection.send(job)
+        with _death_in_words():
+            connection.send(job)
         return index
     return None
 
 
 def _receive(connection: Connection) -> Any:
-    try:
+    with _death_in_words():
         good, answer = connection.recv()
-    except (EOFError, OSError):
-        raise RuntimeError("a worker process died; was there too little memory?") from None
     if not good:
         raise answer
     return answer
+
+
+@contextmanager
+def _death_in_words() -> Iterator[None]:
+    try:
+        yield
+    except (EOFError, OSError):
+        raise OmnibenchError("a worker process died; is there too little memory? try again with one worker") from None
 
 
 @contextmanager

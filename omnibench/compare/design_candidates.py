@@ -221,8 +221,8 @@ def _candidates_of_comparison(
     chosen = integration or config.integration
     if isinstance(found.simulate, RobotConfig):
         raise ConfigError(
-            f"{place}: data set {name} is a simulated robot, whose noise is not stated beforehand; `omnibench simulate` "
-            "it, and design from its folder"
+            f"{place}: data set {name} is a simulated robot, whose noise is not stated beforehand; make it with "
+            "`omnibench simulate`, and design from its folder"
         )
     if found.simulate is None:
         return candidates_of_dataset(load_source(name, found), chosen, f"{place}: data set {name}")

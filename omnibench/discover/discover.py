@@ -11,10 +11,10 @@ import numpy as np
 from omnibench.data.dataset import Dataset
 from omnibench.discover.actuators import look_at_actuators
 from omnibench.discover.calibrations import Request
-from omnibench.discover.extend import extend
+from omnibench.discover.extend import Extended, extend
 from omnibench.discover.groups import check_names
-from omnibench.discover.look import look_at
-from omnibench.discover.model_fit import fit_matrix
+from omnibench.discover.look import Look, look_at
+from omnibench.discover.model_fit import Fit, fit_matrix
 from omnibench.discover.outcome import told
 from omnibench.discover.recording import usable_runs
 from omnibench.discover.result import Discovery
@@ -22,6 +22,8 @@ from omnibench.discover.rivals import rivals_of
 from omnibench.errors import DataError
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
+
+_EXPLAINED = 0.5  # of what slopes left: when more is left by the effects themselves, they are wrong
 
 
 class Watch(Protocol):
@@ -64,6 +66,8 @@ def discover_effects(
     tell.stage("looking where it fails, and at the catalogue")
     look = look_at(plain, None, None, without, rng)
     extended = extend(plain, look.named.chosen)
+    if look.named.tentative:
+        look, extended = _beyond_slopes(plain, look, extended, without, rng)
     if look.named.chosen:
         tell.stage("looking again, now that the noise is known better")
         again = look_at(extended.fit, extended, look.groups, without, rng)
@@ -75,6 +79,20 @@ def discover_effects(
     motors = look_at_actuators(runs, dataset.robot, without, rng)
     tell.stage("comparing on runs that were held out")
     return told(dataset, plain, look, rivals, motors, Request(tuple(without), unknown_term, seed), began)
+
+
+def _beyond_slopes(
+    plain: Fit, look: Look, extended: Extended, without: Sequence[str], rng: np.random.Generator
+) -> tuple[Look, Extended]:
+    """A second look with the names that were given up fitted in full, which stands if that explains what was left.
+
+    Where an effect is many times as large as the noise, its slopes alone leave what another effect would.
+    """
+    tried = extend(plain, look.named.tentative)
+    again = look_at(tried.fit, tried, None, without, rng)
+    if again.named.chosen and again.named.left_share < _EXPLAINED * look.named.left_share:
+        return again, tried
+    return look, extended
 
 
 def _start(dataset: Dataset, calibration: Calibration | None) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,8 @@ from omnibench.discover.held_out import confirmation, folds_of
 from omnibench.discover.model_fit import Fit, paths_of, split_runs
 from omnibench.discover.naming import Named, name_effects
 from omnibench.discover.significance import Gains, gains_of
-from omnibench.discover.whitened import Whitened
+from omnibench.discover.ticks import Rounding
+from omnibench.discover.whitened import Whitened, given
 from omnibench.robot.kinematics import Array
 
 _COARSE = 0.03  # s; what is looked for varies more slowly, and the fit itself takes every sample
@@ -24,7 +25,8 @@ _COARSE = 0.03  # s; what is looked for varies more slowly, and the fit itself t
 class Look:
     """What was looked at and found. data: all columns against what the plain matrix leaves; places: before any effect.
 
-    columns (K, 3, p): of every run, not whitened. folds (Z,): by which runs are held out.
+    columns (K, 3, p): of every run, not whitened. folds (Z,): by which runs are held out. rounding: what the encoders'
+    ticks may have to do with it.
     """
 
     groups: Groups
@@ -33,6 +35,7 @@ class Look:
     folds: NDArray[np.intp]
     named: Named
     places: Gains
+    rounding: Rounding
 
 
 def look_at(
@@ -54,5 +57,18 @@ def look_at(
         ]
     columns = tuple(split_runs(groups.columns, fit.runs))
     data, folds = fit.whitened(columns, residuals), folds_of(fit.runs)
+    rounding = Rounding(fit, columns)
     named = name_effects(data, groups, confirmation(data, folds), rng)
-    return Look(groups, columns, data, folds, named, gains_of(data, groups.matrix.index, groups.places, rng))
+    if doubtful := _within_ticks(data, groups, named, rounding):
+        others = tuple(group for group in groups.effects if group.name not in doubtful)
+        named = name_effects(data, replace(groups, effects=others), confirmation(data, folds), rng)
+    places = gains_of(data, groups.matrix.index, groups.places, rng)
+    return Look(groups, columns, data, folds, named, places, rounding)
+
+
+def _within_ticks(data: Whitened, groups: Groups, named: Named, rounding: Rounding) -> set[str]:
+    """Names that explain no more than rounding to encoder ticks can make."""
+    beyond = groups.matrix.index
+    start = given(data, beyond)
+    chosen = (*named.chosen, *named.tentative)
+    return {group.name for group in chosen if start.gain(group.index) <= rounding.gain(group.index, beyond)}

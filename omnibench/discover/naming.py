@@ -47,7 +47,8 @@ class Named:
 
     chosen: the effects in the order in which they were found. weights: of every candidate. steps: gains of all
     candidates when each effect was looked for. known: probability that what is there is in the catalogue. confusable:
-    of each chosen effect, as stand_ins. left: what generic bases find after the effects.
+    of each chosen effect, as stand_ins. left: what generic bases find after the effects. tentative: names that were
+    given up since too much is left beside them, as columns have it, which are no more than slopes.
     """
 
     chosen: tuple[Group, ...]
@@ -58,6 +59,7 @@ class Named:
     steps: tuple[Gains, ...]
     left: Gains
     left_share: float
+    tentative: tuple[Group, ...] = ()
 
     def is_same_as(self, other: Named) -> bool:
         """Whether the same effects were chosen, in the same shapes."""
@@ -106,7 +108,9 @@ def name_effects(
     if chosen:
         forms = [index for group in chosen for index in group.forms]
         share, known = _known(sets, start, chosen, left, gains_of(data, [*fitted, *forms], groups.places, rng))
+    given_up: tuple[Group, ...] = ()
     if chosen and known < _CREDIBLE:
+        given_up = chosen
         chosen, left = (), gains_of(data, groups.matrix.index, groups.places, rng)
     ordered = tuple(sorted(chosen, key=lambda group: -start.gain(group.index)))
     rivals = [_rivals(start, pool, ordered, place) for place in range(len(ordered))]
@@ -127,6 +131,7 @@ def name_effects(
         tuple(steps),
         left,
         share,
+        given_up,
     )
 
 

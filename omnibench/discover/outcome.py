@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy import stats
@@ -58,7 +59,9 @@ def told(
 ) -> Discovery:
     """All that is said of a discovery."""
     effects, sure = _named_effects(rivals, motors)
-    where, left = places_of(look.places), places_of(look.named.left, left=True)
+    fitted = [*look.groups.matrix.index, *(index for group in look.named.chosen for index in group.index)]
+    where = places_of(look.places, ticks=partial(look.rounding.gain, beyond=look.groups.matrix.index))
+    left = places_of(look.named.left, left=True, ticks=partial(look.rounding.gain, beyond=fitted))
     if motors is not None:
         where, left = where + places_of(motors.places), left + places_of(motors.named.left, left=True)
     where = tuple(sorted(where, key=lambda place: (place.p_value, -place.excess)))
@@ -109,8 +112,13 @@ def told(
     )
 
 
-def places_of(gains: Gains, *, left: bool = False) -> tuple[Place, ...]:
-    """The places that are no chance, the surest first; of each covariate one. left: after effects were added."""
+def places_of(
+    gains: Gains, *, left: bool = False, ticks: Callable[[Sequence[int]], float] | None = None
+) -> tuple[Place, ...]:
+    """The places that are no chance, the surest first; of each covariate one.
+
+    left: after effects were added. ticks: how much rounding to encoder ticks could make columns gain.
+    """
     best: dict[str, int] = {}
     for index in np.argsort(-gains.evidence, kind="stable"):
         best.setdefault(gains.groups[index].name, int(index))
@@ -121,7 +129,9 @@ def places_of(gains: Gains, *, left: bool = False) -> tuple[Place, ...]:
         if p_value < _SHOWN:
             words = f"the residual {'still ' if left else ''}depends on {group.basis.detail}"
             excess, rank = float(gains.excess[index]), int(gains.rank[index])
-            found.append(Place(group.name, group.basis.stage, p_value, excess, rank, words))
+            small = ticks is not None and excess <= ticks(group.index)
+            words += ", by no more than rounding to encoder ticks can make it" if small else ""
+            found.append(Place(group.name, group.basis.stage, p_value, excess, rank, words, small))
     return tuple(found)
 
 
@@ -316,6 +326,11 @@ def _notes(look: Look, fit: Fit) -> tuple[str, ...]:
             else "poses that contradict their neighbours were"
         )
         notes.append(f"{fit.jumps} reference {poses} left out.")
+    if look.rounding.ticks.any():
+        notes.append(
+            f"The wheels were read in encoder ticks of {np.degrees(look.rounding.ticks.max()):.2g} deg; what is left by "
+            "no more than rounding to them can make counts as nothing missing."
+        )
     heading, offset, slope = fit.nuisances.deviations
     for size, words in (
         (heading, f"start headings scatter from run to run by {np.degrees(heading):.2g} deg"),

@@ -20,6 +20,7 @@ from omnibench.robot.odometry import WheelLog
 _MOST_STAMPS = 80  # of a run; neighbours in denser references share their errors
 _JUMP = 4.5  # standard deviations from what a pose's neighbours say
 _MOST_JUMPS = 0.1  # of a run's poses
+_MANY, _MANY_BY_CHANCE = 0.95, 2.39  # a share of all poses, and how many standard deviations these stay below by chance
 _LAST = 5  # samples whose mean rate tells how the robot goes on after the last
 _STANDING = 1e-3  # rad/s
 _LONGEST = 0.5  # s for which it does
@@ -65,10 +66,14 @@ def without_jumps(
 ) -> tuple[tuple[Trajectory, ...], int]:
     """Runs less the poses that contradict their neighbours, and how many these are.
 
-    A pose jumps when its residual lies 4.5 standard deviations from what the run's other residuals make of it; what a
-    model gets wrong varies too slowly for that.
+    A pose jumps when its residual lies 4.5 standard deviations from what the run's other residuals make of it. What a
+    model gets wrong seldom varies as fast as that; where it does, in many poses, jumps must stand out of that, too.
     """
     precisions: dict[bytes, tuple[Array, Array]] = {}
+    everything = [
+        _surprises(own, *_precisions(noise, run.pose_times[1:])) for run, own in zip(runs, residuals, strict=True)
+    ]
+    limit = _JUMP * max(1.0, float(np.quantile(np.concatenate(everything), _MANY)) / _MANY_BY_CHANCE)
     kept, count = [], 0
     for run, own in zip(runs, residuals, strict=True):
         stamps = run.pose_times[1:]
@@ -78,7 +83,7 @@ def without_jumps(
             if key not in precisions:
                 precisions[key] = _precisions(noise, stamps[keep])
             score = _surprises(own[keep], *precisions[key])
-            if keep.sum() < 3 or score.max() < _JUMP:
+            if keep.sum() < 3 or score.max() < limit:
                 break
             keep[np.flatnonzero(keep)[score.argmax()]] = False
         count += int((~keep).sum())

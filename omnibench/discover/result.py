@@ -62,6 +62,7 @@ class Place:
 
     covariate: command, elapsed time, heading, place, order of runs, wheel rate, wheel angle, acceleration or stamps.
     p_value: with all that was looked at counted. excess: whitened chi2 beyond chance. description: in words.
+    within_ticks: rounding to encoder ticks can make as much.
     """
 
     covariate: str
@@ -70,6 +71,7 @@ class Place:
     excess: float
     degrees_of_freedom: int
     description: str
+    within_ticks: bool = False
 
 
 @dataclass(frozen=True)

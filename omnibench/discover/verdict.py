@@ -13,10 +13,14 @@ def verdict_of(
 ) -> Verdict:
     """The verdict. sure_of_class: of each effect, the weight of its name and of those that it is confusable with.
 
-    Motors are a stage of their own: naming what they do explains nothing that the odometry gets wrong.
+    Motors are a stage of their own: naming what they do explains nothing that the odometry gets wrong. A controller
+    whose way of following its targets has no name is told of, and is nothing that the odometry lacks.
     """
     of_odometry = _of_stage(effects, sure_of_class, left, where, motors=False)
-    return of_odometry if of_odometry != "none" else _of_stage(effects, sure_of_class, left, where, motors=True)
+    if of_odometry != "none":
+        return of_odometry
+    of_motors = _of_stage(effects, sure_of_class, left, where, motors=True)
+    return "none" if of_motors == "unknown" else of_motors
 
 
 def _of_stage(
@@ -31,8 +35,7 @@ def _of_stage(
     pairs = zip(effects, sure_of_class, strict=True)
     own = [(effect, sure) for effect, sure in pairs if (effect.stage == "actuator") == motors]
     here, after = (
-        any(place.p_value < CHANCE and (place.stage == "actuator") == motors for place in places)
-        for places in (where, left)
+        any(_counts(place) and (place.stage == "actuator") == motors for place in places) for places in (where, left)
     )
     if not own:
         return "unknown" if here else "none"
@@ -43,15 +46,25 @@ def _of_stage(
     return "incomplete" if any(effect.weight >= SURE for effect, _ in own) else "unknown"
 
 
+def _counts(place: Place) -> bool:
+    return place.p_value < CHANCE and not place.within_ticks
+
+
 def headline_of(verdict: Verdict, effects: Sequence[NamedEffect], where: Sequence[Place], left: Sequence[Place]) -> str:
     """One or two sentences for the top of a report."""
     names = "; ".join(" or ".join((effect.name, *effect.confusable_with)) for effect in effects)
     with_weights = " and ".join(f"{effect.name} ({_percent(effect.weight)})" for effect in effects)
+    where, left = [place for place in where if _counts(place)], [place for place in left if _counts(place)]
     odometry = [place for place in where if place.stage != "actuator"]
     place = (odometry or list(where))[0].description if where else ""
+    if verdict == "none" and where:
+        return (
+            "Nothing is missing in the odometry that these recordings could show. How the motors follow their targets "
+            f"has no name: {place}."
+        )
     if verdict == "none":
         return "Nothing is missing that these recordings could show: what the matrix leaves looks like its noise."
-    remains = f" Something else is left: {left[0].description}." if left and left[0].p_value < CHANCE else ""
+    remains = f" Something else is left: {left[0].description}." if left else ""
     if verdict == "named" and all(effect.stage == "actuator" for effect in effects):
         return f"Of the motors: {with_weights}. Nothing is missing in the odometry that these recordings could show."
     if verdict == "named":

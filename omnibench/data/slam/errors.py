@@ -23,21 +23,22 @@ class PoseErrors:
         self._joint[:3, :3] = np.eye(3)
         self._pose = start
 
-    def step(self, match: Match, moved: Array, skewed: Array) -> Array:
+    def step(self, match: Match, moved: Array, doubt: Array) -> Array:
         """Go on to the pose of a match; its covariance (3, 3).
 
         moved (3,): standard deviations of the motion from the last pose to the start, in the robot's frame, m, m, rad.
-        skewed (3,): the same of what the motion within the scan still does to the match.
+        doubt (3,): the same of the twist within the scan, m/s, m/s, rad/s.
         """
         before, here = _deviation(self._pose), _deviation(match.pose)
         rest = np.eye(3) - match.gain
         row = np.zeros((3, len(self._joint)))
         row[:, :3] = rest @ here @ np.linalg.solve(before, _turn(self._pose) * moved)
         row[:, -3:] = rest @ here
-        weight = match.gain @ np.linalg.pinv(match.information, hermitian=True)
         for keyframe, part in match.by_keyframe.items():
-            row[:, 3 + 3 * keyframe : 6 + 3 * keyframe] += weight @ part @ here
-        noise = weight @ match.scatter @ weight.T + _square(match.gain @ (_turn(match.pose) * skewed))
+            row[:, 3 + 3 * keyframe : 6 + 3 * keyframe] += match.weight @ part @ here
+        noise = match.weight @ match.scatter @ match.weight.T + _square(
+            match.weight @ match.delayed @ (_turn(match.pose) * doubt)
+        )
         covariance = row @ self._joint @ row.T + noise
         back = np.linalg.inv(here)
         across = back @ row @ self._joint[:, :-3]

@@ -17,6 +17,7 @@ from omnibench.data.slam.lines import Lines
 from omnibench.robot.kinematics import Array
 
 _CROSS = 1e-3  # m
+_FEWEST = 20  # points, without which nothing is matched
 _SAME_SIDE = 0.7  # cosine between normals of what may be the same surface
 _FINEST = 1e-5  # m and rad; small_gicp's search ends with a step shorter than this
 _ITERATIONS = 40
@@ -46,10 +47,13 @@ _FIELDS = tuple(field.name for field in fields(Surface))
 
 
 class ScanMap:
-    """Where surfaces were seen, in the run's frame. What is there stays; later scans add what is new."""
+    """Where surfaces were seen, in the run's frame. What is there stays; later scans add what is new.
+
+    spacing: between the points of a surface, m.
+    """
 
     def __init__(self, spacing: float) -> None:
-        self._spacing = spacing
+        self.spacing = spacing
         self.surface = Surface(
             np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0, int)
         )
@@ -58,6 +62,11 @@ class ScanMap:
     def __len__(self) -> int:
         return len(self.surface.centres)
 
+    @property
+    def is_usable(self) -> bool:
+        """Whether there is enough to match against."""
+        return len(self) >= _FEWEST
+
     def add(self, lines: Lines, pose: Array, keyframe: int) -> int:
         """Add what is new of a scan's lines, seen from a pose (3,); how many points that were."""
         seen = self._sampled(lines, pose, keyframe)
@@ -65,7 +74,7 @@ class ScanMap:
         if len(self) and len(new):
             near, distance = self.nearest(seen.centres)
             alike = (self.surface.normals[near] * seen.normals).sum(axis=1) > _SAME_SIDE
-            new = (distance > self._spacing) | (~alike & (distance > self._spacing / 4))
+            new = (distance > self.spacing) | (~alike & (distance > self.spacing / 4))
         if not new.any():
             return 0
         self._lines += len(lines.rays)
@@ -109,7 +118,7 @@ class ScanMap:
         return np.array([found[0, 3], found[1, 3], heading])
 
     def _sampled(self, lines: Lines, pose: Array, keyframe: int) -> Surface:
-        counts = np.maximum(1, np.ceil(2 * lines.half_lengths / self._spacing).astype(int))
+        counts = np.maximum(1, np.ceil(2 * lines.half_lengths / self.spacing).astype(int))
         line = np.repeat(np.arange(len(counts)), counts)
         place = np.arange(len(line)) - np.repeat(np.cumsum(counts) - counts, counts)
         along = ((2 * place + 1) / counts[line] - 1) * lines.half_lengths[line]

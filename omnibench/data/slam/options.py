@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from omnibench.config import Model
+from omnibench.robot.kinematics import Array
 
 
 class SlamOptions(Model):
@@ -35,6 +37,11 @@ class SlamOptions(Model):
         0.1, gt=0, allow_inf_nan=False, description="standard deviation of the odometry's error, share of the distance"
     )
     speed: float = Field(
-        0.3, gt=0, allow_inf_nan=False, description="m/s; what the robot may drive where scans and start tell nothing"
+        0.5, gt=0, allow_inf_nan=False, description="m/s; what the robot may drive where scans and start tell nothing"
     )
-    turn_rate: float = Field(0.5, gt=0, allow_inf_nan=False, description="rad/s; the same")
+    turn_rate: float = Field(1.0, gt=0, allow_inf_nan=False, description="rad/s; the same")
+
+    @property
+    def limits(self) -> Array:
+        """How well (3,) a scan must tell x, y (m) and heading (rad), or the start is kept."""
+        return np.array([self.constrained_position, self.constrained_position, self.constrained_heading])

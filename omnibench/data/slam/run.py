@@ -17,6 +17,8 @@ from omnibench.data.slam.points import ScanPoints, noise_factor, scan_points
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
+_SKEWED = 1e-3  # m or rad, from the first ray of a scan to its last
+_NEEDED = 0.6  # of the points: when fewer match, the map needs more
 _UNTOLD = 0.5  # share of a direction that scans tell: when it is less,
 _OFTEN = 0.1  # in more than this share of the scans, it is said
 
@@ -50,15 +52,13 @@ def run_slam(
     search starts from the last pose. DataError in one line: no scan, or one without returns.
     """
     _check(scans, scanner, options, odometry)
-    motion: Motion
+    duration = float(scanner.delays[-1])
+    motion: Motion = UnknownMotion(scans.times, options)
     if options.start == "odometry" and odometry is not None:
-        motion = OdometryMotion(odometry, options)
-    else:
-        motion = UnknownMotion(options)
-    noise = noise_factor(scans.ranges, scanner)
-    slam = _Slam(scanner, noise, options, motion, np.asarray(start, dtype=float))
-    located = [slam.begin(scans.ranges[0], float(scans.times[0]))]
-    located += [slam.go_on(*scan) for scan in zip(scans.ranges[1:], scans.times[1:].tolist(), strict=True)]
+        motion = OdometryMotion(odometry, scans.times, duration, options)
+    slam = _Slam(scanner, noise_factor(scans.ranges, scanner), options, motion, np.asarray(start, dtype=float))
+    located = [slam.begin(scans.ranges[0])]
+    located += [slam.go_on(number, ranges) for number, ranges in enumerate(scans.ranges[1:], 1)]
     return SlamPath(
         scans.times,
         np.array([match.pose for match, _ in located]),
@@ -73,44 +73,46 @@ class _Slam:
 
     def __init__(self, scanner: Scanner, noise: float, options: SlamOptions, motion: Motion, start: Array) -> None:
         self._scanner, self._noise, self._options, self._motion = scanner, noise, options, motion
-        self._duration = float(scanner.delays[-1])
         self._map = ScanMap(options.spacing)
         self._errors = PoseErrors(start)
         self._pose = self._keyframe = start
-        self._time = 0.0
 
-    def begin(self, ranges: Ranges, time: float) -> tuple[Match, Array]:
+    def begin(self, ranges: Ranges) -> tuple[Match, Array]:
         """The first scan, with which the map begins, at the start pose; its covariance (3, 3)."""
-        twist = self._motion.twist(time, self._duration)
-        scan = self._deskewed(scan_points(ranges, self._scanner, self._noise, twist), twist)
+        scan = self._points(ranges, self._motion.first_twist())
         self._add(scan)
         match = replace(refine(self._map, scan, self._pose, self._pose, self._options), pose=self._pose)
-        self._time = time
         # The pose is exact; what it is for the scans that follow is as uncertain as the scan's noise makes it.
-        limits = [*[self._options.constrained_position] * 2, self._options.constrained_heading]
-        return match, np.linalg.inv(match.information + np.diag(np.power(limits, -2.0)))
+        return match, np.linalg.inv(match.information + np.diag(self._options.limits**-2.0))
 
-    def go_on(self, ranges: Ranges, time: float) -> tuple[Match, Array]:
+    def go_on(self, number: int, ranges: Ranges) -> tuple[Match, Array]:
         """The next scan: its match and the covariance of its pose (3, 3)."""
-        options, motion, last, before = self._options, self._motion, self._pose, self._time
-        start, twist = motion.predicted(last, before, time), motion.twist(time, self._duration)
-        scan = scan_points(ranges, self._scanner, self._noise, twist)
-        still = self._deskewed(scan, twist)
-        found = search(self._map, still, start, options)
-        found = refine(self._map, still, found, start, options, steps=1).pose
-        twist, doubt = motion.corrected(twist, last, found, before, time)
-        still = self._deskewed(scan, twist)
-        match = refine(self._map, still, found, start, options)
-        covariance = self._errors.step(match, motion.deviations(before, time), doubt * self._duration / 2)
-        motion.went(last, match.pose, before, time)
-        self._pose, self._time = match.pose, time
-        x, y, turned = self._pose - self._keyframe
-        if np.hypot(x, y) > options.keyframe_distance or abs(turned) > options.keyframe_angle or not len(self._map):
-            self._add(still)
+        options, motion, last = self._options, self._motion, self._pose
+        expected = motion.expected(number, last)
+        scan = self._points(ranges, expected.twist)
+        found = search(self._map, scan, expected.start, options)
+        found = refine(self._map, scan, found, expected.start, options, steps=1).pose
+        twist, doubt = motion.corrected(number, last, found)
+        if options.deskew:
+            scan = scan.deskewed(twist - expected.twist)
+        else:
+            doubt = twist
+        match = refine(self._map, scan, found, expected.start, options)
+        covariance = self._errors.step(match, expected.deviations, doubt)
+        self._pose = match.pose
+        if self._is_keyframe(match, doubt):
+            self._add(scan)
         return match, covariance
 
-    def _deskewed(self, scan: ScanPoints, twist: Array) -> ScanPoints:
-        return scan.deskewed(twist) if self._options.deskew else scan
+    def _is_keyframe(self, match: Match, doubt: Array) -> bool:
+        """Whether the robot has come far enough for new surfaces; a scan that may be skewed waits while it can."""
+        x, y, turned = match.pose - self._keyframe
+        far = np.hypot(x, y) > self._options.keyframe_distance or abs(turned) > self._options.keyframe_angle
+        skewed = np.abs(doubt).max() * self._scanner.delays[-1] > _SKEWED
+        return bool(far and (match.matched < _NEEDED or not skewed)) or not self._map.is_usable
+
+    def _points(self, ranges: Ranges, twist: Array) -> ScanPoints:
+        return scan_points(ranges, self._scanner, self._noise, twist if self._options.deskew else np.zeros(3))
 
     def _add(self, scan: ScanPoints) -> None:
         """The last pose becomes a keyframe, if its scan saw something new."""

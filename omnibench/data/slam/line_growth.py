@@ -1,0 +1,142 @@
+"""Growing straight pieces along the points of a scan, compiled.
+
+A line n.p = d is seen along the direction phi at the range 1 / (a cos phi + b sin phi) with (a, b) = n / d. The fit is
+to the ranges, which alone are noisy: one to the points would tilt towards the scanner.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+_Float = NDArray[np.float64]
+_Int = NDArray[np.int64]
+
+_SEED = 8  # points that a piece begins with
+_MOST = 256  # points
+_LONGEST = 5.0  # m
+_GAP = 6  # rays without a point that a piece may have
+_STEPS = 2  # of Gauss-Newton
+_ON = 3.0  # standard deviations
+_OFF = 2  # neighbours off the line that end it
+_TRIMMED = 2  # points before such an end, which may be of the next piece already
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def grow_lines(ranges: _Float, cosines: _Float, sines: _Float, deviations: _Float, rays: _Int, part_of: _Int) -> Any:
+    """Lines through neighbouring points: (m, 7) of a, b, covariances aa, ab, bb, index of the first and last point.
+
+    ranges, cosines, sines, deviations (n,): of the points, in the order of their rays (n,). part_of (n,): gets the
+    number of the line that a point is part of, or -1.
+    """
+    count = len(ranges)
+    found = np.empty((count // _SEED + 1, 7))
+    lines, first = 0, 0
+    part_of[:] = -1
+    while first + _SEED <= count:
+        last = first + _SEED
+        fit = _fit(ranges, cosines, sines, deviations, first, last)
+        if rays[last - 1] - rays[first] >= _SEED + _GAP or not _straight(fit):
+            first += 1
+            continue
+        ended = False
+        while not ended:
+            reach, ended = _reach(ranges, cosines, sines, deviations, rays, first, last, fit)
+            if reach <= last:
+                break
+            longer = _fit(ranges, cosines, sines, deviations, first, reach)
+            if not _straight(longer):
+                break
+            last, fit = reach, longer
+        for column in range(5):
+            found[lines, column] = fit[column]
+        found[lines, 5], found[lines, 6] = first, last - 1
+        for point in range(first, last):
+            if abs(ranges[point] - _seen(fit, cosines[point], sines[point])) < _ON * deviations[point]:
+                part_of[point] = lines
+        lines += 1
+        first = last
+    return found[:lines]
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _reach(
+    ranges: _Float,
+    cosines: _Float,
+    sines: _Float,
+    deviations: _Float,
+    rays: _Int,
+    first: int,
+    last: int,
+    fit: Any,
+) -> Any:
+    """How far the points that follow lie on a line, looking as far ahead as it is long; whether it ends there."""
+    most = min(len(ranges), first + _MOST, 2 * last - first)
+    off = 0
+    point = last
+    while point < most:
+        seen = _seen(fit, cosines[point], sines[point])
+        slope_a, slope_b = seen * seen * cosines[point], seen * seen * sines[point]
+        variance = deviations[point] ** 2
+        variance += slope_a * slope_a * fit[2] + 2 * slope_a * slope_b * fit[3] + slope_b * slope_b * fit[4]
+        across = seen * cosines[point] - ranges[first] * cosines[first]
+        along = seen * sines[point] - ranges[first] * sines[first]
+        on = seen > 0 and (ranges[point] - seen) ** 2 < _ON * _ON * variance and math.hypot(across, along) < _LONGEST
+        off = 0 if on else off + 1
+        if off == _OFF or rays[point] - rays[point - 1] > _GAP:
+            return point + 1 - off - _TRIMMED, True
+        point += 1
+    return most, most == len(ranges) or most == first + _MOST
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _fit(ranges: _Float, cosines: _Float, sines: _Float, deviations: _Float, first: int, last: int) -> Any:
+    """A line through points: a, b, covariances aa, ab, bb, misfit, points that count."""
+    a = b = 0.0
+    aa = ab = bb = misfit = 0.0
+    points = 0
+    for step in range(_STEPS + 2):  # the first finds the line by its inverse range, the last only judges it
+        aa = ab = bb = right_a = right_b = misfit = 0.0
+        points = 0
+        for point in range(first, last):
+            cosine, sine, deviation = cosines[point], sines[point], deviations[point]
+            if step == 0:
+                seen, error = ranges[point], -ranges[point]
+            else:
+                inverse = a * cosine + b * sine
+                seen = 1.0 / inverse if inverse > 1e-9 else 1e9
+                error = ranges[point] - seen
+                if step > 1 and abs(error) > 4.0 * deviation:
+                    continue
+            slope_a, slope_b = -seen * seen * cosine / deviation, -seen * seen * sine / deviation
+            error /= deviation
+            aa += slope_a * slope_a
+            ab += slope_a * slope_b
+            bb += slope_b * slope_b
+            right_a += slope_a * error
+            right_b += slope_b * error
+            misfit += error * error
+            points += 1
+        determinant = aa * bb - ab * ab
+        if points < 3 or determinant <= 0.0:
+            return a, b, 0.0, 0.0, 0.0, math.inf, float(points)
+        if step <= _STEPS:
+            a += (bb * right_a - ab * right_b) / determinant
+            b += (aa * right_b - ab * right_a) / determinant
+    return a, b, bb / determinant, -ab / determinant, aa / determinant, misfit, float(points)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _straight(fit: Any) -> Any:
+    freedom = fit[6] - 2
+    return freedom >= _SEED - 4 and fit[5] < freedom + 3.0 * math.sqrt(2.0 * freedom)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _seen(fit: Any, cosine: float, sine: float) -> Any:
+    inverse = fit[0] * cosine + fit[1] * sine
+    return 1.0 / inverse if inverse > 1e-9 else -1.0
