@@ -20,6 +20,7 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
+_AHEAD = 4  # results of each worker that may wait for one before them
 _PATIENCE = 2.0  # s for a process to go by itself
 
 
@@ -40,16 +41,17 @@ def in_processes(
     waiting = enumerate(jobs)
     done: dict[int, Result] = {}
     following = 0
-    with _workers(work, workers, preload) as connections:
-        busy = {connection: index for connection in connections if (index := _send(connection, waiting)) is not None}
-        while busy:
+    with _workers(work, workers, preload) as idle:
+        busy: dict[Connection, int] = {}
+        while True:
+            while idle and len(done) < _AHEAD * workers and (index := _send(idle[-1], waiting)) is not None:
+                busy[idle.pop()] = index
+            if not busy:
+                return
             for connection in wait(list(busy)):
                 assert isinstance(connection, Connection)
-                index = busy.pop(connection)
-                done[index] = _receive(connection)
-                sent = _send(connection, waiting)
-                if sent is not None:
-                    busy[connection] = sent
+                done[busy.pop(connection)] = _receive(connection)
+                idle.append(connection)
             while following in done:
                 yield done.pop(following)
                 following += 1
@@ -95,7 +97,7 @@ def _workers(work: Callable[[Any], Any], count: int, preload: str | None) -> Ite
                 theirs.close()
                 processes.append(process)
                 connections.append(ours)
-        yield connections
+        yield list(connections)
         for connection in connections:
             connection.close()
         for process in processes:

@@ -42,7 +42,7 @@ def test_results_come_in_the_order_of_the_jobs(workers: int) -> None:
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_what_the_work_raises_is_raised_here(workers: int) -> None:
-    with pytest.raises(DataError, match="^two is wrong$"):
+    with pytest.raises(DataError, match="two is wrong"):
         list(in_processes(refused, range(9), workers))
     assert not multiprocessing.active_children()
 
@@ -63,7 +63,7 @@ def test_jobs_are_taken_as_they_are_needed() -> None:
 
     results = in_processes(squared_later, jobs(), 2)
     next(results)
-    assert len(taken) < 50 or taken == list(range(50))
+    assert len(taken) < 20  # though the first result came last
     results.close()
     assert not multiprocessing.active_children()
 
@@ -72,7 +72,14 @@ def test_workers_are_others_with_one_thread_each() -> None:
     found = set(in_processes(threads, range(6), 2))
     assert os.getpid() not in {process for process, _ in found}
     assert {count for _, count in found} == {"1"}
-    assert os.environ.get("OPENBLAS_NUM_THREADS") == os.environ.get("OPENBLAS_NUM_THREADS")
+
+
+def test_this_process_keeps_its_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    assert list(in_processes(squared_later, range(3), 2)) == [0, 1, 4]
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+    assert "OPENBLAS_NUM_THREADS" not in os.environ
 
 
 def test_no_jobs_no_results() -> None:

@@ -328,7 +328,7 @@ def _notes(look: Look, fit: Fit) -> tuple[str, ...]:
         notes.append(f"{fit.jumps} reference {poses} left out.")
     if look.rounding.ticks.any():
         notes.append(
-            f"The wheels were read in encoder ticks of {np.degrees(look.rounding.ticks.max()):.2g} deg; what is left by "
+            f"The wheels were read in ticks of {np.degrees(look.rounding.ticks.max()):.2g} deg; what is left by "
             "no more than rounding to them can make counts as nothing missing."
         )
     heading, offset, slope = fit.nuisances.deviations

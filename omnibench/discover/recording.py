@@ -20,6 +20,7 @@ from omnibench.robot.odometry import WheelLog
 _MOST_STAMPS = 80  # of a run; neighbours in denser references share their errors
 _JUMP = 4.5  # standard deviations from what a pose's neighbours say
 _MOST_JUMPS = 0.1  # of a run's poses
+_RARE = 0.08  # of all poses: more of them are no jumps
 _MANY, _MANY_BY_CHANCE = 0.95, 2.39  # a share of all poses, and how many standard deviations these stay below by chance
 _LAST = 5  # samples whose mean rate tells how the robot goes on after the last
 _STANDING = 1e-3  # rad/s
@@ -69,11 +70,21 @@ def without_jumps(
     A pose jumps when its residual lies 4.5 standard deviations from what the run's other residuals make of it. What a
     model gets wrong seldom varies as fast as that; where it does, in many poses, jumps must stand out of that, too.
     """
-    precisions: dict[bytes, tuple[Array, Array]] = {}
-    everything = [
+    kept, count = _without_surprises(runs, residuals, noise, _JUMP)
+    poses = sum(len(own) for own in residuals)
+    if count <= _RARE * poses:
+        return kept, count
+    surprises = [
         _surprises(own, *_precisions(noise, run.pose_times[1:])) for run, own in zip(runs, residuals, strict=True)
     ]
-    limit = _JUMP * max(1.0, float(np.quantile(np.concatenate(everything), _MANY)) / _MANY_BY_CHANCE)
+    usual = float(np.quantile(np.concatenate(surprises), _MANY)) / _MANY_BY_CHANCE
+    return _without_surprises(runs, residuals, noise, _JUMP * max(1.0, usual))
+
+
+def _without_surprises(
+    runs: Sequence[Trajectory], residuals: Sequence[Array], noise: Noise, limit: float
+) -> tuple[tuple[Trajectory, ...], int]:
+    precisions: dict[bytes, tuple[Array, Array]] = {}
     kept, count = [], 0
     for run, own in zip(runs, residuals, strict=True):
         stamps = run.pose_times[1:]

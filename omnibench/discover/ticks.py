@@ -78,7 +78,7 @@ class Rounding:
 
 
 def _quarter_ticks(run: Trajectory, poses: Array, matrix: Array, ticks: Array) -> Array:
-    """Changes (K, 3, 2N) of a run's poses (K, 3) at pose_times[1:] by a quarter of a tick of each wheel, at both ends."""
+    """Changes (K, 3, 2N) of a run's poses (K, 3) by a quarter of a tick of each wheel, at both ends of its turn."""
     turning = run.rates != 0
     columns = np.zeros((len(poses), 3, 2 * len(ticks)))
     stamps, known = run.pose_times[1:], np.vstack([run.start, poses])

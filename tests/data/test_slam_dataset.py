@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -116,10 +117,11 @@ class TestWhatIsSaid:
     def test_a_corridor_is_named_with_its_direction_and_runs(self) -> None:
         dataset, _ = recorded("corridor", 2)
         (warning,) = slam_dataset(dataset, SlamOptions(), workers=1).warnings
-        # The robot stands along the corridor, and its start pose is turned by 0.5 rad, or 29 deg.
-        assert warning == (
-            "SLAM: scans tell too little along 27 deg of the run's frame: 2 of 2 runs, e.g. run-0, run-1"
+        # The robot stands along the corridor, within some degrees; its start pose is turned by 0.5 rad, or 29 deg.
+        said = (
+            r"SLAM: scans tell too little along (2[4-9]|3[0-4]) deg of the run's frame: 2 of 2 runs, e.g. run-0, run-1"
         )
+        assert re.fullmatch(said, warning)
 
     def test_a_furnished_room_is_fine(self) -> None:
         assert slam_dataset(recorded()[0], SlamOptions(), workers=1).warnings == ()

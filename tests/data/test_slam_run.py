@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -145,7 +146,8 @@ class TestCorridor:
         assert 1 < np.mean([nees(located(run, options), run).mean() for run in runs]) < 5
 
     def test_it_is_said(self) -> None:
-        assert located(driven("corridor", 3)).problems == ("scans tell too little along 0 deg of the run's frame",)
+        (problem,) = located(driven("corridor", 3)).problems  # the robot stands along it, within some degrees
+        assert re.fullmatch(r"scans tell too little along ([0-6]|17\d) deg of the run's frame", problem)
 
     def test_nothing_is_said_of_a_furnished_room(self) -> None:
         assert located(driven("furnished_room", 2)).problems == ()

@@ -9,6 +9,7 @@ import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.scans import Scanner, TrajectoryScans
+from omnibench.data.slam.doubts import Doubt, together
 from omnibench.data.slam.options import SlamOptions
 from omnibench.data.slam.run import SlamPath, run_slam
 from omnibench.errors import DataError
@@ -137,11 +138,12 @@ def _with_path(trajectory: Trajectory, path: SlamPath) -> Trajectory:
 
 def _doubts(trajectories: Sequence[Trajectory], paths: Sequence[SlamPath]) -> tuple[str, ...]:
     """What went wrong, the same of many runs in one sentence."""
-    runs: dict[str, list[str]] = {}
+    found: dict[str, list[tuple[str, Doubt]]] = {}
     for trajectory, path in zip(trajectories, paths, strict=True):
-        for problem in path.problems:
-            runs.setdefault(problem, []).append(trajectory.id)
+        for doubt in path.doubts:
+            found.setdefault(doubt.problem, []).append((trajectory.id, doubt))
     return tuple(
-        f"SLAM: {problem}: {len(names)} of {len(paths)} runs, e.g. {', '.join(names[:3])}"
-        for problem, names in runs.items()
+        f"SLAM: {together([doubt for _, doubt in each])}: {len(each)} of {len(paths)} runs, "
+        f"e.g. {', '.join(name for name, _ in each[:3])}"
+        for each in found.values()
     )

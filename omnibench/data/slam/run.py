@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from omnibench.data.scans import Ranges, Scanner, TrajectoryScans
+from omnibench.data.slam.doubts import Doubt, doubts_of
 from omnibench.data.slam.errors import PoseErrors
 from omnibench.data.slam.map import ScanMap
-from omnibench.data.slam.matching import LOST, Match, refine, search
+from omnibench.data.slam.matching import Match, refine, search
 from omnibench.data.slam.motion import Motion, OdometryMotion, UnknownMotion
 from omnibench.data.slam.options import SlamOptions
 from omnibench.data.slam.points import ScanPoints, noise_factor, scan_points
@@ -19,8 +20,6 @@ from omnibench.robot.kinematics import Array
 
 _SKEWED = 1e-3  # m or rad, from the first ray of a scan to its last
 _NEEDED = 0.6  # of the points: when fewer match, the map needs more
-_UNTOLD = 0.5  # share of a direction that scans tell: when it is less,
-_OFTEN = 0.1  # in more than this share of the scans, it is said
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,14 +27,19 @@ class SlamPath:
     """Poses of the robot at the stamps of its scans.
 
     times (S,): s. poses (S, 3): m, m, rad, in the run's frame, headings continuous. covariances (S, 3, 3).
-    matched (S,): share of each scan's points that lie on the map. problems: what went wrong, in words.
+    matched (S,): share of each scan's points that lie on the map. doubts: what went wrong.
     """
 
     times: Array
     poses: Array
     covariances: Array
     matched: Array
-    problems: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What went wrong, in words."""
+        return tuple(str(doubt) for doubt in self.doubts)
 
 
 def run_slam(
@@ -64,7 +68,7 @@ def run_slam(
         np.array([match.pose for match, _ in located]),
         np.array([covariance for _, covariance in located]),
         np.array([match.matched for match, _ in located]),
-        tuple(_problems([match for match, _ in located])),
+        doubts_of([match for match, _ in located]),
     )
 
 
@@ -119,24 +123,6 @@ class _Slam:
         self._keyframe = self._pose
         if self._map.add(scan.lines, self._pose, self._errors.keyframes):
             self._errors.keep()
-
-
-def _problems(matches: Sequence[Match]) -> Iterator[str]:
-    if any(match.matched < LOST for match in matches):
-        yield "less than a fifth of a scan lies on the map, and its pose is the start of the search"
-    untold = [match for match in matches if match.matched >= LOST and match.told.min() < _UNTOLD]
-    if len(untold) > _OFTEN * len(matches):
-        worst = np.array([match.directions[:, match.told.argmin()] for match in untold])
-        if (np.abs(worst[:, 2]) > np.hypot(worst[:, 0], worst[:, 1])).mean() > 0.5:
-            yield "scans tell too little of the heading"
-        else:  # a direction and its opposite are the same
-            double = np.angle(((worst[:, 0] + 1j * worst[:, 1]) ** 2).sum()) / 2
-            yield f"scans tell too little along {_rounded(np.degrees(double)):.0f} deg of the run's frame"
-
-
-def _rounded(degrees: float) -> float:
-    """To a tenth of a right angle, from 0 to 180."""
-    return 9.0 * round(degrees / 9) % 180
 
 
 def _check(
