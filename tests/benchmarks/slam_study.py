@@ -30,6 +30,7 @@ from omnibench.robot.kinematics import Array, Robot, Wheel
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.published import published_matrix
+from omnibench.threads import one_thread
 
 ROBOT = Robot(
     name="APR-02",
@@ -88,7 +89,8 @@ def study(room: str, options: SlamOptions, runs: int, seed: int = 0) -> dict[str
         rng = np.random.default_rng([seed, number])
         run = drive(plan, lidar, flower_command(number), rng)
         began = time.process_time()
-        paths.append(run_slam(run.scans, lidar.scanner, options, np.zeros(3), run.odometry))
+        with one_thread():
+            paths.append(run_slam(run.scans, lidar.scanner, options, np.zeros(3), run.odometry))
         seconds += time.process_time() - began
         driven.append(run)
     errors = [path.poses - run.true for path, run in zip(paths, driven, strict=True)]

@@ -172,6 +172,18 @@ class TestErrors:
         covariance = errors.step(self.match(np.array([1.0, 2.0, 0.3]), 1.0, 0.002), np.full(3, 0.1), np.zeros(3))
         np.testing.assert_allclose(covariance, 0.002**2 * np.eye(3), atol=1e-15)
 
+    def test_the_oldest_keyframes_are_merged_into_the_next(self) -> None:
+        errors, surroundings = PoseErrors(np.zeros(3)), ScanMap(OPTIONS.spacing)
+        for keyframe, heading in enumerate((0.0, 2.0, 4.0)):
+            pose = np.array([0.0, 0.0, heading])
+            surroundings.add(points_of(ranges_at(pose)).lines, pose, keyframe)
+            errors.keep()
+        seen = surroundings.surface.keyframe
+        errors.merge_oldest()
+        surroundings.merge_oldest()
+        assert errors.keyframes == 2
+        np.testing.assert_array_equal(surroundings.surface.keyframe, np.where(seen == 2, 1, 0))
+
     @given(x=st.floats(-5, 5), y=st.floats(-5, 5), heading=st.floats(-4, 4))
     def test_a_keyframe_hands_its_error_on(self, x: float, y: float, heading: float) -> None:
         errors = PoseErrors(np.zeros(3))

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 from slam_study import Run, drive, flower_command
 
+from omnibench.config import validate
 from omnibench.data.scans import Ranges, TrajectoryScans
 from omnibench.data.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
 from omnibench.data.simulate.flower import Command
 from omnibench.data.simulate.lidar import Lidar, LidarMount
 from omnibench.data.slam.options import SlamOptions
 from omnibench.data.slam.run import SlamPath, run_slam
-from omnibench.errors import DataError
+from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import Array
 
 LIDAR = Lidar()
@@ -221,6 +222,10 @@ class TestImperfectScans:
             DataError, match=rf"the scan at {run.scans.times[3]:g} s is empty: no range from 0.1 to 30 m"
         ):
             located(run)
+
+    def test_distances_that_widen_the_search_are_one_line(self) -> None:
+        with pytest.raises(ConfigError, match=r"search_distance 0\.1 m is less than match_distance 0\.5 m"):
+            validate(SlamOptions, {"search_distance": 0.1, "match_distance": 0.5}, "config")
 
     def test_no_scan_wrong_rays_and_no_odometry_are_one_line_each(self) -> None:
         run = driven("furnished_room", 4)

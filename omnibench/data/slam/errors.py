@@ -58,6 +58,11 @@ class PoseErrors:
         every = np.concatenate([np.arange(size), np.arange(size - 3, size)])
         self._joint = self._joint[np.ix_(every, every)]
 
+    def merge_oldest(self) -> None:
+        """Keyframe 0 is no more; what it saw counts as seen by the next, whose error is larger."""
+        others = np.delete(np.arange(len(self._joint)), [3, 4, 5])
+        self._joint = self._joint[np.ix_(others, others)]
+
 
 def _square(matrix: Array) -> Array:
     return matrix @ matrix.T

@@ -7,7 +7,7 @@ whose five nearest neighbours are itself and whose normal so is the line's.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import small_gicp
@@ -18,9 +18,10 @@ from omnibench.robot.kinematics import Array
 
 _CROSS = 1e-3  # m
 _FEWEST = 20  # points, without which nothing is matched
+_WORTH = 5  # new points, for which a map is made anew
 _SAME_SIDE = 0.7  # cosine between normals of what may be the same surface
 _FINEST = 1e-5  # m and rad; small_gicp's search ends with a step shorter than this
-_ITERATIONS = 40
+_ITERATIONS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +69,14 @@ class ScanMap:
         return len(self) >= _FEWEST
 
     def add(self, lines: Lines, pose: Array, keyframe: int) -> int:
-        """Add what is new of a scan's lines, seen from a pose (3,); how many points that were."""
+        """Add what is new of a scan's lines, seen from a pose (3,), if that is worth it; how many points that were."""
         seen = self._sampled(lines, pose, keyframe)
         new = np.ones(len(seen.centres), dtype=bool)
         if len(self) and len(new):
             near, distance = self.nearest(seen.centres)
             alike = (self.surface.normals[near] * seen.normals).sum(axis=1) > _SAME_SIDE
             new = (distance > self.spacing) | (~alike & (distance > self.spacing / 4))
-        if not new.any():
+        if new.sum() < _WORTH:
             return 0
         self._lines += len(lines.rays)
         fresh = seen.at(np.flatnonzero(new))
@@ -84,6 +85,11 @@ class ScanMap:
         )
         self._rebuild()
         return int(new.sum())
+
+    def merge_oldest(self) -> None:
+        """What keyframe 0 saw counts as seen by the next; all others are one less."""
+        keyframes = np.maximum(self.surface.keyframe - 1, 0)
+        self.surface = replace(self.surface, keyframe=keyframes)
 
     def nearest(self, points: Array) -> tuple[NDArray[np.int_], Array]:
         """For points (n, 2) the nearest of the map: index (n,) and distance (n,), m."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from omnibench.config import Model
 from omnibench.robot.kinematics import Array
@@ -40,6 +40,14 @@ class SlamOptions(Model):
         0.5, gt=0, allow_inf_nan=False, description="m/s; what the robot may drive where scans and start tell nothing"
     )
     turn_rate: float = Field(1.0, gt=0, allow_inf_nan=False, description="rad/s; the same")
+
+    @model_validator(mode="after")
+    def _narrows(self) -> SlamOptions:
+        if self.search_distance < self.match_distance:
+            raise ValueError(
+                f"search_distance {self.search_distance:g} m is less than match_distance {self.match_distance:g} m"
+            )
+        return self
 
     @property
     def limits(self) -> Array:

@@ -19,6 +19,8 @@ from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
 _SKEWED = 1e-3  # m or rad, from the first ray of a scan to its last
+_KEYFRAMES = 300  # whose errors are told apart
+_SAMPLE = 100  # scans that tell the noise
 _NEEDED = 0.6  # of the points: when fewer match, the map needs more
 
 
@@ -60,7 +62,8 @@ def run_slam(
     motion: Motion = UnknownMotion(scans.times, options)
     if options.start == "odometry" and odometry is not None:
         motion = OdometryMotion(odometry, scans.times, duration, options)
-    slam = _Slam(scanner, noise_factor(scans.ranges, scanner), options, motion, np.asarray(start, dtype=float))
+    noise = noise_factor(scans.ranges[:: 1 + len(scans.times) // _SAMPLE], scanner)
+    slam = _Slam(scanner, noise, options, motion, np.asarray(start, dtype=float))
     located = [slam.begin(scans.ranges[0])]
     located += [slam.go_on(number, ranges) for number, ranges in enumerate(scans.ranges[1:], 1)]
     return SlamPath(
@@ -121,8 +124,12 @@ class _Slam:
     def _add(self, scan: ScanPoints) -> None:
         """The last pose becomes a keyframe, if its scan saw something new."""
         self._keyframe = self._pose
-        if self._map.add(scan.lines, self._pose, self._errors.keyframes):
-            self._errors.keep()
+        if not self._map.add(scan.lines, self._pose, self._errors.keyframes):
+            return
+        self._errors.keep()
+        if self._errors.keyframes > _KEYFRAMES:
+            self._map.merge_oldest()
+            self._errors.merge_oldest()
 
 
 def _check(
