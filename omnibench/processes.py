@@ -7,8 +7,9 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from types import ModuleType
 from typing import Any, TypeVar
@@ -84,12 +85,9 @@ def _death_in_words() -> Iterator[None]:
 
 @contextmanager
 def _workers(work: Callable[[Any], Any], count: int, preload: str | None) -> Iterator[list[Connection]]:
-    context = multiprocessing.get_context("forkserver")
-    if preload is not None:
-        context.set_forkserver_preload([__name__, preload])
     processes, connections = [], []
     try:
-        with _one_thread_each(), _main_module_hidden():
+        with one_thread_processes([preload] if preload else []) as context, main_module_hidden():
             for _ in range(count):
                 ours, theirs = context.Pipe()
                 process = context.Process(target=_serve, args=(theirs, work), daemon=True)
@@ -112,8 +110,7 @@ def _workers(work: Callable[[Any], Any], count: int, preload: str | None) -> Ite
 
 def _serve(connection: Connection, work: Callable[[Any], Any]) -> None:
     """The worker process: jobs come, results go, until the parent closes or dies."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     with suppress(EOFError, OSError), one_thread():
         while True:
             job = connection.recv()
@@ -124,7 +121,8 @@ def _serve(connection: Connection, work: Callable[[Any], Any]) -> None:
             connection.send(answer)
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
+    """End this worker when its parent dies, which it must not outlive."""
     parent = multiprocessing.parent_process()
     assert parent is not None  # this is a worker
     with suppress(OSError):
@@ -133,11 +131,19 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
+def one_thread_processes(preload: Sequence[str]) -> Iterator[Any]:
+    """A context whose processes start fast, with one thread each: two at a time should not fight for the cores.
+
+    preload: modules that they will need.
+    """
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__, *preload])
     try:
-        yield
+        with _interrupts_ignored():  # the processes inherit this: the parent decides what Ctrl-C ends
+            forkserver.ensure_running()
+        yield context
     finally:
         for name, value in before.items():
             if value is None:
@@ -147,7 +153,19 @@ def _one_thread_each() -> Iterator[None]:
 
 
 @contextmanager
-def _main_module_hidden() -> Iterator[None]:
+def _interrupts_ignored() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():  # others cannot, and need not
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def main_module_hidden() -> Iterator[None]:
     """A process started here does not run the user's script once more, which so needs no guard against that."""
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")

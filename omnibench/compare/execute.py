@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
-from types import ModuleType
 from typing import Any, Protocol
 
 from omnibench.compare.config import CalibratorEntry, CompareConfig
@@ -24,6 +19,7 @@ from omnibench.compare.store import RunStore, StoredRun
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error, run_calibrator
 from omnibench.fit.parameterisation import ParameterisationName
+from omnibench.processes import end_with_parent, main_module_hidden, one_thread_processes
 from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Robot
 
@@ -31,7 +27,7 @@ from omnibench.robot.kinematics import Robot
 _GRACE = 10.0
 # A process that has answered may take this long to go by itself.
 _PATIENCE = 2.0
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
+_PRELOAD = ("omnibench.compare.execute", "omnibench.fit.sum_of_norms", "nlopt")
 
 
 class Progress(Protocol):
@@ -84,7 +80,7 @@ def execute(plan: Sequence[PlannedRun], store: RunStore, progress: Progress, wor
             progress.ended(run, stored, reused=True)
     active: dict[int, _Active] = {}
     waiting.reverse()
-    with _processes() as context:
+    with one_thread_processes(_PRELOAD) as context:
         try:
             while waiting or active:
                 while waiting and len(active) < workers:
@@ -103,52 +99,10 @@ def execute(plan: Sequence[PlannedRun], store: RunStore, progress: Progress, wor
     return [results[index] for index in range(len(plan))]
 
 
-@contextmanager
-def _processes() -> Iterator[Any]:
-    """Processes that start fast, with one thread each: two runs at a time should not fight for the cores."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["omnibench.compare.execute", "omnibench.fit.sum_of_norms", "nlopt"])
-    try:
-        with _interrupts_ignored():  # the processes inherit this: the parent decides what Ctrl-C ends
-            forkserver.ensure_running()
-        yield context
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-@contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():  # others cannot, and need not
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def _main_module_hidden() -> Iterator[None]:
-    """A process started here does not run the user's script once more, which so needs no guard against that."""
-    main = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = main
-
-
 def _start(context: Any, run: PlannedRun) -> _Active:
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_work, args=(sender, _Job.of(run)), daemon=True)
-    with _main_module_hidden():
+    with main_module_hidden():
         process.start()
     sender.close()
     return _Active(run, process, receiver, time.monotonic())
@@ -179,22 +133,13 @@ class _Job:
 
 def _work(connection: Connection, job: _Job) -> None:
     """The worker process: solve one problem and send the result."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     try:
         answer = StoredRun.of(_solve(job, lambda evaluations, best: connection.send((evaluations, best))))
     except BaseException as error:  # whatever a plug-in raises, wherever, is this run's outcome
         answer = StoredRun.of(RunResult(Outcome.FAILED, describe_error(error), None, None, None, 0, 0.0, ()))
     with suppress(OSError):  # a plug-in may have closed it
         connection.send(answer)
-
-
-def _end_with_parent() -> None:
-    """A run must not outlive a comparison that was killed."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None  # this is a worker
-    with suppress(OSError):
-        wait([parent.sentinel])
-        os._exit(1)
 
 
 def _solve(job: _Job, watch: Callable[[int, float], None]) -> RunResult:

@@ -110,10 +110,7 @@ class TestWhatIsRecorded:
         for table_format in ("parquet", "csv"):
             save_dataset(simulation.dataset, tmp_path / table_format, table_format)
             read = load_dataset(tmp_path / table_format)
-            for run, other in zip(read.trajectories, simulation.dataset.trajectories, strict=True):
-                assert run.pose_covariances is not None
-                np.testing.assert_array_equal(run.poses, other.poses)
-                np.testing.assert_allclose(run.pose_covariances, other.pose_covariances, rtol=0, atol=1e-12)
+            assert read.hash == simulation.dataset.hash
             assert read.scans is not None
             assert read.scans.scanner == simulation.dataset.scans.scanner
             for name, scans in simulation.dataset.scans:

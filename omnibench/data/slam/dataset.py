@@ -133,7 +133,8 @@ def _from_start(path: SlamPath, start: Array) -> SlamPath:
 
 
 def _with_path(trajectory: Trajectory, path: SlamPath) -> Trajectory:
-    return replace(trajectory, pose_times=path.times, poses=path.poses, pose_covariances=path.covariances)
+    symmetric = (path.covariances + np.swapaxes(path.covariances, 1, 2)) / 2  # as a data set holds them
+    return replace(trajectory, pose_times=path.times, poses=path.poses, pose_covariances=symmetric)
 
 
 def _doubts(trajectories: Sequence[Trajectory], paths: Sequence[SlamPath]) -> tuple[str, ...]:
