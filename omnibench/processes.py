@@ -110,6 +110,7 @@ def _workers(work: Callable[[Any], Any], count: int, preload: str | None) -> Ite
 
 def _serve(connection: Connection, work: Callable[[Any], Any]) -> None:
     """The worker process: jobs come, results go, until the parent closes or dies."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends, from whatever thread it asked
     threading.Thread(target=end_with_parent, daemon=True).start()
     with suppress(EOFError, OSError), one_thread():
         while True:
@@ -134,7 +135,7 @@ def end_with_parent() -> None:
 def one_thread_processes(preload: Sequence[str]) -> Iterator[Any]:
     """A context whose processes start fast, with one thread each: two at a time should not fight for the cores.
 
-    preload: modules that they will need.
+    preload: modules that they will need; those of the first who asks in a process are for all that follow.
     """
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from omnibench.config import Model
+from omnibench.data.simulate.config import Positive
 from omnibench.data.simulate.simulate import SimulatedConfig
 from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
 from omnibench.fit.problem import Budget
@@ -79,10 +80,10 @@ class PublishedResult(Model):
 
     label: str
     source: str
-    theoretical_train_cost: float
-    train_cost: float
-    theoretical_validation_cost: float | None = None
-    validation_cost: float | None = None
+    theoretical_train_cost: Positive
+    train_cost: Positive
+    theoretical_validation_cost: Positive | None = None
+    validation_cost: Positive | None = None
 
 
 class CompareConfig(Model):

@@ -27,7 +27,7 @@ from omnibench.robot.kinematics import Robot
 _GRACE = 10.0
 # A process that has answered may take this long to go by itself.
 _PATIENCE = 2.0
-_PRELOAD = ("omnibench.compare.execute", "omnibench.fit.sum_of_norms", "nlopt")
+PRELOAD = ("omnibench.compare.execute", "omnibench.fit.sum_of_norms", "nlopt")
 
 
 class Progress(Protocol):
@@ -80,7 +80,7 @@ def execute(plan: Sequence[PlannedRun], store: RunStore, progress: Progress, wor
             progress.ended(run, stored, reused=True)
     active: dict[int, _Active] = {}
     waiting.reverse()
-    with one_thread_processes(_PRELOAD) as context:
+    with one_thread_processes(PRELOAD) as context:
         try:
             while waiting or active:
                 while waiting and len(active) < workers:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from omnibench.compare.certificates import certify
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.execute import Progress, execute
+from omnibench.compare.execute import PRELOAD, Progress, execute
 from omnibench.compare.output import prepare_output, write_results
 from omnibench.compare.plan import PlannedRun, effective_config, load_calibrators, load_datasets, make_plan
 from omnibench.compare.report import write_report
@@ -22,6 +22,7 @@ from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
 from omnibench.errors import ConfigError, Interrupted, UnknownNameError
 from omnibench.fit.calibrator import RunResult
+from omnibench.processes import one_thread_processes
 from omnibench.registry import PluginFailure
 
 
@@ -47,7 +48,8 @@ def run_comparison(
     failures = load_calibrators(config)
     with _blaming(failures):
         config = effective_config(config)
-        datasets = load_datasets(config, progress.prepared)
+        with one_thread_processes(PRELOAD):  # those that simulate are to serve the calibrators, too
+            datasets = load_datasets(config, progress.prepared)
     plan = make_plan(config, datasets)
     folder = prepare_output(config, output)
     store = RunStore(folder / "runs")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -145,6 +146,59 @@ class TestTheTruth:
         assert turned == pytest.approx(0.02 * 2.4, rel=0.25)  # s in motion
         assert other.final_pose[2] - run.final_pose[2] == pytest.approx(turned, abs=2e-3)  # and SLAM sees it
 
+    @pytest.mark.parametrize(
+        ("effect", "parameters"),
+        [
+            ("wheel_eccentricity", {"a_a": 0.04, "b_b": -0.04, "a_c": 0.04}),
+            ("speed_dependent_radius", {"k": 0.02}),
+            ("thermal_radius_drift", {"k": 4e-3}),
+            ("floor_drift", {"dx": 0.02, "dy": -0.01}),
+            ("centripetal_slip", {"k": 0.1}),
+            ("reference_time_offset", {"tau": 0.15}),
+            ("motor_gain", {"g": 0.05}),
+        ],
+    )
+    def test_an_effect_of_any_stage_acts_on_the_true_robot(self, effect: str, parameters: dict[str, float]) -> None:
+        few = {"commands": {"directions_deg": [45], "turn_rates": [0.35]}, "lidar": {"rays": 540}, "repetitions": 3}
+        hidden = [{"name": effect, "parameters": parameters}]
+        train = {"seed": 1, "distance": 0.8}
+        simulated = made(**few, train=train, truth={"tolerances": {}, "effects": hidden})
+        model = simulated.truth.true_robot().model
+        runs = simulated.dataset.trajectories
+        logs = [run.log(run.pose_times) for run in runs]
+        with_it, without = model.reported(logs), replace(model, terms=()).poses(logs)
+        off, plain = (
+            max(np.hypot(*(own - run.poses)[:, :2].T).max() for own, run in zip(poses, runs, strict=True))
+            for poses in (with_it, without)
+        )
+        assert off < 0.006
+        if effect == "motor_gain":  # it acts before the encoders, which see it
+            targets = [run.targets for run in runs]
+            for run, target in zip(runs, targets, strict=True):
+                assert target is not None
+                turned = np.abs(run.rates).sum() / np.abs(target).sum()
+                assert turned == pytest.approx(1.05, abs=0.02)
+        else:
+            assert plain > 1.5 * off
+
+    def test_runs_begin_ten_seconds_apart_and_not_quite_on_their_mark(self, simulation: Simulation) -> None:
+        runs = simulation.dataset.split("train")
+        for before, after in pairwise(runs):
+            assert before.started_at is not None
+            assert after.started_at == pytest.approx(before.started_at + before.times[-1] + 10)
+        starts = np.array([simulation.starts[run.id] for run in runs])
+        assert simulation.plan is not None
+        spread = starts - simulation.plan.start
+        assert np.all(spread.std(axis=0) > [0.005, 0.005, 0.01])
+        assert np.all(np.abs(spread) < [0.1, 0.1, 0.2])
+
+    def test_a_computer_that_hangs_is_told_and_the_run_is_short(self) -> None:
+        few = {"commands": {"directions_deg": [0], "turn_rates": [0.0]}, "repetitions": 1}
+        stalled = made(**few, link={"stalls_at": 0.5})
+        (run,) = stalled.dataset.trajectories
+        assert any("watchdog" in warning for warning in stalled.dataset.warnings)
+        assert stalled.paths[run.id].at(run.times[-1:])[0, 0] < 0.25
+
     def test_latency_makes_the_reference_late(self) -> None:
         few = {"commands": {"directions_deg": [0], "turn_rates": [0.0]}, "repetitions": 1}
         late = made(**few, lidar={"latency": 0.2})
@@ -191,7 +245,11 @@ class TestWhatIsRefused:
                 ["room", "start"],
                 id="a start outside the room",
             ),
-            pytest.param({"train": {"seed": 1, "distance": 9.0}}, ["train-0"], id="a way through the wall"),
+            pytest.param(
+                {"train": {"seed": 1, "distance": 9.0}}, ["command v0.2", "hits"], id="a way through the wall"
+            ),
+            pytest.param({"train": {"seed": 1, "distance": 1e6}}, ["check the distances"], id="millimetres for metres"),
+            pytest.param({"link": {"refresh": 1e-9}}, ["link.refresh"], id="commands without end"),
             pytest.param({"generator": "robt"}, ["did you mean 'robot'"], id="an unknown generator"),
             pytest.param({"sample_period": 0.0105}, ["sample_period"], id="a period between milliseconds"),
             pytest.param({"lidar": {"rays": 0}}, ["lidar.rays"], id="a LIDAR without rays"),

@@ -16,7 +16,7 @@ from omnibench.data.simulate.simulation import Simulation
 from omnibench.data.simulate.truth import TrueRobot, true_record
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 
-_PAUSE = 10.0  # s between runs
+PAUSE = 10.0  # s between runs
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def _session(config: FlowerConfig, robot: TrueRobot, split: Split, session: Sess
             angles=run.angles,
             targets=run.targets,
         )
-        started_at += float(run.times[-1]) + _PAUSE
+        started_at += float(run.times[-1]) + PAUSE
         angles = run.angles[-1]
 
 

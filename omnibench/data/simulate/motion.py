@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy.optimize import brentq
 
 from omnibench.config import Model
 from omnibench.data.simulate.config import Positive
@@ -46,7 +45,7 @@ class MotionProfile(Model):
 class CommandLink(Model):
     """How commands come to the robot."""
 
-    refresh: Positive = Field(0.3, description="from one command to the next, s")
+    refresh: float = Field(0.3, ge=0.01, allow_inf_nan=False, description="from one command to the next, s")
     watchdog: Positive = Field(0.5, description="longest validity of a command, s")
     lost: float = Field(0.0, ge=0, le=0.9, description="chance that a command is lost on the way")
     stalls_at: float | None = Field(
@@ -174,4 +173,6 @@ def _needed(set_point: SetPoint, now: float, seconds: float, longest: float) -> 
         return 0.0
     if missing(longest + _NOTHING) > 0:
         return None
+    from scipy.optimize import brentq  # which loads slowly
+
     return float(brentq(missing, 0.0, longest + _NOTHING, xtol=1e-14))

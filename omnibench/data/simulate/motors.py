@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -16,10 +17,13 @@ from pydantic import Field, model_validator
 from omnibench.config import Model
 from omnibench.data.simulate.config import Positive
 from omnibench.data.simulate.flower import Command
-from omnibench.data.simulate.motor_loop import TRUE_STEP, MotorSteps, Pid, drive_wheel, motor_steps
 from omnibench.errors import ConfigError
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 
+if TYPE_CHECKING:  # it is compiled, and loads slowly: for those who drive, not for those who read a config
+    from omnibench.data.simulate.motor_loop import MotorSteps, Pid
+
+TRUE_STEP = 1e-3  # s between the recorded true angles
 _RESERVE = 0.1  # share of the fastest rate that is left to the controller
 
 
@@ -125,6 +129,8 @@ def drive_session(
     motor: of all wheels, or one for each. targets: rates of each run (F, N), rad/s. start_angles: (N,), rad.
     ConfigError: a sample period that is not a whole number of milliseconds, or not as many motors as wheels.
     """
+    from omnibench.data.simulate.motor_loop import drive_wheel
+
     steps = round(sample_period / TRUE_STEP)
     if steps < 1 or abs(sample_period - steps * TRUE_STEP) > 1e-9:
         raise ConfigError(f"sample_period {sample_period:g} s: the motors need a whole number of milliseconds")
@@ -144,6 +150,8 @@ def drive_session(
 
 
 def _steps_of(motor: Motor) -> MotorSteps:
+    from omnibench.data.simulate.motor_loop import motor_steps
+
     return motor_steps(
         motor.resistance,
         motor.inductance,
@@ -156,6 +164,8 @@ def _steps_of(motor: Motor) -> MotorSteps:
 
 
 def _pid_of(controller: Controller, motor: Motor) -> Pid:
+    from omnibench.data.simulate.motor_loop import Pid
+
     return Pid(controller.proportional, controller.integral, controller.derivative, motor.supply_voltage)
 
 

@@ -11,11 +11,11 @@ import numpy as np
 from omnibench.data.dataset import Split, Trajectory, make_dataset
 from omnibench.data.scans import ScansInMemory, TrajectoryScans
 from omnibench.data.simulate.floor_plan import FloorPlan, make_plan
-from omnibench.data.simulate.flower import Command, grid_of
+from omnibench.data.simulate.flower import PAUSE, Command, grid_of
 from omnibench.data.simulate.lidar import PoseTrack, measure_scans, scan_stamps
 from omnibench.data.simulate.motion import CommandedMotion, command_motion, target_rates
-from omnibench.data.simulate.motors import DrivenRun, check_reach, drive_session
-from omnibench.data.simulate.robot_config import TRUE_STEP, Placement, RobotConfig, RobotSession
+from omnibench.data.simulate.motors import TRUE_STEP, DrivenRun, check_reach, drive_session
+from omnibench.data.simulate.robot_config import Placement, RobotConfig, RobotSession
 from omnibench.data.simulate.simulation import Simulation, Watch, unwatched
 from omnibench.data.simulate.truth import TrueRobot, true_record
 from omnibench.data.simulate.truth_poses import TruePath
@@ -25,7 +25,8 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
-_PAUSE = 10.0  # s between runs
+_STEP = 0.05  # m along a way that is checked beforehand
+_DENSE = 0.01  # s, at most, between true poses that are kept
 
 
 def simulate_robot(
@@ -42,6 +43,9 @@ def simulate_robot(
     sessions: dict[Split, RobotSession] = {"train": config.train}
     if config.validation is not None:
         sessions["validation"] = config.validation
+    for command in commands:
+        for session in sessions.values():
+            _check_way(config, plan, command, session)
     truth = true_record(config.truth, config.robot, config.sample_period, tuple(sessions), name)
     chain = _Chain(config, truth.true_robot(TRUE_STEP), plan, commands)
     runs: list[_Recorded] = []
@@ -60,8 +64,21 @@ def simulate_robot(
         scans=ScansInMemory(config.lidar.scanner, {run.trajectory.id: run.scans for run in runs}),
     )
     found = slam_dataset(recorded, config.slam, watch=watch)
+    found = replace(found, warnings=(*found.warnings, *_stopped(runs)))
     paths = {run.trajectory.id: run.path for run in runs}
     return Simulation(found, truth, paths, plan, {run.trajectory.id: run.start for run in runs})
+
+
+def _check_way(config: RobotConfig, plan: FloorPlan, command: Command, session: RobotSession) -> None:
+    """ConfigError: the command leads the robot out of the room, were it as designed."""
+    if not command.speed:
+        return
+    times = np.linspace(0.0, session.distance / command.speed, max(2, math.ceil(session.distance / _STEP)))
+    turned = 1j * command.turn_rate * times
+    way = np.expm1(turned) / (1j * command.turn_rate) if command.turn_rate else times.astype(complex)
+    way *= complex(command.twist[0], command.twist[1])
+    poses = np.column_stack([way.real, way.imag, turned.imag])
+    plan.check_path(_in_room(plan.start, poses)[:, :2], times, config.radius, f"command {command.name}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +89,7 @@ class _Recorded:
     scans: TrajectoryScans
     path: TruePath
     start: Array
+    stops: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +141,8 @@ class _Chain:
                 angles=wheels.angles,
                 targets=target,
             )
-            yield self._scanned(run, wheels, rng)
-            started_at += float(motion.times[-1]) + _PAUSE
+            yield self._scanned(run, wheels, motion, rng)
+            started_at += float(motion.times[-1]) + PAUSE
 
     def _motion(self, command: Command, session: RobotSession, rng: np.random.Generator) -> CommandedMotion:
         config = self.config
@@ -134,7 +152,9 @@ class _Chain:
             config.settle, rng,
         )  # fmt: skip
 
-    def _scanned(self, run: Trajectory, wheels: DrivenRun, rng: np.random.Generator) -> _Recorded:
+    def _scanned(
+        self, run: Trajectory, wheels: DrivenRun, motion: CommandedMotion, rng: np.random.Generator
+    ) -> _Recorded:
         """The run with its scans; its poses are the design odometry's until SLAM has found better ones."""
         config, plan = self.config, self.plan
         log = _true_log(run, wheels.wheel_angles)
@@ -147,11 +167,25 @@ class _Chain:
             scans = measure_scans(plan, config.lidar, PoseTrack(log.stamps, _in_room(start, seen)), stamps, rng)
         except DataError as error:
             raise DataError(f"run {run.id}: {error}") from None
-        every = round(config.sample_period / TRUE_STEP)
+        every = round(min(config.sample_period, _DENSE) / TRUE_STEP)
         design = OdometryModel.of_design(config.robot, "arc")
         (odometry,) = design.poses([replace(run.log(stamps), start=np.zeros(3))])
         true = TruePath(log.stamps[::every], path[::every])
-        return _Recorded(replace(run, pose_times=stamps, poses=odometry), scans, true, start)
+        return _Recorded(
+            replace(run, pose_times=stamps, poses=odometry), scans, true, start, motion.stopped_by_watchdog
+        )
+
+
+def _stopped(runs: Sequence[_Recorded]) -> tuple[str, ...]:
+    """A warning where the watchdog stopped the robot."""
+    stopped = [run for run in runs if run.stops]
+    if not stopped:
+        return ()
+    first = stopped[0]
+    return (
+        f"no command was valid for a while, and the watchdog stopped the robot, in {len(stopped)} of {len(runs)} runs, "
+        f"e.g. {first.trajectory.id} at {first.stops[0][0]:.2f} s",
+    )
 
 
 def _true_log(run: Trajectory, wheel_angles: Array) -> WheelLog:

@@ -11,11 +11,11 @@ from omnibench.data.simulate.config import MotionGrid, Positive, Truth
 from omnibench.data.simulate.floor_plan import RoomPlan
 from omnibench.data.simulate.lidar import Lidar
 from omnibench.data.simulate.motion import CommandLink, MotionProfile
-from omnibench.data.simulate.motors import Controller, Encoder, Motor
+from omnibench.data.simulate.motors import TRUE_STEP, Controller, Encoder, Motor
 from omnibench.data.slam.options import SlamOptions
 from omnibench.robot.kinematics import Robot
 
-TRUE_STEP = 0.001  # s: the true robot moves in steps of a millisecond
+_MOST_ANGLES = 1e8  # true wheel angles that are simulated in all
 
 
 class Placement(Model):
@@ -76,4 +76,22 @@ class RobotConfig(Model):
         if not any(self.commands.speeds) and not any(self.commands.turn_rates):
             raise ValueError("commands: no command moves the robot")
         self.truth.check_wheels(self.robot)
+        if self._angles() > _MOST_ANGLES:
+            raise ValueError(
+                f"this is {self._angles():.1g} milliseconds of wheels, more than {_MOST_ANGLES:.0e}; check the "
+                "distances (m), speeds (m/s), accelerations, settle and repetitions"
+            )
         return self
+
+    def _angles(self) -> float:
+        """How many true wheel angles are simulated, roughly."""
+        chosen, profile = self.commands, self.profile
+        sessions = [session for session in (self.train, self.validation) if session is not None]
+        seconds = 0.0
+        for speed in chosen.speeds:
+            directions = len(chosen.directions_deg) if speed else 1
+            for turn_rate in chosen.turn_rates:
+                ramps = 2 * max(speed / profile.acceleration, abs(turn_rate) / profile.turn_acceleration)
+                driven = sum(session.distance / speed if speed else chosen.turn_duration for session in sessions)
+                seconds += directions * (driven + len(sessions) * (ramps + self.settle))
+        return seconds * self.repetitions * len(self.robot.wheels) / TRUE_STEP
