@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
+from errno import EACCES, EPERM, EROFS
 from io import BytesIO
 from pathlib import Path
 from typing import Literal
@@ -52,7 +53,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def _refused(path: Path, error: OSError) -> DataError:
-    return DataError(f"{path}: cannot be written: {error.strerror or error}; free space or choose another place")
+    way_out = "choose another place" if error.errno in (EACCES, EPERM, EROFS) else "free space or choose another place"
+    return DataError(f"{path}: cannot be written: {error.strerror or error}; {way_out}")
 
 
 def write_text(path: Path, text: str) -> None:

@@ -14,7 +14,7 @@ from rich.console import Console
 from omnibench.errors import ConfigError
 from omnibench.live_terminal import LogLines, ReplayBar, print_demonstration, print_played
 from omnibench.plugin_option import Plugins, load_given_plugins, plugin_folders
-from omnibench.terminal import make_console
+from omnibench.terminal import Steps, make_console
 
 if TYPE_CHECKING:
     from omnibench.live.live_config import ClientConfig, LiveConfig
@@ -91,7 +91,8 @@ def replay(
     load_given_plugins(plugins)
     chosen = validate(ReplayConfig, {"speed": _speed(speed), **parse_settings(settings)}, "replay")
     noise = None if calibration is None else read_calibration(calibration).noise
-    recording = load_recording(dataset)
+    with Steps(make_console(error=True)) as watch:
+        recording = load_recording(dataset, watch=watch)
     chain = chain_recording(recording, pause=chosen.pause, split=chosen.split)
     with _client(config, connect, profile, "replay") as (session, keys), stop_on_signals() as stop:
         player = Player(GraphNode(session, keys, "replay"), robot, chain, chosen, noise=noise)
@@ -217,7 +218,8 @@ def _replay_to_node(config: LiveConfig, dataset: Path | None, speed: str | None,
         checked = validate(ReplayConfig, {"speed": _speed(speed)}, "--speed")
         changed = config.replay.model_copy(update={"speed": checked.speed})
         config = config.model_copy(update={"replay": changed})
-    recording = load_recording(source)
+    with Steps(make_console(error=True)) as watch:
+        recording = load_recording(source, watch=watch)
     with (
         ReplayBar(recording.dataset.name) as bar,
         _logging_to(bar.console, logging.WARNING),

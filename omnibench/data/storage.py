@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -113,11 +114,16 @@ def save_dataset(dataset: Dataset, path: Path | str, table_format: TableFormat =
 
 
 def check_folder(folder: Path) -> None:
-    """DataError in one line when a data set cannot be written there, because something else is."""
+    """DataError in one line when a data set cannot be written there: something else is there, or nobody may write."""
     if folder.is_file():
         raise DataError(f"{folder}: is a file; name a folder for the data set")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "dataset.yaml").is_file():
         raise DataError(f"{folder}: holds other files; name an empty or new folder for the data set")
+    existing = next(each for each in (folder.absolute(), *folder.absolute().parents) if each.exists())
+    if not existing.is_dir():
+        raise DataError(f"{folder}: cannot be written: {existing} is not a folder; choose another place")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise DataError(f"{folder}: cannot be written: {existing} is read-only; choose another place")
 
 
 def header_of(dataset: Dataset) -> Header:

@@ -13,14 +13,15 @@ def verdict_of(
 ) -> Verdict:
     """The verdict. sure_of_class: of each effect, the weight of its name and of those that it is confusable with.
 
-    Motors are a stage of their own: naming what they do explains nothing that the odometry gets wrong. A controller
-    whose way of following its targets has no name is told of, and is nothing that the odometry lacks.
+    Motors are a stage of their own: naming what they do explains nothing that the odometry gets wrong. A controller's
+    way of following its targets, as far as it has no name, is told of, and is nothing that the odometry lacks.
     """
     of_odometry = _of_stage(effects, sure_of_class, left, where, motors=False)
     if of_odometry != "none":
         return of_odometry
     of_motors = _of_stage(effects, sure_of_class, left, where, motors=True)
-    return "none" if of_motors == "unknown" else of_motors
+    whole: dict[Verdict, Verdict] = {"unknown": "none", "incomplete": "named"}
+    return whole.get(of_motors, of_motors)
 
 
 def _of_stage(
@@ -66,7 +67,11 @@ def headline_of(verdict: Verdict, effects: Sequence[NamedEffect], where: Sequenc
         return "Nothing is missing that these recordings could show: what the matrix leaves looks like its noise."
     remains = f" Something else is left: {left[0].description}." if left else ""
     if verdict == "named" and all(effect.stage == "actuator" for effect in effects):
-        return f"Of the motors: {with_weights}. Nothing is missing in the odometry that these recordings could show."
+        more = f" Beyond that, {left[0].description}." if left else ""
+        return (
+            "Nothing is missing in the odometry that these recordings could show. Between targets and measured wheel "
+            f"rates: {with_weights}.{more}"
+        )
     if verdict == "named":
         return f"Missing: {with_weights}. With it the model predicts the training runs to within their noise."
     if verdict == "incomplete":

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from omnibench.data.dataset import Dataset
+from omnibench.data.simulate.simulation import Watch, unwatched
 from omnibench.data.simulate.source import read_simulation
 from omnibench.data.simulate.truth import TruthRecord
 from omnibench.data.simulate.truth_poses import TruePath
@@ -27,7 +28,7 @@ class Recording:
     paths: Mapping[str, TruePath] = field(default_factory=dict)
 
 
-def load_recording(path: Path, dataset: str | None = None) -> Recording:
+def load_recording(path: Path, dataset: str | None = None, watch: Watch = unwatched) -> Recording:
     """The data set in a folder, or the simulated one of a comparison's config, with its truth.
 
     dataset: which one, if the config has several. ConfigError or DataError in one line when there is no such thing.
@@ -38,7 +39,7 @@ def load_recording(path: Path, dataset: str | None = None) -> Recording:
     if not path.is_dir():
         source = read_simulation(path, dataset)
         load_plugins(source.effect_plugins, installed=False)
-        simulation = source.simulate()
+        simulation = source.simulate(watch)
         return Recording(simulation.dataset, simulation.truth, simulation.paths)
     if dataset is not None:
         raise ConfigError(f"--dataset {dataset}: {path} is a folder with one data set; leave --dataset out")

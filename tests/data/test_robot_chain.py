@@ -250,7 +250,7 @@ class TestWhatIsRefused:
             ),
             pytest.param({"train": {"seed": 1, "distance": 1e6}}, ["check the distances"], id="millimetres for metres"),
             pytest.param({"link": {"refresh": 1e-9}}, ["link.refresh"], id="commands without end"),
-            pytest.param({"generator": "robt"}, ["did you mean 'robot'"], id="an unknown generator"),
+            pytest.param({"generator": "robt"}, ["generator must be 'flower' or 'robot'"], id="an unknown generator"),
             pytest.param({"sample_period": 0.0105}, ["sample_period"], id="a period between milliseconds"),
             pytest.param({"lidar": {"rays": 0}}, ["lidar.rays"], id="a LIDAR without rays"),
             pytest.param({"motor": {"volts": 1}}, ["motor.volts", "supply_voltage"], id="a misspelt key"),

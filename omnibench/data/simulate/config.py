@@ -110,13 +110,6 @@ class FlowerConfig(Model):
     start: Literal["fixed", "random"] = Field("fixed", description="at the origin, or anywhere with any heading")
     start_area: Positive = Field(4.0, description="side of the square about the origin for random starts, m")
 
-    @field_validator("generator", mode="before")
-    @classmethod
-    def _known(cls, generator: object) -> object:
-        if generator != "flower":
-            raise ValueError(str(UnknownNameError("generator", str(generator), ("flower", "robot"))))
-        return generator
-
     @field_validator("robot")
     @classmethod
     def _named(cls, robot: Robot) -> Robot:

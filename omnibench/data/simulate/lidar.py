@@ -48,7 +48,7 @@ class Lidar(Model):
     resolution: float = Field(0.001, ge=1e-6, le=1, description="step of the ranges, m")
     mount: LidarMount = LidarMount()
     period: tuple[float, float] = Field((0.2, 0.3), description="shortest and longest time between scans, s")
-    latency: float = Field(0.0, ge=0, le=10, description="a scan's stamp is so much later than its first ray, s")
+    latency: float = Field(0.0, ge=0, le=1, description="a scan's stamp is so much later than its first ray, s")
     dropouts: float = Field(0.001, ge=0, lt=1, description="chance that a ray returns nothing")
     distortion: bool = Field(True, description="the robot moves during a scan; false: all rays at the same time")
 

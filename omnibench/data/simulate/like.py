@@ -47,7 +47,10 @@ def simulate_like(dataset: Dataset, calibration: Calibration, noise_seed: int | 
         simulated=True,
     )
     unfitted = unfitted_motions(calibration, dataset.trajectories)
-    return made if unfitted is None else replace(made, warnings=(*made.warnings, unfitted))
+    told = [] if unfitted is None else [unfitted]
+    if dataset.scans is not None:
+        told.append("the recording's scans are left out: they show where its robot was")
+    return replace(made, warnings=(*made.warnings, *told))
 
 
 def _with_noise(dataset: Dataset, poses: list[Array], calibration: Calibration, seed: int) -> list[Array]:

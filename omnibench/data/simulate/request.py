@@ -12,14 +12,14 @@ from omnibench.data.dataset import Dataset
 from omnibench.data.simulate.like import simulate_like
 from omnibench.data.simulate.simulation import Simulation, Watch, unwatched
 from omnibench.data.simulate.source import SimulationSource, read_simulation
+from omnibench.data.simulate.truth import TRUTH_FILE
 from omnibench.data.simulate.truth_poses import write_true_poses
 from omnibench.data.slam.accuracy import SlamAccuracy, slam_accuracy
-from omnibench.data.storage import load_dataset, save_dataset
+from omnibench.data.storage import check_folder, load_dataset, save_dataset
 from omnibench.errors import ConfigError
 from omnibench.files import TableFormat, write_text
 from omnibench.robot.calibration import read_calibration
 
-TRUTH_FILE = "truth.yaml"
 ACCURACY_FILE = "slam_accuracy.json"
 
 
@@ -83,6 +83,7 @@ class SimulationRequest:
 
         OmnibenchError in one line: the config, the recording or the calibration is wrong, or the disk refuses.
         """
+        check_folder(self.output)
         if self.config is None:
             assert self.like is not None
             assert self.model is not None

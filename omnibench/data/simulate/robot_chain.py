@@ -25,6 +25,7 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
+_FOLLOWED = 0.1  # of what wheels were told: so much they may miss
 _STEP = 0.05  # m along a way that is checked beforehand
 _DENSE = 0.01  # s, at most, between true poses that are kept
 
@@ -64,7 +65,7 @@ def simulate_robot(
         scans=ScansInMemory(config.lidar.scanner, {run.trajectory.id: run.scans for run in runs}),
     )
     found = slam_dataset(recorded, config.slam, watch=watch)
-    found = replace(found, warnings=(*found.warnings, *_stopped(runs)))
+    found = replace(found, warnings=(*found.warnings, *_stopped(runs), *_astray(runs)))
     paths = {run.trajectory.id: run.path for run in runs}
     return Simulation(found, truth, paths, plan, {run.trajectory.id: run.start for run in runs})
 
@@ -185,6 +186,24 @@ def _stopped(runs: Sequence[_Recorded]) -> tuple[str, ...]:
     return (
         f"no command was valid for a while, and the watchdog stopped the robot, in {len(stopped)} of {len(runs)} runs, "
         f"e.g. {first.trajectory.id} at {first.stops[0][0]:.2f} s",
+    )
+
+
+def _astray(runs: Sequence[_Recorded]) -> tuple[str, ...]:
+    """A warning where wheels turned otherwise than they were told."""
+    missed = {}
+    for run in runs:
+        rates, targets = run.trajectory.rates, run.trajectory.targets
+        assert targets is not None
+        turned, wanted = (np.abs(each.sum(axis=0)).sum() for each in (rates, targets))
+        if wanted and abs(turned / wanted - 1) > _FOLLOWED:
+            missed[run.trajectory.id] = turned / wanted
+    if not missed:
+        return ()
+    name, share = next(iter(missed.items()))
+    return (
+        f"in {len(missed)} of {len(runs)} runs the wheels do not follow their targets: in {name} they turn "
+        f"{share:.0%} of what they were told; check motor and controller",
     )
 
 

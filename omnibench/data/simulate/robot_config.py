@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from pydantic import Field, FiniteFloat, field_validator, model_validator
@@ -76,6 +77,12 @@ class RobotConfig(Model):
         if not any(self.commands.speeds) and not any(self.commands.turn_rates):
             raise ValueError("commands: no command moves the robot")
         self.truth.check_wheels(self.robot)
+        coarse, fastest = self.encoder.tick / self.sample_period, self.motor.fastest_rate
+        if coarse > fastest / 2:
+            raise ValueError(
+                f"encoder.ticks: one tick a sample is {coarse:.3g} rad/s, and the motor's fastest rate {fastest:.3g} "
+                "rad/s, so that it cannot be controlled; give it more ticks a turn"
+            )
         if self._angles() > _MOST_ANGLES:
             raise ValueError(
                 f"this is {self._angles():.1g} milliseconds of wheels, more than {_MOST_ANGLES:.0e}; check the "
@@ -92,6 +99,8 @@ class RobotConfig(Model):
             directions = len(chosen.directions_deg) if speed else 1
             for turn_rate in chosen.turn_rates:
                 ramps = 2 * max(speed / profile.acceleration, abs(turn_rate) / profile.turn_acceleration)
+                if profile.shape == "jerk_limited":
+                    ramps += 4 * max(math.sqrt(speed / profile.jerk), math.sqrt(abs(turn_rate) / profile.turn_jerk))
                 driven = sum(session.distance / speed if speed else chosen.turn_duration for session in sessions)
                 seconds += directions * (driven + len(sessions) * (ramps + self.settle))
         return seconds * self.repetitions * len(self.robot.wheels) / TRUE_STEP

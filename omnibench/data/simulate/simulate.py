@@ -16,15 +16,17 @@ from omnibench.data.simulate.simulation import Simulation, Watch, unwatched
 _FLOWER, _ROBOT = CHOSEN + FlowerConfig.__name__, CHOSEN + RobotConfig.__name__
 
 
-def _generator(config: Any) -> str:
-    """Which config is meant; what is neither is refused by the flower's in its own words."""
-    found = config.get("generator") if isinstance(config, Mapping) else getattr(config, "generator", None)
-    return _ROBOT if found == "robot" else _FLOWER
+def _generator(config: Any) -> str | None:
+    """Which config is meant; None where none is."""
+    found = config.get("generator", "flower") if isinstance(config, Mapping) else getattr(config, "generator", "flower")
+    return {"flower": _FLOWER, "robot": _ROBOT}.get(str(found))
 
 
 SimulatedConfig = Annotated[
     Annotated[FlowerConfig, Tag(_FLOWER)] | Annotated[RobotConfig, Tag(_ROBOT)],
-    Discriminator(_generator),
+    Discriminator(
+        _generator, custom_error_type="generator", custom_error_message="generator must be 'flower' or 'robot'"
+    ),
 ]
 
 

@@ -20,6 +20,8 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, WheelLog
 from omnibench.robot.published import published_matrix
 
+TRUTH_FILE = "truth.yaml"  # of the truth's folder
+
 
 @dataclass(frozen=True, eq=False)
 class TrueRobot:

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from omnibench.config import read_model
 from omnibench.data.dataset import Dataset
+from omnibench.data.simulate.truth import TRUTH_FILE, TruthRecord
 from omnibench.data.simulate.truth_poses import TruePath, read_true_poses
 from omnibench.data.slam.accuracy import SlamAccuracy, slam_accuracy
 from omnibench.data.slam.dataset import Watch, slam_paths, with_paths
@@ -72,6 +74,9 @@ class SlamRequest:
         if self.truth is None:
             return None
         truth = read_true_poses(self.truth)
+        record = self.truth / TRUTH_FILE
+        if record.is_file() and read_model(TruthRecord, record).robot != recorded.robot:
+            raise DataError(f"--truth {self.truth}: it is another robot's; name the truth of this data set")
         for trajectory in recorded.trajectories:
             if trajectory.id not in truth:
                 raise DataError(

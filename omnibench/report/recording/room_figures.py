@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -193,4 +194,14 @@ def _start(position: Array) -> go.Scatter:
 def _map(traces: Sequence[go.Scatter]) -> go.Figure:
     figure = plot(*traces, xaxis_title_text="x (m)", yaxis_title_text="y (m)")
     equal_aspect(figure)
+    figure.update_xaxes(range=_framed([trace.x for trace in traces]))
+    figure.update_yaxes(range=_framed([trace.y for trace in traces]))
     return figure
+
+
+def _framed(columns: Sequence[Any]) -> list[float]:
+    """From the least to the greatest with a margin, so that no line runs along the frame or out of it."""
+    values = np.concatenate([np.asarray(column, dtype=float) for column in columns])
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    margin = max(0.05 * (high - low), 0.05)  # m
+    return [low - margin, high + margin]
