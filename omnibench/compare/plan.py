@@ -19,8 +19,8 @@ from omnibench.config import read_model, validate
 from omnibench.data.dataset import Dataset
 from omnibench.data.importer import import_dataset
 from omnibench.data.simulate.simulate import simulate_dataset
-from omnibench.data.simulate.simulation import Watch, unwatched
 from omnibench.data.storage import load_dataset
+from omnibench.data.watch import Watch, unwatched
 from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
 from omnibench.fit.calibrator import unloadable
 from omnibench.fit.parameterisation import ParameterisationName

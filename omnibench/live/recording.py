@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.simulate.simulation import Watch, unwatched
 from omnibench.data.simulate.source import read_simulation
 from omnibench.data.simulate.truth import TruthRecord
 from omnibench.data.simulate.truth_poses import TruePath
 from omnibench.data.storage import load_dataset
+from omnibench.data.watch import Watch, unwatched
 from omnibench.errors import ConfigError
 from omnibench.registry import load_plugins
 

@@ -29,6 +29,19 @@ def moved_to(start: Array, poses: Array) -> Array:
     return np.column_stack([start[0] + path.real, start[1] + path.imag, poses[:, 2] + turn])
 
 
+def unit_twist(motion: Array) -> Array:
+    """The constant twist that makes a motion in unit time: the logarithm map of SE(2).
+
+    motion (..., 3): the pose after it as seen from before, m, m, rad. ``advance`` by arcs is the way back. A motion of
+    more than half a turn, for which the twist becomes the less certain the nearer it is to a whole one, is taken to be
+    no longer than one of half a turn.
+    """
+    half = motion[..., 2] / 2
+    longer = 1 / np.sinc(np.minimum(np.abs(half), np.pi / 2) / np.pi)
+    way = (motion[..., 0] + 1j * motion[..., 1]) * longer * np.exp(-1j * half)
+    return np.stack([way.real, way.imag, motion[..., 2]], axis=-1)
+
+
 def correction(in_map: Array, in_odom: Array) -> Array:
     """The pose (3,) of frame odom in frame map, from the robot's pose in both."""
     x, y, heading = in_map.tolist()

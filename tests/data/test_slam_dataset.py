@@ -15,8 +15,9 @@ from omnibench.data.scans import ScansInMemory, TrajectoryScans
 from omnibench.data.simulate.floor_plan import RoomPlan, make_plan
 from omnibench.data.simulate.lidar import Lidar
 from omnibench.data.simulate.truth_poses import TruePath
-from omnibench.data.slam.accuracy import slam_accuracy
+from omnibench.data.slam.accuracy import run_errors, slam_accuracy
 from omnibench.data.slam.dataset import slam_dataset
+from omnibench.data.slam.errors import FLOOR
 from omnibench.data.slam.options import SlamOptions
 from omnibench.errors import DataError
 from omnibench.robot.model import OdometryModel
@@ -97,6 +98,26 @@ class TestPoses:
         assert run.pose_covariances is not None
         assert len(run.pose_covariances) == len(run.poses)
         assert np.abs(run.poses - truth["run-1"].poses).max() < 0.01  # as the odometry missed until then
+        np.testing.assert_array_equal(run.pose_covariances[0], FLOOR)
+
+    def test_are_as_uncertain_as_the_odometry_until_a_first_scan_that_comes_later(self) -> None:
+        dataset, truth = recorded()
+        assert dataset.scans is not None
+        late = {name: TrajectoryScans(scans.times[8:], scans.ranges[8:]) for name, scans in dataset.scans}
+        found = slam_dataset(replace(dataset, scans=ScansInMemory(LIDAR.scanner, late)), SlamOptions(), workers=1)
+        for run in found.trajectories:
+            way = np.hypot(*(run.poses[1] - START)[:2])
+            assert way > 0.2
+            assert run.pose_covariances is not None
+            stated = np.sqrt(np.linalg.eigvalsh(run.pose_covariances[:, :2, :2])[:, -1])
+            assert stated[0] == pytest.approx(1e-4)
+            assert (stated[1:] > 0.09 * way).all()
+        every = slam_accuracy(found, truth).every
+        assert every.nees_mean is not None
+        assert every.nees_mean < 5
+        (warning,) = found.warnings
+        assert warning.startswith("SLAM: the robot moves before the first scan, whose pose is therefore as uncertain")
+        assert "3 of 3 runs" in warning
 
     def test_leave_scans_before_t_0_out(self) -> None:
         dataset, _ = recorded()
@@ -175,6 +196,21 @@ class TestAccuracy:
         assert found.final.bias_forward_m == pytest.approx(0, abs=1e-9)
         assert found.final.position_mean_m == pytest.approx(0.02 * found.distance_m / 3, rel=1e-6)
         assert found.every.nees_mean is None  # covariances are not known
+
+    def test_singular_covariances_of_a_foreign_data_set_are_left_out_of_the_nees(self) -> None:
+        dataset, truth = recorded(runs=1)
+        (run,) = dataset.trajectories
+        path = truth[run.id]
+        poses = path.poses + np.array([0.0, 0.002, 0.0])
+        poses[0] = START
+        flat = np.tile(np.diag([0.001, 0.001, 0.001]) ** 2, (len(poses), 1, 1))
+        none = replace(run, pose_times=path.times, poses=poses, pose_covariances=0 * flat)
+        assert slam_accuracy(replace(dataset, trajectories=(none,)), truth).every.nees_mean is None
+        flat[4, 2, 2] = 0.0
+        some = replace(none, pose_covariances=flat)
+        found = slam_accuracy(replace(dataset, trajectories=(some,)), truth)
+        assert found.every.nees_mean == pytest.approx(4.0)
+        assert np.isnan(run_errors(some, path).nees).sum() == 1
 
     def test_another_truth_is_one_line(self) -> None:
         dataset, truth = recorded()

@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 from omnibench.data.scans import Ranges
 from omnibench.data.simulate.floor_plan import RoomPlan, make_plan
 from omnibench.data.simulate.lidar import Lidar, PoseTrack, measure_scans
-from omnibench.data.slam.errors import PoseErrors
+from omnibench.data.slam.errors import FLOOR, PoseErrors
 from omnibench.data.slam.map import ScanMap
 from omnibench.data.slam.matching import Match, refine, search
 from omnibench.data.slam.options import SlamOptions
 from omnibench.data.slam.pairs import Pairs
 from omnibench.data.slam.points import ScanPoints, noise_factor, scan_points
+from omnibench.data.slam.within import WithinScan
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import compose, relative
 
@@ -45,7 +46,8 @@ def _along(twist: Array, time: float) -> Array:
 
 
 def points_of(ranges: Ranges, twist: Array | None = None) -> ScanPoints:
-    return scan_points(ranges, SCANNER, 1.0, np.zeros(3) if twist is None else twist)
+    within = WithinScan.steady(np.zeros(3) if twist is None else twist, float(SCANNER.delays[-1]))
+    return scan_points(ranges, SCANNER, 1.0, within)
 
 
 @cache
@@ -156,21 +158,42 @@ class TestErrors:
         for number in range(1, 5):
             pose = np.array([0.1 * number, 0.0, 0.0])
             covariance = errors.step(self.match(pose, 0.0), np.array([0.01, 0.005, 0.0]), np.zeros(3))
-        np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [0.04, 0.02, 0.0], atol=1e-12)
+        np.testing.assert_allclose(np.diag(covariance - FLOOR), [0.04**2, 0.02**2, 0.0], atol=1e-15)
 
     def test_an_error_of_heading_swings_the_poses_that_follow(self) -> None:
         errors = PoseErrors(np.zeros(3))
         errors.keep()
         errors.step(self.match(np.zeros(3), 0.0), np.array([0.0, 0.0, 0.01]), np.zeros(3))
         covariance = errors.step(self.match(np.array([2.0, 0.0, 0.0]), 0.0), np.zeros(3), np.zeros(3))
-        np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [0.0, 0.02, 0.01], atol=1e-12)
+        np.testing.assert_allclose(np.diag(covariance - FLOOR), [0.0, 0.02**2, 0.01**2], atol=1e-15)
 
     def test_a_match_to_an_exact_keyframe_has_the_noise_of_the_scans_alone(self) -> None:
         errors = PoseErrors(np.zeros(3))
         errors.keep()
         errors.step(self.match(np.ones(3), 0.0), np.full(3, 0.1), np.zeros(3))
         covariance = errors.step(self.match(np.array([1.0, 2.0, 0.3]), 1.0, 0.002), np.full(3, 0.1), np.zeros(3))
-        np.testing.assert_allclose(covariance, 0.002**2 * np.eye(3), atol=1e-15)
+        np.testing.assert_allclose(covariance - FLOOR, 0.002**2 * np.eye(3), atol=1e-15)
+
+    def test_a_start_that_is_not_exact_hands_its_error_on_which_is_the_motions(self) -> None:
+        start = np.array([0.5, -2.0, np.pi / 2])
+        errors = PoseErrors(start, np.array([0.01, 0.0, 0.0]))  # along the robot's x, which is y of the run
+        np.testing.assert_allclose(errors.covariance - FLOOR, np.diag([0.0, 0.01**2, 0.0]), atol=1e-15)
+        errors.keep()
+        told = errors.step(self.match(start, 1.0, 0.002), np.full(3, 0.1), np.zeros(3))
+        np.testing.assert_allclose(told - FLOOR, np.diag([0.0, 0.01**2, 0.0]) + 0.002**2 * np.eye(3), atol=1e-15)
+        further = errors.step(self.match(start, 0.0), np.array([0.02, 0.0, 0.0]), np.zeros(3))
+        assert further[1, 1] - FLOOR[1, 1] == pytest.approx(0.03**2 + 0.002**2)
+
+    @given(x=st.floats(-5, 5), y=st.floats(-5, 5), heading=st.floats(-4, 4))
+    def test_even_a_robot_that_stands_in_the_dark_has_a_regular_covariance(
+        self, x: float, y: float, heading: float
+    ) -> None:
+        pose = np.array([x, y, heading])
+        errors = PoseErrors(pose)
+        errors.keep()
+        for _ in range(3):
+            covariance = errors.step(self.match(pose, 0.0), np.zeros(3), np.zeros(3))
+        assert np.linalg.eigvalsh(covariance)[0] > 0.5e-10
 
     def test_the_oldest_keyframes_are_merged_into_the_next(self) -> None:
         errors, surroundings = PoseErrors(np.zeros(3)), ScanMap(OPTIONS.spacing)

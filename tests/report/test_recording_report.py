@@ -20,13 +20,12 @@ from report_page import Page
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
-from omnibench.data.slam.accuracy import slam_accuracy
+from omnibench.data.slam.accuracy import run_errors, slam_accuracy
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError
 from omnibench.report.recording.runs import representative_runs
 from omnibench.report.recording.scan_points import scan_points, thinned
 from omnibench.report.recording.section import has_recording, recording_section, write_recording_report
-from omnibench.report.recording.slam_figures import run_errors
 from omnibench.report.recording.wheel_figures import rate_step, wheel_rates
 
 CONTENTS = "What was recorded"
@@ -402,3 +401,13 @@ def test_a_browser_draws_every_plot_and_plays_the_runs(made: Sample, tmp_path: P
     options = re.findall(r'<div class="option"( hidden="")?>', done.stdout)
     assert [hidden == "" for hidden in options] == [False, False, True, False] * 2
     assert "CONSOLE" not in done.stderr
+
+
+def test_singular_covariances_of_a_foreign_recording_are_left_out_of_the_nees(made: Sample, tmp_path: Path) -> None:
+    none = [replace(run, pose_covariances=np.zeros((len(run.poses), 3, 3))) for run in made.dataset.trajectories]
+    told = page(replace(made.dataset, trajectories=tuple(none)), tmp_path, truth=made.truth)
+    assert "Final position errors" in told.text
+    assert "Histogram of the normalised squared errors" not in told.text
+    others = made.dataset.trajectories[1:]
+    some = replace(made.dataset, trajectories=(none[0], *others))
+    assert "NEES of all poses: mean" in page(some, tmp_path, truth=made.truth).text

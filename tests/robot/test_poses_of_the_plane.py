@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from omnibench.robot.planar import compose, correction, moved_to, relative
+from omnibench.robot.odometry import advance
+from omnibench.robot.planar import compose, correction, moved_to, relative, unit_twist
 
 POSES = arrays(float, 3, elements=st.floats(-10, 10))
 
@@ -37,3 +38,15 @@ def test_a_path_that_is_moved_begins_there_and_keeps_its_shape(start: np.ndarray
         np.testing.assert_allclose(
             relative(moved[before], moved[after]), relative(path[before], path[after]), atol=1e-9
         )
+
+
+@given(st.floats(-2, 2), st.floats(-2, 2), st.floats(-np.pi, np.pi))
+def test_the_twist_of_a_motion_makes_it_along_an_arc(x: float, y: float, turn: float) -> None:
+    motion = np.array([x, y, turn])
+    np.testing.assert_allclose(advance(np.zeros(3), unit_twist(motion), "arc"), motion, atol=1e-12)
+    np.testing.assert_allclose(unit_twist(np.stack([motion, motion]))[1], unit_twist(motion), atol=1e-12)
+
+
+@given(st.floats(-20, 20))
+def test_the_twist_of_whole_turns_is_finite(turn: float) -> None:
+    assert np.isfinite(unit_twist(np.array([1.0, -1.0, turn]))).all()

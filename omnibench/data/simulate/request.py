@@ -10,12 +10,13 @@ from pathlib import Path
 from omnibench.config import to_json, to_yaml
 from omnibench.data.dataset import Dataset
 from omnibench.data.simulate.like import simulate_like
-from omnibench.data.simulate.simulation import Simulation, Watch, unwatched
+from omnibench.data.simulate.simulation import Simulation
 from omnibench.data.simulate.source import SimulationSource, read_simulation
 from omnibench.data.simulate.truth import TRUTH_FILE
 from omnibench.data.simulate.truth_poses import write_true_poses
 from omnibench.data.slam.accuracy import SlamAccuracy, slam_accuracy
 from omnibench.data.storage import check_folder, load_dataset, save_dataset
+from omnibench.data.watch import Watch, unwatched
 from omnibench.errors import ConfigError
 from omnibench.files import TableFormat, write_text
 from omnibench.robot.calibration import read_calibration

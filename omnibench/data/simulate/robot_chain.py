@@ -16,10 +16,11 @@ from omnibench.data.simulate.lidar import PoseTrack, measure_scans, scan_stamps
 from omnibench.data.simulate.motion import CommandedMotion, command_motion, target_rates
 from omnibench.data.simulate.motors import TRUE_STEP, DrivenRun, check_reach, drive_session
 from omnibench.data.simulate.robot_config import Placement, RobotConfig, RobotSession
-from omnibench.data.simulate.simulation import Simulation, Watch, unwatched
+from omnibench.data.simulate.simulation import Simulation
 from omnibench.data.simulate.truth import TrueRobot, true_record
 from omnibench.data.simulate.truth_poses import TruePath
 from omnibench.data.slam.dataset import slam_dataset
+from omnibench.data.watch import Watch, unwatched
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel

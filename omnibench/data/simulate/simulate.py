@@ -11,7 +11,8 @@ from omnibench.config import CHOSEN
 from omnibench.data.simulate.config import FlowerConfig
 from omnibench.data.simulate.flower import simulate_flower
 from omnibench.data.simulate.robot_config import RobotConfig
-from omnibench.data.simulate.simulation import Simulation, Watch, unwatched
+from omnibench.data.simulate.simulation import Simulation
+from omnibench.data.watch import Watch, unwatched
 
 _FLOWER, _ROBOT = CHOSEN + FlowerConfig.__name__, CHOSEN + RobotConfig.__name__
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from omnibench.data.dataset import Dataset
 from omnibench.data.simulate.floor_plan import FloorPlan
@@ -26,13 +25,3 @@ class Simulation:
     paths: Mapping[str, TruePath] = field(default_factory=dict)
     plan: FloorPlan | None = None
     starts: Mapping[str, Array] = field(default_factory=dict)
-
-
-class Watch(Protocol):
-    """Told how long work gets on: what is being done, and how many of how many steps are done."""
-
-    def __call__(self, what: str, done: int, total: int) -> None: ...
-
-
-def unwatched(what: str, done: int, total: int) -> None:
-    """Nobody watches."""

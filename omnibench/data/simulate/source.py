@@ -13,7 +13,8 @@ from omnibench.config import Model, parse_yaml, read_yaml, validate
 from omnibench.data.simulate.config import FlowerConfig, Truth
 from omnibench.data.simulate.robot_config import RobotConfig
 from omnibench.data.simulate.simulate import SimulatedConfig, simulate_dataset
-from omnibench.data.simulate.simulation import Simulation, Watch, unwatched
+from omnibench.data.simulate.simulation import Simulation
+from omnibench.data.watch import Watch, unwatched
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.robot.calibration import EffectTerm
 

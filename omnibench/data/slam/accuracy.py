@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from omnibench.config import Model
-from omnibench.data.dataset import Dataset
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.simulate.truth_poses import TruePath
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import moved_to
+
+_SINGULAR = 1e-14  # of the largest variance
 
 
 class ErrorSummary(Model):
@@ -27,7 +32,9 @@ class ErrorSummary(Model):
     bias_forward_m: float
     bias_left_m: float
     bias_heading_rad: float
-    nees_mean: float | None = Field(description="mean of error' covariance^-1 error; 3 for an honest covariance")
+    nees_mean: float | None = Field(
+        description="mean of error' covariance^-1 error; 3 for honest covariances; singular ones are left out"
+    )
 
 
 class SlamAccuracy(Model):
@@ -50,49 +57,77 @@ def slam_accuracy(poses: Dataset, truth: Mapping[str, TruePath]) -> SlamAccuracy
     for trajectory in poses.trajectories:
         if trajectory.id not in truth:
             raise DataError(f"data set {poses.name}: trajectory {trajectory.id} is not in the truth; is it of others?")
-        path = truth[trajectory.id]
-        times, found = trajectory.pose_times[1:], trajectory.poses[1:]
-        if not len(times):
+        if len(trajectory.pose_times) < 2:
             raise DataError(f"data set {poses.name}: trajectory {trajectory.id} has no pose after its start")
-        true = np.column_stack([np.interp(times, path.times, column) for column in path.poses.T])
-        way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path.poses[:, :2], axis=0).T))])
-        covariances = None if trajectory.pose_covariances is None else trajectory.pose_covariances[1:]
-        runs.append(_Errors.of(found, true, covariances, np.interp(times, path.times, way)))
+        runs.append(run_errors(trajectory, truth[trajectory.id]))
     return SlamAccuracy(
         runs=len(runs),
-        distance_m=sum(float(run.way[-1]) for run in runs),
-        final=_summary([run.last() for run in runs]),
+        distance_m=sum(float(run.driven[-1]) for run in runs),
+        final=_summary([run.of(slice(-1, None)) for run in runs]),
         every=_summary(runs),
         drift_position=_growth(runs, [run.position for run in runs]),
-        drift_heading=_growth(runs, [np.abs(run.in_robot[:, 2]) for run in runs]),
+        drift_heading=_growth(runs, [run.heading for run in runs]),
     )
 
 
-class _Errors:
-    """Of one run. in_robot (K, 3): along the robot's axes. way (K,): driven so far, m. nees (K,), if it is known."""
+@dataclass(frozen=True, eq=False)
+class RunErrors:
+    """Errors of a run's reference poses after the first.
 
-    def __init__(self, in_robot: Array, way: Array, nees: Array | None) -> None:
-        self.in_robot, self.way, self.nees = in_robot, way, nees
-        self.position = np.hypot(in_robot[:, 0], in_robot[:, 1])
+    times (K,): of the poses, s. driven (K,): true way until then, m. in_robot (K, 3): along the robot's axes, m, m,
+    rad. nees (K,): error' covariance^-1 error, NaN where the covariance is singular; None without covariances.
+    """
 
-    @classmethod
-    def of(cls, found: Array, true: Array, covariances: Array | None, way: Array) -> _Errors:
-        errors = found - true
-        errors[:, 2] -= 2 * np.pi * np.round(errors[:, 2] / (2 * np.pi))
-        nees = None
-        if covariances is not None:
-            nees = np.einsum("ki,ki->k", errors, np.linalg.solve(covariances, errors[:, :, None])[:, :, 0])
-        turned = (errors[:, 0] + 1j * errors[:, 1]) * np.exp(-1j * true[:, 2])
-        return cls(np.column_stack([turned.real, turned.imag, errors[:, 2]]), way, nees)
+    times: Array
+    driven: Array
+    in_robot: Array
+    nees: Array | None
 
-    def last(self) -> _Errors:
-        return _Errors(self.in_robot[-1:], self.way[-1:], None if self.nees is None else self.nees[-1:])
+    @property
+    def position(self) -> Array:
+        """Magnitudes (K,), m."""
+        return np.hypot(self.in_robot[:, 0], self.in_robot[:, 1])
+
+    @property
+    def heading(self) -> Array:
+        """Magnitudes (K,), rad."""
+        return np.abs(self.in_robot[:, 2])
+
+    def of(self, poses: slice | NDArray[np.bool_]) -> RunErrors:
+        """Of some of the poses."""
+        nees = None if self.nees is None else self.nees[poses]
+        return RunErrors(self.times[poses], self.driven[poses], self.in_robot[poses], nees)
 
 
-def _summary(runs: list[_Errors]) -> ErrorSummary:
+def run_errors(trajectory: Trajectory, truth: TruePath) -> RunErrors:
+    """Errors of a run's reference poses after the first, at their stamps; the true path begins at the run's start."""
+    times = trajectory.pose_times[1:]
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth.poses[:, :2], axis=0).T))])
+    true = TruePath(truth.times, moved_to(trajectory.start, truth.poses)).at(times)
+    errors = trajectory.poses[1:] - true
+    errors[:, 2] -= 2 * np.pi * np.round(errors[:, 2] / (2 * np.pi))
+    covariances = trajectory.pose_covariances
+    nees = None if covariances is None else _nees(errors, covariances[1:])
+    turned = (errors[:, 0] + 1j * errors[:, 1]) * np.exp(-1j * true[:, 2])
+    in_robot = np.column_stack([turned.real, turned.imag, errors[:, 2]])
+    return RunErrors(times, np.interp(times, truth.times, way), in_robot, nees)
+
+
+def _nees(errors: Array, covariances: Array) -> Array:
+    """error' covariance^-1 error (K,); NaN where the covariance, as in a foreign data set, is singular."""
+    values, directions = np.linalg.eigh(covariances)
+    regular = values[:, 0] > _SINGULAR * values[:, -1]
+    along = np.einsum("kij,ki->kj", directions[regular], errors[regular])
+    nees = np.full(len(errors), np.nan)
+    nees[regular] = (along**2 / values[regular]).sum(axis=1)
+    return nees
+
+
+def _summary(runs: list[RunErrors]) -> ErrorSummary:
     errors = np.concatenate([run.in_robot for run in runs])
     position, heading = np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2])
-    nees = [run.nees for run in runs if run.nees is not None]
+    nees = np.concatenate([run.nees for run in runs if run.nees is not None] or [np.zeros(0)])
+    nees = nees[np.isfinite(nees)]
     forward, left, turned = errors.mean(axis=0).tolist()
     return ErrorSummary(
         poses=len(errors),
@@ -105,14 +140,14 @@ def _summary(runs: list[_Errors]) -> ErrorSummary:
         bias_forward_m=forward,
         bias_left_m=left,
         bias_heading_rad=turned,
-        nees_mean=float(np.concatenate(nees).mean()) if nees else None,
+        nees_mean=float(nees.mean()) if len(nees) else None,
     )
 
 
-def _growth(runs: list[_Errors], sizes: list[Array]) -> float:
+def _growth(runs: list[RunErrors], sizes: list[Array]) -> float:
     """The slope k of size^2 = noise^2 + (k way)^2, by least squares; 0 where errors do not grow."""
     squares = np.concatenate(sizes) ** 2
-    ways = np.concatenate([run.way for run in runs]) ** 2
+    ways = np.concatenate([run.driven for run in runs]) ** 2
     ways -= ways.mean()
     spread = float(ways @ ways)
     return float(np.sqrt(max(0.0, ways @ squares / spread))) if spread > 0 else 0.0

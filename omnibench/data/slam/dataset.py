@@ -1,26 +1,30 @@
-"""SLAM of a whole data set: every run's reference poses from its scans alone."""
+"""SLAM of a whole data set: every run's reference poses from its scans."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.scans import Scanner, TrajectoryScans
 from omnibench.data.slam.doubts import Doubt, together
+from omnibench.data.slam.errors import FLOOR
+from omnibench.data.slam.motion import length, odometry_deviations
 from omnibench.data.slam.options import SlamOptions
 from omnibench.data.slam.run import SlamPath, run_slam
+from omnibench.data.watch import Watch
 from omnibench.errors import DataError
 from omnibench.processes import in_processes
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.planar import relative
 
 _AT_START = 1e-6  # s; a scan that is nearer to t = 0 is taken there
-_FEW = 0.5  # of the points: runs in which fewer match are named
-
-Watch = Callable[[str, int, int], None]
+_STEP = 0.05  # s between poses that the way before the first scan is added up from
+_FAR = 5e-3  # m; who moves farther before the first scan is told
 
 
 def slam_dataset(
@@ -112,22 +116,40 @@ def _locate(job: _Job) -> SlamPath:
     try:
         if not len(scans.times):
             raise DataError("SLAM: no scan at or after t = 0")
-        begin = float(scans.times[0])
-        late = begin > _AT_START
-        start = odometry(np.array([begin]))[0] if late else trajectory.start
-        path = run_slam(scans, job.scanner, job.options, start, odometry)
+        if scans.times[0] <= _AT_START:
+            return run_slam(scans, job.scanner, job.options, trajectory.start, odometry)
+        before = _before_first_scan(odometry, float(scans.times[0]))
+        deviations = odometry_deviations(before.driven, job.options.odometry_error)
+        path = run_slam(scans, job.scanner, job.options, before.end, odometry, deviations)
+        return _from_start(path, trajectory.start, before)
     except DataError as error:
         raise DataError(f"data set {job.dataset}: trajectory {trajectory.id}: {error}") from None
-    return _from_start(path, trajectory.start) if late else path
 
 
-def _from_start(path: SlamPath, start: Array) -> SlamPath:
+@dataclass(frozen=True, eq=False)
+class _Before:
+    """The motion from t = 0 to the first scan. driven (3,): m, m, rad, ways there and back added up. end (3,): pose."""
+
+    driven: Array
+    end: Array
+
+
+def _before_first_scan(odometry: Callable[[Array], Array], until: float) -> _Before:
+    poses = odometry(np.linspace(0.0, until, 2 + int(until / _STEP)))
+    moved = [np.abs(relative(one, other)) for one, other in pairwise(poses)]
+    return _Before(np.sum(moved, axis=0), poses[-1])
+
+
+def _from_start(path: SlamPath, start: Array, before: _Before) -> SlamPath:
     """The path with a row for t = 0, when the first scan came later."""
+    far = length(before.driven) > _FAR
+    late = "the robot moves before the first scan, whose pose is therefore as uncertain as the odometry"
     return replace(
         path,
+        doubts=(*path.doubts, Doubt(late)) if far else path.doubts,
         times=np.concatenate([[0.0], path.times]),
         poses=np.vstack([start, path.poses]),
-        covariances=np.concatenate([path.covariances[:1], path.covariances]),
+        covariances=np.concatenate([FLOOR[None], path.covariances]),
         matched=np.concatenate([path.matched[:1], path.matched]),
     )
 

@@ -13,15 +13,25 @@ import numpy as np
 from omnibench.data.slam.matching import Match
 from omnibench.robot.kinematics import Array
 
+FLOOR: Array = np.diag([1e-4, 1e-4, 1e-5]) ** 2  # m^2, m^2, rad^2; no pose is stated to be better known
+
 
 class PoseErrors:
-    """The joint covariance of the motion's error, of every keyframe and of the last pose, which begins as exact."""
+    """The joint covariance of the motion's error, of every keyframe and of the last pose.
 
-    def __init__(self, start: Array) -> None:
+    start (3,): the first pose. moved (3,): standard deviations of the motion until then, in the robot's frame, m, m,
+    rad; default: the start is exact.
+    """
+
+    def __init__(self, start: Array, moved: Array | None = None) -> None:
         # In this order. The motion's error, in units of its standard deviation, is the same in the whole run.
         self._joint = np.zeros((6, 6))
         self._joint[:3, :3] = np.eye(3)
         self._pose = start
+        if moved is not None:
+            row = np.linalg.solve(_deviation(start), _turn(start) * moved)
+            self._joint[-3:, :3], self._joint[:3, -3:] = row, row.T
+            self._joint[-3:, -3:] = _square(row)
 
     def step(self, match: Match, moved: Array, doubt: Array) -> Array:
         """Go on to the pose of a match; its covariance (3, 3).
@@ -45,18 +55,31 @@ class PoseErrors:
         self._joint[-3:, :-3], self._joint[:-3, -3:] = across, across.T
         self._joint[-3:, -3:] = back @ covariance @ back.T
         self._pose = match.pose
-        return covariance
+        return covariance + FLOOR
+
+    @property
+    def covariance(self) -> Array:
+        """Of the last pose, (3, 3)."""
+        here = _deviation(self._pose)
+        return here @ self._joint[-3:, -3:] @ here.T + FLOOR
 
     @property
     def keyframes(self) -> int:
         """How many poses were kept."""
         return len(self._joint) // 3 - 2
 
-    def keep(self) -> None:
-        """The last pose becomes a keyframe, too."""
+    def keep(self, skewed: Array | None = None) -> None:
+        """The last pose becomes a keyframe, too.
+
+        skewed (3,): standard deviations of what its scan saw from what is seen from its pose, along the robot's axes,
+        m, m, rad; default: exact.
+        """
         size = len(self._joint)
         every = np.concatenate([np.arange(size), np.arange(size - 3, size)])
         self._joint = self._joint[np.ix_(every, every)]
+        if skewed is not None:
+            kept = slice(size - 3, size)
+            self._joint[kept, kept] += _square(np.linalg.solve(_deviation(self._pose), _turn(self._pose) * skewed))
 
     def merge_oldest(self) -> None:
         """Keyframe 0 is no more; what it saw counts as seen by the next, whose error is larger."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from omnibench.data.scans import Ranges, Scanner
 from omnibench.data.slam.lines import Lines, fit_lines
+from omnibench.data.slam.within import WithinScan
 from omnibench.robot.kinematics import Array
 
 
@@ -30,17 +31,19 @@ class ScanPoints:
 
     def deskewed(self, twist: Array) -> ScanPoints:
         """The scan if the robot moved with one more twist (3,) than it was taken to, in its frame, m/s, m/s, rad/s."""
-        points, rays = _moved(self.points, self.delays, twist), _turned(self.rays, self.delays * twist[2])
-        lines = self.lines
-        centres, normals = _moved(lines.centres, lines.delays, twist), _turned(lines.normals, lines.delays * twist[2])
-        return replace(self, points=points, rays=rays, lines=replace(lines, centres=centres, normals=normals))
+        motions, of_lines = self.delays[:, None] * twist, self.lines.delays[:, None] * twist
+        lines = replace(
+            self.lines,
+            centres=_moved(self.lines.centres, of_lines),
+            normals=_turned(self.lines.normals, of_lines[:, 2]),
+        )
+        return replace(self, points=_moved(self.points, motions), rays=_turned(self.rays, motions[:, 2]), lines=lines)
 
 
-def scan_points(ranges: Ranges, scanner: Scanner, noise_factor: float, twist: Array) -> ScanPoints:
+def scan_points(ranges: Ranges, scanner: Scanner, noise_factor: float, within: WithinScan) -> ScanPoints:
     """Points and lines of a scan (R,).
 
-    noise_factor: by which ranges are noisier than the scanner says. twist (3,): of the robot during the scan, in its
-    frame, m/s, m/s, rad/s.
+    noise_factor: by which ranges are noisier than the scanner says. within: the robot's motion during the scan.
     """
     returned = np.flatnonzero(scanner.valid(ranges))
     distances, delays = ranges[returned].astype(float), scanner.delays[returned]
@@ -48,10 +51,11 @@ def scan_points(ranges: Ranges, scanner: Scanner, noise_factor: float, twist: Ar
     angles = scanner.angles[returned] + scanner.mount.yaw
     directions = np.column_stack([np.cos(angles), np.sin(angles)])
     mount = np.array([scanner.mount.x, scanner.mount.y])
-    points = _moved(mount + distances[:, None] * directions, delays, twist)
+    motions = within.at(delays)
+    points = _moved(mount + distances[:, None] * directions, motions)
     lines, line = fit_lines(points - mount, deviations, delays, returned)
     lines = replace(lines, centres=lines.centres + mount)
-    return ScanPoints(points, _turned(directions, delays * twist[2]), delays, deviations, lines, line)
+    return ScanPoints(points, _turned(directions, motions[:, 2]), delays, deviations, lines, line)
 
 
 def noise_factor(ranges: Ranges, scanner: Scanner) -> float:
@@ -75,9 +79,7 @@ def _turned(vectors: Array, angles: Array | float) -> Array:
     return np.column_stack([cosine * x - sine * y, sine * x + cosine * y])
 
 
-def _moved(points: Array, delays: Array, twist: Array) -> Array:
-    """Points (n, 2) seen ``delays`` (n,) s on the way with a constant twist, as seen from its beginning."""
-    angles = delays * twist[2]
-    half = angles / 2
-    way = (delays * np.sinc(half / np.pi))[:, None] * _turned(np.broadcast_to(twist[:2], points.shape), half)
-    return _turned(points, angles) + way
+def _moved(points: Array, motions: Array) -> Array:
+    """Points (n, 2) seen after motions (n, 3), each the twist that makes it in unit time, as seen from before."""
+    half = motions[:, 2] / 2
+    return _turned(points, motions[:, 2]) + np.sinc(half / np.pi)[:, None] * _turned(motions[:, :2], half)

@@ -11,10 +11,11 @@ from omnibench.data.dataset import Dataset
 from omnibench.data.simulate.truth import TRUTH_FILE, TruthRecord
 from omnibench.data.simulate.truth_poses import TruePath, read_true_poses
 from omnibench.data.slam.accuracy import SlamAccuracy, slam_accuracy
-from omnibench.data.slam.dataset import Watch, slam_paths, with_paths
+from omnibench.data.slam.dataset import slam_paths, with_paths
 from omnibench.data.slam.options import SlamOptions
 from omnibench.data.slam.summary import SlamSummary, summarise
 from omnibench.data.storage import check_folder, load_dataset, save_dataset
+from omnibench.data.watch import Watch
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import TableFormat
 from omnibench.robot.calibration import read_calibration

@@ -15,10 +15,12 @@ from omnibench.data.slam.matching import Match, refine, search
 from omnibench.data.slam.motion import Motion, OdometryMotion, UnknownMotion
 from omnibench.data.slam.options import SlamOptions
 from omnibench.data.slam.points import ScanPoints, noise_factor, scan_points
+from omnibench.data.slam.within import WithinScan
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
 _SKEWED = 1e-3  # m or rad, from the first ray of a scan to its last
+_CORRECTIONS = 4  # of the motion within a scan, at most
 _KEYFRAMES = 300  # whose errors are told apart
 _SAMPLE = 100  # scans that tell the noise
 _NEEDED = 0.6  # of the points: when fewer match, the map needs more
@@ -38,11 +40,6 @@ class SlamPath:
     matched: Array
     doubts: tuple[Doubt, ...] = ()
 
-    @property
-    def problems(self) -> tuple[str, ...]:
-        """What went wrong, in words."""
-        return tuple(str(doubt) for doubt in self.doubts)
-
 
 def run_slam(
     scans: TrajectoryScans,
@@ -50,20 +47,23 @@ def run_slam(
     options: SlamOptions,
     start: Array,
     odometry: Callable[[Array], Array] | None = None,
+    deviations: Array | None = None,
 ) -> SlamPath:
     """The poses at which a run's scans lie best on the map that they make.
 
-    start (3,): the robot's pose at the first scan. odometry: poses (K, 3) at times (K,) in s, in any frame, of which
-    only the increments are used, to begin the search, to deskew, and where scans tell nothing; needed unless the
-    search starts from the last pose. DataError in one line: no scan, or one without returns.
+    start (3,): the robot's pose at the first scan. odometry: poses (K, 3) at times (K,) >= 0 in s, in any frame, of
+    which only the increments are used, to begin the search, to deskew, and where scans tell nothing; needed unless the
+    search starts from the last pose. deviations (3,): standard deviations of the start, along the robot's axes, m, m,
+    rad; default: it is exact. DataError in one line: no scan, or one without returns.
     """
     _check(scans, scanner, options, odometry)
     duration = float(scanner.delays[-1])
-    motion: Motion = UnknownMotion(scans.times, options)
+    motion: Motion = UnknownMotion(scans.times, duration, options)
     if options.start == "odometry" and odometry is not None:
         motion = OdometryMotion(odometry, scans.times, duration, options)
     noise = noise_factor(scans.ranges[:: 1 + len(scans.times) // _SAMPLE], scanner)
-    slam = _Slam(scanner, noise, options, motion, np.asarray(start, dtype=float))
+    errors = PoseErrors(start, deviations)
+    slam = _Slam(scanner, noise, options, motion, np.asarray(start, dtype=float), errors)
     located = [slam.begin(scans.ranges[0])]
     located += [slam.go_on(number, ranges) for number, ranges in enumerate(scans.ranges[1:], 1)]
     return SlamPath(
@@ -78,55 +78,77 @@ def run_slam(
 class _Slam:
     """A run on its way: the map so far, and how wrong it is."""
 
-    def __init__(self, scanner: Scanner, noise: float, options: SlamOptions, motion: Motion, start: Array) -> None:
+    def __init__(
+        self,
+        scanner: Scanner,
+        noise: float,
+        options: SlamOptions,
+        motion: Motion,
+        start: Array,
+        errors: PoseErrors,
+    ) -> None:
         self._scanner, self._noise, self._options, self._motion = scanner, noise, options, motion
         self._map = ScanMap(options.spacing)
-        self._errors = PoseErrors(start)
+        self._errors = errors
         self._pose = self._keyframe = start
 
     def begin(self, ranges: Ranges) -> tuple[Match, Array]:
         """The first scan, with which the map begins, at the start pose; its covariance (3, 3)."""
-        scan = self._points(ranges, self._motion.first_twist())
-        self._add(scan)
+        within, doubt = self._motion.first()
+        if not self._options.deskew:
+            doubt = within.mean
+        scan = self._points(ranges, within)
+        self._add(scan, doubt)
         match = replace(refine(self._map, scan, self._pose, self._pose, self._options), pose=self._pose)
-        # The pose is exact; what it is for the scans that follow is as uncertain as the scan's noise makes it.
-        return match, np.linalg.inv(match.information + np.diag(self._options.limits**-2.0))
+        # To what the start is known come the errors that scans which are matched to this one see.
+        seen = np.linalg.inv(match.information + np.diag(self._options.limits**-2.0))
+        return match, self._errors.covariance + seen
 
     def go_on(self, number: int, ranges: Ranges) -> tuple[Match, Array]:
         """The next scan: its match and the covariance of its pose (3, 3)."""
         options, motion, last = self._options, self._motion, self._pose
         expected = motion.expected(number, last)
-        scan = self._points(ranges, expected.twist)
+        scan = self._points(ranges, expected.within)
         found = search(self._map, scan, expected.start, options)
-        found = refine(self._map, scan, found, expected.start, options, steps=1).pose
-        twist, doubt = motion.corrected(number, last, found)
-        if options.deskew:
-            scan = scan.deskewed(twist - expected.twist)
-        else:
-            doubt = twist
+        raw = scan
+        correction: Array = np.zeros(3)
+        for _ in range(_CORRECTIONS):
+            found = refine(self._map, scan, found, expected.start, options, steps=1).pose
+            before = correction
+            correction, doubt = motion.corrected(number, last, found, before)
+            if not options.deskew:
+                doubt = expected.within.mean + correction
+                break
+            scan = raw.deskewed(correction)
+            if not self._skews(correction - before):
+                break
         match = refine(self._map, scan, found, expected.start, options)
         covariance = self._errors.step(match, expected.deviations, doubt)
         self._pose = match.pose
         if self._is_keyframe(match, doubt):
-            self._add(scan)
+            self._add(scan, doubt)
         return match, covariance
 
     def _is_keyframe(self, match: Match, doubt: Array) -> bool:
         """Whether the robot has come far enough for new surfaces; a scan that may be skewed waits while it can."""
         x, y, turned = match.pose - self._keyframe
         far = np.hypot(x, y) > self._options.keyframe_distance or abs(turned) > self._options.keyframe_angle
-        skewed = np.abs(doubt).max() * self._scanner.delays[-1] > _SKEWED
-        return bool(far and (match.matched < _NEEDED or not skewed)) or not self._map.is_usable
+        return bool(far and (match.matched < _NEEDED or not self._skews(doubt))) or not self._map.is_usable
 
-    def _points(self, ranges: Ranges, twist: Array) -> ScanPoints:
-        return scan_points(ranges, self._scanner, self._noise, twist if self._options.deskew else np.zeros(3))
+    def _skews(self, twist: Array) -> bool:
+        """Whether a twist (3,) more or less during a scan matters."""
+        return bool(np.abs(twist).max() * self._scanner.delays[-1] > _SKEWED)
 
-    def _add(self, scan: ScanPoints) -> None:
-        """The last pose becomes a keyframe, if its scan saw something new."""
+    def _points(self, ranges: Ranges, within: WithinScan) -> ScanPoints:
+        still = WithinScan.steady(np.zeros(3), within.duration)
+        return scan_points(ranges, self._scanner, self._noise, within if self._options.deskew else still)
+
+    def _add(self, scan: ScanPoints, doubt: Array) -> None:
+        """The last pose becomes a keyframe, if its scan saw something new. doubt (3,): of the twist within the scan."""
         self._keyframe = self._pose
         if not self._map.add(scan.lines, self._pose, self._errors.keyframes):
             return
-        self._errors.keep()
+        self._errors.keep(doubt * self._scanner.delays[-1] / 2)
         if self._errors.keyframes > _KEYFRAMES:
             self._map.merge_oldest()
             self._errors.merge_oldest()

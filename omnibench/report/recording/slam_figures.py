@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.dataset import Dataset
 from omnibench.data.simulate.truth_poses import TruePath
+from omnibench.data.slam.accuracy import RunErrors, run_errors
 from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import count, plural, significant
 from omnibench.report.recording.drawing import joined, short
@@ -24,32 +24,6 @@ _LEAST = 5  # poses in a bin that has a mean
 _RUN = LegendItem("run", "a run", "#c3c9d0")
 _MEAN = LegendItem("mean", "mean", PALETTE[0])
 _HIGH = LegendItem("high", "95th percentile", PALETTE[2], "dash")
-
-
-@dataclass(frozen=True, eq=False)
-class RunErrors:
-    """Errors of a run's reference poses: times (K,), s; driven (K,): true way until then, m; position (K,), m, and
-    heading (K,), rad, both as magnitudes; nees (K,): normalised squared errors, None without covariances."""
-
-    times: Array
-    driven: Array
-    position: Array
-    heading: Array
-    nees: Array | None
-
-
-def run_errors(trajectory: Trajectory, truth: TruePath) -> RunErrors:
-    """Errors of a run's reference poses after the first, at their stamps."""
-    times = trajectory.pose_times[1:]
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth.poses[:, :2], axis=0).T))])
-    error = _from_start(trajectory, trajectory.poses[1:]) - truth.at(times)
-    error[:, 2] -= 2 * np.pi * np.round(error[:, 2] / (2 * np.pi))
-    nees = None
-    if trajectory.pose_covariances is not None:
-        turned = _turned(trajectory, trajectory.pose_covariances[1:])
-        nees = np.einsum("ki,ki->k", error, np.linalg.solve(turned, error[..., None])[..., 0])
-    position = np.hypot(error[:, 0], error[:, 1])
-    return RunErrors(times, np.interp(times, truth.times, way), position, np.abs(error[:, 2]), nees)
 
 
 def error_figures(dataset: Dataset, truth: Mapping[str, TruePath]) -> tuple[Block, ...]:
@@ -74,10 +48,10 @@ def error_figures(dataset: Dataset, truth: Mapping[str, TruePath]) -> tuple[Bloc
 
 def _nees_figures(errors: Sequence[RunErrors]) -> tuple[Block, ...]:
     """Whether errors are as large as the covariances say."""
-    known = [each for each in errors if each.nees is not None]
-    if not known:
+    known = [each.of(np.isfinite(each.nees)) for each in errors if each.nees is not None]
+    if not sum(len(each.times) for each in known):
         return ()
-    values = np.concatenate([each.nees for each in known if each.nees is not None])
+    values = np.concatenate([_squares(each) for each in known])
     limit = max(12.0, 1.2 * float(np.quantile(values, 0.98)))
     edges = np.linspace(0.0, limit, 40)
     heights, _ = np.histogram(values, edges)
@@ -99,7 +73,7 @@ def _nees_figures(errors: Sequence[RunErrors]) -> tuple[Block, ...]:
         "Histogram of the normalised squared errors with the density that honest covariances give",
         340,
     )
-    time = _curves(known, lambda e: e.times, lambda e: _squares(e), "t (s)", "NEES", level=3.0)
+    time = _curves(known, lambda e: e.times, _squares, "t (s)", "NEES", level=3.0)
     caption = (
         "NEES: the squared error, weighted by the inverse covariance; 3 on average (line) where covariances are "
         f"honest, larger where they promise too much. {_beyond(values, limit)}"
@@ -172,18 +146,3 @@ def _histogram(values: Sequence[float], unit: str, title: str) -> Figure:
     told = f"{title}: mean {significant(mean, 2)}{gap}{unit}, 95 % below {significant(high, 2)}{gap}{unit}"
     figure = plot(bars, xaxis_title_text=f"error ({unit})", yaxis_title_text="runs", bargap=0)
     return Figure(told, figure, f"Histogram of {title.lower()} in {unit}", 320)
-
-
-def _from_start(trajectory: Trajectory, poses: Array) -> Array:
-    """Poses (K, 3) as seen from the run's start pose; true paths begin at (0, 0, 0)."""
-    moved = poses - trajectory.start
-    cosine, sine = np.cos(trajectory.start[2]), np.sin(trajectory.start[2])
-    return np.column_stack([moved[:, :2] @ np.array([[cosine, -sine], [sine, cosine]]), moved[:, 2]])
-
-
-def _turned(trajectory: Trajectory, covariances: Array) -> Array:
-    """Covariances (K, 3, 3) along the axes of the run's start pose."""
-    cosine, sine = np.cos(trajectory.start[2]), np.sin(trajectory.start[2])
-    turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    turned: Array = turn @ covariances @ turn.T
-    return turned

@@ -1,0 +1,85 @@
+"""How the robot moves within a scan, smoothly, as a function of time: taken from its odometry, ticks smoothed out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import unit_twist
+
+_AROUND = 0.25  # s; so much of the odometry besides the scan's own time tells the motion within it
+_INSTANT = 0.02  # s between instants at which it is asked
+_DEGREE = 3
+_ALIKE = 4.0  # instants one after another whose errors are the same, as those of ticks are
+
+
+@dataclass(frozen=True, eq=False)
+class WithinScan:
+    """The motion since a scan's stamp: until a delay t the one that the twist c_1 t + c_2 t^2 + ... makes in unit time.
+
+    coefficients (k, 3): m/s^k, m/s^k, rad/s^k, in the robot's frame at the stamp. duration: of the scan, s. deviations
+    (3,): standard deviations of twists until some delay that come from how coarse the odometry is.
+    """
+
+    coefficients: Array
+    duration: float
+    deviations: Array
+
+    @classmethod
+    def steady(cls, twist: Array, duration: float) -> WithinScan:
+        """With a constant twist (3,), m/s, m/s, rad/s."""
+        return cls(twist[None], duration, np.zeros(3))
+
+    def at(self, delays: Array) -> Array:
+        """The motions (n, 3) until delays (n,), s, each as the twist that makes it in unit time."""
+        motions: Array = _powers(delays, len(self.coefficients)) @ self.coefficients
+        return motions
+
+    @property
+    def mean(self) -> Array:
+        """The mean twist (3,) over the scan."""
+        mean: Array = self.duration ** np.arange(len(self.coefficients)) @ self.coefficients
+        return mean
+
+
+def smoothed(odometry: Callable[[Array], Array], times: Array, duration: float) -> tuple[list[WithinScan], Array]:
+    """The motion within each scan, and standard deviations (3,) of the odometry's poses, which tell how coarse it is.
+
+    A motion is the cubic through the odometry about a scan, by least squares; what is left over is coarse.
+    times (S,): of the scans, s. duration: of each, s. There is no odometry before t = 0.
+    """
+    if not duration:
+        return [WithinScan.steady(np.zeros(3), 0.0)] * len(times), np.zeros(3)
+    count = 2 + int((_AROUND + duration) / _INSTANT)
+    delays = np.linspace(-_AROUND / 2, duration + _AROUND / 2, count)
+    delays = np.maximum(times[:, None] + delays, 0.0) - times[:, None]  # (S, count)
+    stamps, place = np.unique(np.column_stack([times, times[:, None] + delays]), return_inverse=True)
+    poses = odometry(stamps)[place.reshape(len(times), -1)]
+    motions = _since(poses[:, 0], poses[:, 1:])
+    basis = np.concatenate([np.ones((*delays.shape, 1)), _powers(delays, _DEGREE)], axis=2)
+    inverse = np.linalg.pinv(basis)
+    fitted = inverse @ motions
+    left = motions - basis @ fitted
+    squares = (left**2).sum(axis=1) / (count - _DEGREE - 1)
+    coarse = squares.mean(axis=0)
+    squares = np.maximum(squares, coarse)  # where no tick falls, there may have been one
+    parts = duration * np.linspace(0.2, 1.0, 5)
+    means = parts[:, None] ** np.arange(_DEGREE) @ inverse[:, 1:]  # twists of parts of the scan: (S, 5, count)
+    deviations = np.sqrt(_ALIKE * (means**2).sum(axis=2).mean(axis=1)[:, None] * squares)
+    motions_within = [WithinScan(each[1:], duration, of) for each, of in zip(fitted, deviations, strict=True)]
+    return motions_within, np.sqrt(coarse)
+
+
+def _powers(delays: Array, count: int) -> Array:
+    """The first ``count`` powers of delays (..., n), from 1 on: (..., n, count)."""
+    return delays[..., None] ** np.arange(1, count + 1)
+
+
+def _since(first: Array, poses: Array) -> Array:
+    """Poses (S, n, 3) as motions since the poses (S, 3)."""
+    moved = poses - first[:, None]
+    way = (moved[..., 0] + 1j * moved[..., 1]) * np.exp(-1j * first[:, None, 2])
+    return unit_twist(np.stack([way.real, way.imag, moved[..., 2]], axis=-1))
