@@ -98,10 +98,13 @@ class ScansOnDisk(Scans):
         for index in np.flatnonzero(np.isnan(ranges).any(axis=1))[:1]:
             raise self._fail(int(rows[index]), "a range is missing or NaN; inf says that nothing was seen")
         for index in np.flatnonzero(~self.scanner.valid(ranges).any(axis=1))[:1]:
+            seen = ranges[index][np.isfinite(ranges[index])]
+            in_millimetres = len(seen) > 0 and self.scanner.valid(seen / 1000).mean() > 0.5
             raise self._fail(
                 int(rows[index]),
                 f"the scan of {whose} at {times[index]:g} s is empty: no range from "
-                f"{self.scanner.range_min:g} to {self.scanner.range_max:g} m; remove the row",
+                f"{self.scanner.range_min:g} to {self.scanner.range_max:g} m; "
+                + ("they look like mm, give m" if in_millimetres else "remove the row"),
             )
         return ranges
 
@@ -114,7 +117,7 @@ class ScansOnDisk(Scans):
             values = texts.list.eval(pl.element().cast(pl.Float32, strict=False))
             broken = texts.list.len() != values.list.drop_nulls().list.len()
             for index in broken.arg_true()[:1]:
-                raise self._fail(int(rows[index]), "ranges must be numbers with a blank between them")
+                raise self._fail(int(rows[index]), "ranges must be numbers, in CSV with a blank between them")
             return values
         if not isinstance(column.dtype, pl.List) or not column.dtype.inner.is_numeric():
             raise DataError(f"{self.file}: column 'ranges' holds {column.dtype}, expected lists of numbers")

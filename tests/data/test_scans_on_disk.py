@@ -215,6 +215,10 @@ BROKEN: dict[str, tuple[Callable[[pl.DataFrame], pl.DataFrame], str]] = {
         with_cell(6, "ranges", [math.inf] * 6 + [0.01]),
         r"row 6: the scan of trajectory run-2 at 0\.15 s is empty: no range from 0\.1 to 30 m; remove the row",
     ),
+    "millimetres": (
+        with_cell(6, "ranges", [1234.0] * 6 + [math.inf]),
+        r"row 6: .* is empty: no range from 0\.1 to 30 m; they look like mm, give m",
+    ),
 }
 
 
