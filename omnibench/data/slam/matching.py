@@ -18,6 +18,12 @@ _FEWEST = 30  # points that small_gicp is asked to match
 _COARSE = 4  # of so many points one, for the search from afar
 _ROUGHLY = 1e-3  # m and rad; how finely that ends
 _SINGULAR = 1e-12  # of the largest information
+_SUSPECT = 0.02  # of the largest information: what is less is tried out, and so is
+_CERTAIN = 0.98  # what is certain to a lesser share than this
+_NOTHING = 1e-3  # that is told is not
+_TRIED: Array = np.array([0.1, 0.1, 0.05])  # m, m, rad; how far
+_MOST = 200  # points that are asked
+_FALSE, _TRUE = 0.5, 0.8  # of the rise promised: what is less is no information, what is more is taken as it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +78,7 @@ def refine(
         pairs = Pairs(surroundings, scan, pose)
         information = pairs.information()
         values, directions = np.linalg.eigh(limits[:, None] * information * limits)
-        told = _told(pairs, limits[:, None] * directions)
+        told = _told(pairs, limits[:, None] * directions, values)
         gain = (limits[:, None] * directions) @ (told[:, None] * directions.T) / limits
         tells = values > _SINGULAR * values[-1]
         inverses = np.divide(1.0, values, out=np.zeros(3), where=tells)
@@ -92,12 +98,26 @@ def refine(
     )
 
 
-def _told(pairs: Pairs, directions: Array) -> Array:
+def _told(pairs: Pairs, directions: Array, information: Array) -> Array:
     """How far points tell the pose along directions (3, 3; columns) as long as the limits: (3,).
 
-    The share rises so steeply with the information that, where scans tell the pose, nothing of the start remains.
+    The share rises so steeply with the information (3,) that, where scans tell the pose, nothing of the start remains.
     """
     if pairs.matched < LOST:
         return np.zeros(3)
-    squares = np.square(pairs.certain_information(directions))
-    return squares / (1 + squares)
+    certain = pairs.certain_information(directions)
+    squares = np.square(certain)
+    told: Array = squares / (1 + squares)
+    suspect = (information < _SUSPECT * information[-1]) | (certain < _CERTAIN * information)
+    for number in np.flatnonzero(suspect & (told > _NOTHING)):
+        told[number] *= _borne_out(pairs, directions[:, number])
+    return told
+
+
+def _borne_out(pairs: Pairs, direction: Array) -> float:
+    """How far the information along a direction (3,) is true, 0 to 1, tried out some way along it.
+
+    Straight pieces of a round wall lock with those of the map as if the wall had edges, but only near where they are.
+    """
+    step = direction / np.max(np.abs(direction) / _TRIED)
+    return float(np.clip((pairs.rise(step, _MOST) - _FALSE) / (_TRUE - _FALSE), 0.0, 1.0))

@@ -34,7 +34,8 @@ class Pairs:
         distances, aside = (normals * away).sum(axis=1), (tangents * away).sum(axis=1)
         facing = -(normals * (scan.rays[straight] @ turn)).sum(axis=1)
         variances = scan.deviations[straight] ** 2 * np.maximum(facing**2, _GRAZING)
-        alike = (normals * (scan.lines.normals @ turn)[scan.line[straight]]).sum(axis=1) > _PARALLEL
+        normals_seen = (scan.lines.normals @ turn)[scan.line[straight]]
+        alike = (normals * normals_seen).sum(axis=1) > _PARALLEL
         on = (np.abs(aside) < surroundings.spacing) & (np.abs(distances) < _OUTLIER * np.sqrt(variances))
         kept = np.flatnonzero(on & alike & (facing > 0))
         self.matched = len(kept) / len(scan.points)
@@ -43,6 +44,8 @@ class Pairs:
         self._slopes = _slopes(normals[kept], seen[kept])
         self._along = _slopes(tangents[kept], seen[kept])
         self._delays = scan.delays[straight[kept]]
+        self._surroundings, self._pose, self._seen = surroundings, pose, seen[kept]
+        self._seen_normals = normals_seen[kept]
 
     def information(self) -> Array:
         """Of the points about the pose, (3, 3)."""
@@ -58,6 +61,31 @@ class Pairs:
         doubtful = _FEIGNED**2 * self._surface.tilt_variances[:, None] * feigned**2
         certain: Array = self._weights @ np.maximum(moved**2 - doubtful, 0.0)
         return certain
+
+    def rise(self, step: Array, most: int) -> float:
+        """How far the squares of distances rise if the pose moves by a step (3,), as a share of what slopes promise.
+
+        There the points find their surfaces anew; those that find none do not count. The mean of both ways, so that it
+        does not matter whether the pose is the best. 1 where nothing rises. most: points that are asked, at most.
+        """
+        some = slice(None, None, 1 + len(self._weights) // most)
+        seen, weights, limit = self._seen[some], self._weights[some], _OUTLIER**2
+        distances, slopes, normals_seen = self._distances[some], self._slopes[some], self._seen_normals[some]
+        rises = promised = 0.0
+        for moved in (step, -step):
+            cosine, sine = np.cos(moved[2]), np.sin(moved[2])
+            turn = np.array([[cosine, sine], [-sine, cosine]])
+            points = self._pose[:2] + moved[:2] + seen @ turn
+            index, apart = self._surroundings.nearest(points)
+            surface = self._surroundings.surface
+            normals, away = surface.normals[index], points - surface.centres[index]
+            across = (normals * away).sum(axis=1)
+            alike = (normals * (normals_seen @ turn)).sum(axis=1) > _PARALLEL
+            there = alike & (apart**2 - across**2 < self._surroundings.spacing**2)
+            before = (weights * distances**2)[there]
+            rises += float((np.minimum(weights * across**2, limit)[there] - before).sum())
+            promised += float((np.minimum(weights * (distances + slopes @ moved) ** 2, limit)[there] - before).sum())
+        return rises / promised if promised > 0 else 1.0
 
     def scatter(self) -> Array:
         """Covariance of the gradient (3, 3): noise of this scan and of the map's lines."""

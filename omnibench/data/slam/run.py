@@ -71,7 +71,7 @@ def run_slam(
         np.array([match.pose for match, _ in located]),
         np.array([covariance for _, covariance in located]),
         np.array([match.matched for match, _ in located]),
-        doubts_of([match for match, _ in located]),
+        doubts_of([match for match, _ in located], options, _at(odometry, scans.times)),
     )
 
 
@@ -152,6 +152,12 @@ class _Slam:
         if self._errors.keyframes > _KEYFRAMES:
             self._map.merge_oldest()
             self._errors.merge_oldest()
+
+
+def _at(odometry: Callable[[Array], Array] | None, times: Array) -> Array | None:
+    """The odometry at times (S,), of which several may be the same."""
+    stamps, place = np.unique(times, return_inverse=True)
+    return None if odometry is None else odometry(stamps)[place]
 
 
 def _check(
