@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field, FiniteFloat, field_validator, model_validator
+from pydantic import AfterValidator, Field, FiniteFloat, model_validator
 
 from omnibench.config import Model
 from omnibench.errors import UnknownNameError
@@ -18,6 +18,15 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 _MOST_ROWS = 1e8
+
+
+def _named(robot: Robot) -> Robot:
+    if not robot.name:
+        raise ValueError("give the robot a name")
+    return robot
+
+
+NamedRobot = Annotated[Robot, AfterValidator(_named)]
 
 
 class Tolerances(Model):
@@ -96,7 +105,7 @@ class FlowerConfig(Model):
     """A flower-shaped experiment, simulated: constant commands or ramps, wheel rates and reference poses with noise."""
 
     generator: Literal["flower"] = "flower"
-    robot: Robot
+    robot: NamedRobot
     sample_period: Positive = Field(0.01, description="s")
     pose_period: Positive = Field(0.25, description="time between reference poses, s")
     commands: Commands
@@ -109,13 +118,6 @@ class FlowerConfig(Model):
     order: Literal["shuffled", "sorted"] = "shuffled"
     start: Literal["fixed", "random"] = Field("fixed", description="at the origin, or anywhere with any heading")
     start_area: Positive = Field(4.0, description="side of the square about the origin for random starts, m")
-
-    @field_validator("robot")
-    @classmethod
-    def _named(cls, robot: Robot) -> Robot:
-        if not robot.name:
-            raise ValueError("give the robot a name")
-        return robot
 
     @model_validator(mode="after")
     def _something_moves(self) -> FlowerConfig:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Literal
 
 import numpy as np
 
@@ -84,6 +85,14 @@ def grid_of(chosen: MotionGrid) -> list[Command]:
     ]
 
 
+def runs_of(
+    commands: Sequence[Command], repetitions: int, order: Literal["shuffled", "sorted"], rng: np.random.Generator
+) -> list[tuple[Command, int]]:
+    """Every command with the number of each of its repetitions, in the order in which they are driven."""
+    runs = [(command, repetition) for command in commands for repetition in range(1, repetitions + 1)]
+    return [runs[index] for index in rng.permutation(len(runs))] if order == "shuffled" else runs
+
+
 def duration_of(command: Command, session: Session, chosen: Commands) -> float:
     """How long a command is driven in a session, s; ramps lengthen a run so that the way stays."""
     driven = session.distance / command.speed if command.speed else chosen.turn_duration
@@ -110,9 +119,7 @@ def _mean_shares(times: Array, ramp: float) -> Array:
 
 def _session(config: FlowerConfig, robot: TrueRobot, split: Split, session: Session) -> Iterator[Trajectory]:
     rng = np.random.default_rng(session.seed)
-    runs = [(command, repetition) for command in commands_of(config) for repetition in range(1, config.repetitions + 1)]
-    if config.order == "shuffled":
-        runs = [runs[index] for index in rng.permutation(len(runs))]
+    runs = runs_of(commands_of(config), config.repetitions, config.order, rng)
     started_at, angles = 0.0, np.zeros(len(config.robot.wheels))
     for number, (command, repetition) in enumerate(runs, 1):
         before = _Before(split, started_at, angles)

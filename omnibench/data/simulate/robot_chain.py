@@ -11,7 +11,7 @@ import numpy as np
 from omnibench.data.dataset import Split, Trajectory, make_dataset
 from omnibench.data.scans import ScansInMemory, TrajectoryScans
 from omnibench.data.simulate.floor_plan import FloorPlan, make_plan
-from omnibench.data.simulate.flower import PAUSE, Command, grid_of
+from omnibench.data.simulate.flower import PAUSE, Command, grid_of, runs_of
 from omnibench.data.simulate.lidar import PoseTrack, measure_scans, scan_stamps
 from omnibench.data.simulate.motion import CommandedMotion, command_motion, target_rates
 from omnibench.data.simulate.motors import TRUE_STEP, DrivenRun, check_reach, drive_session
@@ -106,9 +106,7 @@ class _Chain:
     def session(self, split: Split, session: RobotSession) -> Iterator[_Recorded]:
         """The runs of a session one after the other; the wheels go on turning from where they were."""
         config, rng = self.config, np.random.default_rng(session.seed)
-        runs = [(command, number) for command in self.commands for number in range(1, config.repetitions + 1)]
-        if config.order == "shuffled":
-            runs = [runs[index] for index in rng.permutation(len(runs))]
+        runs = runs_of(self.commands, config.repetitions, config.order, rng)
         motions = [self._motion(command, session, rng) for command, _ in runs]
         targets = [target_rates(config.robot, motion) for motion in motions]
         told = [self.robot.driven(motion.times, each) for motion, each in zip(motions, targets, strict=True)]

@@ -8,13 +8,12 @@ from typing import Literal
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
 from omnibench.config import Model
-from omnibench.data.simulate.config import MotionGrid, Positive, Truth
+from omnibench.data.simulate.config import MotionGrid, NamedRobot, Positive, Truth
 from omnibench.data.simulate.floor_plan import RoomPlan
 from omnibench.data.simulate.lidar import Lidar
 from omnibench.data.simulate.motion import CommandLink, MotionProfile
 from omnibench.data.simulate.motors import TRUE_STEP, Controller, Encoder, Motor
 from omnibench.data.slam.options import SlamOptions
-from omnibench.robot.kinematics import Robot
 
 _MOST_ANGLES = 1e8  # true wheel angles that are simulated in all
 
@@ -37,7 +36,7 @@ class RobotConfig(Model):
     """A simulated robot: commands, motors under PID, encoders, true motion, LIDAR in a room, SLAM."""
 
     generator: Literal["robot"]
-    robot: Robot
+    robot: NamedRobot
     sample_period: Positive = Field(0.01, description="of the PID controllers and of the encoders, s")
     commands: MotionGrid
     profile: MotionProfile = MotionProfile()
@@ -56,13 +55,6 @@ class RobotConfig(Model):
     slam: SlamOptions = SlamOptions()
     train: RobotSession
     validation: RobotSession | None = None
-
-    @field_validator("robot")
-    @classmethod
-    def _named(cls, robot: Robot) -> Robot:
-        if not robot.name:
-            raise ValueError("give the robot a name")
-        return robot
 
     @field_validator("sample_period")
     @classmethod
