@@ -4,22 +4,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from omnibench.compare.design import design_experiment
     from omnibench.compare.plan import read_compare_config
     from omnibench.compare.run import run_comparison
     from omnibench.data.dataset import Dataset, Trajectory, make_dataset
     from omnibench.data.importer import import_dataset
-    from omnibench.data.simulate.simulate import simulate_dataset
     from omnibench.data.storage import load_dataset, save_dataset
+    from omnibench.design.design import design_experiment
     from omnibench.discover.discover import discover_effects
     from omnibench.errors import OmnibenchError
     from omnibench.fit.calibrate import calibrate
     from omnibench.fit.certify import certify_optimum
     from omnibench.fit.evaluate import evaluate
     from omnibench.fit.inspect import inspect_dataset
-    from omnibench.live.subscriber import subscribe
+    from omnibench.live.wire.subscriber import subscribe
     from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
-    from omnibench.robot.export import export_calibration
+    from omnibench.robot.export.formats import export_calibration
+    from omnibench.simulate.simulate import simulate_dataset
 
 __all__ = [
     "Calibration",
@@ -47,12 +47,12 @@ __all__ = [
 
 # Imported when first asked for: the command line starts at once, and Ctrl-C finds it listening.
 _HOMES = {
-    "compare.design": ("design_experiment",),
+    "design.design": ("design_experiment",),
     "compare.plan": ("read_compare_config",),
     "compare.run": ("run_comparison",),
     "data.dataset": ("Dataset", "Trajectory", "make_dataset"),
     "data.importer": ("import_dataset",),
-    "data.simulate.simulate": ("simulate_dataset",),
+    "simulate.simulate": ("simulate_dataset",),
     "data.storage": ("load_dataset", "save_dataset"),
     "discover.discover": ("discover_effects",),
     "errors": ("OmnibenchError",),
@@ -62,7 +62,7 @@ _HOMES = {
     "fit.inspect": ("inspect_dataset",),
     "live.subscriber": ("subscribe",),
     "robot.calibration": ("Calibration", "read_calibration", "write_calibration"),
-    "robot.export": ("export_calibration",),
+    "robot.export.formats": ("export_calibration",),
 }
 
 

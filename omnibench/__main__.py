@@ -10,7 +10,7 @@ from contextlib import suppress
 from types import FrameType
 from typing import Any, NoReturn
 
-_COMMANDS = ("__main__.py", "cli.py", "live_cli.py")  # whose imports go on while nothing is under way yet
+_COMMANDS = ("__main__.py", "app.py", "live_commands.py")  # whose imports go on while nothing is under way yet
 
 
 def main() -> None:
@@ -19,7 +19,7 @@ def main() -> None:
         with suppress(ValueError):  # not in the main thread
             signal.signal(signal.SIGINT, _interrupted)
     try:
-        from omnibench.cli import app
+        from omnibench.cli.app import app
 
         _run(app)
     except KeyboardInterrupt:

@@ -15,7 +15,7 @@ import yaml
 
 from omnibench.__main__ import main
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.results import ComparisonResult
+from omnibench.compare.result import ComparisonResult
 from omnibench.compare.run import run_comparison
 
 ROOT = Path(__file__).resolve().parents[1]

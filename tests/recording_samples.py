@@ -10,11 +10,11 @@ import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.scans import ScansInMemory
-from omnibench.data.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
-from omnibench.data.simulate.lidar import Lidar, PoseTrack, measure_scans, scan_stamps
-from omnibench.data.simulate.truth_poses import TruePath
+from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.robot.path import Path
+from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
+from omnibench.simulate.chain.lidar import Lidar, PoseTrack, measure_scans, scan_stamps
 
 ROBOT = Robot(
     name="APR-02",

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from omnibench.compare.plan import PlannedRun
-from omnibench.compare.problem import make_problem
-from omnibench.compare.results import BoxCertificate, ScoredRun
+from omnibench.compare.result import BoxCertificate, ScoredRun
+from omnibench.compare.run_problem import make_problem
 from omnibench.compare.scoring import box_contains, box_of, has_no_box
 from omnibench.fit.certify import prove, proven_gap
 from omnibench.fit.cost import SumOfNorms

@@ -8,12 +8,12 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from omnibench.config import Model
-from omnibench.data.simulate.config import Positive
-from omnibench.data.simulate.simulate import SimulatedConfig
 from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
 from omnibench.fit.problem import Budget
 from omnibench.fit.span import Unidentified
 from omnibench.robot.odometry import Integration
+from omnibench.simulate.config import Positive
+from omnibench.simulate.simulate import SimulatedConfig
 
 
 class ImportSource(Model):

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from omnibench.compare.config import CalibratorEntry, CompareConfig
 from omnibench.compare.plan import PlannedRun, load_calibrators
-from omnibench.compare.problem import make_problem
+from omnibench.compare.run_problem import make_problem
 from omnibench.compare.store import RunStore, StoredRun
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error, run_calibrator

@@ -12,7 +12,7 @@ from typing import Any, get_type_hints
 import polars as pl
 
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.results import ComparisonResult, EntryStatistics, Interval, RunRecord, ScoredRun
+from omnibench.compare.result import ComparisonResult, EntryStatistics, Interval, RunRecord, ScoredRun
 from omnibench.config import read_yaml, to_json, to_yaml
 from omnibench.data.dataset import Dataset
 from omnibench.errors import DataError

@@ -18,7 +18,6 @@ from omnibench.compare.config import CalibratorEntry, CompareConfig, DatasetSour
 from omnibench.config import read_model, validate
 from omnibench.data.dataset import Dataset
 from omnibench.data.importer import import_dataset
-from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.data.storage import load_dataset
 from omnibench.data.watch import Watch, unwatched
 from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
@@ -26,6 +25,7 @@ from omnibench.fit.calibrator import unloadable
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import make_parameterisation, training_split
 from omnibench.registry import PluginFailure, calibrators, costs, load_plugins
+from omnibench.simulate.simulate import simulate_dataset
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ def _code(entry: CalibratorEntry, cost: str) -> str:
 @cache
 def _shared_code() -> str:
     package = Path(__file__).parents[1]
-    return _digest(sorted([*package.glob("robot/*.py"), *package.glob("fit/*.py")]))
+    return _digest(sorted([*package.glob("robot/**/*.py"), *package.glob("fit/**/*.py")]))
 
 
 def _digest(files: Iterable[Path]) -> str:

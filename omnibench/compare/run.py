@@ -12,8 +12,8 @@ from omnibench.compare.config import CompareConfig
 from omnibench.compare.execute import PRELOAD, Progress, execute
 from omnibench.compare.output import prepare_output, write_results
 from omnibench.compare.plan import PlannedRun, effective_config, load_calibrators, load_datasets, make_plan
-from omnibench.compare.report import write_report
-from omnibench.compare.results import ComparisonResult, ScoredRun
+from omnibench.compare.report.comparison_report import write_report
+from omnibench.compare.result import ComparisonResult, ScoredRun
 from omnibench.compare.scoring import score
 from omnibench.compare.statistics import entry_statistics, is_mean
 from omnibench.compare.store import RunStore

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from omnibench.compare.plan import UNBOUNDED, PlannedRun
-from omnibench.compare.results import RunRecord, ScoredRun
+from omnibench.compare.result import RunRecord, ScoredRun
 from omnibench.data.dataset import Dataset, Split, Trajectory
 from omnibench.errors import PluginError
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.compare.config import Bootstrap
-from omnibench.compare.results import EntryStatistics, Interval, ScoredRun
+from omnibench.compare.result import EntryStatistics, Interval, ScoredRun
 from omnibench.robot.kinematics import Array
 
 # A difference below this share of the best cost's own standard error is of no practical interest.

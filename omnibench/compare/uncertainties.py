@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from omnibench.compare.plan import UNBOUNDED, PlannedRun
-from omnibench.compare.problem import make_problem
-from omnibench.compare.results import EntryStatistics, ScoredRun
+from omnibench.compare.result import EntryStatistics, ScoredRun
+from omnibench.compare.run_problem import make_problem
 from omnibench.fit.calibrator import RunResult
-from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
+from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 
 
 def typical_uncertainties(

@@ -9,7 +9,7 @@ import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.extend import Extended
-from omnibench.discover.novelty import driven_motions
+from omnibench.discover.selection.extrapolation import driven_motions
 from omnibench.environment import package_versions
 from omnibench.errors import DataError
 from omnibench.robot.calibration import Calibration, EffectTerm, Provenance, covariance_rows, matrix_rows

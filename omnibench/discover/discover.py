@@ -9,16 +9,16 @@ from typing import Protocol
 import numpy as np
 
 from omnibench.data.dataset import Dataset
-from omnibench.discover.actuators import look_at_actuators
 from omnibench.discover.calibrations import Request
+from omnibench.discover.conclude import told
 from omnibench.discover.extend import Extended, extend
-from omnibench.discover.groups import check_names
-from omnibench.discover.look import Look, look_at
 from omnibench.discover.model_fit import Fit, fit_matrix
-from omnibench.discover.outcome import told
-from omnibench.discover.recording import usable_runs
+from omnibench.discover.regressors.actuators import look_at_actuators
 from omnibench.discover.result import Discovery
-from omnibench.discover.rivals import rivals_of
+from omnibench.discover.selection.candidate_groups import check_names
+from omnibench.discover.selection.competing_models import rivals_of
+from omnibench.discover.selection.screening import Look, look_at
+from omnibench.discover.usable_runs import usable_runs
 from omnibench.errors import DataError
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array

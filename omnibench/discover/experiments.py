@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 from omnibench.config import to_yaml
 from omnibench.data.dataset import Dataset
-from omnibench.data.simulate.config import FlowerConfig
 from omnibench.discover.model_fit import Fit
 from omnibench.discover.result import Experiment, NamedEffect
 from omnibench.robot.calibration import matrix_rows
+from omnibench.simulate.config import FlowerConfig
 
 
 def experiments_for(dataset: Dataset, effects: Sequence[NamedEffect], fit: Fit) -> tuple[Experiment, ...]:

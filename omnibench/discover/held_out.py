@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.extend import Extended
 from omnibench.discover.model_fit import Fit, at_runs
-from omnibench.discover.recording import in_start_frames
+from omnibench.discover.regressors.whitened import Whitened, whitened
 from omnibench.discover.result import Gap, HeldOut
-from omnibench.discover.whitened import Whitened, whitened
-from omnibench.fit.repetitions import differences_between_repetitions, grouped
+from omnibench.discover.usable_runs import in_start_frames
+from omnibench.fit.least_squares.repetitions import differences_between_repetitions, grouped
 from omnibench.robot.kinematics import Array
 
 _FOLDS = 5

@@ -11,7 +11,7 @@ import polars as pl
 
 from omnibench.config import Model, to_json, to_yaml
 from omnibench.discover.document import discovery_document, experiment_file
-from omnibench.discover.report import discovery_report
+from omnibench.discover.report.discovery_report import discovery_report
 from omnibench.discover.result import Discovery
 from omnibench.files import encode_table, remove, write_files
 from omnibench.report.render import render

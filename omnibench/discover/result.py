@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from omnibench.data.dataset import Dataset
-from omnibench.fit.noise import NoiseEstimate
+from omnibench.fit.least_squares.noise import NoiseEstimate
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.effects.effect import Stage
 from omnibench.robot.kinematics import Array

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from omnibench.discover.naming import CHANCE, SURE
 from omnibench.discover.result import NamedEffect, Place, Verdict
+from omnibench.discover.selection.model_selection import CHANCE, SURE
 
 
 def verdict_of(

@@ -9,7 +9,6 @@ from typing import Any
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError
-from omnibench.fit.bootstrap import ElementIntervals, bootstrap_intervals
 from omnibench.fit.calibrator import Calibrator, RunResult, run_calibrator
 from omnibench.fit.cost import Cost
 from omnibench.fit.parameterisation import (
@@ -21,8 +20,9 @@ from omnibench.fit.parameterisation import (
 )
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
 from omnibench.fit.span import Unidentified
-from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
-from omnibench.fit.unidentified import warnings_of_calibration
+from omnibench.fit.uncertainty.bootstrap import ElementIntervals, bootstrap_intervals
+from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
+from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import Calibration, Provenance, covariance_rows, matrix_rows
 from omnibench.robot.model import OdometryModel

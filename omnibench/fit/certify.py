@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
 from omnibench.errors import DataError
-from omnibench.fit.lower_bound import LowerBounds, Node
+from omnibench.fit.bounds.lower_bound import LowerBounds, Node
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
 from omnibench.registry import costs

@@ -9,7 +9,7 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.cost import Cost, SumOfNorms
-from omnibench.fit.noise import LEAST_WHITE
+from omnibench.fit.least_squares.noise import LEAST_WHITE
 from omnibench.robot.kinematics import Array
 
 

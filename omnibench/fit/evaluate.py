@@ -9,8 +9,8 @@ import numpy as np
 
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory
-from omnibench.data.unfitted import unfitted_motions
 from omnibench.errors import DataError
+from omnibench.fit.domain_check import unfitted_motions
 from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array

@@ -7,8 +7,8 @@ import numpy as np
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Split
 from omnibench.data.scans import Scans
-from omnibench.fit.identifiability import Identifiability, identifiability
 from omnibench.fit.span import direction_in_words, driven_span
+from omnibench.fit.uncertainty.identifiability import Identifiability, identifiability
 
 
 class SplitContent(Model):

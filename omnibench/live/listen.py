@@ -19,10 +19,10 @@ from rich.table import Table
 from rich.text import Text
 
 from omnibench.errors import DataError
-from omnibench.live.presence import checked_robot, unheard
+from omnibench.live.network.presence import checked_robot, unheard
+from omnibench.live.robot_monitor import OdometryNews, RobotNews, Watch
 from omnibench.live.stopping import ticks
-from omnibench.live.topics import KeySpace
-from omnibench.live.watch import OdometryNews, RobotNews, Watch
+from omnibench.live.wire.topics import KeySpace
 
 _REFRESH: Final = 0.2  # s, of the table
 _LINE_PERIOD: Final = 1.0  # s, of lines

@@ -14,16 +14,16 @@ from typing import Any
 
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError, one_line
-from omnibench.live.desk import Desk
-from omnibench.live.health import Health
-from omnibench.live.live_config import LiveConfig, RobotConfig
-from omnibench.live.memory import RobotMemory
-from omnibench.live.presence import alive_robots
-from omnibench.live.quiet import Quiet
-from omnibench.live.service import RobotService
-from omnibench.live.session import open_session
-from omnibench.live.topics import TOPICS, GraphNode, KeySpace
-from omnibench.live.tracker import RobotTracker
+from omnibench.live.config import LiveConfig, RobotConfig
+from omnibench.live.control.query_server import Desk
+from omnibench.live.estimation.health import Health
+from omnibench.live.estimation.saved_state import RobotMemory
+from omnibench.live.estimation.tracker import RobotTracker
+from omnibench.live.network.presence import alive_robots
+from omnibench.live.network.rate_limiter import Quiet
+from omnibench.live.network.session import open_session
+from omnibench.live.robot_service import RobotService
+from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace
 from omnibench.registry import load_plugins
 from omnibench.robot.calibration import Calibration, read_calibration
 

@@ -14,10 +14,10 @@ from rich.live import Live
 from rich.text import Text
 
 from omnibench.errors import DataError
-from omnibench.live.presence import alive_robots, unheard
-from omnibench.live.recorder import Recorder
+from omnibench.live.network.presence import alive_robots, unheard
 from omnibench.live.stopping import ticks
-from omnibench.live.topics import TOPICS, KeySpace
+from omnibench.live.wire.recorder import Recorder
+from omnibench.live.wire.topics import TOPICS, KeySpace
 
 _PERIOD: Final = 0.25  # s, of the line on a terminal
 _PIPED_PERIOD: Final = 10.0  # s, of the lines when piped

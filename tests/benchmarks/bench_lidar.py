@@ -12,11 +12,11 @@ import time
 import numpy as np
 import pytest
 
-from omnibench.data.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
-from omnibench.data.simulate.floor_plans import PLANS
-from omnibench.data.simulate.lidar import Lidar, PoseTrack, measure_scans, scan_stamps
-from omnibench.data.simulate.ray_casting import cast_rays
 from omnibench.robot.kinematics import Array
+from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
+from omnibench.simulate.chain.floor_plans import PLANS
+from omnibench.simulate.chain.lidar import Lidar, PoseTrack, measure_scans, scan_stamps
+from omnibench.simulate.chain.ray_casting import cast_rays
 
 RUN = 6.5  # s
 RUNS = 190  # of 25 scans: about a session of 180 flower runs

@@ -19,10 +19,10 @@ from itertools import product
 import numpy as np
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from omnibench.data.simulate.flower import Command
-from omnibench.data.simulate.motion import CommandLink, MotionProfile, command_motion, target_rates
-from omnibench.data.simulate.motors import Controller, DrivenRun, Encoder, Motor, drive_session
 from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
+from omnibench.simulate.chain.motors import Controller, DrivenRun, Encoder, Motor, drive_session
+from omnibench.simulate.flower import Command
 
 PERIOD = 0.01
 APR_02 = Robot(

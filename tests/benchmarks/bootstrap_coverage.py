@@ -16,12 +16,12 @@ import numpy as np
 from scipy.stats import binom
 
 from omnibench.compare.plan import read_compare_config
-from omnibench.data.simulate.simulate import simulate_dataset
-from omnibench.data.simulate.source import read_simulation
-from omnibench.fit.bootstrap import bootstrap_intervals
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
+from omnibench.fit.uncertainty.bootstrap import bootstrap_intervals
 from omnibench.registry import calibrators, costs
+from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import read_simulation
 
 CONFIG = Path(__file__).parents[2] / "configs" / "apr02.yaml"
 

@@ -17,15 +17,15 @@ from functools import partial
 import numpy as np
 from scipy import stats
 
-from omnibench.data.simulate.config import Commands, EncoderNoise, FlowerConfig, Session, Truth
-from omnibench.data.simulate.simulate import simulate_dataset
-from omnibench.data.simulate.truth import true_matrix
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
+from omnibench.simulate.config import Commands, EncoderNoise, FlowerConfig, Session, Truth
+from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.truth import true_matrix
 
 ROBOT = Robot(
     name="APR-02",

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from omnibench.live.arrivals import ReplayConfig
-from omnibench.live.chain import Chain, chain_recording, chained_truth
-from omnibench.live.fusion import FusionSettings
-from omnibench.live.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
-from omnibench.live.recording import load_recording
-from omnibench.live.replay import events
-from omnibench.live.tracker import RobotTracker
+from omnibench.live.estimation.fusion import FusionSettings
+from omnibench.live.estimation.tracker import RobotTracker
+from omnibench.live.replay.arrivals import ReplayConfig
+from omnibench.live.replay.concatenated_drive import Chain, chain_recording, chained_truth
+from omnibench.live.replay.played_recording import load_recording
+from omnibench.live.replay.replay_player import events
+from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 from omnibench.robot.calibration import Calibration, read_calibration
 from omnibench.robot.model import OdometryModel
 

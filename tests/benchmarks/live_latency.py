@@ -28,7 +28,7 @@ import yaml
 import zenoh
 from zenoh.handlers import Callback, FifoChannel
 
-from omnibench.live.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
+from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 from omnibench.robot.calibration import Calibration, Noise, matrix_rows, write_calibration
 from omnibench.testing.synthetic import synthetic_robot
 

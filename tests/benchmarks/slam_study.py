@@ -20,16 +20,16 @@ from functools import partial
 import numpy as np
 
 from omnibench.data.scans import TrajectoryScans
-from omnibench.data.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
-from omnibench.data.simulate.flower import Command
-from omnibench.data.simulate.lidar import Lidar, PoseTrack, measure_scans, scan_stamps
-from omnibench.data.simulate.motion import CommandLink, MotionProfile, command_motion, target_rates
-from omnibench.data.slam.options import SlamOptions
-from omnibench.data.slam.run import SlamPath, run_slam
 from omnibench.robot.kinematics import Array, Robot, Wheel
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
-from omnibench.robot.published import published_matrix
+from omnibench.robot.published_matrices import published_matrix
+from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
+from omnibench.simulate.chain.lidar import Lidar, PoseTrack, measure_scans, scan_stamps
+from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
+from omnibench.simulate.flower import Command
+from omnibench.slam.slam_options import SlamOptions
+from omnibench.slam.slam_run import SlamPath, run_slam
 from omnibench.threads import one_thread
 
 ROBOT = Robot(

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binomtest
 
-from omnibench.data.simulate.simulate import simulate_dataset
-from omnibench.data.simulate.source import read_simulation
 from omnibench.fit.calibrate import calibrate
-from omnibench.fit.physical import geometry_of
+from omnibench.fit.uncertainty.physical import geometry_of
+from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import read_simulation
 
 CONFIG = Path(__file__).parents[2] / "configs" / "apr02.yaml"
 

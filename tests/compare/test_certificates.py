@@ -8,10 +8,10 @@ import pytest
 from commands import compared_here, search, small
 from report_samples import config, page, run
 
+from omnibench.cli.terminal.calibration_tables import make_console
+from omnibench.cli.terminal.comparison_tables import print_result
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.results import ComparisonResult
-from omnibench.compare.terminal import print_result
-from omnibench.terminal import make_console
+from omnibench.compare.result import ComparisonResult
 
 PROVEN = {"gap": 0.05, "seconds": 30}
 ENTRIES = ["theoretical", "closed_form", {"name": "closed_form", "box": "paper"}, search(), "parametric"]

@@ -16,10 +16,10 @@ from commands import COMMAND, ENVIRONMENT, compared, flower, search, small, summ
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import PlannedRun
 from omnibench.compare.run import run_comparison
-from omnibench.data.simulate.config import FlowerConfig
-from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.data.storage import save_dataset
 from omnibench.fit.calibrator import RunResult
+from omnibench.simulate.config import FlowerConfig
+from omnibench.simulate.simulate import simulate_dataset
 
 pytestmark = pytest.mark.usefixtures("registries_as_before")
 
@@ -127,7 +127,7 @@ def without_seconds(output: Path) -> list[dict[str, Any]]:
 def test_ctrl_c_before_the_first_run_ends_in_one_line(tmp_path: Path) -> None:
     config = write_config(tmp_path, calibrators=SEARCHES)
     program = "import os, signal, sys, threading; sys.argv[0] = 'omnibench'; "
-    program += "from omnibench.__main__ import main; import omnibench.cli; "
+    program += "from omnibench.__main__ import main; import omnibench.cli.app; "
     program += "threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start(); main()"
     run = subprocess.run(
         [COMMAND[0], "-c", program, "compare", str(config), "--output", str(tmp_path / "out")],

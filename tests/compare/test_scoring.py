@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
-from omnibench.compare.results import RunRecord
+from omnibench.compare.result import RunRecord
 from omnibench.compare.scoring import SplitScorer, heading_error, position_error, score
 from omnibench.errors import PluginError
 from omnibench.fit.calibrator import Outcome, RunResult
 from omnibench.fit.cost import Cost
 from omnibench.robot.kinematics import Array
-from omnibench.robot.published import published_matrix
+from omnibench.robot.published_matrices import published_matrix
 
 TRUE = published_matrix("palacin2023_eq8")
 WIDE = {"lower": [[-1.0] * 3] * 3, "upper": [[1.0] * 3] * 3}

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from omnibench.compare.config import Bootstrap
-from omnibench.compare.results import EntryStatistics, RunRecord, ScoredRun
+from omnibench.compare.result import EntryStatistics, RunRecord, ScoredRun
 from omnibench.compare.statistics import NEGLIGIBLE_SHARE, entry_statistics, is_mean
 from omnibench.fit.calibrator import Outcome
 from omnibench.robot.kinematics import Array

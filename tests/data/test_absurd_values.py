@@ -12,10 +12,10 @@ from commands import flower
 
 from omnibench.config import validate
 from omnibench.data.dataset import make_dataset
-from omnibench.data.simulate.config import FlowerConfig
-from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError
+from omnibench.simulate.config import FlowerConfig
+from omnibench.simulate.simulate import simulate_dataset
 
 
 @pytest.mark.parametrize(

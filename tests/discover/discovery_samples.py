@@ -8,10 +8,10 @@ from functools import cache
 from typing import Any
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.simulate.config import FlowerConfig
-from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.result import Discovery, Experiment, HeldOut, Novelty, Place
+from omnibench.simulate.config import FlowerConfig
+from omnibench.simulate.simulate import simulate_dataset
 
 APR02 = {
     "name": "APR-02",

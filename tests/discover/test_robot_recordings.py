@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.simulate.simulate import simulate_dataset
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.ticks import ticks_of
+from omnibench.discover.regressors.encoder_quantisation import ticks_of
+from omnibench.simulate.simulate import simulate_dataset
 
 FEW: dict[str, Any] = {
     "commands": {"speeds": [0.2], "directions_deg": [0, 60, 120, 180, 240, 300], "turn_rates": [-0.35, 0.0, 0.35]},

@@ -9,7 +9,7 @@ import pytest
 from discovery_samples import simulated
 
 from omnibench.discover.model_fit import fit_matrix
-from omnibench.discover.recording import log_of, usable_runs
+from omnibench.discover.usable_runs import log_of, usable_runs
 from omnibench.errors import DataError
 
 

@@ -15,10 +15,10 @@ from scipy.optimize import minimize
 from omnibench.compare.plan import load_source, read_compare_config
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import ConfigError, DataError
+from omnibench.fit.bounds.lower_bound import LowerBounds
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.certify import certify_optimum, prove
 from omnibench.fit.cost import Cost
-from omnibench.fit.lower_bound import LowerBounds
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators

@@ -15,7 +15,7 @@ from omnibench.config import validate
 from omnibench.errors import ConfigError
 from omnibench.fit.parameterisation import Box, GeometryLimits, MatrixElements, WheelGeometry, make_bounds
 from omnibench.robot.kinematics import Array, Robot, Wheel, inverse_kinematic_matrix
-from omnibench.robot.published import published_matrix
+from omnibench.robot.published_matrices import published_matrix
 from omnibench.testing.synthetic import synthetic_robot
 
 APR_02 = Robot(

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.live.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
-from omnibench.live.odometry import Motion
+from omnibench.live.estimation.live_odometry import Motion
+from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 from omnibench.robot.calibration import Calibration, Noise, covariance_rows, matrix_rows
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, WheelLog

@@ -18,9 +18,9 @@ from drives import calibration
 from sessions import free_port, raw_session
 
 from omnibench.config import to_yaml
-from omnibench.live.live_config import LiveConfig, read_live_config
-from omnibench.live.messages import JOINT_STATE, JointState
+from omnibench.live.config import LiveConfig, read_live_config
 from omnibench.live.node import LiveNode
+from omnibench.live.wire.messages import JOINT_STATE, JointState
 from omnibench.robot.calibration import Calibration, write_calibration
 
 

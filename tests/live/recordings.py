@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.simulate.config import Commands, EncoderNoise, FlowerConfig, Session, Tolerances, Truth
-from omnibench.data.simulate.simulate import simulate_dataset
-from omnibench.live.recording import Recording
+from omnibench.live.replay.played_recording import Recording
 from omnibench.robot.calibration import EffectTerm
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
+from omnibench.simulate.config import Commands, EncoderNoise, FlowerConfig, Session, Tolerances, Truth
+from omnibench.simulate.simulate import simulate_dataset
 from omnibench.testing import synthetic_robot
 
 PERIOD = 0.02  # s

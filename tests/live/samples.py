@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from omnibench.live.messages import Diagnostic, Diagnostics, JointState, Odometry, PoseEstimate, Transform
+from omnibench.live.wire.messages import Diagnostic, Diagnostics, JointState, Odometry, PoseEstimate, Transform
 
 STAMP = 1_700_000_000_123_456_789
 PERIOD = 10_000_000  # ns

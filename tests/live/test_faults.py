@@ -17,7 +17,7 @@ from drives import SECOND, calibration, drive, slam
 from nodes import Command, as_text, asked, config_of, running, sent, write_node
 from sessions import free_port, raw_session, until
 
-from omnibench.live.messages import JOINT_STATE, ODOMETRY, JointState, Odometry
+from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY, JointState, Odometry
 
 _BLOCK: Any = zenoh.CongestionControl.BLOCK
 _FROZEN = """

@@ -19,11 +19,11 @@ from samples import odometry
 from sessions import Loopback, until
 
 from omnibench.errors import ConfigError, DataError
-from omnibench.live.counts import Counts
+from omnibench.live.estimation.counts import Counts
 from omnibench.live.listen import listen, plain, state, view
-from omnibench.live.messages import Diagnostic, Diagnostics, Odometry
-from omnibench.live.topics import GraphNode, KeySpace, Profile
-from omnibench.live.watch import HealthNews, OdometryNews, RobotNews, Watch
+from omnibench.live.robot_monitor import HealthNews, OdometryNews, RobotNews, Watch
+from omnibench.live.wire.messages import Diagnostic, Diagnostics, Odometry
+from omnibench.live.wire.topics import GraphNode, KeySpace, Profile
 
 KEYS = KeySpace()
 

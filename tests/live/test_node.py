@@ -15,9 +15,9 @@ from nodes import asked, config_of, running, sent
 from sessions import until
 
 from omnibench.errors import ConfigError, DataError
-from omnibench.live.live_config import LiveConfig, read_live_config
-from omnibench.live.messages import DIAGNOSTICS, ODOMETRY, TRANSFORMS, Odometry
+from omnibench.live.config import LiveConfig, read_live_config
 from omnibench.live.node import LiveNode
+from omnibench.live.wire.messages import DIAGNOSTICS, ODOMETRY, TRANSFORMS, Odometry
 
 
 def test_wheel_samples_become_the_batch_odometry_on_every_topic(tmp_path: Path) -> None:

@@ -20,13 +20,13 @@ from report_page import Page
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
-from omnibench.data.slam.accuracy import run_errors, slam_accuracy
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError
 from omnibench.report.recording.runs import representative_runs
 from omnibench.report.recording.scan_points import scan_points, thinned
 from omnibench.report.recording.section import has_recording, recording_section, write_recording_report
 from omnibench.report.recording.wheel_figures import rate_step, wheel_rates
+from omnibench.slam.accuracy import run_errors, slam_accuracy
 
 CONTENTS = "What was recorded"
 PLOTLY = 4.9e6  # bytes, at most

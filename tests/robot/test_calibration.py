@@ -29,7 +29,7 @@ from omnibench.robot.calibration import (
 )
 from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
 from omnibench.robot.kinematics import Array, Robot, Wheel
-from omnibench.robot.published import published_matrix
+from omnibench.robot.published_matrices import published_matrix
 from omnibench.robot.signals import Signals
 
 ROBOT = Robot(

@@ -20,7 +20,7 @@ from omnibench.robot.kinematics import (
     inverse_kinematic_matrix,
     wheel_equations,
 )
-from omnibench.robot.published import published_matrix
+from omnibench.robot.published_matrices import published_matrix
 
 APR_02 = tuple(
     Wheel(name=n, radius=0.148, distance=0.195, angle=math.radians(a))

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from omnibench.robot.kinematics import Array, Robot, Wheel
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch, OdometryStream, WheelLog
-from omnibench.robot.published import published_matrix
+from omnibench.robot.published_matrices import published_matrix
 
 BOTH: tuple[Integration, ...] = ("euler", "arc")
 ROBOT = Robot(

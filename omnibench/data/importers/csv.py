@@ -16,9 +16,9 @@ from omnibench.data.alignment import align, median_period
 from omnibench.data.dataset import Dataset, Split, Trajectory, make_dataset
 from omnibench.data.delimited import read_numbers
 from omnibench.data.importer import Importer
-from omnibench.data.robot_option import RobotOption
+from omnibench.data.importers.robot_option import RobotOption
+from omnibench.data.importers.tum import read_tum
 from omnibench.data.splits import Names, every_second, repetitions, split_by_name
-from omnibench.data.tum import read_tum
 from omnibench.errors import DataError
 from omnibench.registry import Options, importers
 from omnibench.robot.kinematics import Array

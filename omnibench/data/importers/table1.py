@@ -15,7 +15,7 @@ from omnibench.data.alignment import align, median_period
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, make_dataset
 from omnibench.data.delimited import NumberTable, read_numbers
 from omnibench.data.importer import Importer
-from omnibench.data.robot_option import RobotOption
+from omnibench.data.importers.robot_option import RobotOption
 from omnibench.data.splits import Names, every_second, repetitions, split_by_name
 from omnibench.errors import DataError
 from omnibench.registry import Options, importers

@@ -9,7 +9,7 @@ from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
-from omnibench.robot.published import PUBLISHED, published_matrix
+from omnibench.robot.published_matrices import PUBLISHED, published_matrix
 
 
 class PublishedOptions(Options):

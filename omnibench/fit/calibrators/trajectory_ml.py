@@ -26,12 +26,12 @@ from pydantic import Field, model_validator
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.cost_weights import cost_weightings
-from omnibench.fit.gauss_newton import Descent, descend
-from omnibench.fit.noise import NoiseEstimate, estimate_noise
+from omnibench.fit.least_squares.gauss_newton import Descent, descend
+from omnibench.fit.least_squares.noise import NoiseEstimate, estimate_noise
+from omnibench.fit.least_squares.start_noise import separate_start_noise
+from omnibench.fit.least_squares.trajectory_covariance import FitCovariance
+from omnibench.fit.least_squares.trajectory_fit import OFFSET, SLOPE, TURN, Estimate, TrajectoryFit
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.fit.start_noise import separate_start_noise
-from omnibench.fit.trajectory_covariance import FitCovariance
-from omnibench.fit.trajectory_fit import OFFSET, SLOPE, TURN, Estimate, TrajectoryFit
 from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array

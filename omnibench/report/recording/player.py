@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.simulate.truth_poses import TruePath
+from omnibench.data.true_poses import TruePath
 from omnibench.report.blocks import LegendItem, Player
 from omnibench.report.numbers import listing
 from omnibench.report.recording.drawing import (

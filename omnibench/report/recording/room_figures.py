@@ -10,7 +10,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.simulate.truth_poses import TruePath
+from omnibench.data.true_poses import TruePath
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import count, plural
 from omnibench.report.recording.drawing import (

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.simulate.truth_poses import TruePath
-from omnibench.data.slam.accuracy import SlamAccuracy, slam_accuracy
+from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
 from omnibench.report.blocks import Badge, Block, Callout, Choice, Document, Fact, Facts, Section
 from omnibench.report.numbers import fixed
@@ -26,9 +25,10 @@ from omnibench.report.recording.wheel_figures import wheel_rates
 from omnibench.report.render import write_document
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
+from omnibench.slam.accuracy import SlamAccuracy, slam_accuracy
 
 if TYPE_CHECKING:  # shapely takes its time, and most recordings have no plan
-    from omnibench.data.simulate.floor_plan import FloorPlan
+    from omnibench.simulate.chain.floor_plan import FloorPlan
 
 _SIMULATED = Badge("SIMULATED DATA", "warning")
 

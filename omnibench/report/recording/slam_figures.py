@@ -8,14 +8,14 @@ import numpy as np
 import plotly.graph_objects as go
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.simulate.truth_poses import TruePath
-from omnibench.data.slam.accuracy import RunErrors, run_errors
+from omnibench.data.true_poses import TruePath
 from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import count, plural, significant
 from omnibench.report.recording.drawing import joined, short
 from omnibench.report.recording.scan_points import evenly
 from omnibench.report.style import INK, PALETTE, QUIET, plot
 from omnibench.robot.kinematics import Array
+from omnibench.slam.accuracy import RunErrors, run_errors
 
 _RUNS = 150  # drawn one by one
 _BINS = 16  # of time or way

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from omnibench.data.slam.accuracy import ErrorSummary, SlamAccuracy
 from omnibench.report.blocks import Block, Cell, Column, Fact, Facts, Row, Table
 from omnibench.report.numbers import NOTHING, count, plural, significant
+from omnibench.slam.accuracy import ErrorSummary, SlamAccuracy
 
 
 def accuracy_blocks(accuracy: SlamAccuracy) -> tuple[Block, ...]:

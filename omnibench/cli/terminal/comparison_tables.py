@@ -1,0 +1,237 @@
+"""A comparison on a terminal: progress while it runs, the paper's Tables 2 and 3 when it has."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from omnibench.cli.terminal.calibration_tables import Steps
+from omnibench.compare.plan import PlannedRun
+from omnibench.compare.result import ComparisonResult, EntryStatistics, Interval
+from omnibench.data.dataset import SPLITS, Split
+from omnibench.fit.calibrator import RunResult
+
+
+class Bars:
+    """A bar for the whole comparison and one for every run that is under way."""
+
+    def __init__(self, console: Console) -> None:
+        self._progress = Progress(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[note]}"),
+            TimeElapsedColumn(),
+            console=console,
+        )
+        self._all = self._progress.add_task("runs", total=None, note="")
+        self._tasks: dict[str, TaskID] = {}
+        self._preparation = Steps(console)
+
+    def __enter__(self) -> Bars:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._preparation.__exit__()
+        self._progress.stop()
+
+    def prepared(self, what: str, done: int, total: int) -> None:
+        """A bar for each stage in which data sets are made."""
+        self._preparation(what, done, total)
+
+    def planned(self, runs: int) -> None:
+        """How many runs there will be; only now is there something to show."""
+        self._preparation.__exit__()
+        self._progress.update(self._all, total=runs)
+        self._progress.start()
+
+    def began(self, run: PlannedRun) -> None:
+        """A bar of evaluations for the run."""
+        total = run.config.budget.evaluations
+        self._tasks[run_title(run)] = self._progress.add_task(run_title(run), total=total, note="")
+
+    def moved(self, run: PlannedRun, evaluations: int, best: float) -> None:
+        """Evaluations so far and the best cost."""
+        self._progress.update(self._tasks[run_title(run)], completed=evaluations, note=f"best {best:.6f}")
+
+    def ended(self, run: PlannedRun, result: RunResult, reused: bool) -> None:
+        """The bar gives way to a line."""
+        task = self._tasks.pop(run_title(run), None)
+        if task is not None:
+            self._progress.remove_task(task)
+        self._progress.console.print(run_line(run, result, reused))
+        self._progress.advance(self._all)
+
+
+class Lines:
+    """Plain lines, for pipes and logs."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._preparation = Steps(console)
+        self._runs = 0
+        self._ended = 0
+
+    def __enter__(self) -> Lines:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def prepared(self, what: str, done: int, total: int) -> None:
+        """A line for each stage in which data sets are made."""
+        self._preparation(what, done, total)
+
+    def planned(self, runs: int) -> None:
+        """How many runs there will be."""
+        self._runs = runs
+
+    def began(self, run: PlannedRun) -> None: ...
+
+    def moved(self, run: PlannedRun, evaluations: int, best: float) -> None: ...
+
+    def ended(self, run: PlannedRun, result: RunResult, reused: bool) -> None:
+        """One line for every run."""
+        self._ended += 1
+        line = f"[{self._ended}/{self._runs}] {run_line(run, result, reused)}"
+        self._console.print(line, soft_wrap=True)
+
+
+def run_title(run: PlannedRun) -> str:
+    """Data set, entry and seed of a run."""
+    return f"{run.dataset_name} {run.label} seed {run.seed}"
+
+
+def run_line(run: PlannedRun, result: RunResult, reused: bool) -> str:
+    """How a run ended, in one line."""
+    cost = "no answer" if result.cost is None else f"cost {result.cost:.6f}"
+    kept = ", kept from an earlier run" if reused else ""
+    figures = f"{cost}, {result.evaluations} evaluations, {result.seconds:.1f} s{kept}"
+    return f"{run_title(run)}: {result.outcome}, {figures} ({result.reason})"
+
+
+def print_result(console: Console, result: ComparisonResult) -> None:
+    """The tables of every data set, how each matrix was found, and the runs without an answer."""
+    for name, dataset in result.datasets.items():
+        entries = [entry for entry in result.statistics if entry.dataset == name]
+        where = f"{name}{' (simulated data)' if dataset.simulated else ''}"
+        for split in SPLITS:
+            if count := len(dataset.split(split)):
+                title = f"{_TITLES[split]}: {where}, {count} trajectories, cost {result.config.cost.name}"
+                console.print(_cost_table(title, entries, split), "")
+        console.print(_error_table(f"Final errors: {where}", entries), "")
+    console.print(_search_table(result), "")
+    for record in (run.record for run in result.runs):
+        if record.matrix is None:
+            title = f"{record.dataset} {record.label} seed {record.seed}"
+            console.print(f"no answer: {title}: {record.outcome}: {record.reason}", soft_wrap=True)
+    console.print(
+        "intervals: 95 % bootstrap over trajectories;  = : practically equal to the best;  gap: above the "
+        "exact optimum in the same box;  proven: what any optimiser could still save of the cost there, at most",
+        soft_wrap=True,
+    )
+
+
+_TITLES: dict[Split, str] = {"train": "Training", "validation": "Validation"}
+
+
+def _new_table(title: str, words: Sequence[str], numbers: Sequence[str]) -> Table:
+    """A table that folds in a narrow terminal and leaves nothing out."""
+    table = Table(
+        title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0)
+    )
+    for heading in words:
+        table.add_column(heading, overflow="fold", min_width=len("closed_form") if heading == "M^-1" else None)
+    for heading in numbers:
+        table.add_column(heading, justify="right", overflow="fold")
+    return table
+
+
+def _cost_table(title: str, entries: Iterable[EntryStatistics], split: Split) -> Table:
+    """The paper's Table 2 or 3, with intervals."""
+    calibrated = f"CF {_TITLES[split].lower()}"
+    headings = ("CF theoretical", calibrated, "95 % interval", "Improvement", "95 % interval")
+    table = _new_table(title, ["M^-1"], headings)
+    for entry in entries:
+        if entry.typical is None:
+            table.add_row(entry.label, "", "no answer")
+            continue
+        record = entry.typical.record
+        train = split == "train"
+        theoretical = record.theoretical_train_cost if train else record.theoretical_validation_cost
+        cost = entry.train if train else entry.validation
+        improvement = entry.train_improvement if train else entry.validation_improvement
+        cells = ["" if theoretical is None else f"{theoretical:.4f}"]
+        cells += _interval(cost, "{:.4f}") + _interval(improvement, "{:.2%}")
+        table.add_row(entry.label, *cells, style="bold" if entry.is_best else None)
+    return table
+
+
+def _error_table(title: str, entries: Iterable[EntryStatistics]) -> Table:
+    """Mean errors of the final pose on both splits, and how the entries compare."""
+    errors = ("training: position", "heading", "validation: position", "heading")
+    table = _new_table(title, ["M^-1"], [*errors, "cost against best", "95 % interval"])
+    for entry in entries:
+        if entry.typical is None:
+            table.add_row(entry.label, "no answer")
+            continue
+        record = entry.typical.record
+        cells = (
+            *_error_cells(record.train_position_m, record.train_heading_rad),
+            *_error_cells(record.validation_position_m, record.validation_heading_rad),
+            *_against_best(entry),
+        )
+        table.add_row(entry.label, *cells, style="bold" if entry.is_best else None)
+    return table
+
+
+def _error_cells(position: float | None, heading: float | None) -> tuple[str, str]:
+    if position is None or heading is None:
+        return "", ""
+    return f"{1000 * position:.1f} mm", f"{math.degrees(heading):.2f} deg"
+
+
+def _search_table(result: ComparisonResult) -> Table:
+    headings = ("runs", "evaluations", "time", "gap", "proven", "on a bound")
+    several = len(result.datasets) > 1
+    table = _new_table("How each was found", [*(["data set"] * several), "M^-1", "box", "outcome"], headings)
+    for entry in result.statistics:
+        records = [run.record for run in result.runs]
+        own = [record for record in records if (record.dataset, record.label) == (entry.dataset, entry.label)]
+        table.add_row(
+            *([entry.dataset] * several),
+            entry.label,
+            entry.box,
+            ", ".join(dict.fromkeys(str(record.outcome) for record in own)),
+            f"{entry.answers}/{entry.runs}",
+            f"{entry.evaluations_median:.0f}" if entry.evaluations_median is not None else "",
+            f"{entry.seconds_median:.2f} s" if entry.seconds_median is not None else "",
+            f"{entry.gap_median:.1e}" if entry.gap_median is not None else "",
+            f"{max(entry.proven_gap_median, 0.0):.2%}" if entry.proven_gap_median is not None else "",
+            _on_bounds(entry),
+        )
+    return table
+
+
+def _on_bounds(entry: EntryStatistics) -> str:
+    if entry.typical is None:
+        return ""
+    record = entry.typical.record
+    return ", ".join([*record.at_bounds, *(f"{name} (held)" for name in record.held)])
+
+
+def _against_best(entry: EntryStatistics) -> list[str]:
+    if entry.is_best:
+        return ["best", ""]
+    difference, interval = _interval(entry.difference, "{:+.5f}")
+    return [f"{'= ' if entry.practically_equal else ''}{difference}", interval]
+
+
+def _interval(interval: Interval | None, form: str) -> list[str]:
+    if interval is None:
+        return ["", ""]
+    return [form.format(interval.value), f"{form.format(interval.low)} .. {form.format(interval.high)}"]

@@ -1,0 +1,196 @@
+"""A discovery on a terminal: what is under way, and then the answer in a screenful of 80 columns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from omnibench.discover.document import experiment_file
+from omnibench.discover.report.wording import (
+    VERDICTS,
+    chance,
+    closed_in_words,
+    data_in_words,
+    gap_decimals,
+    held_out_in_words,
+    novelties_in_words,
+    reading,
+    value_and_interval,
+    weight_in_words,
+    with_unit,
+    worst_of_each,
+)
+from omnibench.discover.result import Discovery, Gap, NamedEffect
+from omnibench.report.numbers import fixed, listing, plural
+
+_WIDTH = 80
+_HIDDEN = 4  # effects of which the terminal says how large they could be
+_PLACES = 4
+_PARAMETERS = 9  # of each effect
+_LINES = 3  # of notes, and of warnings
+
+
+class Stages:
+    """What is under way: a line that changes on a terminal, a line for each stage where it is piped."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}", markup=False),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._progress.add_task("reading", total=None)
+
+    def __enter__(self) -> Stages:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def stage(self, text: str) -> None:
+        """What is done from now on."""
+        if self._console.is_terminal:
+            self._progress.update(self._task, description=text)
+        else:
+            self._console.print(text, soft_wrap=True)
+
+
+def print_discovery(console: Console, discovery: Discovery, folder: Path) -> None:
+    """Verdict, effects, places, gap, what could still hide, and the files in ``folder``."""
+    width = min(console.width, _WIDTH)
+    console.print(data_in_words(discovery), soft_wrap=True)
+    console.print(f"verdict: {discovery.verdict} ({VERDICTS[discovery.verdict]})", style="bold", width=width)
+    console.print(discovery.headline, width=width)
+    for effect in discovery.effects:
+        console.print("", width=width)
+        console.print(_effect_title(effect), style="bold", width=width)
+        console.print(_effect_table(effect), width=width)
+    for table in _tables(discovery):
+        console.print("", table, width=width)
+    for line in _remarks(discovery):
+        console.print(line, width=width)
+    _print_files(console, discovery, folder)
+
+
+def _tables(discovery: Discovery) -> Iterator[Table]:
+    if discovery.where:
+        yield _place_table(discovery)
+    yield _gap_table(discovery)
+    if discovery.hidden:
+        yield _hidden_table(discovery)
+
+
+def _effect_title(effect: NamedEffect) -> str:
+    others = [name for name in effect.confusable_with if name != effect.name]
+    alike = f", or {' or '.join(others)}" if others else ""
+    return f"added: {effect.name}{alike} (stage {effect.stage}), weight {weight_in_words(effect.weight)}"
+
+
+def _effect_table(effect: NamedEffect) -> Table:
+    table = _table(None, ("parameter",), ("value", "95 % interval"))
+    for parameter in effect.parameters[:_PARAMETERS]:
+        value, interval, unit = value_and_interval(parameter)
+        table.add_row(parameter.name, with_unit(value, unit), "chosen" if parameter.shape else interval)
+    if len(effect.parameters) > _PARAMETERS:
+        table.caption = f"{len(effect.parameters) - _PARAMETERS} more in the report"
+        table.caption_justify = "left"
+    return table
+
+
+def _place_table(discovery: Discovery) -> Table:
+    table = _table("where the plain matrix fails", ("residual over", "in words"), ("chance",))
+    strongest = {place.covariate: place for place in reversed(discovery.where)}  # the first of each
+    for place in [place for place in discovery.where if strongest[place.covariate] is place][:_PLACES]:
+        table.add_row(place.covariate, place.description, chance(place.p_value))
+    return table
+
+
+def _gap_table(discovery: Discovery) -> Table:
+    table = _table("the gap", ("data", "measure"), ("before", "after", "floor", "closed"))
+    for held in discovery.held_out:
+        where = f"{held_out_in_words(discovery, held)}, {plural(held.runs, 'run')}"
+        table.add_row(where, *_gap_cells(held.eq6))
+        table.add_row("", *_gap_cells(held.chi2))
+        before, after = (f"{1000 * value:.1f} mm" for value in held.position_m)
+        table.add_row("", "position", before, after, "", "")
+        before, after = (f"{math.degrees(value):.2f}°" for value in held.heading_rad)
+        table.add_row("", "heading", before, after, "", "")
+    if not discovery.held_out:
+        table.add_row("training runs", *_gap_cells(discovery.gap))
+    return table
+
+
+def _gap_cells(gap: Gap) -> tuple[str, ...]:
+    decimals = gap_decimals(gap)
+    measure = "Eq. (6)" if gap.metric == "eq6" else "whitened χ²"
+    values = (fixed(value, decimals) for value in (gap.before, gap.after, gap.floor))
+    return (measure, *values, closed_in_words(gap))
+
+
+def _hidden_table(discovery: Discovery) -> Table:
+    """The effects that could be largest for what is plausible of them."""
+    table = _table("what could still hide", ("effect", "parameter"), ("at most ±", "plausible ±"))
+    worst = worst_of_each(discovery.hidden)
+    for each in worst[:_HIDDEN]:
+        shown = reading(each.unit)
+        table.add_row(each.name, each.parameter, shown.words(each.limit, 2), shown.words(each.plausible, 2))
+    if len(worst) > _HIDDEN:
+        table.caption = f"the largest for their kind; {plural(len(worst) - _HIDDEN, 'more effect')} in the report"
+        table.caption_justify = "left"
+    return table
+
+
+def _remarks(discovery: Discovery) -> Iterator[str]:
+    yield ""
+    if discovery.left:
+        first = {place.covariate: place for place in reversed(discovery.left)}
+        left = listing([f"{p.covariate} ({chance(p.p_value)})" for p in discovery.left if first[p.covariate] is p])
+        yield f"Left over: the residuals still depend on {left}."
+    for effect in discovery.effects:
+        if effect.in_doubt:
+            yield f"In doubt: {effect.name}: {effect.in_doubt}."
+    if discovery.classes:
+        yield f"These data cannot tell apart: {'; '.join(' or '.join(names) for names in discovery.classes)}."
+    if discovery.absorbed:
+        absorbed = listing([each.name for each in discovery.absorbed], 12)
+        yield f"Absorbed by any matrix, and so never named: {absorbed}."
+    yield from _first(novelties_in_words(discovery.novelties), "warning: not driven in training: ", "such warning")
+    yield from _first(discovery.notes, "- ", "note")
+
+
+def _first(lines: Sequence[str], head: str, kind: str) -> Iterator[str]:
+    """As many lines as a screen has room for."""
+    yield from (f"{head}{line}" for line in lines[:_LINES])
+    if len(lines) > _LINES:
+        yield f"{plural(len(lines) - _LINES, f'more {kind}')} in the report"
+
+
+def _print_files(console: Console, discovery: Discovery, folder: Path) -> None:
+    console.print(f"extended calibration: {folder / 'model.yaml'}", soft_wrap=True)
+    for number, each in enumerate(discovery.experiments, 1):
+        file = folder / experiment_file(number)
+        console.print(f"to separate {listing(list(each.separates))}:\n{file}", soft_wrap=True)
+    console.print(f"report: {folder / 'report.html'}", soft_wrap=True)
+
+
+def _table(title: str | None, words: Sequence[str], numbers: Sequence[str]) -> Table:
+    """A table that folds in a narrow terminal and leaves nothing out."""
+    table = Table(
+        title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0)
+    )
+    for heading in words:
+        table.add_column(heading, overflow="fold")
+    for heading in numbers:
+        table.add_column(heading, justify="right", overflow="fold", no_wrap=heading != "95 % interval")
+    return table

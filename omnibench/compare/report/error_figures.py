@@ -1,0 +1,228 @@
+"""Final error by command, before and after: a flower where directions were commanded, boxes where not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import plotly.graph_objects as go
+
+from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_LOOK, DatasetView, Look
+from omnibench.compare.report.wording import position_unit
+from omnibench.compare.result import EntryStatistics, ScoredRun
+from omnibench.data.dataset import Split, Trajectory
+from omnibench.fit.evaluate import positions_and_headings
+from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem, Paragraph
+from omnibench.report.numbers import fixed
+from omnibench.report.style import INK, plot, text
+from omnibench.robot.kinematics import Array
+
+# Rates of turn from the most negative to the most positive: blue, grey, orange and steps between.
+_TURN_COLOURS = ("#0072b2", "#5b6772", "#d97706", "#aa3377", "#4fb0e8", "#7b4b2a", "#8f8f1f")
+_MANY_GROUPS = 12
+_Motion = tuple[float, float]  # speed, m/s, and rate of turn, rad/s
+
+
+def error_blocks(view: DatasetView) -> tuple[Block, ...]:
+    """Final errors before and after, by command."""
+    best = view.best
+    if best is None or best.typical is None:
+        return ()
+    after = view.errors(best.typical, view.scored)
+    if after is None:
+        return ()
+    trajectories = view.dataset.split(view.scored)
+    if _is_flower(trajectories):
+        return _flower_blocks(view, trajectories, after, best.label)
+    return (_boxes(view, best, best.typical),)
+
+
+@dataclass(frozen=True)
+class _Quantity:
+    """What is drawn: an error of each trajectory, in a unit."""
+
+    name: str
+    unit: str
+    before: Array
+    after: Array
+    decimals: int
+
+
+def _quantities(before: Array, after: Array) -> tuple[_Quantity, _Quantity]:
+    (p0, h0), (p1, h1) = positions_and_headings(before), positions_and_headings(after)
+    factor, unit, decimals = position_unit(float(p0.mean()), float(p1.mean()))
+    return (
+        _Quantity("position error", unit, factor * p0, factor * p1, decimals),
+        _Quantity("heading error", "°", np.degrees(h0), np.degrees(h1), 2),
+    )
+
+
+def _is_flower(trajectories: Sequence[Trajectory]) -> bool:
+    """Whether at least three directions were driven at each of a few speeds and rates of turn."""
+    if any(t.alpha is None or t.omega is None for t in trajectories):
+        return False
+    directions: dict[_Motion, set[int]] = {}
+    for trajectory in trajectories:
+        if _moves(trajectory):
+            directions.setdefault(_motion(trajectory), set()).add(round(math.degrees(trajectory.alpha or 0.0)) % 360)
+    return 0 < len(directions) <= len(_TURN_COLOURS) and all(len(found) >= 3 for found in directions.values())
+
+
+def _motion(trajectory: Trajectory) -> _Motion:
+    """Speed and rate of turn, without the digits that a measured command has."""
+    return round(trajectory.v or 0.0, 2), round(trajectory.omega or 0.0, 2)
+
+
+def _moves(trajectory: Trajectory) -> bool:
+    return trajectory.v is None or trajectory.v > 0
+
+
+def _flower_blocks(
+    view: DatasetView, trajectories: Sequence[Trajectory], after: Array, label: str
+) -> tuple[Block, ...]:
+    turn_rates = sorted({_motion(t) for t in trajectories if _moves(t)})
+    several_speeds = len({speed for speed, _ in turn_rates}) > 1
+    legend = []
+    for index, (speed, omega) in enumerate(turn_rates):
+        name = f"ω = {fixed(omega, 2)} rad/s" + (f", v = {fixed(speed, 2)} m/s" if several_speeds else "")
+        legend.append(LegendItem(f"turn-{index}", name, _TURN_COLOURS[index % len(_TURN_COLOURS)]))
+    figures = []
+    for quantity in _quantities(view.design_errors[view.scored], after):
+        means = [_petals(trajectories, key, quantity) for key in turn_rates]
+        largest = max(float(max(before.max(), values.max())) for _, before, values in means)
+        reached = max(float(values.max()) for _, _, values in means)
+        for title, column, limit in (
+            ("theoretical", 1, largest),
+            (f"{label}, same scale", 2, largest),
+            (f"{label}, enlarged", 2, reached),
+        ):
+            curves = [(petals[0], petals[column]) for petals in means]
+            figures.append(
+                Figure(
+                    f"Mean final {quantity.name} ({quantity.unit}), {title}",
+                    _polar(curves, legend, quantity, 1.08 * limit),
+                    f"Mean final {quantity.name} in {quantity.unit} by direction of motion and rate of turn, {title}",
+                    300,
+                )
+            )
+    caption = (
+        f"Mean over the repetitions of each command, {SPLIT_NAMES[view.scored]} data. The angle is the commanded "
+        "direction α in the robot's frame, forward up and left to the left; the radius is the error."
+    )
+    grid = FigureGrid(tuple(figures), tuple(legend), 3, caption)
+    return (grid, *_turns_on_the_spot(view, trajectories, after))
+
+
+def _petals(trajectories: Sequence[Trajectory], key: _Motion, quantity: _Quantity) -> tuple[Array, Array, Array]:
+    """Directions (deg) and mean errors before and after of one speed and rate of turn, the first direction repeated."""
+    of_key = [i for i, t in enumerate(trajectories) if _moves(t) and _motion(t) == key]
+    direction = np.array([round(math.degrees(trajectories[i].alpha or 0.0), 3) % 360 for i in of_key])
+    angles = np.unique(direction)
+    chosen = [np.array(of_key)[direction == angle] for angle in angles]
+    before = np.array([quantity.before[rows].mean() for rows in chosen])
+    after = np.array([quantity.after[rows].mean() for rows in chosen])
+    closed = np.append(angles, angles[0])
+    return closed, np.append(before, before[0]), np.append(after, after[0])
+
+
+def _polar(
+    curves: Sequence[tuple[Array, Array]], legend: Sequence[LegendItem], quantity: _Quantity, limit: float
+) -> go.Figure:
+    hover = f"%{{r:.{quantity.decimals}f}} {quantity.unit}"
+    traces = [
+        go.Scatterpolar(
+            theta=angles.tolist(),
+            r=np.round(values, 4).tolist(),
+            mode="lines+markers",
+            line={"color": item.colour, "width": 2},
+            marker={"size": 5},
+            legendgroup=item.key,
+            hovertemplate=f"{text(item.label)}, α %{{theta:.0f}}°<br>{hover}<extra></extra>",
+        )
+        for (angles, values), item in zip(curves, legend, strict=True)
+    ]
+    figure = plot(
+        *traces,
+        polar={
+            "angularaxis": {"rotation": 90, "direction": "counterclockwise", "dtick": 30, "ticksuffix": "°"},
+            "radialaxis": {"range": [0, limit], "nticks": 5, "angle": 75, "tickangle": 75, "showline": False},
+        },
+    )
+    figure.update_layout(margin={"l": 38, "r": 38, "t": 26, "b": 26})
+    return figure
+
+
+def _turns_on_the_spot(view: DatasetView, trajectories: Sequence[Trajectory], after: Array) -> tuple[Block, ...]:
+    still = np.array([not _moves(t) for t in trajectories])
+    if not still.any():
+        return ()
+    parts = [
+        f"mean {quantity.name} {fixed(quantity.before[still].mean(), quantity.decimals)} → "
+        f"{fixed(quantity.after[still].mean(), quantity.decimals)} {quantity.unit}"
+        for quantity in _quantities(view.design_errors[view.scored], after)
+    ]
+    return (Paragraph(f"Turns on the spot have no direction and are not drawn: {', '.join(parts)}.", "note"),)
+
+
+def _boxes(view: DatasetView, best: EntryStatistics, typical: ScoredRun) -> FigureGrid:
+    """Boxes over the trajectories of each command or session, both splits."""
+    groups: list[str] = []
+    before, after = [], []
+    for split in view.design_errors:
+        errors = view.errors(typical, split)
+        if errors is not None:
+            groups += _groups(view, split)
+            before.append(view.design_errors[split])
+            after.append(errors)
+    quantities = _quantities(np.concatenate(before), np.concatenate(after))
+    look = view.looks[best.label]
+    figures = tuple(
+        Figure(
+            f"Final {quantity.name} ({quantity.unit})",
+            _box_figure(groups, quantity, look),
+            f"Final {quantity.name} in {quantity.unit} of each group of trajectories, theoretical and {best.label}",
+            80 + 44 * len(set(groups)),
+        )
+        for quantity in quantities
+    )
+    items = (THEORETICAL_LOOK.legend,) if look is THEORETICAL_LOOK else (THEORETICAL_LOOK.legend, look.legend)
+    return FigureGrid(
+        figures,
+        items,
+        1,
+        "Every point is a trajectory; the box holds the middle half, its line is the median.",
+    )
+
+
+def _groups(view: DatasetView, split: Split) -> list[str]:
+    trajectories = view.dataset.split(split)
+    for names in ([t.command for t in trajectories], [t.session for t in trajectories]):
+        if None not in names and len(set(names)) <= _MANY_GROUPS:
+            return [f"{SPLIT_NAMES[split]}: {name}" for name in names]
+    return [SPLIT_NAMES[split]] * len(trajectories)
+
+
+def _box_figure(groups: Sequence[str], quantity: _Quantity, look: Look) -> go.Figure:
+    series = [(THEORETICAL_LOOK, quantity.before)] + ([] if look is THEORETICAL_LOOK else [(look, quantity.after)])
+    traces = [
+        go.Box(
+            y=[text(group) for group in groups],
+            x=np.round(values, 4).tolist(),
+            orientation="h",
+            boxpoints="all",
+            jitter=0.5,
+            pointpos=0,
+            line={"color": drawn.colour, "width": 1.5},
+            marker={"color": drawn.colour, "size": 4, "opacity": 0.6},
+            fillcolor="rgba(255,255,255,0)",
+            legendgroup=drawn.key,
+            hovertemplate=f"{text(drawn.label)}: %{{x:.{quantity.decimals}f}} {quantity.unit}<extra></extra>",
+        )
+        for drawn, values in series
+    ]
+    figure = plot(*traces, boxmode="group", xaxis_title_text=f"final {quantity.name} ({quantity.unit})")
+    figure.update_xaxes(rangemode="tozero")
+    figure.update_yaxes(tickfont_color=INK, autorange="reversed", ticks="")  # first group on top
+    return figure

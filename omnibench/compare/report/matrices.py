@@ -1,0 +1,170 @@
+"""The report's matrices: elements, their differences by Eq. (10)-(11), physical parameters."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+
+from omnibench.compare.report.tables import entry_cell, on_bounds
+from omnibench.compare.report.view import DatasetView
+from omnibench.compare.result import RunRecord
+from omnibench.fit.parameterisation import FittedParameter
+from omnibench.fit.span import driven_span
+from omnibench.report.blocks import Block, Cell, Code, Column, Paragraph, Row, Table
+from omnibench.report.numbers import NOTHING, fixed, significant
+from omnibench.robot.kinematics import Array
+
+# An element this much smaller than the largest of its row is a zero, up to rounding: Eq. (7) gives m12 as 1e-17.
+_ZERO_SHARE = 1e-9
+
+
+def matrix_blocks(view: DatasetView) -> tuple[Block, ...]:
+    """Everything that the report says of the matrices."""
+    if not view.calibrated:
+        return (Paragraph("No run gave a matrix.", "note"),)
+    blocks: list[Block] = [_element_table(view), _difference_table(view, None)]
+    if view.reference_entry is not None and len(view.calibrated) > 1:
+        blocks.append(_difference_table(view, view.reference_entry[0].label))
+    parameters = parameter_table(view)
+    if parameters is not None:
+        blocks.append(parameters)
+    blocks.append(
+        Code(matrices_as_text(view), "Matrices with all digits (YAML): rows x and y in m/rad, heading in rad/rad")
+    )
+    return tuple(blocks)
+
+
+def differences(matrix: Array, reference: Array) -> Array:
+    """D of Eq. (10), (11): reference * (1 + D) = matrix, element by element (3, N); NaN where the reference is 0."""
+    zero = np.abs(reference) <= _ZERO_SHARE * np.abs(reference).max(axis=1, keepdims=True)
+    quotient: Array = matrix / np.where(zero, np.nan, reference) - 1
+    return quotient
+
+
+def matrices_as_text(view: DatasetView) -> str:
+    """Every matrix with the digits that bring back the same numbers, as YAML reads them."""
+    named = [("theoretical", view.design_matrix)]
+    named += [(entry.label, run.matrix) for entry, run in view.calibrated if run.matrix is not None]
+    parts = []
+    for label, matrix in named:
+        rows = ",\n  ".join(f"[{', '.join(repr(float(value)) for value in row)}]" for row in matrix)
+        parts.append(f"{json.dumps(label)}: [\n  {rows}]")
+    return "\n".join(parts)
+
+
+def parameter_table(view: DatasetView) -> Table | None:
+    """Physical parameters and their deviation from the design values, as in section 4.2; None without any."""
+    fitted = [(entry, run.record) for entry, run in view.calibrated if run.record.parameters]
+    if not fitted:
+        return None
+    names = list(dict.fromkeys(p.name for _, record in fitted for p in record.parameters or ()))
+    rows = []
+    for name in names:
+        kind, _, wheel = name.partition("_")
+        cells = [Cell(f"{kind}, wheel {wheel}" if wheel else name)]
+        found = [next((p for p in record.parameters or () if p.name == name), None) for _, record in fitted]
+        known = next(parameter for parameter in found if parameter is not None)
+        cells.append(Cell(_shown(known.design, known.unit)))
+        for parameter, (_, record) in zip(found, fitted, strict=True):
+            cells.append(_parameter_cell(parameter, _marks(record).get(name, "")))
+        rows.append(Row(tuple(cells)))
+    columns = (Column("Parameter", numeric=False), Column("design"), *(Column(entry.label) for entry, _ in fitted))
+    return Table(
+        "Physical parameters and their deviation from the design values",
+        columns,
+        tuple(rows),
+        "As section 4.2 of the paper. Each matrix has one such geometry, but it takes up whatever else is wrong "
+        "with the model, so a parameter by itself is not a measurement of the robot. † on a bound of its limits."
+        + (" ‡ held by limits without width." if any(record.held for _, record in fitted) else ""),
+    )
+
+
+def _element_table(view: DatasetView) -> Table:
+    rows = [Row((entry_cell(view, None), *(Cell(fixed(float(v), 6)) for v in view.design_matrix.ravel())))]
+    for entry, run in view.calibrated:
+        if run.matrix is None:
+            continue
+        marks = _marks(run.record) if entry.parameterisation == "matrix" else {}
+        cells = [
+            Cell(fixed(float(value), 6) + marks.get(name, ""))
+            for name, value in zip(_element_names(view), run.matrix.ravel(), strict=True)
+        ]
+        rows.append(Row((entry_cell(view, entry), *cells), "best" if entry.is_best else "plain"))
+    held = any(run.record.held for entry, run in view.calibrated if entry.parameterisation == "matrix")
+    return Table(
+        "Inverse kinematic matrices M⁻¹",
+        (Column("M⁻¹", numeric=False), *_element_columns(view, with_units=True)),
+        tuple(rows),
+        f"Columns of each row in the order of the wheels: {', '.join(view.dataset.robot.wheel_names)}. "
+        f"† on a bound of its box.{' ‡ held by the box, which has no width there.' if held else ''}",
+    )
+
+
+def _difference_table(view: DatasetView, against: str | None) -> Table:
+    """Differences from the design values, or from the entry called ``against``."""
+    matrices = {entry.label: run.matrix for entry, run in view.calibrated if run.matrix is not None}
+    reference = view.design_matrix if against is None else matrices[against]
+    project = _span_projector(view)
+    rows = []
+    for entry, run in view.calibrated:
+        if run.matrix is None or entry.label == against:
+            continue
+        matrix = run.matrix if project is None else reference + (run.matrix - reference) @ project
+        share = differences(matrix, reference).ravel()
+        moved = (matrix - reference).ravel()
+        cells = tuple(_difference_cell(float(s), float(d)) for s, d in zip(share, moved, strict=True))
+        rows.append(Row((entry_cell(view, entry), *cells)))
+    name = "the design values" if against is None else against
+    note = "Eq. (10) and (11) of the paper, element by element. Where the reference is 0 the change itself is given."
+    if project is not None:
+        note += " Compared on the span of wheel rates that the data drive; across it the matrix is not determined."
+    return Table(
+        f"Differences from {name}",
+        (Column("M⁻¹", numeric=False), *_element_columns(view, with_units=False)),
+        tuple(rows),
+        note,
+    )
+
+
+def _difference_cell(share: float, moved: float) -> Cell:
+    if math.isnan(share):
+        return Cell("0" if abs(moved) < 1e-15 else significant(moved, 2, signed=True), "reference is 0")
+    return Cell(f"{fixed(100 * share, 3, signed=True)} %")
+
+
+def _span_projector(view: DatasetView) -> Array | None:
+    wheels = len(view.dataset.robot.wheels)
+    training = view.dataset.split("train")
+    if wheels == 3 or not training:
+        return None
+    driven = driven_span(training).driven
+    projector: Array = driven.T @ driven
+    return projector
+
+
+def _element_names(view: DatasetView) -> list[str]:
+    return [f"m{row}{column}" for row in (1, 2, 3) for column in range(1, len(view.dataset.robot.wheels) + 1)]
+
+
+def _element_columns(view: DatasetView, with_units: bool) -> tuple[Column, ...]:
+    units = {"1": "m/rad", "2": "m/rad", "3": "rad/rad"} if with_units else dict.fromkeys("123", "")
+    return tuple(Column(name, units[name[1]]) for name in _element_names(view))
+
+
+def _shown(value: float, unit: str) -> str:
+    """A parameter's value with its unit as a person reads it: angles in degrees."""
+    return f"{fixed(math.degrees(value), 3)}°" if unit == "rad" else f"{fixed(value, 5)} {unit}"
+
+
+def _marks(record: RunRecord) -> dict[str, str]:
+    return {**dict.fromkeys(on_bounds(record), "†"), **dict.fromkeys(record.held, "‡")}
+
+
+def _parameter_cell(parameter: FittedParameter | None, mark: str) -> Cell:
+    if parameter is None:
+        return Cell(NOTHING)
+    percent = parameter.deviation_percent
+    deviation = "design is 0" if percent is None else f"{fixed(percent, 2, signed=True)} %"
+    return Cell(_shown(parameter.value, parameter.unit) + (mark and f" {mark}"), deviation)

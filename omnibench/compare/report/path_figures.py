@@ -1,0 +1,199 @@
+"""Fig. 5 to 7 of the paper: reference, theoretical and calibrated paths, and the detail of their ends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import plotly.graph_objects as go
+
+from omnibench.compare.report.view import REFERENCE_LOOK, SPLIT_NAMES, THEORETICAL_LOOK, DatasetView, Look
+from omnibench.data.dataset import Trajectory
+from omnibench.report.blocks import Figure, FigureGrid
+from omnibench.report.recording.runs import describe
+from omnibench.report.style import INK, equal_aspect, plot, text
+from omnibench.robot.kinematics import Array
+
+_SHOWN = 4
+_POINTS = 160  # of a drawn path
+_TAIL = 0.15  # share of a run that the detail of its end is drawn from
+_PAPER_DIRECTIONS = (30, 210, 120, 300)  # deg, of Fig. 6 (a) to (d)
+_PAPER_TURN_RATE = 0.35  # rad/s
+
+
+def path_grid(view: DatasetView) -> FigureGrid:
+    """A few trajectories of the scored split: whole paths, each beside the detail of its end."""
+    figures: list[Figure] = []
+    for trajectory in chosen_trajectories(view.dataset.split(view.scored)):
+        title = describe(trajectory)
+        figures.append(
+            Figure(
+                title,
+                _path(view, trajectory),
+                f"Paths of {title}: reference, theoretical and calibrated odometry, x and y in metres",
+                400,
+            )
+        )
+        figures.append(
+            Figure(
+                f"Its end: {_ends_in_words(view, trajectory)}",
+                _end(view, trajectory),
+                f"Final poses of {title} about the reference's final position, in millimetres",
+                400,
+            )
+        )
+    looks = [REFERENCE_LOOK, THEORETICAL_LOOK, *(view.looks[entry.label] for entry, _ in view.calibrated)]
+    return FigureGrid(
+        tuple(figures),
+        tuple(look.legend for look in looks),
+        2,
+        f"As Fig. 5 to 7 of the paper, on {SPLIT_NAMES[view.scored]} trajectories. Right: final poses about the "
+        "reference's final position, the short strokes show the headings. The window holds the nearer ends; "
+        "Autoscale, at the top right of a plot, shows all.",
+    )
+
+
+def chosen_trajectories(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+    """Up to four trajectories worth a look: the paper's commands where they were driven, else a spread."""
+    first_of = {t.command or t.session or t.id: t for t in reversed(trajectories)}
+    distinct = [t for t in trajectories if first_of[t.command or t.session or t.id] is t]
+    commanded = [t for t in distinct if t.alpha is not None and t.omega is not None and (t.v is None or t.v > 0)]
+    paper = [found for degrees in _PAPER_DIRECTIONS if (found := _with_command(commanded, degrees)) is not None]
+    if len(paper) == _SHOWN:
+        return paper
+    # Turns show an error of the model best.
+    if commanded:
+        strongest = max(abs(t.omega or 0.0) for t in commanded)
+        distinct = [t for t in commanded if math.isclose(abs(t.omega or 0.0), strongest)]
+        distinct.sort(key=lambda t: ((t.omega or 0.0) < 0, t.alpha or 0.0))
+    pool = distinct if len(distinct) >= _SHOWN else list(trajectories)
+    picks = np.unique(np.linspace(0, len(pool) - 1, min(_SHOWN, len(pool))).round().astype(int))
+    return [pool[index] for index in picks]
+
+
+def _with_command(trajectories: Sequence[Trajectory], degrees: float) -> Trajectory | None:
+    for trajectory in trajectories:
+        direction = math.degrees(trajectory.alpha or 0.0) % 360
+        if abs(direction - degrees) < 0.5 and math.isclose(trajectory.omega or 0.0, _PAPER_TURN_RATE, abs_tol=1e-3):
+            return trajectory
+    return None
+
+
+def _models(view: DatasetView) -> list[tuple[Look, Array]]:
+    drawn = [(THEORETICAL_LOOK, view.design_matrix)]
+    calibrated = sorted(view.calibrated, key=lambda pair: pair[0].is_best)  # the best on top
+    drawn += [(view.looks[entry.label], run.matrix) for entry, run in calibrated if run.matrix is not None]
+    return drawn
+
+
+def _path(view: DatasetView, trajectory: Trajectory) -> go.Figure:
+    reference = _thinned(trajectory.poses, 2 * _POINTS)
+    stamps = np.linspace(0.0, trajectory.pose_times[-1], _POINTS)
+    traces = [_line(REFERENCE_LOOK, reference, 3.5), _ends(REFERENCE_LOOK, reference[-1:], 9)]
+    for look, matrix in _models(view):
+        (poses,) = view.model(matrix).poses([trajectory.log(stamps)])
+        traces += [_line(look, poses, 1.8), _ends(look, poses[-1:], 7)]
+    start = trajectory.start
+    traces.append(
+        go.Scatter(
+            x=[start[0]],
+            y=[start[1]],
+            mode="markers",
+            marker={"symbol": "circle-open", "size": 9, "color": INK, "line": {"width": 2}},
+            hovertemplate="start<extra></extra>",
+        )
+    )
+    figure = plot(*traces, xaxis_title_text="x (m)", yaxis_title_text="y (m)")
+    equal_aspect(figure)
+    return figure
+
+
+def _end(view: DatasetView, trajectory: Trajectory) -> go.Figure:
+    final = trajectory.final_pose
+    duration = trajectory.pose_times[-1]
+    stamps = np.linspace((1 - _TAIL) * duration, duration, 60)
+    tails = [(look, view.model(matrix).poses([trajectory.log(stamps)])[0]) for look, matrix in _models(view)]
+    calibrated = tails[1:] or tails  # the design values come first, and are far away
+    half = _window([_distance_mm(poses[-1], final) for _, poses in calibrated])
+    late = trajectory.poses[trajectory.pose_times >= min(stamps[0], trajectory.pose_times[-2])]
+    traces = _tail_traces(REFERENCE_LOOK, late, final, half, width=2.6)
+    for look, poses in tails:
+        traces += _tail_traces(look, poses, final, half, width=1.6)
+    figure = plot(*traces, xaxis_title_text="x − x of reference (mm)", yaxis_title_text="y − y of reference (mm)")
+    figure.update_xaxes(range=[-half, half])
+    figure.update_yaxes(range=[-half, half])
+    equal_aspect(figure)
+    return figure
+
+
+def _tail_traces(look: Look, poses: Array, final: Array, half: float, width: float) -> list[go.Scatter]:
+    millimetres = 1e3 * (poses[:, :2] - final[:2])
+    end = millimetres[-1]
+    stroke = end + 0.28 * half * np.array([[0.0, 0.0], [math.cos(poses[-1, 2]), math.sin(poses[-1, 2])]])
+    words = f"{text(look.label)}: {math.hypot(*end):.1f} mm, {math.degrees(poses[-1, 2] - final[2]):.2f}°"
+    shared = {"legendgroup": look.key, "hovertemplate": f"{words}<extra></extra>"}
+    colour = {"color": look.colour}
+    return [
+        go.Scatter(x=_short(millimetres[:, 0]), y=_short(millimetres[:, 1]), mode="lines", opacity=0.55,
+                   line={**colour, "width": width, "dash": look.dash}, **shared),
+        go.Scatter(x=_short(stroke[:, 0]), y=_short(stroke[:, 1]), mode="lines",
+                   line={**colour, "width": 2.2}, **shared),
+        go.Scatter(x=_short(end[:1]), y=_short(end[1:]), mode="markers",
+                   marker={**colour, "symbol": look.symbol, "size": 11, "line": {"width": 2}}, **shared),
+    ]  # fmt: skip
+
+
+def _ends_in_words(view: DatasetView, trajectory: Trajectory) -> str:
+    """How far the theoretical end and the best one are from the reference's."""
+    (design,) = view.model(view.design_matrix).poses([trajectory.final_log])
+    parts = [f"theoretical {_distance_mm(design[-1], trajectory.final_pose):.0f} mm off"]
+    best = view.best
+    if best is not None and best.typical is not None and best.typical.matrix is not None:
+        (pose,) = view.model(best.typical.matrix).poses([trajectory.final_log])
+        parts.append(f"{best.label} {_distance_mm(pose[-1], trajectory.final_pose):.0f} mm")
+    return ", ".join(parts)
+
+
+def _window(distances: Sequence[float]) -> float:
+    """Half the width (mm) of a detail that holds the reference's end and the nearer half of the others at least."""
+    near = [distance for distance in distances if distance <= 2.5 * float(np.median(distances))]
+    return max(5.0, 1.45 * max(near))
+
+
+def _distance_mm(pose: Array, reference: Array) -> float:
+    return 1e3 * float(math.hypot(pose[0] - reference[0], pose[1] - reference[1]))
+
+
+def _line(look: Look, poses: Array, width: float) -> go.Scatter:
+    return go.Scatter(
+        x=_short(poses[:, 0]),
+        y=_short(poses[:, 1]),
+        mode="lines",
+        line={"color": look.colour, "width": width, "dash": look.dash},
+        legendgroup=look.key,
+        hovertemplate=f"{text(look.label)}<br>x %{{x:.3f}} m, y %{{y:.3f}} m<extra></extra>",
+    )
+
+
+def _ends(look: Look, poses: Array, size: int) -> go.Scatter:
+    return go.Scatter(
+        x=_short(poses[:, 0]),
+        y=_short(poses[:, 1]),
+        mode="markers",
+        marker={"color": look.colour, "size": size, "symbol": look.symbol, "line": {"width": 2}},
+        legendgroup=look.key,
+        hoverinfo="skip",
+    )
+
+
+def _thinned(poses: Array, limit: int) -> Array:
+    picks = np.unique(np.linspace(0, len(poses) - 1, min(limit, len(poses))).round().astype(int))
+    thinned: Array = poses[picks]
+    return thinned
+
+
+def _short(values: Array) -> list[float]:
+    """Coordinates with the digits that a screen can show."""
+    rounded: list[float] = np.round(values, 5).tolist()
+    return rounded

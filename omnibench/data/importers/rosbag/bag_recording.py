@@ -1,0 +1,212 @@
+"""One bag as a recording of wheels, poses and commands, and its runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from omnibench.data.alignment import align
+from omnibench.data.dataset import Trajectory
+from omnibench.data.importers.rosbag.bag import Bag, Topic, open_bag
+from omnibench.data.importers.rosbag.cutting import Cut, Piece, between_rests, find_rests, from_cuts, windows
+from omnibench.data.importers.rosbag.message_streams import (
+    PoseStream,
+    Stamps,
+    WheelStream,
+    header_stamp,
+    read_poses,
+    read_wheels,
+)
+from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
+from omnibench.data.importers.rosbag.scan_stream import RunScans, ScanStream, read_scans
+from omnibench.data.importers.rosbag.topic_choice import pose_topic, scan_topic, wheel_topic
+from omnibench.data.importers.rosbag.wheel_samples import FASTEST, Losses, WheelSamples, seconds, wheel_samples
+from omnibench.errors import DataError, one_line
+from omnibench.robot.kinematics import Array
+
+_SAME_TIME = 1e-9  # s, that of the stamps
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What a bag holds, in s since the first wheel message. place: bag and wheel topic, for messages.
+
+    referenced: it holds reference poses; without, the poses are zeros at the stamps of the scans.
+    """
+
+    name: str
+    place: str
+    samples: WheelSamples
+    pose_times: Array
+    poses: Array
+    covariances: Array | None
+    cuts: tuple[Cut, ...]
+    scans: ScanStream | None
+    referenced: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run and its scans, where there are any."""
+
+    trajectory: Trajectory
+    scans: RunScans | None
+
+
+def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list[str]) -> Recording:
+    """Read one bag; ``warnings`` is told what had to be left out. DataError, ConfigError."""
+    with open_bag(path) as bag:
+        topic = wheel_topic(bag, options.wheel_topic)
+        scan = scan_topic(bag, options.scan_topic, topic) if options.scans else None
+        reference = pose_topic(bag, options.pose_topic, topic, scan)
+        commands = bag.topic(options.cut_topic, "cut_topic") if options.cut_topic else None
+        wheels = read_wheels(bag, topic, options.robot, options.joints, options.use, warnings)
+        poses = read_poses(bag, reference, warnings) if reference else None
+        cuts = _read_cuts(bag, commands, wheels) if commands else []
+        scans = read_scans(bag, scan, options.scanner_mount, warnings) if scan else None
+    if reference and poses:
+        _check_clocks(path, topic, wheels, "poses", reference, poses.stamps)
+    if scan and scans:
+        _check_clocks(path, topic, wheels, "scans", scan, scans.stamps)
+    if poses is None:
+        assert scans is not None  # else a topic of poses is asked for
+        poses = PoseStream(scans.stamps, np.zeros((len(scans.stamps), 3)), None)
+    place = f"{path}: topic {topic.name}"
+    signs = np.array(options.joint_signs or [1] * len(options.robot.wheels), dtype=float)
+    samples, losses = wheel_samples(wheels, signs, options.wheel_wrap, options.still, place)
+    warnings.extend(f"{place}: {told}; runs end there" for told in _told(losses, options))
+    pose_times = seconds(poses.stamps, samples.origin)
+    return Recording(
+        name, place, samples, pose_times, poses.poses, poses.covariances, tuple(cuts), scans, reference is not None
+    )
+
+
+def cut_into_runs(recording: Recording, options: RosbagOptions, *, alone: bool = True) -> tuple[list[Run], list[str]]:
+    """The runs of a recording, named by their number, all of them training; and warnings of what is left out.
+
+    alone: it is the only one, so that a recording without any rest deserves a warning, too.
+    """
+    runs: list[Run] = []
+    pieces = short = bare = uncut = 0
+    for number, part in enumerate(recording.samples.stretches(), 1):
+        session = recording.name if number == 1 or recording.samples.angles is None else f"{recording.name}#{number}"
+        for piece in _pieces(recording, part, options):
+            pieces += 1
+            uncut += (piece.begin, piece.end) == (recording.samples.begins[part][0], recording.samples.ends[part][-1])
+            if piece.moving < options.least_run:
+                short += 1
+                continue
+            run = _run(recording, part, piece, f"{len(runs) + 1:03d}", session)
+            if run is None:
+                bare += 1
+            else:
+                runs.append(run)
+    reasons = []
+    if short:
+        reasons.append(f"{short} are shorter than {options.least_run:g} s (least_run)")
+    if bare:
+        reasons.append(f"{bare} hold fewer than two {'reference poses' if recording.referenced else 'scans'}")
+    if reasons:
+        return runs, [f"{recording.place}: of {pieces} drives {' and '.join(reasons)}, and are left out"]
+    if not runs:
+        return runs, [f"{recording.place}: {_nothing(options)}"]
+    if alone and options.cut == "rests" and uncut == len(runs):
+        told = f"no rest of {options.least_rest:g} s cuts it; set cut=topic or cut=windows for more runs"
+        return runs, [f"{recording.place}: {told}"]
+    return runs, []
+
+
+def _nothing(options: RosbagOptions) -> str:
+    if options.cut == "rests":
+        return f"the wheels rest all the time (less than {options.rest_rate:g} rad/s, rest_rate)"
+    return f"no message of {options.cut_topic} while the wheels were recorded"
+
+
+def _pieces(recording: Recording, part: slice, options: RosbagOptions) -> list[Piece]:
+    times, angles = recording.samples.edges(part)
+    span = (float(times[0]), float(times[-1]))
+    if options.cut == "rests":
+        rests = find_rests(times, angles, options.least_rest, options.still)
+        return between_rests(span, rests, recording.pose_times)
+    if options.cut == "topic":
+        return from_cuts(times, angles, recording.cuts, recording.pose_times, options.still)
+    return windows(span, options.window or span[1] - span[0])
+
+
+def _run(recording: Recording, part: slice, piece: Piece, number: str, session: str) -> Run | None:
+    samples, times = recording.samples, recording.pose_times
+    within = (samples.begins[part] < piece.end - _SAME_TIME) & (samples.ends[part] > piece.begin + _SAME_TIME)
+    chosen = part.start + np.flatnonzero(within)
+    # From reference pose to reference pose: one interpolated within a drive would be wrong by the path's bend.
+    seen = (times >= piece.begin - _SAME_TIME) & (times <= piece.end + _SAME_TIME)
+    if seen.sum() < 2:
+        return None
+    aligned = align(float(samples.begins[chosen[0]]), samples.ends[chosen], times[seen], recording.poses[seen])
+    if aligned is None:
+        return None
+    kept = chosen[aligned.kept]
+    ends = samples.ends[kept] - aligned.zero
+    shown = np.searchsorted(times, aligned.pose_times + (aligned.zero - _SAME_TIME / 2))
+    scans = recording.scans
+    trajectory = Trajectory(
+        id=number if piece.command is None else f"{number}-{piece.command}",
+        split="train",
+        times=ends,
+        rates=samples.rates[kept],
+        pose_times=aligned.pose_times,
+        poses=aligned.poses,
+        command=piece.command,
+        session=session,
+        started_at=aligned.zero - float(samples.begins[0 if samples.angles is None else part.start]),
+        duration=float(ends[-1]),
+        angles=None if samples.angles is None else samples.angles[kept],
+        pose_covariances=None if recording.covariances is None else recording.covariances[shown],
+    )
+    seen_by = None if scans is None else scans.between(aligned.zero, aligned.zero + float(ends[-1]), samples.origin)
+    return Run(trajectory, seen_by)
+
+
+def _read_cuts(bag: Bag, topic: Topic, wheels: WheelStream) -> list[Cut]:
+    """When each message of a topic was sent, and the text of a String.
+
+    Messages without a header have only the recorder's clock; the wheels, which have both, tell what it is by theirs.
+    """
+    order = np.argsort(wheels.logged, kind="stable")
+    logged, stamps = wheels.logged[order], np.maximum.accumulate(wheels.stamps[order])
+    first, origin = int(logged[0]), int(wheels.stamps[0])
+    cuts = []
+    for record in bag.records(topic):
+        stamp = header_stamp(record.message)
+        if stamp > 0:
+            time = (stamp - origin) / 1e9
+        else:
+            time = float(np.interp(record.logged - first, logged - first, (stamps - origin) / 1e9))
+        text = record.message.data if topic.type == "std_msgs/msg/String" and record.message else ""
+        cuts.append(Cut(time, one_line(str(text)) or None))
+    return sorted(cuts, key=lambda cut: cut.time)
+
+
+def _check_clocks(path: Path, topic: Topic, wheels: WheelStream, what: str, other: Topic, stamps: Stamps) -> None:
+    inside = (stamps >= wheels.stamps[0]) & (stamps <= wheels.stamps[-1])
+    if inside.sum() >= 2:
+        return
+    spans = (f"{each[0] / 1e9:.3f} to {each[-1] / 1e9:.3f} s" for each in (stamps, wheels.stamps))
+    shown = " and ".join(f"{each.name} {span}" for each, span in zip((other, topic), spans, strict=True))
+    raise DataError(
+        f"{path}: no two {what} while the wheels were recorded, by the stamps of their headers ({shown}); both must be "
+        "stamped by one clock"
+    )
+
+
+def _told(losses: Losses, options: RosbagOptions) -> list[str]:
+    told = []
+    if losses.gaps:
+        told.append(
+            f"wheel samples are missing {losses.gaps} times while the wheels turned, up to {losses.longest:.3g} s"
+        )
+    if losses.restarts:
+        hint = "" if options.wheel_wrap else " (if that is a counter that wraps, set wheel_wrap)"
+        told.append(f"the positions begin anew {losses.restarts} times, by more than {FASTEST:g} rad/s{hint}")
+    return told

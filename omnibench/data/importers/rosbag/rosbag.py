@@ -1,0 +1,126 @@
+"""Importer of ROS recordings: MCAP files, rosbag2 folders and ROS 1 bags."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from omnibench.data.alignment import median_period
+from omnibench.data.dataset import Dataset, Split, Trajectory, make_dataset
+from omnibench.data.importer import Importer
+from omnibench.data.importers.rosbag.bag import find_bags
+from omnibench.data.importers.rosbag.bag_recording import cut_into_runs, read_recording
+from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
+from omnibench.data.importers.rosbag.scan_stream import RunScans, gather_scans
+from omnibench.data.splits import every_second, repetitions, split_by_name
+from omnibench.errors import DataError
+from omnibench.registry import importers
+from omnibench.robot.model import OdometryModel
+
+
+@importers.register("rosbag")
+class Rosbag(Importer):
+    """ROS recordings: MCAP, rosbag2 (sqlite3 and mcap) and ROS 1, with wheels and reference poses or laser scans.
+
+    The source is a bag, or a folder of bags; ``robot`` (a YAML file or a mapping) is the only option that must be
+    given. Wheels are a sensor_msgs/JointState, poses a geometry_msgs/PoseWithCovarianceStamped or PoseStamped or a
+    nav_msgs/Odometry. A bag with several of them lists them, and ``wheel_topic`` and ``pose_topic`` choose. Joints are
+    those called like the wheels (``a``, ``wheel_a``, ``a_wheel_joint``), or ``joints`` names them in the robot's order;
+    ``joint_signs: [-1, 1, 1]`` turns a wheel round: a positive rate drives the robot counter-clockwise.
+
+    scans: of a sensor_msgs/LaserScan (``scan_topic``; ``scans: false`` leaves them out) go into the data set, where the
+    scanner is mounted is told by /tf_static or ``scanner_mount: {x, y, yaw}`` (m, rad). A bag with scans and without
+    reference poses (odometry is none) gets them from its scans by SLAM, as ``slam`` says; each run then begins at
+    (0, 0, 0).
+
+    times: the stamps of the headers, of all topics by one clock; when a message was recorded does not matter.
+    Messages recorded late are sorted; those without a stamp, with a stamp that was there or with values that are not
+    finite are left out. Warnings say how many. Positions (rad) are preferred: their differences are exact however many
+    samples were lost. Velocities count as the mean since the message before.
+
+    cut: at ``rests`` (each run keeps a little of the rest at both ends, and begins and ends at a reference pose there);
+    by a ``topic`` (a message of ``cut_topic`` begins a run, and a String says which command is driven); in ``windows``
+    of ``window`` s; or ``none``. Where samples are missing while the wheels turn, or the positions begin anew, a run
+    ends in any case, and another session begins. Poses are as recorded; t = 0 is a run's first pose.
+
+    Splits: ``train`` and ``validation`` are patterns of run names (``00*``, ``*-forward``); with one of them all other
+    runs go to the other side, with both the runs in neither are left out, with none every second run of a command
+    validates. A run is called by its number, before it the bag (``day1/003``) if there are several, and after it the
+    command (``003-forward``) if there is one.
+    """
+
+    Options = RosbagOptions
+    options: RosbagOptions
+
+    def read(self, source: Path) -> Dataset:
+        """All bags at or below ``source``; DataError names the bag, the topic and the message of what is wrong."""
+        bags = find_bags(source)
+        warnings: list[str] = []
+        runs: list[Trajectory] = []
+        scans: dict[str, RunScans] = {}
+        bare: list[Path] = []
+        for name, path in bags.items():
+            recording = read_recording(path, name, self.options, warnings)
+            if not recording.referenced:
+                bare.append(path)
+            found, left_out = cut_into_runs(recording, self.options, alone=len(bags) == 1)
+            warnings += left_out
+            for run in found:
+                named = replace(run.trajectory, id=f"{name}/{run.trajectory.id}") if len(bags) > 1 else run.trajectory
+                runs.append(named)
+                if run.scans is not None:
+                    scans[named.id] = run.scans
+        if not runs:
+            raise DataError(f"{warnings[-1]}; nothing is left")
+        if bare:
+            runs = self._placed(runs, bare, len(bags))
+        if any(run.angles is None for run in runs):
+            runs = [replace(run, angles=None) for run in runs]
+        if any(run.pose_covariances is None for run in runs):
+            runs = [replace(run, pose_covariances=None) for run in runs]
+        chosen = self._split(runs)
+        dataset = make_dataset(
+            self.options.name,
+            self.options.robot,
+            self.options.sample_period or median_period([run.times for run in runs]),
+            chosen,
+            description=self.options.description,
+            source=self.options.source,
+            licence=self.options.licence,
+            scans=gather_scans({run.id: scans[run.id] for run in chosen if run.id in scans}),
+        )
+        if bare:
+            dataset = self._mapped(dataset)
+            made = "reference poses were made from the scans by SLAM, because no topic holds any"
+            warnings += [f"{path}: {made}" for path in bare]
+        return replace(dataset, warnings=(*warnings, *dataset.warnings))
+
+    def _placed(self, runs: Sequence[Trajectory], bare: Sequence[Path], bags: int) -> list[Trajectory]:
+        """Runs of bags without reference poses, at the design odometry's poses until SLAM has found better ones."""
+        if len(bare) < bags:
+            raise DataError(
+                f"{bare[0]}: no topic holds reference poses, as it does in other bags; import those without apart"
+            )
+        design = OdometryModel.of_design(self.options.robot, "arc")
+        poses = design.poses([run.log(run.pose_times) for run in runs])
+        return [replace(run, poses=pose) for run, pose in zip(runs, poses, strict=True)]
+
+    def _mapped(self, dataset: Dataset) -> Dataset:
+        # Imported here, because small_gicp takes a moment.
+        from omnibench.slam.slam_dataset import slam_dataset
+
+        return slam_dataset(dataset, self.options.slam)
+
+    def _split(self, runs: Sequence[Trajectory]) -> list[Trajectory]:
+        splits: Sequence[Split | None]
+        if self.options.train or self.options.validation:
+            splits = split_by_name([run.id for run in runs], self.options.train, self.options.validation, "run")
+        else:
+            splits = every_second([run.command for run in runs])
+        numbers = repetitions([run.command or run.id for run in runs])
+        return [
+            replace(run, split=split, repetition=number if run.command else None)
+            for run, split, number in zip(runs, splits, numbers, strict=True)
+            if split is not None
+        ]

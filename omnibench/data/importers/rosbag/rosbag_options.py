@@ -1,0 +1,89 @@
+"""The options of the importer of ROS recordings."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from omnibench.data.importers.robot_option import RobotOption
+from omnibench.data.importers.rosbag.message_streams import Use
+from omnibench.data.scans import Mount
+from omnibench.data.splits import Names
+from omnibench.registry import Options
+from omnibench.slam.slam_options import SlamOptions
+
+
+class RosbagOptions(Options):
+    """The robot, topics and joints, how the recording is cut into runs, and which of these train and validate."""
+
+    robot: RobotOption = Field(description="mapping as in dataset.yaml, or path of a YAML file")
+    wheel_topic: str | None = Field(
+        None,
+        min_length=1,
+        description="sensor_msgs/JointState; default: the only one, or the one ending in joint_states",
+    )
+    pose_topic: str | None = Field(
+        None,
+        min_length=1,
+        description="PoseWithCovarianceStamped, PoseStamped or Odometry; default: the only one, or the one ending in "
+        "slam_pose",
+    )
+    scan_topic: str | None = Field(
+        None, min_length=1, description="sensor_msgs/LaserScan; default: the only one, or the one ending in /scan"
+    )
+    scans: bool = Field(True, description="false: leave the scans out")
+    scanner_mount: Mount | None = Field(
+        None, description="x, y, yaw of the scanner on the robot; default: what /tf_static says, else the middle"
+    )
+    slam: SlamOptions = Field(SlamOptions(), description="how bags without reference poses get them from their scans")
+    joints: Names = Field((), description="in the robot's wheel order; default: those called like the wheels")
+    joint_signs: tuple[Literal[1, -1], ...] = Field((), description="-1 for joints that count the other way round")
+    wheel_wrap: float | None = Field(
+        None, gt=0, allow_inf_nan=False, description="positions begin again after this many rad"
+    )
+    use: Use = Field("auto", description="positions or velocities of the joints; auto: positions, if they are there")
+    cut: Literal["rests", "topic", "windows", "none"] = Field(
+        "rests", description="where one run ends and another begins"
+    )
+    least_rest: float = Field(0.5, gt=0, allow_inf_nan=False, description="s; shorter rests do not cut")
+    rest_rate: float = Field(
+        0.05, gt=0, allow_inf_nan=False, description="rad/s; wheels that turn slower, over least_rest, rest"
+    )
+    least_run: float = Field(1.0, ge=0, allow_inf_nan=False, description="s; shorter drives are left out")
+    cut_topic: str | None = Field(
+        None, min_length=1, description="each message begins a run; a std_msgs/String names its command"
+    )
+    window: float | None = Field(None, gt=0, allow_inf_nan=False, description="s; length of the runs of cut: windows")
+    train: Names = Field((), description="patterns of run names that train")
+    validation: Names = Field((), description="patterns of run names that validate")
+    sample_period: float | None = Field(
+        None, gt=0, allow_inf_nan=False, description="s; default: the median of the wheel samples"
+    )
+    name: str = Field("rosbag", min_length=1, description="name of the data set")
+    description: str = Field("", description="of the data set")
+    source: str = Field("", description="where the recording comes from")
+    licence: str = Field("", description="of the recording")
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> RosbagOptions:
+        wheels = len(self.robot.wheels)
+        for key in ("joints", "joint_signs"):
+            given = len(getattr(self, key))
+            if given not in (0, wheels):
+                raise ValueError(f"{key} has {given} values, expected {wheels}, one for each wheel")
+        if not self.scans and (self.scan_topic is not None or self.scanner_mount is not None):
+            raise ValueError("scans=false leaves the scans out; leave scan_topic and scanner_mount out, too")
+        if len(set(self.joints)) < len(self.joints):
+            raise ValueError("joints names one joint twice; name another one for each wheel")
+        if self.wheel_wrap is not None and self.use == "velocities":
+            raise ValueError("wheel_wrap is for positions; leave it out with use=velocities")
+        for key, cut in (("cut_topic", "topic"), ("window", "windows")):
+            if (getattr(self, key) is not None) != (self.cut == cut):
+                raise ValueError(f"cut={cut} and {key} belong together; give both or none")
+        return self
+
+    @property
+    def still(self) -> float:
+        """Angle that resting wheels stay within for ``least_rest`` s, rad."""
+        return self.rest_rate * self.least_rest

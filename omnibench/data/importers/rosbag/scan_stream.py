@@ -1,0 +1,244 @@
+"""Scans of a bag: what the scanner is, which scans are of use, and reading those of a run when they are wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from omnibench.config import validate
+from omnibench.data.importers.rosbag.bag import Bag, Topic, open_bag
+from omnibench.data.importers.rosbag.message_streams import Sieve, Stamps, header_stamp
+from omnibench.data.importers.rosbag.scanner_frames import Seat, seat_of
+from omnibench.data.scans import Mount, Ranges, Scanner, Scans, TrajectoryScans
+from omnibench.errors import ConfigError, DataError
+from omnibench.robot.kinematics import Array
+
+# By how much the geometry of two scans of one scanner may differ; it comes in single precision.
+_SAME = 1e-5  # rad over the whole scan, m
+_SAME_PACE = 0.1  # of the time between rays, which some drivers measure anew for every scan
+_WAY_OUT = "scans=false leaves the scans out"
+
+
+@dataclass(frozen=True, eq=False)
+class ScanStream:
+    """Those scans of a bag's topic that are of use.
+
+    stamps (S,): of the first rays, ns, increasing. logged (S,): when each was recorded, ns.
+    """
+
+    path: Path
+    topic: Topic
+    scanner: Scanner
+    stamps: Stamps
+    logged: Stamps
+
+    @property
+    def place(self) -> str:
+        """Bag and topic, for messages."""
+        return f"{self.path}: topic {self.topic.name}"
+
+    def between(self, zero: float, end: float, origin: int) -> RunScans | None:
+        """The scans of a run from ``zero`` to ``end`` (s since ``origin``, ns); None when there is none."""
+        times = (self.stamps - origin) / 1e9 - zero
+        inside = np.flatnonzero((times >= -0.5e-9) & (times <= end - zero + 0.5e-9))
+        if not len(inside):
+            return None
+        part = replace(self, stamps=self.stamps[inside], logged=self.logged[inside])
+        return RunScans(part, np.maximum(times[inside], 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class RunScans:
+    """The scans of a run, still in their bag, and their times (S,) in the run, s."""
+
+    stream: ScanStream
+    times: Array
+
+    def read(self) -> TrajectoryScans:
+        """Read them. DataError: the bag is not what it was."""
+        stream = self.stream
+        keys = zip(stream.logged.tolist(), stream.stamps.tolist(), strict=True)
+        places = {key: index for index, key in enumerate(keys)}
+        ranges = np.empty((len(self.times), stream.scanner.rays), np.float32)
+        with open_bag(stream.path) as bag:
+            topic = bag.topic(stream.topic.name, "scan_topic")
+            for record in bag.records(topic, int(stream.logged.min()), int(stream.logged.max())):
+                place = places.pop((record.logged, header_stamp(record.message)), None)
+                if place is not None and len(record.message.ranges) == stream.scanner.rays:
+                    ranges[place] = _measured(record.message)
+        if places:
+            raise DataError(f"{stream.place}: the bag has changed since it was opened; import it again")
+        return TrajectoryScans(self.times, ranges)
+
+
+class BagScans(Scans):
+    """The scans of a data set that is being imported: one run's are read from its bag at a time."""
+
+    def __init__(self, scanner: Scanner, runs: Mapping[str, RunScans]) -> None:
+        self.scanner = scanner
+        self._runs = dict(runs)
+
+    @property
+    def trajectories(self) -> tuple[str, ...]:
+        return tuple(self._runs)
+
+    def times(self, trajectory: str) -> Array:
+        return self._of(trajectory).times
+
+    def of(self, trajectory: str) -> TrajectoryScans:
+        return self._of(trajectory).read()
+
+    def _of(self, trajectory: str) -> RunScans:
+        if trajectory not in self._runs:
+            raise DataError(f"trajectory {trajectory} has no scans")
+        return self._runs[trajectory]
+
+
+def gather_scans(runs: Mapping[str, RunScans]) -> BagScans | None:
+    """The scans of all runs, if there are any. DataError: the bags' scanners differ."""
+    if not runs:
+        return None
+    first, *others = {id(run.stream.scanner): run.stream for run in runs.values()}.values()
+    for other in others:
+        told = _difference(_Shape.of_scanner(first.scanner), _Shape.of_scanner(other.scanner))
+        if not told and first.scanner.mount != other.scanner.mount:
+            told = f"the mount is {other.scanner.mount}, expected {first.scanner.mount}"
+        if told:
+            raise DataError(f"{other.place}: {told} as in {first.path}; import the bags apart; {_WAY_OUT}")
+    return BagScans(first.scanner, runs)
+
+
+def read_scans(bag: Bag, topic: Topic, mount: Mount | None, warnings: list[str]) -> ScanStream:
+    """Look every scan of a topic through; ``warnings`` is told what is left out. DataError.
+
+    mount: where the scanner sits; None: where /tf_static says, else in the middle of the robot, with a warning.
+    """
+    sieve, place = Sieve(bag, topic), f"{bag.path}: topic {topic.name}"
+    shape, frame, scan_time = None, "", 0.0
+    rows: list[tuple[int, int, int, bool, float]] = []
+    for record, stamp, (found, pace, seen) in sieve.sifted(_laser_scan):
+        if shape is None:
+            shape, frame, scan_time = found, record.message.header.frame_id, float(record.message.scan_time)
+        told = _difference(shape, found)
+        if told:
+            raise DataError(
+                f"{place}, message {record.number}: {told} as in the messages before; the scans must be those of one "
+                f"scanner, of one number of rays; {_WAY_OUT}"
+            )
+        rows.append((record.number, stamp, record.logged, seen, pace))
+    numbers, stamps, logged = (np.array([row[column] for row in rows], dtype=np.int64) for column in range(3))
+    if shape is not None:
+        empty = f"are empty (no range from {shape.range_min:g} to {shape.range_max:g} m)"
+        good = sieve.keep(np.array([row[3] for row in rows]), numbers, empty)
+        order = good[sieve.in_order(stamps[good], numbers[good])]
+    try:
+        sieve.require(len(order) if shape else 0)
+    except DataError as error:
+        raise DataError(f"{error}; {_WAY_OUT}") from None
+    assert shape is not None  # else nothing is left
+    warnings.extend(sieve.told())
+    pace = _pace([row[4] for row in rows], scan_time, place, warnings)
+    scanner = _scanner(shape, pace, _seat(bag, frame, mount, place, warnings), topic, place)
+    return ScanStream(bag.path, topic, scanner, stamps[order], logged[order])
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """What the scans of one scanner have in common."""
+
+    rays: int
+    angle_min: float
+    angle_increment: float
+    range_min: float
+    range_max: float
+
+    @classmethod
+    def of_scanner(cls, scanner: Scanner) -> _Shape:
+        return cls(scanner.rays, scanner.angle_min, scanner.angle_increment, scanner.range_min, scanner.range_max)
+
+
+def _laser_scan(message: Any) -> tuple[_Shape, float, bool]:
+    """The shape of a scan, the time between its rays (s), and whether it saw anything."""
+    ranges, range_max = message.ranges, float(message.range_max)
+    if not np.isfinite(range_max):  # some drivers know no limit
+        range_max = float(np.finfo(np.float32).max)
+    shape = _Shape(
+        len(ranges), float(message.angle_min), float(message.angle_increment), float(message.range_min), range_max
+    )
+    return shape, float(message.time_increment), bool(np.isfinite(_measured(message)).any())
+
+
+def _measured(message: Any) -> Ranges:
+    """The ranges of a scan (R,), m; inf for all that are no measurement: NaN, 0, and out of the scanner's range."""
+    ranges = np.asarray(message.ranges, dtype=np.float32)
+    good = (ranges >= message.range_min) & (ranges <= message.range_max) & (ranges > 0)  # False for NaN
+    return np.where(good, ranges, np.float32(np.inf))
+
+
+def _difference(expected: _Shape, found: _Shape) -> str:
+    """The first thing in which two scans differ, as ``rays is 720, expected 1080``; else an empty text."""
+    if found.rays != expected.rays:
+        return f"a scan has {found.rays} ranges, expected {expected.rays}"
+    for name, tolerance in (
+        ("angle_min", _SAME),
+        ("angle_increment", _SAME / max(expected.rays, 1)),
+        ("range_min", _SAME),
+        ("range_max", _SAME * max(1.0, abs(expected.range_max))),
+    ):
+        ours, theirs = getattr(expected, name), getattr(found, name)
+        if not abs(ours - theirs) <= tolerance:
+            return f"{name} is {theirs:g}, expected {ours:g}"
+    return ""
+
+
+def _pace(paces: list[float], scan_time: float, place: str, warnings: list[str]) -> float:
+    """The time between rays, s, of the scanner."""
+    pace = float(np.median(paces))
+    if np.abs(np.array(paces) - pace).max() > _SAME_PACE * abs(pace):
+        low, high = min(paces), max(paces)
+        warnings.append(
+            f"{place}: time_increment varies from {low:.3g} to {high:.3g} s; its median, {pace:.3g} s, is taken"
+        )
+    if pace == 0 and scan_time > 0:
+        warnings.append(
+            f"{place}: time_increment is 0, so that each scan counts as taken at one instant, though scan_time is "
+            f"{scan_time:.3g} s"
+        )
+    return pace
+
+
+def _seat(bag: Bag, frame: str, mount: Mount | None, place: str, warnings: list[str]) -> Seat:
+    if mount is not None:
+        return Seat(mount)
+    seat = seat_of(bag, frame)
+    if seat is None:
+        warnings.append(
+            f"{place}: nothing tells where the scanner ({frame or 'a frame without a name'}) is mounted (no /tf_static "
+            "from base_link); the robot's middle is taken; set scanner_mount={x: 0.1, y: 0, yaw: 0} (m, rad)"
+        )
+    return seat or Seat(Mount())
+
+
+def _scanner(shape: _Shape, pace: float, seat: Seat, topic: Topic, place: str) -> Scanner:
+    sign = -1.0 if seat.upside_down else 1.0
+    try:
+        return validate(
+            Scanner,
+            {
+                "name": topic.name,
+                "rays": shape.rays,
+                "angle_min": sign * shape.angle_min,
+                "angle_increment": sign * shape.angle_increment,
+                "time_increment": pace,
+                "range_min": shape.range_min,
+                "range_max": shape.range_max,
+                "mount": seat.mount,
+            },
+            place,
+        )
+    except ConfigError as error:
+        raise DataError(f"{error}; {_WAY_OUT}") from None

@@ -1,0 +1,71 @@
+"""Where a scanner sits on its robot, by the fixed transforms of a bag (``/tf_static``)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from omnibench.data.importers.rosbag.bag import Bag
+from omnibench.data.scans import Mount
+from omnibench.errors import DataError
+from omnibench.robot.kinematics import Array
+
+_BASES = ("base_link", "base_footprint", "base")  # REP-105; with or without the robot's namespace
+_LARGEST_TILT = math.radians(20)
+
+
+@dataclass(frozen=True)
+class Seat:
+    """A mount. upside_down: rays that count counter-clockwise for the scanner run clockwise for the robot."""
+
+    mount: Mount
+    upside_down: bool = False
+
+
+def seat_of(bag: Bag, frame: str) -> Seat | None:
+    """Where the frame of a scanner is in the robot's; None when the bag does not tell. DataError: it is tilted."""
+    parents = _fixed_transforms(bag)
+    child, whole = frame.strip("/"), np.eye(4)
+    for _ in range(len(parents) + 1):
+        if child.rpartition("/")[2] in _BASES:
+            return _planar(whole, bag, frame)
+        if child not in parents:
+            return None
+        child, step = parents[child]
+        whole = step @ whole
+    return None  # a ring of frames
+
+
+def _fixed_transforms(bag: Bag) -> dict[str, tuple[str, Array]]:
+    """Of every frame its parent, and the transform (4, 4) from the frame to the parent."""
+    found: dict[str, tuple[str, Array]] = {}
+    for topic in bag.topics:
+        if topic.type != "tf2_msgs/msg/TFMessage" or not topic.name.endswith("tf_static"):
+            continue
+        for record in bag.records(topic):
+            for each in getattr(record.message, "transforms", ()):
+                turn, place = each.transform.rotation, each.transform.translation
+                matrix = np.eye(4)
+                try:
+                    matrix[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+                except ValueError:  # all zeros: no rotation, and so no transform
+                    continue
+                matrix[:3, 3] = place.x, place.y, place.z
+                if np.isfinite(matrix).all():
+                    found[each.child_frame_id.strip("/")] = each.header.frame_id.strip("/"), matrix
+    return found
+
+
+def _planar(transform: Array, bag: Bag, frame: str) -> Seat:
+    tilt = math.acos(np.clip(transform[2, 2], -1.0, 1.0))
+    upside_down = tilt > math.pi / 2
+    if min(tilt, math.pi - tilt) > _LARGEST_TILT:
+        raise DataError(
+            f"{bag.path}: the scanner's frame {frame} is tilted by {math.degrees(tilt):.0f} degrees, so that it does "
+            "not scan the plane of the floor; if it does, set scanner_mount; scans=false leaves the scans out"
+        )
+    yaw = math.atan2(transform[1, 0], transform[0, 0])
+    return Seat(Mount(x=float(transform[0, 3]), y=float(transform[1, 3]), yaw=yaw), upside_down)

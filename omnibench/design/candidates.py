@@ -1,0 +1,302 @@
+"""Candidate runs for a design: the commands of recordings, of a simulated data set, or of a design config."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from omnibench.compare.config import CompareConfig, DatasetSource
+from omnibench.compare.plan import load_source, read_compare_config
+from omnibench.config import read_model, read_yaml
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.storage import load_dataset
+from omnibench.design.config import DesignConfig, TimedCommand
+from omnibench.design.d_optimality import Counts
+from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError
+from omnibench.fit.problem import training_split
+from omnibench.fit.span import aligned, direction_in_words, driven_span, motion_in_words
+from omnibench.fit.uncertainty.identifiability import identifiability
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Robot, wheel_equations
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import Integration
+from omnibench.simulate.chain.robot_config import RobotConfig
+from omnibench.simulate.config import FlowerConfig
+from omnibench.simulate.flower import commanded_rates, commands_of, duration_of, stamps_of_run
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateRun:
+    """A command that a design may choose, and the runs that tell what it is worth: recorded, or one as designed."""
+
+    name: str
+    runs: tuple[Trajectory, ...]
+
+    @property
+    def duration(self) -> float:
+        """The mean duration of its runs, s."""
+        return float(np.mean([run.pose_times[-1] for run in self.runs]))
+
+    @property
+    def distance(self) -> float:
+        """The way of the robot's centre, m: as commanded, or else as the reference saw it."""
+        given = self.runs[0].distance
+        if given is not None:
+            return float(given)
+        return float(np.mean([np.hypot(*np.diff(run.poses[:, :2], axis=0).T).sum() for run in self.runs]))
+
+
+@dataclass(frozen=True, eq=False)
+class CandidatePool:
+    """All that a design is made from.
+
+    sets: indices of the candidates of each set. baseline (C,): how often each is driven in the experiment that
+    designs are measured by. recorded: the candidates' wheel logs are recordings; else rates are as designed.
+    """
+
+    source: str
+    name: str
+    description: str
+    robot: Robot
+    integration: Integration
+    candidates: tuple[CandidateRun, ...]
+    sets: Mapping[str, tuple[int, ...]]
+    baseline: Counts
+    baseline_name: str
+    noise: Noise
+    noise_source: str
+    simulated: bool
+    recorded: bool
+    notes: tuple[str, ...]
+
+    def runs(self, name: str) -> tuple[Trajectory, ...]:
+        """The runs of a set's candidates."""
+        return tuple(run for index in self.sets[name] for run in self.candidates[index].runs)
+
+
+def read_candidates(
+    source: Path | str, *, dataset: str | None = None, integration: Integration | None = None
+) -> CandidatePool:
+    """The candidates of a data set folder, of a comparison config's data set, or of a design config.
+
+    dataset: which, where a comparison config has several. integration: in place of the config's, or of arcs.
+    OmnibenchError in one line that names the source, what is wrong and the way out.
+    """
+    path = Path(source)
+    if path.is_dir():
+        _no_choice(dataset, path)
+        return candidates_of_dataset(load_dataset(path), integration or "arc", str(path))
+    content = read_yaml(path)
+    if isinstance(content, Mapping) and "datasets" in content:
+        return _candidates_of_comparison(read_compare_config(path), dataset, integration, str(path))
+    _no_choice(dataset, path)
+    config = read_model(DesignConfig, path)
+    return candidates_of_config(
+        config if integration is None else config.model_copy(update={"integration": integration}), str(path)
+    )
+
+
+def candidates_of_dataset(dataset: Dataset, integration: Integration = "arc", source: str = "") -> CandidatePool:
+    """The commands of the training runs, as recorded; the noise is estimated from their repetitions.
+
+    DataError: no command is named, or only one; the commands leave part of the matrix open; there is no noise at all.
+    """
+    place = source or f"data set {dataset.name}"
+    training = training_split(dataset)
+    commands: dict[str, list[Trajectory]] = {}
+    for run in training:
+        if run.command is not None and len(run.pose_times) > 1:
+            commands.setdefault(run.command, []).append(run)
+    if not commands:
+        raise DataError(f"{place}: no training run has a command; fill the column command, so that a design can choose")
+    if len(commands) == 1:
+        raise DataError(f"{place}: {next(iter(commands))} is its only command; a design needs several to choose from")
+    named = [run for runs in commands.values() for run in runs]
+    require_every_motion(dataset.robot, named, place, DataError)
+    told = identifiability(dataset.robot, named, integration)
+    if _silent(told.noise):
+        raise DataError(f"{place}: repetitions agree without any noise, so that nothing can be weighed against it")
+    unnamed = len(training) - len(named)
+    notes = [f"{unnamed} of {len(training)} training runs have no command or one pose: left out"] if unnamed else []
+    if dataset.simulated:
+        notes.append("The recordings are simulated, and so is the noise that was estimated from them.")
+    return CandidatePool(
+        source=place,
+        name=dataset.name,
+        description=dataset.description,
+        robot=dataset.robot,
+        integration=integration,
+        candidates=tuple(CandidateRun(name, tuple(runs)) for name, runs in commands.items()),
+        sets={dataset.name: tuple(range(len(commands)))},
+        baseline=np.array([len(runs) for runs in commands.values()]),
+        baseline_name=f"the {len(named)} training runs of {dataset.name}",
+        noise=told.noise,
+        noise_source=f"estimated from {told.noise_source}",
+        simulated=dataset.simulated,
+        recorded=True,
+        notes=tuple(notes),
+    )
+
+
+def candidates_of_config(config: DesignConfig, source: str = "") -> CandidatePool:
+    """The commands of a design config, driven as designed.
+
+    ConfigError: a set leaves part of the matrix open, or has one command; the noise is zero.
+    """
+    place = source or f"config {config.name}"
+    periods = (config.sample_period, config.pose_period)
+    commands = {name: config.commands(name) for name in config.sets}
+    pool, candidates = _driven_as_designed(config.robot, config.integration, periods, commands)
+    sets = {name: tuple(pool[each] for each in own) for name, own in commands.items()}
+    baseline = np.zeros(len(candidates), dtype=np.intp)
+    baseline[list(sets[config.baseline.set])] = config.baseline.repetitions
+    count = len(sets[config.baseline.set])
+    return _checked(
+        CandidatePool(
+            source=place,
+            name=config.name,
+            description=config.description,
+            robot=config.robot,
+            integration=config.integration,
+            candidates=candidates,
+            sets=sets,
+            baseline=baseline,
+            baseline_name=f"{count} commands of {config.baseline.set} x {config.baseline.repetitions}",
+            noise=config.noise,
+            noise_source="assumed: as the config says",
+            simulated=True,
+            recorded=False,
+            notes=config.notes,
+        )
+    )
+
+
+def candidates_of_simulation(
+    name: str, config: FlowerConfig, integration: Integration, source: str = "", notes: Sequence[str] = ()
+) -> CandidatePool:
+    """The commands that a simulated data set's training session drives, as designed, with the noise that is simulated.
+
+    ConfigError: the commands leave part of the matrix open, there is one only, or the noise is zero.
+    """
+    ramp = config.commands.ramp
+    commands = tuple(
+        TimedCommand(each, duration_of(each, config.train, config.commands), ramp) for each in commands_of(config)
+    )
+    periods = (config.sample_period, config.pose_period)
+    _, candidates = _driven_as_designed(config.robot, integration, periods, {name: commands})
+    scale = config.train.noise_scale
+    noise = Noise(**{kind: scale * getattr(config.noise, kind) for kind in Noise.model_fields})
+    return _checked(
+        CandidatePool(
+            source=source or f"data set {name}",
+            name=name,
+            description="",
+            robot=config.robot,
+            integration=integration,
+            candidates=candidates,
+            sets={name: tuple(range(len(candidates)))},
+            baseline=np.full(len(candidates), config.repetitions),
+            baseline_name=f"{len(candidates)} commands of {name} x {config.repetitions}",
+            noise=noise,
+            noise_source="assumed: what the config simulates for training",
+            simulated=True,
+            recorded=False,
+            notes=tuple(notes),
+        )
+    )
+
+
+def _candidates_of_comparison(
+    config: CompareConfig, name: str | None, integration: Integration | None, place: str
+) -> CandidatePool:
+    if name is not None and name not in config.datasets:
+        raise UnknownNameError("data set", name, config.datasets, place)
+    if name is None and len(config.datasets) > 1:
+        raise ConfigError(f"{place}: it has several data sets; choose one with --dataset: {', '.join(config.datasets)}")
+    name = name or next(iter(config.datasets))
+    found: DatasetSource = config.datasets[name]
+    chosen = integration or config.integration
+    if isinstance(found.simulate, RobotConfig):
+        raise ConfigError(
+            f"{place}: data set {name} is a simulated robot, whose noise is not stated beforehand; make it with "
+            "`omnibench simulate`, and design from its folder"
+        )
+    if found.simulate is None:
+        return candidates_of_dataset(load_source(name, found), chosen, f"{place}: data set {name}")
+    return candidates_of_simulation(name, found.simulate, chosen, place, config.notes)
+
+
+def _driven_as_designed(
+    robot: Robot,
+    integration: Integration,
+    periods: tuple[float, float],
+    sets: Mapping[str, Iterable[TimedCommand]],
+) -> tuple[dict[TimedCommand, int], tuple[CandidateRun, ...]]:
+    """Each command once, with its index, and its run: constant wheel rates by the design values, poses to match."""
+    commands = list(dict.fromkeys(each for own in sets.values() for each in own))
+    model = OdometryModel.of_design(robot, integration)
+    names = [each.command.name for each in commands]
+    candidates = []
+    for each, name in zip(commands, names, strict=True):
+        command = each.command
+        title = name if names.count(name) == 1 else f"{name}_t{each.duration:.4g}"
+        times, pose_times = stamps_of_run(each.duration, *periods)
+        rates = commanded_rates(robot, command, times, each.ramp)
+        still = Trajectory(title, "train", times, rates, pose_times, np.zeros((len(pose_times), 3)))
+        (poses,) = model.poses([still.log(pose_times)])
+        run = replace(
+            still,
+            poses=poses,
+            command=title,
+            v=command.speed,
+            alpha=command.direction,
+            omega=command.turn_rate,
+            duration=float(times[-1]),
+            distance=command.speed * (float(times[-1]) - each.ramp),
+        )
+        candidates.append(CandidateRun(title, (run,)))
+    return {each: index for index, each in enumerate(commands)}, tuple(candidates)
+
+
+def _checked(pool: CandidatePool) -> CandidatePool:
+    if _silent(pool.noise):
+        raise ConfigError(f"{pool.source}: noise: give position and heading some noise, or nothing can be weighed")
+    for name, own in pool.sets.items():
+        place = f"{pool.source}: {name}"
+        if len(own) == 1:
+            raise ConfigError(f"{place}: it has one command only; a design needs several to choose from")
+        require_every_motion(pool.robot, pool.runs(name), place, ConfigError)
+    return pool
+
+
+def _silent(noise: Noise) -> bool:
+    """Whether position or heading has no noise of any kind."""
+    return any(
+        not any(getattr(noise, f"{kind}_{coordinate}") for kind in ("pose", "walk", "bias"))
+        for coordinate in ("position", "heading")
+    )
+
+
+def require_every_motion(robot: Robot, runs: Sequence[Trajectory], place: str, error: type[OmnibenchError]) -> None:
+    """Refuse runs that leave a motion out which the robot can make: no design of them can tell the matrix there."""
+    # Of the whole space of wheel rates only this part belongs to a robot that does not slip.
+    possible, _ = np.linalg.qr(wheel_equations(robot.wheels))  # (N, 3)
+    _, strengths, motions = np.linalg.svd(np.vstack([driven_span(runs).strong @ possible, np.zeros((3, 3))]))
+    missing = motions[strengths < 0.5] @ possible.T
+    if len(missing):
+        words = [
+            f"{direction_in_words(direction, robot.wheel_names)} ({motion_in_words(direction, robot)})"
+            for direction in aligned(missing, robot)
+        ]
+        raise error(
+            f"{place}: its commands do not drive the wheels along {' nor along '.join(words)}, beyond what slip may "
+            "do, and so cannot identify the matrix there; add commands that do"
+        )
+
+
+def _no_choice(dataset: str | None, path: Path) -> None:
+    if dataset is not None:
+        raise ConfigError(f"--dataset: is for a comparison config with several data sets; {path} is none")

@@ -1,0 +1,157 @@
+"""What the YAML of a design says: a robot, its noise, and sets of commands to choose from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, FiniteFloat, Tag, field_validator, model_validator
+
+from omnibench.config import Model
+from omnibench.data.importers.robot_option import RobotOption
+from omnibench.errors import UnknownNameError
+from omnibench.robot.calibration import Noise
+from omnibench.robot.odometry import Integration
+from omnibench.simulate.config import MotionGrid, Positive
+from omnibench.simulate.flower import Command, grid_of
+
+_MOST_COMMANDS = 5000
+_MOST_SAMPLES = 2e7
+Name = Annotated[str, Field(min_length=1, max_length=60)]
+
+
+@dataclass(frozen=True)
+class TimedCommand:
+    """A motion command, how long it is driven, and how long of that its speed rises and falls, s."""
+
+    command: Command
+    duration: float
+    ramp: float = 0.0
+
+
+class CommandGrid(MotionGrid):
+    """Every direction with every rate of turn, at each speed."""
+
+    distance: Positive | None = Field(None, description="length of each run, m; or give duration")
+    duration: Positive | None = Field(None, description="duration of each run that is not a turn on the spot, s")
+
+    @model_validator(mode="after")
+    def _length_is_given(self) -> CommandGrid:
+        if any(self.speeds) and (self.distance is None) == (self.duration is None):
+            raise ValueError("give the length of the runs: either distance (m) or duration (s)")
+        return self
+
+    def commands(self) -> Iterator[TimedCommand]:
+        """The commands in the order of the grid."""
+        for command in grid_of(self):
+            driven = self.duration or (self.distance or 0.0) / max(command.speed, 1e-9)
+            yield TimedCommand(command, driven if command.speed else self.turn_duration)
+
+
+class SingleCommand(Model):
+    """One command."""
+
+    speed: float = Field(ge=0, allow_inf_nan=False, description="m/s")
+    direction_deg: FiniteFloat = Field(0.0, description="degrees, in the robot's frame")
+    turn_rate: FiniteFloat = Field(0.0, description="rad/s")
+    duration: Positive = Field(description="s")
+
+    @model_validator(mode="after")
+    def _moves(self) -> SingleCommand:
+        if not self.speed and not self.turn_rate:
+            raise ValueError("this command does not move the robot; give a speed or a turn_rate")
+        return self
+
+    def commands(self) -> Iterator[TimedCommand]:
+        """The one command."""
+        direction = math.radians(self.direction_deg) if self.speed else 0.0
+        yield TimedCommand(Command(self.speed, direction, self.turn_rate), self.duration)
+
+
+class OtherSet(Model):
+    """The commands of another set, taken over."""
+
+    set: Name = Field(description="its name")
+
+
+def _kind(block: Any) -> str:
+    keys = set(block) if isinstance(block, Mapping) else set()
+    if isinstance(block, OtherSet) or "set" in keys:
+        return "set"
+    return "command" if isinstance(block, SingleCommand) or keys & {"speed", "direction_deg", "turn_rate"} else "grid"
+
+
+Block = Annotated[
+    Annotated[CommandGrid, Tag("grid")] | Annotated[SingleCommand, Tag("command")] | Annotated[OtherSet, Tag("set")],
+    Discriminator(_kind),
+]
+
+
+class DesignBaseline(Model):
+    """The experiment that designs are measured by: every command of a set, so many times."""
+
+    set: Name = Field(description="a name among sets")
+    repetitions: int = Field(5, gt=0, le=1000, description="runs of each command")
+
+
+class DesignConfig(Model):
+    """Commands worth considering, for a robot that nothing has been recorded of yet."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=60)
+    description: str = ""
+    notes: tuple[str, ...] = Field((), description="what a reader of the result must know")
+    robot: RobotOption
+    integration: Integration = "arc"
+    sample_period: Positive = Field(0.01, description="time between wheel samples, s")
+    pose_period: Positive = Field(0.25, description="time between reference poses, s")
+    noise: Noise = Field(description="of the reference poses, as far as it is known")
+    sets: dict[Name, tuple[Block, ...]] = Field(
+        min_length=1, description="each a grid of commands, or a list of grids, single commands and other sets"
+    )
+    baseline: DesignBaseline
+
+    @field_validator("sets", mode="before", json_schema_input_type=dict[Name, Block | tuple[Block, ...]])
+    @classmethod
+    def _one_block_stands_for_a_list(cls, sets: Any) -> Any:
+        if not isinstance(sets, Mapping):
+            return sets
+        return {name: [blocks] if isinstance(blocks, Mapping) else blocks for name, blocks in sets.items()}
+
+    @model_validator(mode="after")
+    def _sets_are_known_and_of_a_size(self) -> DesignConfig:
+        if self.baseline.set not in self.sets:
+            raise ValueError(str(UnknownNameError("set", self.baseline.set, self.sets, "baseline")))
+        for name in self.sets:
+            commands = self.commands(name)
+            if not commands:
+                raise ValueError(f"sets.{name}: no command moves the robot")
+            samples = sum(each.duration for each in commands) * (1 / self.sample_period + 1 / self.pose_period)
+            if len(commands) > _MOST_COMMANDS or samples > _MOST_SAMPLES:
+                raise ValueError(
+                    f"sets.{name}: these are {len(commands)} commands with {samples:.1g} wheel samples and poses, more "
+                    f"than {_MOST_COMMANDS} or {_MOST_SAMPLES:.0e}; check the grids, durations and periods"
+                )
+        return self
+
+    def commands(self, name: str) -> tuple[TimedCommand, ...]:
+        """The commands of a set and of the sets that it takes over, each once. ValueError: unknown set, or a circle."""
+        return tuple(dict.fromkeys(self._expanded(name, ())))
+
+    def _expanded(self, name: str, above: tuple[str, ...]) -> Iterator[TimedCommand]:
+        for block in self.sets[name]:
+            if not isinstance(block, OtherSet):
+                yield from block.commands()
+            elif block.set not in self.sets:
+                raise ValueError(str(UnknownNameError("set", block.set, self.sets, f"sets.{name}")))
+            elif block.set in (*above, name):
+                raise ValueError(f"sets.{name}: takes over {block.set!r}, which takes over {name!r}; leave one out")
+            else:
+                yield from self._expanded(block.set, (*above, name))
+
+
+Use = Literal["final", "trajectory"]
+"""What a calibration is made from: the final pose alone, as Eq. (6), or every reference pose under the noise model."""
+Per = Literal["run", "second", "metre"]
+"""What a run costs: 1, its duration, or the way that its wheels roll (their mean; turns on the spot have one too)."""

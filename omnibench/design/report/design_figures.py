@@ -1,0 +1,294 @@
+"""The plots of a design: the chosen paths, and precision and efficiency against the number of runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import numpy as np
+import plotly.graph_objects as go
+
+from omnibench.design.report.design_wording import baseline_runs, command_in_words
+from omnibench.design.result import Candidate, Design, Precision, SetDesign, Step
+from omnibench.report.blocks import Dash, Figure, FigureGrid, LegendItem
+from omnibench.report.numbers import percent, plural
+from omnibench.report.style import INK, PALETTE, QUIET, equal_aspect, logarithmic, plot, text
+from omnibench.robot.kinematics import Array
+
+_LEFT, _STRAIGHT, _RIGHT = PALETTE[0], "#5b6772", PALETTE[1]
+_UNUSED = "#d4d9df"
+_STRAIGHT_BELOW = math.radians(2)
+_ROW_DASHES: tuple[Dash, ...] = ("solid", "dash", "dot")
+_ROW_NAMES = ("x (row 1)", "y (row 2)", "heading (row 3)")
+
+
+def path_figures(design: Design) -> FigureGrid:
+    """The commands of each set as a flower: chosen ones in colour, as wide as they are often driven."""
+    figures = tuple(
+        Figure(
+            f"{found.name}: {plural(found.step.effort.runs, 'run')} of {plural(len(found.chosen), 'command')}",
+            _flower(design, found),
+            f"Paths of the {len(found.commands)} commands of {found.name}; chosen: "
+            + ", ".join(f"{command_in_words(design.candidate(each.command))} {each.runs}x" for each in found.chosen),
+            560,
+        )
+        for found in design.sets
+    )
+    legend = (
+        LegendItem("left", "turning left", _LEFT),
+        LegendItem("straight", "straight", _STRAIGHT),
+        LegendItem("right", "turning right", _RIGHT, "dash"),
+        LegendItem("unused", "candidates not chosen", _UNUSED),
+    )
+    return FigureGrid(
+        figures,
+        legend,
+        2 if len(figures) > 1 else 1,
+        "All paths start at the origin, heading along x, and end at the dot. The more often a command is driven, the "
+        "wider its line (and its number stands at its end). Turns on the spot are arcs about the origin.",
+    )
+
+
+def precision_figures(design: Design) -> FigureGrid:
+    """Standard deviations of the best runs found against their number and against the time that they take."""
+    figures = [
+        Figure(
+            f"All elements together, as a multiple of the baseline's ({baseline_runs(design)} runs)",
+            _curves(design, _runs, "runs", [(lambda step: step.relative, "solid")], "standard deviation / baseline's"),
+            "Geometric mean of the standard deviations against the number of runs, on logarithmic scales",
+        ),
+        Figure(
+            "The same against the time of driving",
+            _curves(
+                design,
+                lambda step: step.effort.seconds,
+                "time of driving (s)",
+                [(lambda step: step.relative, "solid")],
+                "standard deviation / baseline's",
+            ),
+            "Geometric mean of the standard deviations against the time of driving, on logarithmic scales",
+        ),
+        Figure(
+            "Rows of the matrix: x solid, y dashed, heading dotted",
+            _curves(
+                design,
+                _runs,
+                "runs",
+                [(_of_row(row), dash) for row, dash in enumerate(_ROW_DASHES)],
+                "% of the row's largest element",
+            ),
+            "Largest standard deviation of each row's elements against the number of runs, on logarithmic scales",
+        ),
+    ]
+    if design.baseline.precision.physical is not None:
+        figures.append(
+            Figure(
+                "Wheels: radius solid, distance dashed",
+                _curves(design, _runs, "runs", [(_radius, "solid"), (_distance, "dash")], "% of the design value"),
+                "Largest standard deviation of the wheels' radii and distances against the number of runs",
+            )
+        )
+    return FigureGrid(
+        tuple(figures),
+        _legend(design),
+        2,
+        "One standard deviation of the best unbiased estimate (the Cramér-Rao bound), under the noise model below. The "
+        "ring is the chosen design, the grey diamond the baseline.",
+    )
+
+
+def efficiency_figure(design: Design) -> FigureGrid:
+    """How close exact designs come to the bound that no design exceeds."""
+    traces = []
+    lowest = min(step.efficiency for found in design.sets for step in found.steps)
+    for found, colour in _coloured(design):
+        traces.append(
+            _line(
+                [step.effort.runs for step in found.steps],
+                [100 * step.efficiency for step in found.steps],
+                [f"{found.name}, {_step_in_words(step)}" for step in found.steps],
+                found.name,
+                colour,
+                "solid",
+            )
+        )
+        traces.append(_ring(found.step.effort.runs, 100 * found.step.efficiency, found.name, colour))
+    most = max(found.steps[-1].effort.runs for found in design.sets)
+    figure = plot(*traces, xaxis_title_text="runs", yaxis_title_text="efficiency (% of the bound)")
+    few = min(found.steps[0].effort.runs for found in design.sets)
+    logarithmic(figure, "x", few, most)
+    figure.update_yaxes(range=[max(0.0, 100 * lowest - 3), 102])
+    figure.add_hline(y=100, line={"color": INK, "width": 1.2})
+    figure.add_hline(y=99, line={"color": QUIET, "width": 1, "dash": "dot"})
+    baselines = ", ".join(f"{percent(found.baseline_efficiency)} of {found.name}'s" for found in design.sets)
+    return FigureGrid(
+        (
+            Figure(
+                "Information per run against the bound" if design.per == "run" else "Information for its cost",
+                figure,
+                "Efficiency of the exact designs against the number of runs, and the bound at 100 %",
+                340,
+            ),
+        ),
+        _legend(design),
+        1,
+        "Solid line: the bound of Kiefer and Wolfowitz, which no design from the set exceeds; dotted: 1 % below it. "
+        f"Numbers of runs that do not share out evenly lose a little. The baseline reaches {baselines} bound.",
+    )
+
+
+def _curves(
+    design: Design,
+    across: Callable[[Precision], float],
+    x_title: str,
+    upwards: Sequence[tuple[Callable[[Precision], float], Dash]],
+    y_title: str,
+) -> go.Figure:
+    baseline = design.baseline.precision
+    traces = []
+    for found, colour in _coloured(design):
+        words = [f"{found.name}, {_step_in_words(step)}" for step in found.steps]
+        x = [across(step) for step in found.steps]
+        for value, dash in upwards:
+            traces.append(_line(x, [value(step) for step in found.steps], words, found.name, colour, dash))
+            traces.append(_ring(across(found.step), value(found.step), found.name, colour))
+    for value, _ in upwards:
+        traces.append(
+            go.Scatter(
+                x=[across(baseline)],
+                y=[value(baseline)],
+                mode="markers",
+                marker={"symbol": "diamond", "size": 10, "color": QUIET},
+                hovertemplate=f"baseline, {text(design.baseline.name)}: %{{y:.3g}}<extra></extra>",
+            )
+        )
+    figure = plot(*traces, xaxis_title_text=x_title, yaxis_title_text=y_title)
+    if len(upwards) == 1:
+        figure.add_hline(y=value(baseline), line={"color": QUIET, "width": 1, "dash": "dot"})
+    shown = [step for found in design.sets for step in found.steps] + [baseline]
+    logarithmic(figure, "x", min(map(across, shown)), max(map(across, shown)))
+    heights = [value(step) for value, _ in upwards for step in shown]
+    logarithmic(figure, "y", min(heights), max(heights))
+    return figure
+
+
+def _runs(step: Precision) -> float:
+    return step.effort.runs
+
+
+def _of_row(row: int) -> Callable[[Precision], float]:
+    return lambda step: step.row_percent[row]
+
+
+def _radius(step: Precision) -> float:
+    assert step.physical is not None
+    return step.physical.radius_percent
+
+
+def _distance(step: Precision) -> float:
+    assert step.physical is not None
+    return step.physical.distance_percent
+
+
+def _step_in_words(step: Step) -> str:
+    return f"{plural(step.effort.runs, 'run')}, {step.effort.seconds:.0f} s, {percent(step.efficiency, 2)} of the bound"
+
+
+def _line(
+    x: Sequence[float], y: Sequence[float], words: Sequence[str], key: str, colour: str, dash: Dash
+) -> go.Scatter:
+    return go.Scatter(
+        x=list(x),
+        y=[float(f"{value:.6g}") for value in y],
+        mode="lines",
+        line={"color": colour, "width": 2, "dash": dash},
+        legendgroup=key,
+        text=[text(each) for each in words],
+        hovertemplate="%{text}<br>%{y:.4g}<extra></extra>",
+    )
+
+
+def _ring(x: float, y: float, key: str, colour: str) -> go.Scatter:
+    return go.Scatter(
+        x=[x],
+        y=[y],
+        mode="markers",
+        marker={"symbol": "circle-open", "size": 11, "color": colour, "line": {"width": 2.5}},
+        legendgroup=key,
+        hoverinfo="skip",
+    )
+
+
+def _coloured(design: Design) -> Iterator[tuple[SetDesign, str]]:
+    for index, found in enumerate(design.sets):
+        yield found, PALETTE[index % len(PALETTE)]
+
+
+def _legend(design: Design) -> tuple[LegendItem, ...]:
+    return tuple(LegendItem(found.name, found.name, colour) for found, colour in _coloured(design))
+
+
+def _flower(design: Design, found: SetDesign) -> go.Figure:
+    counts: Mapping[str, int] = {each.command: each.runs for each in found.chosen}
+    candidates = [design.candidate(name) for name in found.commands]
+    reach = max(max(math.hypot(x, y) for x, y, _ in each.path) for each in candidates) or 1.0
+    spots = [each for each in candidates if _on_the_spot(each)]
+    radii = {each.name: reach * (0.1 + 0.3 * index / len(spots)) for index, each in enumerate(spots)}
+    traces = []
+    for each in sorted(candidates, key=lambda each: (counts.get(each.name, 0) > 0, -_turned(each))):
+        points = _arc(each, radii[each.name]) if each.name in radii else np.array(each.path)[:, :2]
+        traces += _path(each, points, counts.get(each.name, 0))
+    traces.append(
+        go.Scatter(x=[0], y=[0], mode="markers", marker={"color": INK, "size": 7}, hovertemplate="start<extra></extra>")
+    )
+    figure = plot(*traces, xaxis_title_text="x (m)", yaxis_title_text="y (m)")
+    equal_aspect(figure)
+    return figure
+
+
+def _path(candidate: Candidate, points: Array, runs: int) -> list[go.Scatter]:
+    turned = _turned(candidate)
+    width = min(2.0 + 1.2 * runs, 14.0)
+    key, colour = ("left", _LEFT) if turned > 0 else ("right", _RIGHT)
+    if abs(turned) < _STRAIGHT_BELOW:
+        key, colour = "straight", _STRAIGHT
+    # Left and right turns may run along the same circle: dashes over a line show both.
+    line = {"color": colour, "width": width, "dash": "dash" if key == "right" else "solid"}
+    words = f"{text(command_in_words(candidate))}, {candidate.duration_s:.3g} s"
+    shared = {"hovertemplate": f"{words}: {plural(runs, 'run') if runs else 'not chosen'}<extra></extra>"}
+    x, y = np.round(points.T, 4).tolist()
+    if not runs:
+        unused = {"color": _UNUSED, "width": 1}
+        return [go.Scatter(x=x, y=y, mode="lines", line=unused, legendgroup="unused", **shared)]
+    end = {"mode": "markers+text", "text": [f"<b>{runs}×</b>"]} if runs > 1 else {"mode": "markers"}
+    return [
+        go.Scatter(x=x, y=y, mode="lines", line=line, legendgroup=key, **shared),
+        go.Scatter(
+            x=x[-1:],
+            y=y[-1:],
+            marker={"color": colour, "size": width + 5},
+            textposition="top center" if y[-1] >= 0 else "bottom center",
+            textfont={"size": 13, "color": INK},
+            legendgroup=key,
+            cliponaxis=False,
+            **end,
+            **shared,
+        ),
+    ]
+
+
+def _turned(candidate: Candidate) -> float:
+    """How far a run turns, rad; to the left if positive."""
+    return candidate.path[-1][2] - candidate.path[0][2]
+
+
+def _on_the_spot(candidate: Candidate) -> bool:
+    return max(math.hypot(x, y) for x, y, _ in candidate.path) < 0.01
+
+
+def _arc(candidate: Candidate, radius: float) -> Array:
+    """A turn on the spot as an arc about the origin, at most most of a circle."""
+    turned = _turned(candidate)
+    shown = math.copysign(min(abs(turned), math.radians(330)), turned)
+    angles = np.linspace(0.0, shown, 60)
+    return radius * np.column_stack([np.cos(angles), np.sin(angles)])

@@ -1,0 +1,98 @@
+"""A design in words: commands, efforts and sentences that terminal and report share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from omnibench.design.config import Per, Use
+from omnibench.design.result import Candidate, Design, Effort, SetDesign
+from omnibench.report.numbers import count, fixed, percent, plural, significant
+
+USE_IN_WORDS: Mapping[Use, str] = {"final": "final poses", "trajectory": "whole trajectories"}
+UNIT_OF_COST: Mapping[Per, str] = {"run": "runs", "second": "s", "metre": "m of wheel"}
+
+
+def command_in_words(candidate: Candidate) -> str:
+    """A command as ``0.2 m/s at 30°, −0.35 rad/s``; by its name where it is not known."""
+    if candidate.speed is None or candidate.direction is None or candidate.turn_rate is None:
+        return candidate.name
+    turn = f"{_plain(candidate.turn_rate)} rad/s"
+    if candidate.speed == 0:
+        return f"on the spot, {turn}"
+    degrees = math.degrees(candidate.direction) % 360
+    return f"{_plain(candidate.speed)} m/s at {fixed(degrees, 0)}°, {turn if candidate.turn_rate else 'straight'}"
+
+
+def duration_in_words(seconds: float) -> str:
+    """A time of driving, s or min."""
+    return f"{significant(seconds, 3)} s" if seconds < 120 else f"{fixed(seconds / 60, 1)} min"
+
+
+def effort_in_words(effort: Effort) -> str:
+    """``6 runs, 33.5 s, 6.7 m``."""
+    runs = plural(effort.runs, "run")
+    return f"{runs}, {duration_in_words(effort.seconds)}, {significant(effort.metres, 3)} m"
+
+
+def origin_in_words(design: Design) -> str:
+    """Where candidates and noise come from, so that nobody takes an assumption for a measurement."""
+    if design.recorded:
+        kind = "simulated recordings" if design.simulated else "recordings"
+        return f"candidates: commands of {kind}; noise {design.noise_source}"
+    return f"candidates: commands as designed, nothing recorded; noise {design.noise_source}"
+
+
+def choice_in_words(design: Design, found: SetDesign) -> str:
+    """How good the chosen runs of a set are, and by what guarantee."""
+    runs = plural(found.step.effort.runs, "run")
+    share = percent(found.step.efficiency, 2)
+    lost = percent(1 - found.step.efficiency, 2)
+    bound = f"{share} of the bound that no design from these {plural(len(found.commands), 'command')} exceeds"
+    if design.runs_asked is not None:
+        return f"{runs}, as asked for, reach {bound}."
+    if found.reached:
+        return f"{runs} are within 1 % of the D-optimum: they reach {bound} (at most {lost} is lost)."
+    return f"No design found is within 1 % of the bound; the best, of {runs}, reaches {bound}."
+
+
+def equal_in_words(design: Design, found: SetDesign, use: Use) -> str:
+    """How many runs of a set tell as much as the baseline."""
+    equal = next(each for each in found.equivalents if each.use == use)
+    if equal.least is None:
+        return "none: they leave part of the matrix open"
+    least = f"{least_in_words(equal.least)} {UNIT_OF_COST[design.per]}"
+    if equal.effort is None:
+        return f"none within the repetitions allowed (no design does it below {least})"
+    return f"{effort_in_words(equal.effort)} (no design does it below {least})"
+
+
+def headline(design: Design) -> str:
+    """The answer, a sentence for each set."""
+    return " ".join(_verdict(design, found) for found in design.sets)
+
+
+def _verdict(design: Design, found: SetDesign) -> str:
+    equal = next(each for each in found.equivalents if each.use == design.use)
+    words = f"{found.name}: {plural(found.step.effort.runs, 'run')} of {plural(len(found.chosen), 'command')} tell "
+    if found.reached:
+        words += f"as much per {design.per} as the best design from {len(found.commands)} commands, within 1 %"
+    else:
+        words += f"{percent(found.step.efficiency)} of what the best design may per {design.per}"
+    if equal.effort is not None:
+        words += f"; {count(equal.effort.runs)} of the best runs tell as much as the baseline's {baseline_runs(design)}"
+    return words + "."
+
+
+def least_in_words(least: float) -> str:
+    """A lower bound to a tenth, rounded down so that it stays one."""
+    return fixed(math.floor(10 * least) / 10, 1)
+
+
+def baseline_runs(design: Design) -> str:
+    """How many runs the baseline has."""
+    return count(design.baseline.precision.effort.runs)
+
+
+def _plain(value: float) -> str:
+    return f"{value:.3g}".replace("-", "−")

@@ -1,0 +1,170 @@
+"""The information of candidate runs, and what so many of each mean in numbers that a person reads."""
+
+from __future__ import annotations
+
+import math
+from typing import get_args
+
+import numpy as np
+
+from omnibench.design.candidates import CandidatePool, CandidateRun
+from omnibench.design.config import Per, Use
+from omnibench.design.d_optimality import Candidates, Counts
+from omnibench.design.result import Candidate, Chosen, Effort, PhysicalSpread, Precision, Step
+from omnibench.errors import ConfigError
+from omnibench.fit.parameterisation import WheelGeometry
+from omnibench.fit.span import direction_in_words, driven_span
+from omnibench.fit.uncertainty.information import information_of_runs
+from omnibench.fit.uncertainty.physical import is_invertible, matrix_slopes
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Array, Robot
+
+USES: tuple[Use, ...] = get_args(Use)
+_PATH_POINTS = 160
+
+
+class DesignProblem:
+    """The information of all candidates for each use, and what counts of them (C,) mean in numbers a person reads."""
+
+    def __init__(self, pool: CandidatePool, use: Use, per: Per, repetitions: int | None) -> None:
+        self.pool, self.use, self.per, self.repetitions = pool, use, per, repetitions
+        self.described = tuple(_described(each, pool.robot) for each in pool.candidates)
+        self.costs = np.array([_cost(each, per) for each in self.described])
+        directions = driven_span([run for each in pool.candidates for run in each.runs]).strong
+        # What no candidate drives keeps its start values: elements (3N,) = basis @ parameters (p,).
+        self.basis: Array = np.kron(np.eye(3), directions.T)
+        self.information = {each: self._information(each) for each in USES}
+        self._everything: dict[Use, Candidates] = {}
+        self._physical = _element_slopes(pool.robot) if len(directions) == 3 and is_invertible(pool.robot) else None
+
+    def _information(self, use: Use) -> Array:
+        """Mean information (C, p, p) of a run of each candidate."""
+        noise = self.pool.noise if use == "trajectory" else evenly(self.pool.noise)
+        matrix = self.pool.robot.inverse_kinematic_matrix
+        means = [
+            information_of_runs(
+                each.runs, matrix, self.pool.integration, noise, stamps="final" if use == "final" else "reference"
+            ).mean(axis=0)
+            for each in self.pool.candidates
+        ]
+        return self.basis.T @ np.array(means) @ self.basis
+
+    def everything(self, use: Use) -> Candidates:
+        """All candidates, so that designs from different sets are measured alike."""
+        if use not in self._everything:
+            self._everything[use] = self.candidates(use)
+        return self._everything[use]
+
+    def candidates(self, use: Use, name: str | None = None) -> Candidates:
+        """The candidates of a set, or all, as a design chooses from them. ConfigError when something stays open."""
+        chosen = list(range(len(self.described)) if name is None else self.pool.sets[name])
+        information = self.information[use][chosen]
+        try:
+            return Candidates(information, self.costs[chosen], self.repetitions)
+        except ValueError:
+            raise ConfigError(self._open(information, use, name)) from None
+
+    def _open(self, information: Array, use: Use, name: str | None) -> str:
+        scale = 1 / np.sqrt(np.maximum(np.diagonal(information.mean(axis=0)), np.finfo(float).tiny))
+        weakest = np.linalg.eigh(information.mean(axis=0) * scale * scale[:, None])[1][:, 0] * scale
+        elements = (self.basis @ weakest).reshape(3, -1)
+        direction = np.linalg.svd(elements)[2][0]
+        row = int(np.argmax(np.linalg.norm(elements, axis=1))) + 1
+        poses = "the final poses" if use == "final" else "the poses"
+        return (
+            f"{self.pool.source}: {poses} of {name or 'all commands'} leave row {row} of the matrix open along "
+            f"{direction_in_words(direction, self.pool.robot.wheel_names)}; add commands that tell it"
+        )
+
+    def of_all(self, name: str, counts: Counts) -> Counts:
+        """Counts of a set's candidates as counts (C,) of all."""
+        every: Counts = np.zeros(len(self.described), dtype=np.intp)
+        every[list(self.pool.sets[name])] = counts
+        return every
+
+    def effort(self, counts: Counts) -> Effort:
+        """What driving so many runs of each takes."""
+        sums = np.array([[each.duration_s, each.distance_m, each.rolled_m] for each in self.described]).T @ counts
+        return Effort(runs=int(counts.sum()), seconds=sums[0], metres=sums[1], wheel_metres=sums[2])
+
+    def precision(self, counts: Counts) -> Precision:
+        """How well so many runs of each tell the matrix."""
+        everything = self.everything(self.use)
+        covariance = self.basis @ everything.covariance(counts) @ self.basis.T
+        deviations = np.sqrt(np.maximum(np.diagonal(covariance), 0.0)).reshape(3, -1)
+        largest = np.abs(self.pool.robot.inverse_kinematic_matrix).max(axis=1)
+        first, second, third = (100 * deviations.max(axis=1) / largest).tolist()
+        relative = math.sqrt(everything.root(self.pool.baseline) / everything.root(counts))
+        physical = None if self._physical is None else _physical_spread(self._physical, covariance, self.pool.robot)
+        return Precision(
+            effort=self.effort(counts), relative=relative, row_percent=(first, second, third), physical=physical
+        )
+
+    def step(self, counts: Counts, bound: float) -> Step:
+        """The same with the efficiency against a bound."""
+        efficiency = self.everything(self.use).criterion(counts) / bound
+        return Step(**dict(self.precision(counts)), efficiency=efficiency)
+
+    def chosen(self, counts: Counts) -> tuple[Chosen, ...]:
+        """The commands with runs."""
+        return tuple(
+            Chosen(command=each.name, runs=int(count))
+            for each, count in zip(self.described, counts, strict=True)
+            if count
+        )
+
+
+def evenly(noise: Noise) -> Noise:
+    """A noise model with the same figures (m, rad) for position and heading, as Eq. (6) weighs them: their RMS."""
+    return Noise(
+        **{
+            f"{kind}_{coordinate}": math.sqrt(
+                (2 * getattr(noise, f"{kind}_position") ** 2 + getattr(noise, f"{kind}_heading") ** 2) / 3
+            )
+            for kind in ("pose", "walk", "bias")
+            for coordinate in ("position", "heading")
+        }
+    )
+
+
+def _described(candidate: CandidateRun, robot: Robot) -> Candidate:
+    first = candidate.runs[0]
+    picks = np.unique(np.linspace(0, len(first.poses) - 1, _PATH_POINTS).round().astype(int))
+    x, y, heading = (first.poses[picks] - first.start).T
+    turn = np.exp(-1j * first.start[2]) * (x + 1j * y)
+    path = np.round(np.column_stack([turn.real, turn.imag, heading]), 5)
+    known = first.v is not None and first.alpha is not None and first.omega is not None
+    radii = np.array([wheel.radius for wheel in robot.wheels])
+    rolled = [
+        float((np.abs(run.rates) * np.diff(run.times, prepend=0.0)[:, None] * radii).sum() / len(radii))
+        for run in candidate.runs
+    ]
+    return Candidate(
+        name=candidate.name,
+        speed=first.v if known else None,
+        direction=first.alpha if known else None,
+        turn_rate=first.omega if known else None,
+        duration_s=candidate.duration,
+        distance_m=candidate.distance,
+        rolled_m=float(np.mean(rolled)),
+        path=tuple((px, py, ph) for px, py, ph in path.tolist()),
+    )
+
+
+def _cost(candidate: Candidate, per: Per) -> float:
+    return {"run": 1.0, "second": candidate.duration_s, "metre": candidate.rolled_m}[per]
+
+
+def _element_slopes(robot: Robot) -> Array:
+    """Derivatives (9, 9) of the physical parameters of three omni wheels with respect to the matrix elements."""
+    return np.linalg.inv(matrix_slopes(robot, WheelGeometry(robot).start))
+
+
+def _physical_spread(slopes: Array, covariance: Array, robot: Robot) -> PhysicalSpread:
+    deviations = np.sqrt(np.diagonal(slopes @ covariance @ slopes.T)).reshape(3, -1)
+    design = WheelGeometry(robot).start.reshape(3, -1)
+    return PhysicalSpread(
+        radius_percent=float((100 * deviations[0] / design[0]).max()),
+        distance_percent=float((100 * deviations[1] / design[1]).max()),
+        angle_deg=float(np.degrees(deviations[2]).max()),
+    )

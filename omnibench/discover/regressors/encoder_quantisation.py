@@ -1,0 +1,101 @@
+"""Encoder ticks: what a wheel turns between the last tick and standstill is not seen, and no effect explains it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from omnibench.data.dataset import Trajectory
+from omnibench.discover.model_fit import Fit
+from omnibench.discover.regressors.whitened import given
+from omnibench.fit.least_squares.repetitions import grouped
+from omnibench.robot.kinematics import Array
+
+_FEWEST = 50  # samples in which a wheel turns, to tell ticks from chance
+_MOST = 10_000  # ticks in a sample; finer ones are no matter
+_MEAN = 0.25  # of a tick
+_WHOLE = 1e-3  # of a tick: by so much multiples may differ from whole ones
+
+
+def ticks_of(runs: Sequence[Trajectory]) -> Array:
+    """The angle (N,) of a tick of each wheel's encoder, rad; 0 where measured angles are no multiples of one."""
+    steps = np.concatenate([run.rates * np.diff(run.times, prepend=0.0)[:, None] for run in runs])
+    return np.array([_tick(np.abs(own)) for own in steps.T])
+
+
+def _tick(steps: Array) -> float:
+    turning = steps[steps > 0]
+    if len(turning) < _FEWEST:
+        return 0.0
+    floor = turning.max() / _MOST
+    ordered = np.sort(np.append(turning, 0.0))
+    gaps = np.diff(ordered)
+    gaps = gaps[gaps > floor]
+    if not len(gaps):
+        return 0.0
+    tick = float(gaps.min())
+    near = np.round(turning / tick)
+    if not near.any():
+        return 0.0
+    tick = float(turning @ near / (near @ near))  # of all, which the smallest gap alone says less exactly
+    return tick if (np.abs(turning / tick - np.round(turning / tick)) < _WHOLE * np.maximum(near, 1)).all() else 0.0
+
+
+class Rounding:
+    """How much of chi2 columns could explain of what rounding to ticks does, if every command conspired.
+
+    A controller stops a wheel at the same place within a tick each time that a command is repeated; so the wheel's true
+    angle is off the measured one by up to half a tick, a quarter in the mean, for a whole command, where it begins to
+    turn and where it rests.
+    """
+
+    def __init__(self, fit: Fit, columns: Sequence[Array]) -> None:
+        """columns (K, 3, p): of every run of the fit, not whitened."""
+        self.ticks = ticks_of(fit.runs)
+        self._count = columns[0].shape[2]
+        if not self.ticks.any():
+            return
+        hidden = [
+            _quarter_ticks(run, run.poses[1:] - own, fit.model.matrix, self.ticks)
+            for run, own in zip(fit.runs, fit.residuals, strict=True)
+        ]
+        data = fit.whitened([np.concatenate(each, axis=2) for each in zip(columns, hidden, strict=True)])
+        members = grouped([run.command or run.id for run in fit.runs])
+        products = [each[:, : self._count].T @ each[:, self._count :] for each in data.columns]
+        self._products = np.concatenate([sum(products[run] for run in runs) for runs in members], axis=1)
+        self._data = data
+
+    def gain(self, index: Sequence[int], beyond: Sequence[int]) -> float:
+        """An upper bound on what the columns ``index`` could gain beyond others that are fitted."""
+        if not self.ticks.any():
+            return 0.0
+        left = given(self._data, beyond)
+        taken = given(self._data, []).roots(beyond)
+        own = self._products[list(index)]
+        own = own - (self._data.information[np.ix_(index, beyond)] @ taken) @ (taken.T @ self._products[list(beyond)])
+        return float(np.linalg.norm(left.roots(index).T @ own, axis=0).sum() ** 2)
+
+
+def _quarter_ticks(run: Trajectory, poses: Array, matrix: Array, ticks: Array) -> Array:
+    """Changes (K, 3, 2N) of a run's poses (K, 3) by a quarter of a tick of each wheel, at both ends of its turn."""
+    turning = run.rates != 0
+    columns = np.zeros((len(poses), 3, 2 * len(ticks)))
+    stamps, known = run.pose_times[1:], np.vstack([run.start, poses])
+    for wheel in np.flatnonzero(turning.any(axis=0) & (ticks > 0)):
+        moving = np.flatnonzero(turning[:, wheel])
+        first, last = moving[0], moving[-1]
+        moments = (run.times[first - 1] if first else 0.0, run.times[last])
+        for column, moment in zip((wheel, wheel + len(ticks)), moments, strict=True):
+            later = stamps > moment - 1e-9
+            place = [float(np.interp(moment, run.pose_times, values)) for values in known.T]
+            columns[later, :, column] = _MEAN * ticks[wheel] * _turned(matrix[:, wheel], place, poses[later])
+    return columns
+
+
+def _turned(wheel: Array, place: Sequence[float], poses: Array) -> Array:
+    """Changes (K, 3) of later poses by a radian more of a wheel (3,), its column of the matrix, at a place."""
+    x, y, heading = place
+    step = complex(wheel[0], wheel[1]) * np.exp(1j * heading)
+    moved = step + 1j * wheel[2] * ((poses[:, 0] - x) + 1j * (poses[:, 1] - y))
+    return np.column_stack([moved.real, moved.imag, np.full(len(poses), wheel[2])])

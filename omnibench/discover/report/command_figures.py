@@ -1,0 +1,193 @@
+"""Final residuals by command: on a map and over the direction where commands are a flower, else in rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import plotly.graph_objects as go
+
+from omnibench.discover.report.before_after import BAND, NOISE, Look, legend, numbers
+from omnibench.discover.report.command_map import command_in_words, command_maps, mean_of
+from omnibench.discover.report.residuals import NORMAL_95, CommandResidual, Residuals
+from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem, Paragraph
+from omnibench.report.numbers import fixed
+from omnibench.report.style import INK, QUIET, plot, text
+
+_ROWS = 16  # commands that are listed
+_ON_MAP = 200
+# Rates of turn from the most negative to the most positive.
+_TURN_COLOURS = ("#0072b2", "#5b6772", "#d97706", "#aa3377", "#4fb0e8", "#7b4b2a", "#8f8f1f")
+
+
+def command_blocks(residuals: Residuals, looks: Sequence[Look]) -> tuple[Block, ...]:
+    """Final residuals of every command, before and after."""
+    commands = residuals.commands
+    if _is_flower(commands):
+        moving = [each for each in commands if math.hypot(*each.end[:2]) > 0.05]
+        return (command_maps(moving, looks), *_headings_by_direction(commands, looks))
+    return (_rows(commands, looks),)
+
+
+def _is_flower(commands: Sequence[CommandResidual]) -> bool:
+    """Whether the commands' ends lie apart, so that residuals can be drawn there."""
+    if not 3 <= len(commands) <= _ON_MAP:
+        return False
+    ends = np.array([each.end[:2] for each in commands])
+    apart = np.linalg.norm(ends[:, None] - ends[None], axis=2) + np.diag([np.inf] * len(ends))
+    residual = np.median([np.hypot(*each.means[0, :2]) for each in commands])
+    return bool(np.quantile(apart.min(axis=1), 0.2) > max(float(residual), 0.02))
+
+
+def _headings_by_direction(commands: Sequence[CommandResidual], looks: Sequence[Look]) -> tuple[Block, ...]:
+    """Mean final heading residuals over the commanded direction, a colour for each rate of turn."""
+    known = [each for each in commands if each.run.alpha is not None and each.run.omega is not None]
+    moving = [each for each in known if each.run.v is None or each.run.v > 0]
+    still = [each for each in known if each.run.v == 0]
+    motions = sorted({_motion(each) for each in moving})
+    distinct = {(_direction(each), *_motion(each)) for each in moving}
+    directions = {_direction(each) for each in moving}
+    if len(motions) > len(_TURN_COLOURS) or len(distinct) < len(moving) or len(directions) < 3:
+        return (_rows(commands, looks),)
+    several = len({speed for speed, _ in motions}) > 1
+    items = [
+        LegendItem(
+            f"turn-{index}",
+            f"ω = {fixed(rate, 2)} rad/s" + (f", v = {fixed(speed, 2)} m/s" if several else ""),
+            colour,
+        )
+        for index, ((speed, rate), colour) in enumerate(zip(motions, _TURN_COLOURS, strict=False))
+    ]
+    curves = [
+        (item, sorted((each for each in moving if _motion(each) == motion), key=_direction))
+        for motion, item in zip(motions, items, strict=True)
+    ]
+    panels = [_heading_plot(curves, look, moving) for look in looks]
+    reach = max(panel[1] for panel in panels)
+    figures = []
+    for look, (figure, _) in zip(looks, panels, strict=True):
+        figure.update_yaxes(range=[-reach, reach])
+        figures.append(
+            Figure(
+                f"Final heading residuals, {look.label}",
+                figure,
+                f"Mean final heading residual in degrees over the commanded direction, {look.label}",
+                300,
+            )
+        )
+    grid = FigureGrid(
+        tuple(figures), (*items, NOISE), 2,
+        "Mean over the runs of each command; the band holds 95 % of what noise alone would do.",
+    )  # fmt: skip
+    return (grid, *_turns_on_the_spot(still, looks))
+
+
+def _heading_plot(
+    curves: Sequence[tuple[LegendItem, Sequence[CommandResidual]]], look: Look, commands: Sequence[CommandResidual]
+) -> tuple[go.Figure, float]:
+    half = math.degrees(NORMAL_95 * float(np.median([each.error[2] for each in commands])))
+    ends = [_direction(each) for each in commands]
+    low, high = min(ends) - 10, max(ends) + 10
+    traces = [
+        go.Scatter(x=[low, high, high, low], y=[half, half, -half, -half], mode="none", fill="toself",
+                   fillcolor=BAND, legendgroup=NOISE.key, hoverinfo="skip")
+    ]  # fmt: skip
+    reach = 1.4 * half
+    for item, own in curves:
+        values = np.degrees([mean_of(each, look)[2] for each in own])
+        reach = max(reach, 1.1 * float(np.abs(values).max()))
+        traces.append(
+            go.Scatter(
+                x=numbers(np.array([_direction(each) for each in own])),
+                y=numbers(values),
+                mode="lines+markers",
+                line={"color": item.colour, "width": 2},
+                legendgroup=item.key,
+                text=[text(command_in_words(each)) for each in own],
+                hovertemplate="%{text}<br>%{y:.3f}°<extra></extra>",
+            )
+        )
+    figure = plot(*traces, xaxis_title_text="commanded direction α (°)", yaxis_title_text="heading residual (°)")
+    figure.update_xaxes(range=[low, high], dtick=60)
+    figure.add_hline(y=0, line={"color": QUIET, "width": 1})
+    return figure, reach
+
+
+def _turns_on_the_spot(still: Sequence[CommandResidual], looks: Sequence[Look]) -> tuple[Block, ...]:
+    if not still:
+        return ()
+    parts = []
+    for each in sorted(still, key=_motion):
+        values = " → ".join(f"{fixed(math.degrees(mean_of(each, look)[2]), 2, signed=True)}°" for look in looks)
+        noise = fixed(math.degrees(NORMAL_95 * each.error[2]), 2)
+        parts.append(f"{command_in_words(each)}: {values} (noise ±{noise}°)")
+    return (Paragraph(f"Turns on the spot, mean heading residual: {'; '.join(parts)}.", "note"),)
+
+
+def _rows(commands: Sequence[CommandResidual], looks: Sequence[Look]) -> FigureGrid:
+    """One row for each command, those with the largest residuals if there are many."""
+    shown = sorted(commands, key=lambda each: -float(np.abs(each.means[0] / each.error).max()))[:_ROWS]
+    shown = [each for each in commands if each in shown]
+    figures = []
+    for axis, (name, factor, unit) in enumerate(
+        (("forward", 1e3, "mm"), ("to the left", 1e3, "mm"), ("heading", math.degrees(1.0), "°"))
+    ):
+        figures.append(
+            Figure(
+                f"Final residual {name}" if axis < 2 else "Final heading residual",
+                _row_plot(shown, looks, axis, factor, unit),
+                f"Mean final residual of each command, {name}, in {unit}",
+                90 + 22 * len(shown),
+            )
+        )
+    words = f"The {len(shown)} commands of {len(commands)} with the largest residuals for their noise. "
+    caption = (
+        f"{words if len(shown) < len(commands) else ''}Mean over the runs of each command, seen from its start pose; "
+        "grey bars hold 95 % of what noise alone would do to that mean."
+    )
+    return FigureGrid(tuple(figures), legend(looks), 3 if max(len(each.name) for each in shown) < 14 else 1, caption)
+
+
+def _row_plot(
+    commands: Sequence[CommandResidual], looks: Sequence[Look], axis: int, factor: float, unit: str
+) -> go.Figure:
+    names = [text(each.name) for each in commands]
+    half = [NORMAL_95 * factor * each.error[axis] for each in commands]
+    traces: list[go.Bar | go.Scatter] = [
+        go.Bar(
+            y=names,
+            x=numbers(2 * np.array(half)),
+            base=numbers(-np.array(half)),
+            orientation="h",
+            marker={"color": "#d9dde2", "line": {"width": 0}},
+            width=0.6,
+            legendgroup=NOISE.key,
+            hovertemplate="noise ±%{customdata:.3g} " + unit + "<extra></extra>",
+            customdata=numbers(np.array(half)),
+        )
+    ]
+    traces += [
+        go.Scatter(
+            y=names,
+            x=numbers(factor * np.array([mean_of(each, look)[axis] for each in commands])),
+            mode="markers",
+            marker={"color": look.colour, "size": 9},
+            legendgroup=look.key,
+            hovertemplate=f"{text(look.label)}: %{{x:.3g}} {unit}<extra></extra>",
+        )
+        for look in looks
+    ]
+    figure = plot(*traces, xaxis_title_text=f"residual ({unit})")
+    figure.update_yaxes(autorange="reversed", ticks="", tickfont_color=INK)
+    figure.add_vline(x=0, line={"color": QUIET, "width": 1})
+    return figure
+
+
+def _motion(each: CommandResidual) -> tuple[float, float]:
+    """Speed and rate of turn, without the digits that a measured command has."""
+    return round(each.run.v or 0.0, 2), round(each.run.omega or 0.0, 2)
+
+
+def _direction(each: CommandResidual) -> float:
+    return round(math.degrees(each.run.alpha or 0.0), 3) % 360

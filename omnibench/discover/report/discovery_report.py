@@ -1,0 +1,284 @@
+"""The report of a discovery: where, what, how sure, how much better. One HTML file that opens offline."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from datetime import UTC, datetime
+
+from omnibench.discover.document import experiment_file
+from omnibench.discover.report.evidence_figures import candidate_grid, gap_grid, hidden_grid, waterfall_grid
+from omnibench.discover.report.tables import (
+    absorbed_table,
+    gap_table,
+    held_out_table,
+    hidden_table,
+    not_looked_for_table,
+    novelty_table,
+    parameter_table,
+    place_table,
+    step_table,
+)
+from omnibench.discover.report.where_section import where_section
+from omnibench.discover.report.wording import (
+    STAGES,
+    VERDICTS,
+    VERDICTS_AT_LENGTH,
+    closed_in_words,
+    decisive,
+    effect_in_words,
+    final_errors_in_words,
+    gap_decimals,
+    gap_in_words,
+    held_out_in_words,
+    noise_in_words,
+    novelties_in_words,
+    parameter_in_words,
+    weight_in_words,
+)
+from omnibench.discover.result import Discovery, NamedEffect
+from omnibench.environment import package_versions
+from omnibench.report.blocks import (
+    Badge,
+    Block,
+    Callout,
+    Code,
+    Details,
+    Document,
+    Fact,
+    Facts,
+    Paragraph,
+    Section,
+)
+from omnibench.report.numbers import count, fixed, listing, plural
+
+
+def discovery_report(discovery: Discovery, options: str) -> Document:
+    """The report as blocks; options: the effective ones, in YAML."""
+    dataset = discovery.dataset
+    return Document(
+        title=f"What the odometry model lacks: {dataset.name}",
+        subtitle=dataset.description,
+        sections=(
+            answer_section(discovery),
+            where_section(discovery),
+            what_section(discovery),
+            sure_section(discovery),
+            better_section(discovery),
+            basis_section(discovery, options),
+        ),
+        badges=(Badge("SIMULATED DATA", "warning"),) if dataset.simulated else (),
+        footer=f"omnibench {package_versions().get('omnibench', '')}, written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+    )
+
+
+def answer_section(discovery: Discovery) -> Section:
+    """The answer in words and figures, and what warns of it."""
+    return Section("answer", "Answer", tuple(_answer(discovery)))
+
+
+def _answer(discovery: Discovery) -> Iterator[Block]:
+    yield Paragraph(discovery.headline, "lead")
+    yield Facts(tuple(_tiles(discovery)), "tiles")
+    yield Callout("Motions that the training runs never had", novelties_in_words(discovery.novelties), "warning")
+    yield Callout("Before you read on", discovery.notes)
+
+
+def _tiles(discovery: Discovery) -> Iterator[Fact]:
+    yield Fact("Verdict", discovery.verdict, VERDICTS[discovery.verdict])
+    for effect in discovery.effects:
+        values = "; ".join(parameter_in_words(each) for each in effect.parameters[:2])
+        more = f" and {len(effect.parameters) - 2} more" if len(effect.parameters) > 2 else ""
+        yield Fact(
+            f"{effect.stage}, weight {weight_in_words(effect.weight)}",
+            effect_in_words(effect).replace("_", " "),
+            values + more,
+        )
+    held = decisive(discovery)
+    if held is None:
+        gap = discovery.gap
+        yield Fact("Gap closed, training runs", closed_in_words(gap), gap_in_words(gap))
+        return
+    position, heading = final_errors_in_words(held)
+    where = f"{held_out_in_words(discovery, held)}, {plural(held.runs, 'run')}"
+    yield Fact("Final position error, mean", position, where)
+    yield Fact("Final heading error, mean", heading, where)
+    yield Fact("Gap closed, Eq. (6)", closed_in_words(held.eq6), where)
+
+
+def what_section(discovery: Discovery) -> Section:
+    """The effects that were found with their parameters, and those that a matrix absorbs."""
+    return Section("what", "What", tuple(_what(discovery)))
+
+
+def _what(discovery: Discovery) -> Iterator[Block]:
+    yield Paragraph(VERDICTS_AT_LENGTH[discovery.verdict])
+    if discovery.effects:
+        for effect in discovery.effects:
+            yield Callout(_effect_title(effect), tuple(_effect_remarks(effect)))
+        yield parameter_table(discovery.effects, discovery.dataset)
+    if discovery.absorbed:
+        yield absorbed_table(discovery)
+    if discovery.not_looked_for:
+        yield Details(
+            f"Effects that these recordings cannot show ({len(discovery.not_looked_for)})",
+            (not_looked_for_table(discovery),),
+        )
+
+
+def _effect_title(effect: NamedEffect) -> str:
+    return f"{effect.name}: stage {effect.stage} ({STAGES[effect.stage]})"
+
+
+def _effect_remarks(effect: NamedEffect) -> Iterator[str]:
+    yield effect.physics
+    others = [name for name in effect.confusable_with if name != effect.name]
+    if others:
+        yield f"These data cannot tell it from {listing(others)}: any of them closes the gap as well."
+    if effect.in_doubt:
+        yield f"In doubt: {effect.in_doubt}."
+    if effect.source:
+        yield f"Described in: {effect.source}."
+
+
+def sure_section(discovery: Discovery) -> Section:
+    """Weights, candidates, what is left, what cannot be told apart, what could still hide."""
+    return Section("sure", "How sure", tuple(_how_sure(discovery)))
+
+
+def _how_sure(discovery: Discovery) -> Iterator[Block]:
+    if discovery.effects:
+        yield Facts(
+            tuple(
+                Fact(
+                    effect_in_words(effect).replace("_", " "),
+                    weight_in_words(effect.weight),
+                    f"weight of the name; χ² falls by {count(effect.gain)} "
+                    f"for {plural(effect.degrees_of_freedom, 'parameter')}",
+                )
+                for effect in discovery.effects
+            ),
+            "tiles",
+        )
+    grid = candidate_grid(discovery)
+    if grid is not None:
+        yield grid
+    yield from _left_over(discovery)
+    yield from _classes(discovery)
+    yield from _hidden(discovery)
+
+
+def _left_over(discovery: Discovery) -> Iterator[Block]:
+    if discovery.left:
+        caption = "What the residuals still depend on, after all that was added"
+        yield place_table(discovery.left, caption)
+    elif discovery.effects:
+        yield Paragraph("After what was added, the residuals depend on nothing that was looked at: noise is left.")
+
+
+def _classes(discovery: Discovery) -> Iterator[Block]:
+    if discovery.classes:
+        yield Callout(
+            "What these data cannot tell apart", tuple(" or ".join(names) for names in discovery.classes), "plain"
+        )
+    for number, each in enumerate(discovery.experiments, 1):
+        yield Paragraph(f"To separate {listing(list(each.separates))}: {each.description}")
+        title = f"That experiment as a config ({experiment_file(number)}): simulate it, or drive its commands"
+        yield Details(title, (Code(each.config),))
+
+
+def _hidden(discovery: Discovery) -> Iterator[Block]:
+    if not discovery.hidden:
+        return
+    grid = hidden_grid(discovery.hidden)
+    if grid is not None:
+        yield grid
+    yield Details(f"The same in numbers ({len(discovery.hidden)})", (hidden_table(discovery.hidden),))
+
+
+def better_section(discovery: Discovery) -> Section:
+    """Errors before and after against the floor, on runs that no fit has seen."""
+    return Section("better", "How much better", tuple(_how_much_better(discovery)))
+
+
+def _how_much_better(discovery: Discovery) -> Iterator[Block]:
+    if discovery.held_out:
+        yield Paragraph(_better_in_words(discovery))
+    yield gap_grid(discovery)
+    grid = waterfall_grid(discovery)
+    if grid is not None:
+        yield grid
+    yield held_out_table(discovery) if discovery.held_out else gap_table(discovery)
+    if len(discovery.steps) > 1:
+        yield Details("Every step in numbers", (step_table(discovery),))
+    if discovery.novelties:
+        words = (
+            "The held-out runs drive motions that no training run had. There the extended model extrapolates, and its "
+            "bound may be wider than the plain matrix's.",
+        )
+        yield Callout("Warning: new motions", words, "warning")
+        yield novelty_table(discovery.novelties)
+
+
+def _better_in_words(discovery: Discovery) -> str:
+    held = decisive(discovery)
+    assert held is not None
+    where = f"On the {held_out_in_words(discovery, held)}, {plural(held.runs, 'run')}, "
+    before, after = (
+        f"{fixed(1e3 * position, 1)} mm and {fixed(math.degrees(heading), 2)}°"
+        for position, heading in zip(held.position_m, held.heading_rad, strict=True)
+    )
+    if before == after:
+        return f"{where}the mean final error is {after}, by the plain matrix as by the extended model."
+    closed = "" if held.eq6.closed is None else f": {closed_in_words(held.eq6)} of the gap down to the floor is closed"
+    decimals = gap_decimals(held.eq6)
+    return (
+        f"{where}the mean final error goes from {before} by the plain matrix to {after} by the extended model; Eq. (6) "
+        f"goes from {fixed(held.eq6.before, decimals)} to {fixed(held.eq6.after, decimals)}{closed}."
+    )
+
+
+def basis_section(discovery: Discovery, options: str) -> Section:
+    """Data, noise, options and files."""
+    return Section("basis", "What this rests on", tuple(_basis(discovery, options)))
+
+
+def _basis(discovery: Discovery, options: str) -> Iterator[Block]:
+    dataset, noise = discovery.dataset, discovery.noise
+    position, heading = noise_in_words(noise.noise)
+    runs = [run for run in dataset.trajectories if run.split == "train"]
+    commands = {run.command for run in runs if run.command is not None}
+    sessions = {run.session for run in runs if run.session is not None}
+    facts = [
+        Fact("Data set", dataset.name, "simulated" if dataset.simulated else "recorded"),
+        Fact("Source", dataset.source),
+        Fact(
+            "Training runs",
+            f"{plural(len(discovery.trajectories), 'run')}, {plural(discovery.poses, 'reference pose')}",
+            f"{plural(discovery.outliers, 'pose')} left out as outliers" if discovery.outliers else "",
+        ),
+        Fact("Commands", count(len(commands)) if commands else "not known"),
+        Fact("Sessions", listing(sorted(sessions)) if sessions else "not known"),
+        Fact("Noise of positions", position),
+        Fact("Noise of headings", heading),
+        Fact(
+            "Noise from",
+            noise.description,
+            "repetitions show it, whatever the model gets wrong"
+            if noise.source == "repetitions"
+            else "nothing is repeated: what no model here expresses counts as noise",
+        ),
+        Fact("Robot", dataset.robot.name, plural(len(dataset.robot.wheels), "wheel")),
+        Fact("Odometry", "exact arcs" if discovery.extended.integration == "arc" else "Euler steps, Eq. (1)"),
+        Fact("Content (SHA-256)", dataset.hash[:16]),
+        Fact("Time", f"{fixed(discovery.seconds, 1)} s"),
+        Fact("Versions", ", ".join(f"{name} {version}" for name, version in package_versions().items())),
+    ]
+    yield Facts(tuple(fact for fact in facts if fact.value))
+    yield Callout("Warnings on reading the data", dataset.warnings, "warning")
+    yield Paragraph(
+        "Beside this report: model.yaml is the extended calibration and plain.yaml the matrix alone, both ready for "
+        "omnibench evaluate, simulate and live; discovery.json holds all figures, residuals.parquet every residual "
+        "before and after."
+    )
+    yield Details("Effective options (config.yaml)", (Code(options),))

@@ -1,0 +1,275 @@
+"""How sure, and how much better: candidates of each step, the waterfall of steps, gaps, what could still hide."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import plotly.graph_objects as go
+
+from omnibench.discover.report.before_after import AFTER, BEFORE, FLOOR
+from omnibench.discover.report.wording import (
+    METRICS,
+    added,
+    closed_in_words,
+    decisive,
+    floor_in_words,
+    gap_decimals,
+    held_out_in_words,
+    reading,
+    weight_in_words,
+    worst_of_each,
+)
+from omnibench.discover.result import Candidate, Discovery, Gap, Hidden, Step
+from omnibench.report.blocks import Figure, FigureGrid, LegendItem
+from omnibench.report.numbers import fixed
+from omnibench.report.style import INK, QUIET, logarithmic, plot, text
+
+_CANDIDATES = 8  # of each step
+_UNCHOSEN = "#b9c0c8"
+_GAINED, _LOST = "#7fb8d8", "#e3a3a3"
+_FLOOR_LEGEND = LegendItem("floor", "floor", FLOOR, "dash")
+
+
+def candidate_grid(discovery: Discovery) -> FigureGrid | None:
+    """The gain of every effect that was tried, step by step."""
+    found = {effect.name for effect in discovery.effects}
+    figures = []
+    for number, tried in enumerate(discovery.candidates, 1):
+        shown = sorted((each for each in tried if each.gain > 0), key=lambda each: -each.gain)[:_CANDIDATES]
+        if not shown:
+            continue
+        chosen = next((each.name for each in shown if each.name in found and _is_step(discovery, number, each)), None)
+        title = f"Step {number}: {f'{chosen} is added' if chosen else 'nothing is added'}"
+        figures.append(
+            Figure(
+                title,
+                _candidate_bars(shown, chosen),
+                "Gain in whitened chi2 of each candidate: "
+                + ", ".join(f"{each.name} {each.gain:.3g}, weight {weight_in_words(each.weight)}" for each in shown),
+                80 + 34 * len(shown),
+            )
+        )
+    if not figures:
+        return None
+    return FigureGrid(
+        tuple(figures),
+        (LegendItem("chosen", "added", AFTER), LegendItem("other", "not added", _UNCHOSEN)),
+        2 if len(figures) > 1 else 1,
+        "By how much each candidate would lower the whitened χ² of the training runs, the "
+        f"{_CANDIDATES} largest; at the bars, the weight of the name and the degrees of freedom.",
+    )
+
+
+def _is_step(discovery: Discovery, number: int, candidate: Candidate) -> bool:
+    """Whether a candidate is the effect that a step added."""
+    if number < len(discovery.steps):
+        return added(discovery.steps[number]) == candidate.name
+    return False
+
+
+def _candidate_bars(shown: Sequence[Candidate], chosen: str | None) -> go.Figure:
+    bars = [
+        _Bar(
+            _folded(each.name),
+            0.0,
+            each.gain,
+            f"{weight_in_words(each.weight)}, {each.degrees_of_freedom} df",
+            *(("chosen", AFTER) if each.name == chosen else ("other", _UNCHOSEN)),
+        )
+        for each in shown
+    ]
+    return _bars(bars, "gain in whitened χ²", 1.55)
+
+
+@dataclass(frozen=True)
+class _Bar:
+    """A horizontal bar from low to high with its label; key: of the legend."""
+
+    name: str
+    low: float
+    high: float
+    label: str
+    key: str
+    colour: str
+
+
+def _bars(bars: Sequence[_Bar], x_title: str, room: float) -> go.Figure:
+    """Bars from the top down; room: how much wider than the longest bar the plot is, for the labels."""
+    traces = [
+        go.Bar(
+            y=[bar.name for bar in bars if bar.key == key],
+            x=[float(f"{bar.high - bar.low:.6g}") for bar in bars if bar.key == key],
+            base=[float(f"{bar.low:.6g}") for bar in bars if bar.key == key],
+            orientation="h",
+            marker={"color": [bar.colour for bar in bars if bar.key == key]},
+            text=[bar.label for bar in bars if bar.key == key],
+            textposition="outside",
+            cliponaxis=False,
+            textfont={"size": 12, "color": INK},
+            legendgroup=key,
+            hovertemplate="%{y}: %{text}<extra></extra>",
+        )
+        for key in dict.fromkeys(bar.key for bar in bars)
+    ]
+    figure = plot(*traces, barmode="overlay", xaxis_title_text=x_title)
+    figure.update_xaxes(range=[0, room * max(bar.high for bar in bars)])
+    figure.update_yaxes(
+        ticks="", tickfont_color=INK, categoryorder="array", categoryarray=[bar.name for bar in reversed(bars)]
+    )
+    return figure
+
+
+def waterfall_grid(discovery: Discovery) -> FigureGrid | None:
+    """Error after each step, down to the floor."""
+    steps = discovery.steps
+    if len(steps) < 2:
+        return None
+    held = decisive(discovery)
+    unseen = held is not None and all(step.eq6_held_out is not None and step.held_out is not None for step in steps)
+    if unseen and held is not None:
+        where = held_out_in_words(discovery, held)
+        values = [[step.eq6_held_out for step in steps], [step.held_out for step in steps]]
+        floors: list[float | None] = [held.eq6.floor, held.chi2.floor]
+    else:
+        where, gap = "training runs", discovery.gap
+        values = [[step.eq6_train for step in steps], [step.train for step in steps]]
+        floors = [gap.floor if gap.metric == metric and not discovery.held_out else None for metric in METRICS]
+    figures = tuple(
+        Figure(
+            f"{title}, {where}",
+            _waterfall(steps, [value for value in own if value is not None], floor, title),
+            f"{title} of the plain matrix and after each effect that was added, {where}",
+            110 + 44 * (len(steps) + 1),
+        )
+        for title, own, floor in zip(METRICS.values(), values, floors, strict=True)
+    )
+    legend = (
+        LegendItem("before", "plain matrix", BEFORE),
+        LegendItem("down", "gained by an effect", _GAINED),
+        *((LegendItem("up", "lost by an effect", _LOST),) if any(_rises(own) for own in values) else ()),
+        LegendItem("after", "extended model", AFTER),
+        *((_FLOOR_LEGEND,) if any(floor is not None for floor in floors) else ()),
+    )
+    return FigureGrid(figures, legend, 2)
+
+
+def _rises(values: Sequence[float | None]) -> bool:
+    known = [value for value in values if value is not None]
+    return any(after > before for before, after in pairwise(known))
+
+
+def _waterfall(steps: Sequence[Step], values: Sequence[float], floor: float | None, title: str) -> go.Figure:
+    decimals = max(2, min(6, 2 - _exponent(min(value for value in values if value > 0))))
+    bars = [_Bar("plain matrix", 0.0, values[0], fixed(values[0], decimals), "before", BEFORE)]
+    for step, (before, after) in zip(steps[1:], pairwise(values), strict=True):
+        key, colour = ("down", _GAINED) if after <= before else ("up", _LOST)
+        label = fixed(after - before, decimals, signed=True)
+        bars.append(_Bar(_folded(f"+ {added(step)}"), min(before, after), max(before, after), label, key, colour))
+    bars.append(_Bar("extended model", 0.0, values[-1], fixed(values[-1], decimals), "after", AFTER))
+    figure = _bars(bars, title, 1.25)
+    if floor is not None:
+        figure.add_vline(x=floor, line={"color": FLOOR, "width": 2, "dash": "dash"})
+    return figure
+
+
+def gap_grid(discovery: Discovery) -> FigureGrid:
+    """Before, after and floor of every gap, on the training runs and on those held out."""
+    gaps: list[tuple[str, Gap]] = []
+    for held in discovery.held_out:
+        where = held_out_in_words(discovery, held)
+        gaps += [(where, held.eq6), (where, held.chi2)]
+    if not gaps:
+        gaps.append(("training runs", discovery.gap))
+    figures = tuple(
+        Figure(
+            f"{METRICS[gap.metric]}, {name}: {closed_in_words(gap)}{'' if gap.closed is None else ' closed'}",
+            _gap_bars(gap),
+            f"{METRICS[gap.metric]} on {name}: before {gap.before:.4g}, after {gap.after:.4g}, floor {gap.floor:.4g}",
+            190,
+        )
+        for name, gap in gaps
+    )
+    return FigureGrid(
+        figures,
+        (
+            LegendItem("before", "plain matrix (before)", BEFORE),
+            LegendItem("after", "extended model (after)", AFTER),
+            LegendItem("floor", "floor", FLOOR),
+        ),
+        2 if len(figures) > 1 else 1,
+        floor_in_words(discovery),
+    )
+
+
+def _gap_bars(gap: Gap) -> go.Figure:
+    decimals = gap_decimals(gap)
+    bars = [
+        _Bar("before", 0.0, gap.before, fixed(gap.before, decimals), "before", BEFORE),
+        _Bar("after", 0.0, gap.after, fixed(gap.after, decimals), "after", AFTER),
+        _Bar("floor", 0.0, gap.floor, fixed(gap.floor, decimals), "floor", FLOOR),
+    ]
+    return _bars(bars, METRICS[gap.metric], 1.25)
+
+
+def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
+    """How large each effect could be unseen, as a share of what is plausible."""
+    shown = [each for each in reversed(worst_of_each(hidden)) if each.plausible > 0 and each.limit > 0]
+    if not shown:
+        return None
+    names = [text(f"{each.name}: {each.parameter}") for each in shown]
+    traces = []
+    for key, symbol, colour, attribute, words in (
+        ("limit", "circle", AFTER, "limit", "at most"),
+        ("detectable", "diamond-open", INK, "detectable", "found nearly always from"),
+    ):
+        values = [getattr(each, attribute) for each in shown]
+        traces.append(
+            go.Scatter(
+                y=names,
+                x=[float(f"{100 * value / each.plausible:.4g}") for value, each in zip(values, shown, strict=True)],
+                mode="markers",
+                marker={"color": colour, "symbol": symbol, "size": 9, "line": {"width": 1.5}},
+                legendgroup=key,
+                text=[
+                    f"{words} ±{reading(each.unit).words(value, 2)}" for value, each in zip(values, shown, strict=True)
+                ],
+                hovertemplate="%{y}<br>%{text}<extra></extra>",
+            )
+        )
+    figure = plot(*traces, xaxis_title_text="% of the plausible range")
+    shares = [100 * value / each.plausible for each in shown for value in (each.limit, each.detectable)]
+    logarithmic(figure, "x", min([*shares, 50.0]), max([*shares, 200.0]))
+    figure.add_vline(x=100, line={"color": QUIET, "width": 1.2, "dash": "dot"})
+    figure.update_yaxes(ticks="", tickfont_color=INK, showgrid=True)
+    return FigureGrid(
+        (
+            Figure(
+                "What could still hide, as a share of what is plausible",
+                figure,
+                "For each effect that was not found, how large it could be unseen in per cent of its plausible range",
+                90 + 26 * len(shown),
+            ),
+        ),
+        (
+            LegendItem("limit", "could be this large (95 %)", AFTER),
+            LegendItem("detectable", "found nearly always from here on", INK, "dot"),
+        ),
+        1,
+        "Of each effect the parameter that could be largest. Left of the dotted line the data tell more than what is "
+        "plausible of such an effect anyway; right of it an effect of plausible size could hide.",
+    )
+
+
+def _folded(name: str) -> str:
+    """A long name on two lines."""
+    if len(name) < 16 or "_" not in name:
+        return text(name)
+    cuts = [index for index, letter in enumerate(name) if letter == "_"]
+    cut = min(cuts, key=lambda index: abs(index - len(name) / 2))
+    return f"{text(name[: cut + 1])}<br>{text(name[cut + 1 :])}"
+
+
+def _exponent(value: float) -> int:
+    return int(f"{value:e}".split("e")[1])

@@ -1,0 +1,191 @@
+"""Residuals before and after, as the pictures need them: by command, and against any covariate of the motion.
+
+Against a covariate they are not averaged, as a pose holds all that went wrong before it. What is drawn is the change
+of the motion (along the way, across it, in turning, or of a wheel's rate) that, constant within each bin of the
+covariate, explains the residuals best: generalised least squares under the noise model.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.data.dataset import Trajectory
+from omnibench.discover.regressors.paths import Paths, make_paths
+from omnibench.discover.result import Discovery
+from omnibench.fit.least_squares.noise import Whitener
+from omnibench.fit.least_squares.repetitions import grouped
+from omnibench.robot.kinematics import Array
+
+# Standard deviations: 95 % of a normal distribution of the line, and of the plane.
+NORMAL_95 = 1.96
+CIRCLE_95 = 2.448
+_STAMPS = 15_000  # of all runs, for the fits
+_DETERMINED = 1e-4  # share of a bin's information that others must leave
+_COMMANDS = 8  # from which on they are flipped whole
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Values (n, 2) before and after with standard errors (n, 2) of what comes out by chance; NaN: not told."""
+
+    values: Array
+    errors: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CommandResidual:
+    """Final residuals of one command: means over its runs, in the frame of the start pose (x forward).
+
+    end (3,): final pose; means (2, 3): before and after, m, m, rad; error (3,): their standard error by the noise.
+    """
+
+    name: str
+    run: Trajectory
+    runs: int
+    end: Array
+    means: Array
+    error: Array
+
+
+class Residuals:
+    """The training runs with their residuals, in the order in which they were driven.
+
+    runs: by session and time. each: before and after, (K, 3) of each run, reference minus odometry, m, m, rad.
+    spread: by how much the residuals that are left exceed the noise, at least 1; standard errors are multiplied by it.
+    """
+
+    def __init__(self, discovery: Discovery) -> None:
+        trajectories = {run.id: run for run in discovery.dataset.trajectories}
+        runs = [trajectories[name] for name in discovery.trajectories]
+        order = sorted(range(len(runs)), key=lambda i: (str(runs[i].session), runs[i].started_at or 0.0))
+        self.runs = tuple(runs[index] for index in order)
+        self.each = tuple(tuple(own[index] for index in order) for own in (discovery.before, discovery.after))
+        self.noise = discovery.noise.noise
+        white = np.concatenate([each.ravel() for each in discovery.whitened_after])
+        self.spread = max(1.0, math.sqrt(float(np.square(white).mean())))
+        self._calibration = discovery.plain
+
+    def deviations(self, times: Array) -> Array:
+        """Standard deviations (n, 3) of single poses' errors at times (n,), m, m, rad."""
+        noise = self.noise
+        position = np.sqrt(noise.pose_position**2 + noise.walk_position**2 * times + noise.bias_position**2)
+        heading = np.sqrt(noise.pose_heading**2 + noise.walk_heading**2 * times + noise.bias_heading**2)
+        return self.spread * np.column_stack([position, position, heading])
+
+    @cached_property
+    def commands(self) -> tuple[CommandResidual, ...]:
+        """Final residuals by command; runs without one stand for themselves."""
+        found = []
+        for members in grouped([(run.command, run.id if run.command is None else None) for run in self.runs]):
+            first = self.runs[members[0]]
+            ends, finals, variances = [], [], []
+            for index in members:
+                run = self.runs[index]
+                ends.append(_seen_from(run.start, run.final_pose - run.start))
+                finals.append([_seen_from(run.start, own[index][-1]) for own in self.each])
+                variances.append(self.deviations(run.pose_times[-1:])[0] ** 2)
+            error: Array = np.sqrt(np.sum(variances, axis=0)) / len(members)
+            end: Array = np.mean(ends, axis=0)
+            means: Array = np.mean(finals, axis=0)
+            found.append(CommandResidual(first.command or first.id, first, len(members), end, means, error))
+        return tuple(found)
+
+    @cached_property
+    def paths(self) -> Paths:
+        """The paths of the runs by the plain matrix, with thinned stamps."""
+        logs = [replace(run.reference_log, stamps=run.pose_times[1:][chosen]) for run, chosen in self._thinned]
+        return make_paths(
+            self._calibration.robot, self._calibration.matrix_array, logs, self._calibration.sample_period
+        )
+
+    @cached_property
+    def stamp_numbers(self) -> NDArray[np.intp]:
+        """Of each of the paths' stamps, its number in its run, the first being 0."""
+        return np.concatenate([chosen for _, chosen in self._thinned])
+
+    @cached_property
+    def _thinned(self) -> list[tuple[Trajectory, NDArray[np.intp]]]:
+        """Of each run the stamps that are fitted; some are enough, and their noise is what it was."""
+        stride = max(1, math.ceil(sum(map(len, self.each[0])) / _STAMPS))
+        return [(run, np.arange(len(own))[(len(own) - 1) % stride :: stride])
+                for run, own in zip(self.runs, self.each[0], strict=True)]  # fmt: skip
+
+    @cached_property
+    def _white(self) -> list[tuple[Whitener, Array]]:
+        """Of each run its whitening and its whitened residuals (3 K, 2) before and after."""
+        whiteners: dict[bytes, Whitener] = {}
+        found = []
+        for (run, chosen), before, after in zip(self._thinned, *self.each, strict=True):
+            stamps = run.pose_times[1:][chosen]
+            whitener = whiteners.setdefault(stamps.tobytes(), Whitener(self.noise, stamps))
+            both = whitener(np.stack([before[chosen], after[chosen]], axis=-1))
+            found.append((whitener, both.reshape(-1, 2)))
+        return found
+
+    def fit(self, columns: Array) -> Fitted:
+        """What changes of the motion explain the residuals; columns (S, 3, n): their slopes at the paths' stamps.
+
+        By chance: under the noise, or if the residuals of whole commands (of runs, where commands are few) came with
+        random signs, whatever makes them; the larger of both.
+        """
+        size = columns.shape[2]
+        information, scores = np.zeros((size, size)), np.empty((len(self.runs), size, 2))
+        for row, (part, (whitener, residuals)) in enumerate(zip(self.paths.parts, self._white, strict=True)):
+            white = whitener(columns[part]).reshape(-1, size)
+            information += white.T @ white
+            scores[row] = white.T @ residuals
+        scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+        scale[np.diag(information) < 1e-12 * np.diag(information).max(initial=0.0)] = 0.0
+        correlation = information * np.outer(scale, scale)
+        inverse = np.linalg.pinv(correlation, rcond=_DETERMINED, hermitian=True) * np.outer(scale, scale)
+        told = (scale > 0) & _is_estimable(correlation)
+        noise = self.spread * np.sqrt(np.maximum(np.diag(inverse), 0.0))
+        pulls = np.stack([scores[list(members)].sum(axis=0) for members in self._clusters])
+        flipped = np.sqrt(np.square(np.einsum("ij,cjm->cim", inverse, pulls)).sum(axis=0))
+        values = inverse @ scores.sum(axis=0)
+        errors = np.maximum(noise[:, None], flipped)
+        return Fitted(np.where(told[:, None], values, np.nan), np.where(told[:, None], errors, np.nan))
+
+    def fit_runs(self, columns: Array) -> Fitted:
+        """The same for one change (S, 3, 1) and each run by itself: values (Z, 2), by chance under the noise."""
+        values, errors = np.full((len(self.runs), 2), np.nan), np.full((len(self.runs), 2), np.nan)
+        for row, (part, (whitener, residuals)) in enumerate(zip(self.paths.parts, self._white, strict=True)):
+            white = whitener(columns[part]).reshape(-1)
+            if (information := float(white @ white)) > 0:
+                values[row] = white @ residuals / information
+                errors[row] = self.spread / math.sqrt(information)
+        return Fitted(values, errors)
+
+    @cached_property
+    def _clusters(self) -> list[tuple[int, ...]]:
+        """The runs of each command, or each run by itself where commands are few."""
+        commands = grouped([(run.command, run.id if run.command is None else None) for run in self.runs])
+        return commands if len(commands) >= _COMMANDS else [(index,) for index in range(len(self.runs))]
+
+
+def _is_estimable(information: Array) -> NDArray[np.bool_]:
+    """Which parameters have no part in a direction that the data leave open."""
+    values, vectors = np.linalg.eigh(information)
+    open_ones = vectors[:, values < _DETERMINED * max(float(values.max(initial=0.0)), 1e-300)]
+    return np.square(open_ones).sum(axis=1) < 0.01
+
+
+def shares(values: Array, edges: Sequence[float] | Array) -> Array:
+    """Which bin (F, B) each of values (F,) is in: 1 there and 0 elsewhere; all 0 outside the edges."""
+    bins = np.searchsorted(np.asarray(edges), values, side="right") - 1
+    bins = np.where(values == edges[-1], len(edges) - 2, bins)
+    found: Array = (bins[:, None] == np.arange(len(edges) - 1)).astype(float)
+    return found
+
+
+def _seen_from(start: Array, difference: Array) -> Array:
+    """A difference of poses in the frame of a start pose."""
+    cosine, sine = math.cos(start[2]), math.sin(start[2])
+    x, y, turned = difference
+    return np.array([cosine * x + sine * y, -sine * x + cosine * y, turned])

@@ -1,0 +1,243 @@
+"""The tables of a discovery's report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from omnibench.data.dataset import Dataset
+from omnibench.discover.report.wording import (
+    METRICS,
+    STAGES,
+    added,
+    chance,
+    closed_in_words,
+    final_errors_in_words,
+    floor_in_words,
+    gap_decimals,
+    held_out_in_words,
+    reading,
+    share_of_plausible,
+    value_and_interval,
+    weight_in_words,
+)
+from omnibench.discover.result import Discovery, Gap, Hidden, NamedEffect, Novelty, Place
+from omnibench.registry import effects
+from omnibench.report.blocks import Cell, Column, Row, Table
+from omnibench.report.numbers import NOTHING, count, fixed, percent, plural, significant
+from omnibench.robot.effects.effect import Effect
+
+
+def place_table(places: Sequence[Place], caption: str) -> Table:
+    """What the residual depends on, with its significance."""
+    rows = tuple(
+        Row(
+            (
+                Cell(each.covariate, f"{each.stage}: {STAGES[each.stage]}"),
+                Cell(each.description),
+                Cell(chance(each.p_value)),
+                Cell(significant(each.excess, 3)),
+                Cell(count(each.degrees_of_freedom)),
+            )
+        )
+        for each in places
+    )
+    return Table(
+        caption,
+        (
+            Column("Residual over", numeric=False),
+            Column("In words", numeric=False),
+            Column("Chance"),
+            Column("Excess", "χ²"),
+            Column("Degrees of freedom"),
+        ),
+        rows,
+        "Chance: how often noise alone would show as much in any of all the places that were looked at. Excess: "
+        "whitened χ² beyond what the degrees of freedom take by chance.",
+    )
+
+
+def parameter_table(found: Sequence[NamedEffect], dataset: Dataset) -> Table:
+    """Every effect's parameters with their intervals."""
+    rows: list[Row] = []
+    for effect in found:
+        meanings = _meanings(effect.name, dataset)
+        others = [name for name in effect.confusable_with if name != effect.name]
+        alike = f", cannot be told from {' and '.join(others)}" if others else ""
+        rows.append(
+            Row((Cell(f"{effect.name} ({effect.stage}), weight {weight_in_words(effect.weight)}{alike}"),), "group")
+        )
+        for each in effect.parameters:
+            value, interval, unit = value_and_interval(each)
+            kept = "chosen among a few" if each.shape else interval or NOTHING
+            rows.append(
+                Row((Cell(each.name, meanings.get(each.name, "")), Cell(value), Cell(kept), Cell(unit or NOTHING)))
+            )
+    return Table(
+        "Parameters of what was added",
+        (Column("Parameter", numeric=False), Column("Value"), Column("95 % interval"), Column("Unit", numeric=False)),
+        tuple(rows),
+    )
+
+
+def _meanings(name: str, dataset: Dataset) -> Mapping[str, str]:
+    """What an effect's parameters mean, in words; nothing of a term that is no effect."""
+    if name not in {entry.name for entry in effects.entries()}:
+        return {}
+    sessions = tuple(dict.fromkeys(run.session for run in dataset.trajectories if run.session is not None))
+    effect: Effect = effects.create(name)
+    return {each.name: each.description for each in effect.parameters(dataset.robot, sessions)}
+
+
+def held_out_table(discovery: Discovery) -> Table:
+    """Both gaps and the final errors on the runs that no fit has seen."""
+    rows: list[Row] = []
+    for each in discovery.held_out:
+        where = f"{held_out_in_words(discovery, each)}: {plural(each.runs, 'run')}"
+        rows += [Row((Cell(where),), "group"), _gap_row(each.eq6), _gap_row(each.chi2)]
+        position, heading = final_errors_in_words(each)
+        rows += [_plain_row("Final position error, mean", position), _plain_row("Final heading error, mean", heading)]
+    return Table("On runs that no fit has seen", _GAP_COLUMNS, tuple(rows), _gap_note(discovery))
+
+
+def gap_table(discovery: Discovery) -> Table:
+    """The gap on its own."""
+    return Table("The gap on the training runs", _GAP_COLUMNS, (_gap_row(discovery.gap),), _gap_note(discovery))
+
+
+_GAP_COLUMNS = (
+    Column("Measure", numeric=False),
+    Column("Before"),
+    Column("After"),
+    Column("Floor"),
+    Column("Closed"),
+    Column("Std. error of the gap"),
+)
+
+
+def _gap_note(discovery: Discovery) -> str:
+    return (
+        f"Before: the plain matrix; after: the extended model. {floor_in_words(discovery)} Closed: the share of "
+        "before − floor that is gone, where that is more than two standard errors."
+    )
+
+
+def _gap_row(gap: Gap) -> Row:
+    decimals = gap_decimals(gap)
+    values = (gap.before, gap.after, gap.floor)
+    cells = (Cell(fixed(value, decimals)) for value in values)
+    return Row(
+        (Cell(METRICS[gap.metric]), *cells, Cell(closed_in_words(gap)), Cell(significant(gap.standard_error, 2)))
+    )
+
+
+def _plain_row(name: str, words: str) -> Row:
+    before, _, after = words.partition(" → ")
+    unit = " mm" if after.endswith(" mm") else ""
+    return Row((Cell(name), Cell(f"{before}{unit}"), Cell(after), Cell(NOTHING), Cell(NOTHING), Cell(NOTHING)))
+
+
+def step_table(discovery: Discovery) -> Table:
+    """The waterfall in numbers."""
+    steps = discovery.steps
+    rows = tuple(
+        Row(
+            (
+                Cell(step.name if index == 0 else f"+ {added(step)}"),
+                *(Cell(significant(value, 4)) for value in
+                  (step.eq6_train, step.eq6_held_out, step.train, step.held_out)),
+            )
+        )
+        for index, step in enumerate(steps)
+    )  # fmt: skip
+    return Table(
+        "Step by step",
+        (
+            Column("Model", numeric=False),
+            Column("Eq. (6)", "training"),
+            Column("Eq. (6)", "held out"),
+            Column("χ² per residual", "training"),
+            Column("χ² per residual", "held out"),
+        ),
+        rows,
+    )
+
+
+def hidden_table(hidden: Sequence[Hidden]) -> Table:
+    """How large every effect could still be, the largest for its kind first."""
+    rows = []
+    for each in sorted(hidden, key=share_of_plausible, reverse=True):
+        shown, share = reading(each.unit), share_of_plausible(each)
+        rows.append(
+            Row(
+                (
+                    Cell(each.name),
+                    Cell(each.parameter),
+                    Cell(f"±{shown.number(each.limit, 2)}"),
+                    Cell(f"±{shown.number(each.detectable, 2)}"),
+                    Cell(f"±{shown.number(each.plausible, 2)}"),
+                    Cell(shown.unit or NOTHING),
+                    Cell(percent(share, 0) if share < 100 else "> 10,000 %"),
+                )
+            )
+        )
+    return Table(
+        "How large an effect of each kind could still hide",
+        (
+            Column("Effect", numeric=False),
+            Column("Parameter", numeric=False),
+            Column("At most (95 %)"),
+            Column("Found nearly always from"),
+            Column("Plausible"),
+            Column("Unit", numeric=False),
+            Column("Of the plausible"),
+        ),
+        tuple(rows),
+        "At most: its parameter lies within ± this with 95 %, given what was added.",
+    )
+
+
+def absorbed_table(discovery: Discovery) -> Table:
+    """Effects that a matrix reproduces, and what would tell them."""
+    rows = tuple(
+        Row((Cell(each.name), Cell(each.stage, STAGES[each.stage]), Cell(each.measurement or NOTHING)))
+        for each in discovery.absorbed
+    )
+    return Table(
+        "Absorbed: any of these may be there, and no odometry run would show it",
+        (Column("Effect", numeric=False), Column("Stage", numeric=False), Column("What would tell", numeric=False)),
+        rows,
+        "A free matrix reproduces them on these data exactly, or to far below the noise. They are never named.",
+    )
+
+
+def not_looked_for_table(discovery: Discovery) -> Table:
+    """Effects that these recordings cannot show."""
+    rows = tuple(Row((Cell(name), Cell(reason))) for name, reason in discovery.not_looked_for)
+    columns = (Column("Effect", numeric=False), Column("Why", numeric=False))
+    return Table("Not looked for", columns, rows)
+
+
+def novelty_table(novelties: Sequence[Novelty]) -> Table:
+    """Motions that the training runs never had, with the bounds that widen."""
+    rows = tuple(
+        Row(
+            (
+                Cell(each.command),
+                Cell(each.description),
+                Cell(significant(1e3 * each.before_m, 3)),
+                Cell(significant(1e3 * each.after_m, 3)),
+            )
+        )
+        for each in novelties
+    )
+    return Table(
+        "Motions of the held-out runs that no training run drives",
+        (
+            Column("Command", numeric=False),
+            Column("What is new", numeric=False),
+            Column("Plain matrix", "mm"),
+            Column("Extended model", "mm"),
+        ),
+        rows,
+        "Bounds (95 %) of the final position error that each model promises there.",
+    )

@@ -1,0 +1,1 @@
+"""Model selection: which effects of the catalogue are missing."""

@@ -1,0 +1,1 @@
+"""A proven lower bound of the cost over a box."""

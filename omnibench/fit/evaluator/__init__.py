@@ -1,0 +1,1 @@
+"""Costs and poses of many candidate matrices at once."""

@@ -1,0 +1,1 @@
+"""Weighted least squares of whole reference trajectories: noise, nuisances, steps."""

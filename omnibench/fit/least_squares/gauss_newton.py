@@ -1,0 +1,124 @@
+"""Gauss-Newton steps of a trajectory fit within the box of a calibration problem."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from omnibench.fit.least_squares.trajectory_fit import Estimate, Linearisation, TrajectoryFit, Weighting
+from omnibench.fit.problem import CalibrationProblem
+from omnibench.robot.kinematics import Array
+
+_MOST_STEPS = 25
+_MOST_HALVINGS = 8
+_SHARES = (1.0, 0.3, 0.0)  # of a run's nuisance steps
+_RANK = 1e-12  # share of the strongest direction below which one is not determined at all
+_NO_GAIN, _NO_SHARE = 1e-2, 1e-5  # of the objective, which is in units of the noise, and as a share of it
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """Where the steps led: the estimate, the fit about it, and whether it has settled there."""
+
+    estimate: Estimate
+    linear: Linearisation
+    settled: bool
+
+
+def descend(
+    problem: CalibrationProblem,
+    fit: TrajectoryFit,
+    estimate: Estimate,
+    weightings: Sequence[Weighting],
+    deviations: Array,
+    tolerance: float,
+) -> Descent:
+    """Steps within the box until one of the vector is smaller than ``tolerance`` standard errors.
+
+    deviations (3,): of the nuisances, 0 for one that is held. The recorded path has a kink at every sample, and so has
+    the objective as a function of a clock's offset. Every run therefore goes as far along its nuisances' steps as does
+    it good; where they gain no more, the vector is settled with the nuisances held.
+
+    Every vector that is tried is counted by ``problem.cost``; where that is not finite no way leads.
+    """
+    move = _Move(problem, fit, weightings)
+    linear = fit.linearise(estimate, weightings, deviations)
+    if (deviations > 0).any():
+        for _ in range(_MOST_STEPS):
+            before = float(linear.chi2.sum())
+            found, size = move.step(estimate, linear, deviations)
+            if found is None:
+                break
+            estimate = found
+            linear = fit.linearise(estimate, weightings, deviations)
+            after = float(linear.chi2.sum())
+            if size < tolerance or before - after < _NO_GAIN + _NO_SHARE * after:
+                break
+    settled = False
+    for _ in range(_MOST_STEPS):
+        held = fit.linearise(estimate, weightings, np.zeros(3))
+        found, size = move.step(estimate, held, np.zeros(3))
+        settled = size < tolerance and found is not None
+        if found is None:
+            settled = size < 10 * tolerance and move.leads(estimate.vector)  # but for rounding
+            break
+        estimate = found
+        if settled:
+            break
+    return Descent(estimate, fit.linearise(estimate, weightings, deviations), settled)
+
+
+@dataclass(frozen=True, eq=False)
+class _Move:
+    problem: CalibrationProblem
+    fit: TrajectoryFit
+    weightings: Sequence[Weighting]
+
+    def leads(self, vector: Array) -> bool:
+        """Whether a vector (n,) has a finite cost."""
+        return bool(np.isfinite(self.problem.cost(vector[None])[0]))
+
+    def step(self, estimate: Estimate, linear: Linearisation, deviations: Array) -> tuple[Estimate | None, float]:
+        """One step down from an estimate, or None if there is none, and how many standard errors the whole step is."""
+        problem, total = self.problem, linear.information.sum(axis=0)
+        whole = bounded_step(problem, estimate.vector, total, linear.scores.sum(axis=0))
+        size = float(np.sqrt(max(whole @ total @ whole, 0.0)))
+        limit = float(linear.chi2.sum()) * (1 + 1e-12)
+        for halvings in range(_MOST_HALVINGS):
+            step = 0.5**halvings * whole
+            vector = np.clip(estimate.vector + step, problem.lower, problem.upper)
+            if not self.leads(vector):
+                continue
+            shares = _SHARES if (deviations > 0).any() else (0.0,)
+            turns = linear.nuisance_steps(step)
+            trials = [Estimate(vector, estimate.nuisances + share * turns) for share in shares]
+            values = np.array([self.fit.chi2(trial, self.weightings, deviations) for trial in trials])
+            best = values.argmin(axis=0)
+            if values.min(axis=0).sum() <= limit:
+                nuisances = np.array([trial.nuisances for trial in trials])[best, np.arange(len(best))]
+                return Estimate(vector, nuisances), size
+        return None, size
+
+
+def bounded_step(problem: CalibrationProblem, vector: Array, information: Array, score: Array) -> Array:
+    """The step (n,) within the box that minimises d'A d / 2 + g'd; none along directions that A does not know."""
+    free = problem.free
+    step = np.zeros(len(vector))
+    if not free.any():
+        return step
+    unit = (problem.upper - problem.lower)[free]
+    values, directions = np.linalg.eigh(information[np.ix_(free, free)] * np.outer(unit, unit))
+    known = values > _RANK * max(float(values[-1]), 0.0)
+    roots, directions = np.sqrt(values[known]), directions[:, known]
+    target = -(directions.T @ (score[free] * unit)) / roots
+    inner = directions @ (target / roots)
+    low, high = ((bound - vector)[free] / unit for bound in (problem.lower, problem.upper))
+    if ((inner < low) | (inner > high)).any() and known.any():
+        room = 1e-9  # of the box: lsq_linear wants some, and the vector is clipped
+        bounds = (np.minimum(low, 0.0) - room, np.maximum(high, 0.0) + room)
+        inner = lsq_linear(roots[:, None] * directions.T, target, bounds=bounds, tol=1e-12).x
+    step[free] = inner * unit
+    return step

@@ -1,0 +1,183 @@
+"""The noise of reference poses: whitening of residuals, and variance components from repetitions.
+
+The errors of one run at its stamps t_i > 0, of x and y alike and of the heading apart, have the covariance
+
+    white^2 I + walk^2 min(t_i, t_j) + bias^2 1 1^T.
+
+Of (r_1, r_2 - r_1, r_3 - r_2, ...) it is tridiagonal, so that all that follows takes a time proportional to K.
+A shift of the start pose is a bias, exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.linalg.lapack import dpbtrf, dtbtrs
+from scipy.optimize import minimize
+
+from omnibench.data.dataset import Trajectory
+from omnibench.errors import DataError
+from omnibench.fit.least_squares.repetitions import Difference, differences_between_repetitions
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Array
+
+# White noise, m or rad, that stands in where there is neither white noise nor walk and the covariance is singular.
+LEAST_WHITE = 1e-9
+# Components as shares of the residuals' size, on a logarithmic scale.
+_LOGARITHMS = (np.log(1e-4), np.log(1e2))
+_NO_LOSS = 1e-3  # of twice the logarithm of the likelihood
+_COORDINATES = (("position", slice(0, 2)), ("heading", slice(2, 3)))
+
+
+class Whitener:
+    """Turns the pose residuals of one run into independent ones of unit variance, exactly, in O(K).
+
+    stamps (K,): s, > 0, increasing; the start pose at t = 0 is not among them. log_determinant: of the covariance of
+    all 3K residuals. Without white noise and walk the covariance is singular: white noise of 1e-9 (m, rad) stands in.
+    """
+
+    log_determinant: float
+
+    def __init__(self, noise: Noise, stamps: Array) -> None:
+        stamps = np.asarray(stamps, dtype=float)
+        if stamps.ndim != 1 or len(stamps) == 0 or not (np.diff(stamps, prepend=0.0) > 0).all():
+            raise ValueError("stamps must be increasing and > 0")
+        steps = np.diff(stamps, prepend=0.0)
+        self._position = _Factor(noise.pose_position, noise.walk_position, noise.bias_position, steps)
+        self._heading = _Factor(noise.pose_heading, noise.walk_heading, noise.bias_heading, steps)
+        self.log_determinant = 2 * self._position.log_determinant + self._heading.log_determinant
+
+    def __call__(self, residuals: Array) -> Array:
+        """Whitened residuals, or derivatives of residuals: (K, 3) or (K, 3, n) to the same shape."""
+        differences = _differences(residuals)
+        split = 2 * differences.shape[1] // 3
+        white = [self._position.whiten(differences[:, :split]), self._heading.whiten(differences[:, split:])]
+        return np.concatenate(white, axis=1).reshape(residuals.shape)
+
+
+class _Factor:
+    """The Cholesky factor of one coordinate's covariance, as a lower bidiagonal matrix of the differences.
+
+    steps (K,): s from each stamp to the next, the first from t = 0.
+    """
+
+    def __init__(self, white: float, walk: float, bias: float, steps: Array) -> None:
+        walked = walk**2 * (steps[1:] if bias else steps)
+        if white**2 + walked.min(initial=np.inf) < LEAST_WHITE**2:
+            white = LEAST_WHITE
+        bands = np.empty((2, len(steps)), order="F")
+        bands[0] = 2 * white**2 + walk**2 * steps
+        bands[0, 0] += bias**2 - white**2
+        bands[1] = -(white**2)
+        self._factor, failed = dpbtrf(bands, lower=1, overwrite_ab=1)
+        if failed:
+            raise ValueError("noise or stamps are not finite")
+        self.log_determinant = float(2 * np.log(self._factor[0]).sum())
+
+    def whiten(self, differences: Array) -> Array:
+        """Independent values (K, n) of differences (K, n) between successive residuals, the first from 0."""
+        whitened, _ = dtbtrs(self._factor, differences, uplo="L")
+        return whitened
+
+
+def _differences(residuals: Array) -> Array:
+    """Differences (K, n) of residuals (K, ...) from one stamp to the next, the first from 0."""
+    flat = residuals.reshape(len(residuals), -1)
+    differences = flat.copy()
+    differences[1:] -= flat[:-1]
+    return differences
+
+
+@dataclass(frozen=True)
+class NoiseEstimate:
+    """A noise model and where it comes from.
+
+    degrees_of_freedom: independent differences between runs, or the runs themselves where none is repeated.
+    """
+
+    noise: Noise
+    source: Literal["repetitions", "within runs"]
+    degrees_of_freedom: int
+    description: str
+
+
+def estimate_noise(
+    trajectories: Sequence[Trajectory], residuals: Sequence[Array], near: Noise | None = None
+) -> NoiseEstimate:
+    """Variance components by restricted maximum likelihood from the differences between repetitions of a command.
+
+    residuals: for every trajectory (K, 3) at its pose_times[1:], odometry minus reference, m, m, rad, of any decent
+    fit: what the model gets wrong of a command drops out of the differences. Repetitions are runs of one command
+    within a session (within a split if no session repeats a command). Runs whose stamps differ are compared at the
+    nearest ones, without interpolation, which would take away white noise. Without repetitions the residuals
+    themselves are taken for noise, and the estimate says so. near: an earlier estimate, from which to search; without
+    one the search begins in several places. DataError without trajectories.
+    """
+    differences = differences_between_repetitions(trajectories, residuals)
+    if not differences.each:
+        raise DataError("no trajectory has a reference pose after its start; the noise cannot be estimated")
+    return NoiseEstimate(
+        _components(differences.each, near), differences.source, len(differences.each), differences.description
+    )
+
+
+def _components(differences: Sequence[Difference], near: Noise | None) -> Noise:
+    """The noise model that makes the differences most likely, position and heading each by itself."""
+    groups: dict[bytes, tuple[Array, list[Array]]] = {}
+    for each in differences:
+        groups.setdefault(each.stamps.tobytes(), (each.stamps, []))[1].append(each.values)
+    found: dict[str, float] = {}
+    for name, columns in _COORDINATES:
+        samples = [
+            (stamps, np.stack(values, axis=-1)[:, columns].reshape(len(stamps), -1))
+            for stamps, values in groups.values()
+        ]
+        names = [f"{kind}_{name}" for kind in ("pose", "walk", "bias")]
+        start = None if near is None else np.array([getattr(near, each) for each in names])
+        found |= dict(zip(names, _most_likely(samples, start), strict=True))
+    return Noise(**found)
+
+
+def _most_likely(groups: list[tuple[Array, Array]], near: Array | None) -> tuple[float, float, float]:
+    """White noise, walk and bias for which samples (K, n) at stamps (K,) are most likely; near (3,): where to begin."""
+    count = sum(values.size for _, values in groups)
+    size = float(np.sqrt(sum(np.square(values).sum() for _, values in groups) / count))
+    if size < LEAST_WHITE:
+        return 0.0, 0.0, 0.0
+    longest = max(float(stamps[-1]) for stamps, _ in groups)
+    units = size * np.array([1.0, longest**-0.5, 1.0])
+
+    prepared = [(np.diff(stamps, prepend=0.0), np.asfortranarray(_differences(values))) for stamps, values in groups]
+
+    def surprise(components: Array) -> float:
+        white, walk, bias = components
+        total = 0.0
+        for steps, differences in prepared:
+            factor = _Factor(white, walk, bias, steps)
+            total += differences.shape[1] * factor.log_determinant + float(np.square(factor.whiten(differences)).sum())
+        return total / count
+
+    if near is not None and near.any():
+        starts = np.log(np.clip(near / units, 0.05, 50.0))[None]
+    else:  # the likelihood may have a hill for each component that could dominate
+        starts = np.log(0.1 + 0.6 * np.eye(3))
+    tries = [
+        minimize(
+            lambda logarithms: surprise(units * np.exp(logarithms)),
+            start,
+            method="L-BFGS-B",
+            bounds=[_LOGARITHMS] * 3,
+            options={"eps": 1e-5, "ftol": 1e-8},
+        )
+        for start in starts
+    ]
+    best = units * np.exp(min(tries, key=lambda each: float(each.fun)).x)
+    for index in np.argsort(best / units):  # on a logarithmic scale none is ever zero
+        without = np.where(np.arange(3) == index, 0.0, best)
+        if count * (surprise(without) - surprise(best)) < _NO_LOSS:
+            best = without
+    white, walk, bias = best
+    return float(white), float(walk), float(bias)

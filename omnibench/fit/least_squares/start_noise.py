@@ -1,0 +1,114 @@
+"""How far the start headings of runs are off, beside the other noise: one variance more.
+
+An error e of a run's start position shifts its poses by e: a bias. An error of its start heading shifts the headings
+alike, and also turns the path about the start: with u the derivative of the poses by the start heading, the
+covariance of a run grows by deviation^2 u u', which the turned path tells from a biased heading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize, minimize_scalar
+
+from omnibench.data.dataset import Trajectory
+from omnibench.fit.least_squares.noise import LEAST_WHITE, Whitener
+from omnibench.fit.least_squares.repetitions import Difference, differences_between_repetitions
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Array
+
+_NAMES = ("pose_position", "walk_position", "bias_position", "pose_heading", "walk_heading", "bias_heading")
+# Twice the gain in log-likelihood that a variance of zero exceeds by chance in 5 % of cases.
+_GAIN = 2.71
+_LARGEST = 0.3  # rad
+
+
+@dataclass(frozen=True)
+class StartNoise:
+    """The noise with the start headings apart; start_heading: their standard deviation, rad, 0 where none shows."""
+
+    noise: Noise
+    start_heading: float
+
+
+def separate_start_noise(
+    trajectories: Sequence[Trajectory], residuals: Sequence[Array], turning: Sequence[Array], noise: Noise
+) -> StartNoise:
+    """The noise and the start headings' deviation that make the differences between repetitions most likely.
+
+    residuals (K, 3) of every trajectory as for estimate_noise; turning (K, 3): derivatives of its poses by its start
+    heading; noise: the estimate without start noise, where the search begins. A deviation that does not raise the
+    likelihood beyond chance (5 %) is none.
+    """
+    groups = by_stamps(differences_between_repetitions(trajectories, residuals, turning).each)
+    constant = noise.bias_heading
+
+    def apart(deviation: float) -> Noise:
+        rest = np.sqrt(max(constant**2 - deviation**2, 0.0))
+        return noise.model_copy(update={"bias_heading": float(rest)})
+
+    before = _surprise(groups, noise, 0.0)
+    first = minimize_scalar(
+        lambda deviation: _surprise(groups, apart(deviation), deviation),
+        bounds=(0.0, min(max(2 * constant, 4 * noise.pose_heading, 1e-6), _LARGEST)),
+        method="bounded",
+        options={"xatol": 1e-6},
+    )
+    if before - float(first.fun) < _GAIN / 4:  # the others, fitted again, will not add that much
+        return StartNoise(noise, 0.0)
+    found, deviation, after = _polished(groups, apart(float(first.x)), float(first.x))
+    return StartNoise(found, deviation) if before - after > _GAIN else StartNoise(noise, 0.0)
+
+
+def by_stamps(differences: Sequence[Difference]) -> list[tuple[Array, Array]]:
+    """Stamps (K,) and, of the n differences that have these, values (K, 3, n) beside derivatives (K, 3, n)."""
+    groups: dict[bytes, list[Difference]] = {}
+    for each in differences:
+        groups.setdefault(each.stamps.tobytes(), []).append(each)
+    return [
+        (
+            members[0].stamps,
+            np.stack([*(each.values for each in members), *(each.companion for each in members)], axis=-1),
+        )
+        for members in groups.values()
+    ]
+
+
+def _surprise(groups: list[tuple[Array, Array]], noise: Noise, deviation: float) -> float:
+    """Minus twice the log-likelihood, less a constant."""
+    total = 0.0
+    for stamps, everything in groups:
+        whitener = Whitener(noise, stamps)
+        count = everything.shape[2] // 2
+        white = whitener(everything).reshape(-1, 2 * count)
+        values, columns = white[:, :count], white[:, count:]
+        lengths = 1 + deviation**2 * np.square(columns).sum(axis=0)
+        along = (values * columns).sum(axis=0)
+        total += count * whitener.log_determinant + float(np.log(lengths).sum() + np.square(values).sum())
+        total -= deviation**2 * float((along**2 / lengths).sum())
+    return total
+
+
+def _polished(groups: list[tuple[Array, Array]], noise: Noise, deviation: float) -> tuple[Noise, float, float]:
+    """All components together, from a good start."""
+    start = np.array([*(getattr(noise, name) for name in _NAMES), deviation])
+    # From zero there is no way up on a logarithmic scale.
+    start[:3] = np.maximum(start[:3], 0.1 * max(start[:3].max(), LEAST_WHITE))
+    start[3:] = np.maximum(start[3:], 0.1 * max(start[3:].max(), LEAST_WHITE))
+
+    def described(logarithms: Array) -> tuple[Noise, float]:
+        values = [float(value) for value in start * np.exp(logarithms)]
+        return Noise(**dict(zip(_NAMES, values[:6], strict=True))), values[6]
+
+    count = sum(everything[..., 0].size for _, everything in groups)
+    answer = minimize(
+        lambda logarithms: _surprise(groups, *described(logarithms)) / count,
+        np.zeros(7),
+        method="L-BFGS-B",
+        bounds=[(-5.0, 5.0)] * 7,
+        options={"eps": 1e-5, "ftol": 1e-10},
+    )
+    found, deviation = described(answer.x)
+    return found, deviation, _surprise(groups, found, deviation)

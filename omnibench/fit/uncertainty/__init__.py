@@ -1,0 +1,1 @@
+"""How precisely recordings determine a calibration: covariance, intervals, identifiability."""

@@ -1,0 +1,51 @@
+"""Fisher information of the matrix elements: how sharply runs tell them, given the noise of the reference poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from omnibench.data.dataset import Trajectory
+from omnibench.fit.least_squares.noise import Whitener
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
+
+Stamps = Literal["reference", "final"]
+
+
+def information_of_run(
+    run: Trajectory | WheelLog, matrix: Array, integration: Integration, noise: Noise, *, stamps: Stamps = "reference"
+) -> Array:
+    """Fisher information (3N, 3N) of the elements of ``matrix`` (3, N), row by row, from one run; 1/element squared.
+
+    J^T C^-1 J with the derivatives J of the poses and their covariance C under ``noise``, at all reference poses after
+    the start or at the last alone. A WheelLog has its own stamps, > 0. Wheel rates and start pose count as exact; a
+    noisy start position is part of the noise's bias.
+    """
+    log = run if isinstance(run, WheelLog) else _log(run, stamps)
+    jacobian = OdometryBatch([log], integration).jacobian(matrix)  # (K, 3, 3, N)
+    whitened = Whitener(noise, log.stamps)(jacobian.reshape(len(jacobian), 3, -1))
+    columns = whitened.reshape(-1, whitened.shape[-1])
+    information: Array = columns.T @ columns
+    return information
+
+
+def information_of_runs(
+    runs: Sequence[Trajectory | WheelLog],
+    matrix: Array,
+    integration: Integration,
+    noise: Noise,
+    *,
+    stamps: Stamps = "reference",
+) -> Array:
+    """Fisher information (Z, 3N, 3N) of each of the runs; that of all of them is its sum."""
+    size = matrix.size
+    each = [information_of_run(run, matrix, integration, noise, stamps=stamps) for run in runs]
+    return np.array(each).reshape(len(runs), size, size)
+
+
+def _log(run: Trajectory, stamps: Stamps) -> WheelLog:
+    return run.final_log if stamps == "final" else run.reference_log

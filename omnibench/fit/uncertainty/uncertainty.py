@@ -1,0 +1,213 @@
+"""How sure a calibration is: covariance of the matrix elements and of the physical parameters behind them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from omnibench.errors import DataError
+from omnibench.fit.calibrator import RunResult
+from omnibench.fit.cost import SumOfNorms
+from omnibench.fit.least_squares.noise import NoiseEstimate, estimate_noise
+from omnibench.fit.parameterisation import MatrixElements, WheelGeometry
+from omnibench.fit.problem import CalibrationProblem
+from omnibench.fit.span import driven_span, unidentified_directions
+from omnibench.fit.uncertainty.bootstrap import ElementIntervals
+from omnibench.fit.uncertainty.information import information_of_run, information_of_runs
+from omnibench.fit.uncertainty.physical import (
+    ParameterEstimate,
+    geometry_of,
+    is_invertible,
+    matrix_slopes,
+    told_parameters,
+    unit_of,
+)
+from omnibench.fit.uncertainty.sandwich import Pulls, pulls_of_runs, sandwich
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import OdometryBatch
+
+__all__ = ["NoCovarianceError", "Uncertainty", "information_of_run", "information_of_runs", "uncertainty_of"]
+
+_INTERVAL = 0.95
+_MANY = 10**9  # degrees of freedom
+# How far to look for a lower cost than the answer's, and which gain is none.
+_MOST_STEPS = 20
+_NO_GAIN = 1e-4
+_NO_ERROR = 1e-9  # m, rad: rounding
+
+
+class NoCovarianceError(DataError):
+    """Why a calibration has no covariance, in one line."""
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """How sure a calibration is, given that what it kept is right.
+
+    covariance (3N, 3N): of the elements, row by row, m and rad per rad of wheel. Rows and columns of elements that are
+    held at their start or lie on a bound are zero, and so is the variance along directions of wheel rates that were
+    kept at the design values. standard_deviations (3, N). intervals: 95 %, by Student's t.
+    parameters: of the wheels' geometry, where the matrix means one (three omni wheels) or it was what was searched;
+    a parameter that the data do not tell by itself has no standard deviation. noise: of the reference poses.
+    basis: what the covariance comes from. source: what it rests on, in words.
+    """
+
+    covariance: Array
+    standard_deviations: Array
+    intervals: ElementIntervals
+    parameters: tuple[ParameterEstimate, ...] | None
+    noise: Noise
+    basis: Literal["likelihood", "scatter"]
+    degrees_of_freedom: int | None
+    source: str
+
+
+def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertainty:
+    """The uncertainty of what a run found.
+
+    A covariance that the calibrator gives itself (trajectory_ml) is taken; otherwise it is the sandwich of an estimate
+    that minimises a sum of norms (fit/sandwich.py). Physical parameters that need directions of wheel rates which the
+    data do not identify have no standard deviation, whether or not these directions were fitted.
+
+    NoCovarianceError, with the reason, when there is no answer, the cost is no sum of norms, the answer is no minimum
+    (a published matrix, a search that stopped too early), or the runs are too few.
+    """
+    if result.matrix is None or result.vector is None:
+        raise NoCovarianceError(f"no covariance without an answer: {result.reason}")
+    slopes = element_slopes(problem, result.vector)
+    freedom: int | None
+    if result.covariance is not None:
+        found, freedom = result.covariance, None
+        source = "the calibrator's own (see its reason)"
+    else:
+        found, freedom, source = _by_scatter(problem, result)
+    covariance = slopes @ found @ slopes.T
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(result.matrix.shape)
+    reach = _quantile(freedom) * deviations
+    noise = result.noise or noise_of(problem, result.matrix).noise
+    return Uncertainty(
+        covariance=covariance,
+        standard_deviations=deviations,
+        intervals=ElementIntervals(result.matrix - reach, result.matrix + reach),
+        parameters=_parameters(problem, result, found, covariance, _quantile(freedom)),
+        noise=noise,
+        basis="scatter" if result.covariance is None else "likelihood",
+        degrees_of_freedom=freedom,
+        source=source,
+    )
+
+
+def noise_of(problem: CalibrationProblem, matrix: Array) -> NoiseEstimate:
+    """The noise of the reference poses of a problem's runs, by the residuals of ``matrix`` (3, N)."""
+    residuals = []
+    for run in problem.trajectories:
+        odometry = OdometryBatch([run.reference_log], problem.integration)
+        residuals.append(odometry.poses(matrix[None])[0] - run.poses[1:])
+    return estimate_noise(problem.trajectories, residuals)
+
+
+def element_slopes(problem: CalibrationProblem, vector: Array) -> Array:
+    """Derivatives (3N, n) of the matrix elements, row by row, with respect to the searched numbers."""
+    searched = problem.parameterisation
+    if isinstance(searched, MatrixElements):
+        known = np.eye(searched.null.shape[1]) - searched.null.T @ searched.null
+        slopes: Array = np.kron(np.eye(3), known)
+        return slopes
+    return matrix_slopes(problem.robot, vector)
+
+
+def _by_scatter(problem: CalibrationProblem, result: RunResult) -> tuple[Array, int, str]:
+    """Covariance (n, n) of the vector, its degrees of freedom, and what it rests on."""
+    objective = problem.objective
+    assert result.vector is not None and result.matrix is not None  # noqa: PT018 (uncertainty_of has looked)
+    if not isinstance(objective, SumOfNorms):
+        raise NoCovarianceError(f"no covariance: the cost {objective.name} is no sum of norms")
+    free = problem.free & ~np.isin(problem.names, result.at_bounds)
+    if not element_slopes(problem, result.vector)[:, free].any():
+        raise NoCovarianceError("no covariance: nothing was free to be fitted")
+    if result.cost is not None and result.cost < _NO_ERROR:
+        raise NoCovarianceError("no covariance: no error is left to judge by")
+    try:
+        pulls = _pulls(problem, objective, result.vector, free)
+        answer = sandwich(pulls)
+        _check_minimum(problem, objective, result.vector, free, pulls)
+    except NoCovarianceError:
+        raise
+    except DataError as error:
+        raise NoCovarianceError(f"no covariance: {error}") from None
+    covariance = np.zeros((problem.size, problem.size))
+    covariance[np.ix_(free, free)] = answer.covariance
+    return covariance, answer.degrees_of_freedom, answer.words
+
+
+def _pulls(problem: CalibrationProblem, objective: SumOfNorms, vector: Array, free: NDArray[np.bool_]) -> Pulls:
+    """What each run pulls the free numbers by at a vector (n,)."""
+    matrix = problem.matrix(vector)
+    errors = problem.odometry.poses(matrix[None])[0] - problem.reference
+    slopes = element_slopes(problem, vector)[:, free]
+    jacobian = problem.odometry.jacobian(matrix).reshape(len(errors), 3, -1) @ slopes
+    return pulls_of_runs(objective, problem.odometry, errors, jacobian, problem.trajectories)
+
+
+def _check_minimum(
+    problem: CalibrationProblem, objective: SumOfNorms, vector: Array, free: NDArray[np.bool_], pulls: Pulls
+) -> None:
+    """NoCovarianceError when a lower cost is more than a standard deviation away, as it is said to be there."""
+    better, cost = vector, float(problem.values(vector[None])[0])
+    for _ in range(_MOST_STEPS):
+        moved = better.copy()
+        moved[free] += pulls.step
+        value = float(problem.values(moved[None])[0])
+        if not value < cost * (1 - _NO_GAIN):
+            break
+        better, cost = moved, value
+        pulls = _pulls(problem, objective, better, free)
+    deviations = np.sqrt(np.maximum(np.diag(sandwich(pulls).covariance), 0.0))
+    away = np.abs(better - vector)[free]
+    count = float(np.max(away[deviations > 0] / deviations[deviations > 0], initial=0.0))
+    if count > 1.0:
+        raise NoCovarianceError(
+            f"no covariance: the answer is {count:.0f} standard deviations or more from a better one"
+        )
+
+
+def _parameters(
+    problem: CalibrationProblem, result: RunResult, of_vector: Array, of_elements: Array, reach: float
+) -> tuple[ParameterEstimate, ...] | None:
+    robot = problem.robot
+    assert result.vector is not None and result.matrix is not None  # noqa: PT018 (uncertainty_of has looked)
+    if problem.parameterisation.name == "geometry":
+        values, covariance = result.vector, of_vector
+    elif is_invertible(robot):
+        try:
+            values = geometry_of(result.matrix, robot)
+            turned = np.linalg.inv(matrix_slopes(robot, values))
+        except (DataError, np.linalg.LinAlgError):
+            return None
+        covariance = turned @ of_elements @ turned.T
+    else:
+        return None
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    kept = unidentified_directions(robot, driven_span(problem.trajectories))
+    return tuple(
+        ParameterEstimate(
+            name=name,
+            value=float(value),
+            unit=unit_of(name),
+            standard_deviation=float(deviation) if told else None,
+            low=float(value - reach * deviation) if told else None,
+            high=float(value + reach * deviation) if told else None,
+        )
+        for name, value, deviation, told in zip(
+            WheelGeometry(robot).names, values, deviations, told_parameters(robot, kept), strict=True
+        )
+    )
+
+
+def _quantile(freedom: int | None) -> float:
+    return float(stats.t.isf((1 - _INTERVAL) / 2, freedom or _MANY))

@@ -1,0 +1,166 @@
+"""What a config says of a node: its robots, how they are fused, where messages go, and how Zenoh is reached."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+
+from omnibench.config import Model, read_model, read_yaml, validate
+from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.live.estimation.fusion import FusionSettings
+from omnibench.live.estimation.tracker import Frames
+from omnibench.live.estimation.wheel_input import WheelSettings
+from omnibench.live.network.session_config import SessionConfig
+from omnibench.live.replay.arrivals import ReplayConfig
+from omnibench.live.wire.topics import Profile
+
+
+def _form(value: Any) -> str:
+    """Which of the two forms a choice has, so that a mistake in one is not explained by the other."""
+    return "settings" if isinstance(value, Mapping | Model) else "name"
+
+
+_Form = Discriminator(_form)
+FusionChoice = Annotated[
+    Annotated[Literal["none", "ekf"], Tag("name")] | Annotated[FusionSettings, Tag("settings")], _Form
+]
+FramesChoice = Annotated[Annotated[Literal["prefixed"], Tag("name")] | Annotated[Frames, Tag("settings")], _Form]
+
+
+class RobotConfig(Model):
+    """One robot of a node."""
+
+    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", description="begins its topics: <name>/odom")
+    calibration: Path = Field(description="calibration file")
+    wheels: WheelSettings = WheelSettings()
+    fusion: FusionChoice | None = Field(None, description="default: the node's")
+    frames: FramesChoice | None = Field(
+        None,
+        description="default: map, odom, base_link (REP-105); of several robots in a node map, <name>/odom, "
+        "<name>/base_link. tf is everybody's: prefixed names them so for a single robot, too, as robots of several "
+        "nodes on one network need it",
+    )
+
+
+class ReplaySource(ReplayConfig):
+    """What ``--replay`` plays unless it names something else, and how."""
+
+    dataset: Path | None = Field(None, description="a data set folder, or a comparison's config with a simulated one")
+    robot: str | None = Field(None, description="whose messages are played; default: the first robot")
+
+
+class LiveConfig(Model):
+    """A node."""
+
+    name: str = Field("omnibench", pattern=r"^[A-Za-z][A-Za-z0-9_]*$", description="the node's name in the ROS graph")
+    description: str = ""
+    robots: tuple[RobotConfig, ...] = Field((), description="may be empty for a router")
+    fusion: FusionChoice = Field("none", description="of SLAM poses: none, ekf, or its settings")
+    stale_after: float = Field(0.5, gt=0, allow_inf_nan=False, description="no wheel sample for so long is told, s")
+    profile: Profile = Field("plain", description="plain: plain Zenoh and the DDS bridge; rmw, humble: rmw_zenoh")
+    domain: int = Field(0, ge=0, le=232, description="ROS_DOMAIN_ID, for rmw and humble")
+    zenoh: SessionConfig = SessionConfig()
+    plugins: tuple[Path, ...] = Field((), description="folders of effects that calibrations name")
+    state: Path | None = Field(None, description="folder in which pose and calibration outlive the node")
+    record: Path | None = Field(None, description="MCAP file to record to")
+    foxglove: bool | int = Field(False, description="serve Foxglove's WebSocket on loopback; a number is the port")
+    replay: ReplaySource = ReplaySource()
+
+    @field_validator("record")
+    @classmethod
+    def _is_mcap(cls, record: Path | None) -> Path | None:
+        if record is not None and record.suffix != ".mcap":
+            raise ValueError(f"{str(record)!r}: name a file that ends in .mcap")
+        return record
+
+    @model_validator(mode="after")
+    def _robots_differ(self) -> LiveConfig:
+        names = [robot.name for robot in self.robots]
+        if len(set(names)) < len(names):
+            raise ValueError(f"robots: names must differ: {', '.join(names)}")
+        if not names and self.zenoh.mode != "router":
+            raise ValueError(
+                "robots: none is given; without robots a node can only be a router (zenoh: {mode: router})"
+            )
+        return self
+
+    def fusion_of(self, robot: RobotConfig) -> FusionSettings | None:
+        """How a robot's SLAM poses are fused, if they are."""
+        chosen = self.fusion if robot.fusion is None else robot.fusion
+        if isinstance(chosen, FusionSettings):
+            return chosen
+        return FusionSettings() if chosen == "ekf" else None
+
+    def frames_of(self, robot: RobotConfig) -> Frames:
+        """A robot's frames: tf is everybody's, so that those of several robots carry their names."""
+        if isinstance(robot.frames, Frames):
+            return robot.frames
+        if robot.frames is None and len(self.robots) == 1:
+            return Frames()
+        return Frames(odom=f"{robot.name}/odom", base=f"{robot.name}/base_link")
+
+    def on_common_frames(self) -> list[str]:
+        """The robots that publish tf between frames whose names another node's robot has as well by default."""
+        common, fusing = Frames(), (robot for robot in self.robots if self.fusion_of(robot) is not None)
+        framed = ((robot.name, self.frames_of(robot)) for robot in fusing)
+        return [name for name, frames in framed if frames.odom == common.odom or frames.base == common.base]
+
+
+def read_live_config(path: Path | str) -> LiveConfig:
+    """Read a node's config; paths in it start from its folder. ConfigError in one line."""
+    path = Path(path)
+    config = read_model(LiveConfig, path)
+    folder = path.resolve().parent
+
+    def there(value: Path | None) -> Path | None:
+        return None if value is None else folder / value
+
+    changes: dict[str, Any] = {
+        "robots": tuple(each.model_copy(update={"calibration": folder / each.calibration}) for each in config.robots),
+        "zenoh": config.zenoh.relative_to(folder),
+        "plugins": tuple(folder / each for each in config.plugins),
+        "state": there(config.state),
+        "record": there(config.record),
+        "replay": config.replay.model_copy(update={"dataset": there(config.replay.dataset)}),
+    }
+    return config.model_copy(update=changes)
+
+
+class ClientConfig(Model):
+    """How a program reaches a node: what ``--config`` of listen, replay and record holds."""
+
+    zenoh: SessionConfig = SessionConfig(mode="client")
+    profile: Profile = "plain"
+    domain: int = Field(0, ge=0, le=232)
+
+
+def read_client_config(path: Path | str) -> ClientConfig:
+    """Read how a node is reached: a client's config, or the node's own. ConfigError in one line."""
+    path = Path(path)
+    content = read_yaml(path)
+    if isinstance(content, dict) and "robots" in content:
+        node = read_live_config(path)
+        return ClientConfig(zenoh=client_session(node.zenoh), profile=node.profile, domain=node.domain)
+    config = validate(ClientConfig, content, str(path))
+    return config.model_copy(update={"zenoh": config.zenoh.relative_to(path.resolve().parent)})
+
+
+def client_session(node: SessionConfig) -> SessionConfig:
+    """How a client on the same machine reaches a node with these settings, as the same user."""
+    if node.mode == "client":
+        return node
+    here = [each.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for each in node.listening]
+    return SessionConfig(mode="client", connect=tuple(here) or node.connecting, user=node.user, tls=node.tls)
+
+
+def robot_called(config: LiveConfig, name: str | None) -> RobotConfig:
+    """The robot of that name, or the first one. UnknownNameError, or ConfigError when there is none."""
+    if not config.robots:
+        raise ConfigError("the config has no robot")
+    for robot in config.robots:
+        if name in (None, robot.name):
+            return robot
+    raise UnknownNameError("robot", str(name), [robot.name for robot in config.robots])

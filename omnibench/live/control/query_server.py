@@ -1,0 +1,233 @@
+"""Answers to questions about a node's robots, and orders to them: ``omnibench/<robot>/<service>``, in JSON."""
+
+from __future__ import annotations
+
+import logging
+import math
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from typing import Any, Final, cast
+
+import numpy as np
+import zenoh
+from zenoh.handlers import Callback
+
+from omnibench.config import Model, to_json
+from omnibench.errors import ConfigError, DataError, OmnibenchError, one_line
+from omnibench.live.control.orders import read_pose, read_sent_calibration, read_time
+from omnibench.live.estimation.saved_state import RobotMemory
+from omnibench.live.estimation.tracker import RobotTracker
+from omnibench.live.network.rate_limiter import Quiet
+from omnibench.robot.calibration import Calibration
+from omnibench.robot.kinematics import Array
+
+LOG = logging.getLogger("omnibench.live")
+_READING: Final = ("info", "calibration", "health", "pose")
+_ORDERS: Final = ("set_pose", "reset", "swap")
+_LONGEST: Final = 1 << 16  # bytes of a request
+_MOST_WAITING: Final = 64  # requests
+_FAREWELL: Final = 6.0  # s
+
+
+class Desk:
+    """Answers queries and takes calibrations for one robot after another, in a thread of its own.
+
+    What is too long, or too much at once, is refused where it comes in, so that the wheels' stream goes on. A reply has
+    the congestion control of its query, whatever is said here: for a client that asked with BLOCK and does not read,
+    Zenoh waits up to 5 s and then parts with it. Until then the desk waits; the stream does not.
+
+    info: robot -> what ``info`` answers. memories: of the robots whose calibrations outlive the node.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        trackers: Mapping[str, RobotTracker],
+        info: Callable[[RobotTracker], Mapping[str, Any]],
+        memories: Mapping[str, RobotMemory],
+    ) -> None:
+        self._trackers = trackers
+        self._info = info
+        self._memories = memories
+        self._quiet = Quiet()
+        self._refused = 0
+        self._work: queue.Queue[Callable[[], None] | None] = queue.Queue(_MOST_WAITING)
+        self._thread = threading.Thread(target=self._run, name="desk", daemon=True)
+        self._open: list[Any] = []
+        for name in trackers:
+            self._open += self._declare(session, name)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Answer what was asked and no more."""
+        for each in self._open:
+            each.undeclare()
+        with suppress(queue.Full):  # a client that does not read may hold the desk: not for ever, nor us
+            self._work.put(None, timeout=_FAREWELL)
+        self._thread.join(_FAREWELL)
+
+    def _declare(self, session: zenoh.Session, name: str) -> list[Any]:
+        def asked_for(service: str) -> Callable[[zenoh.Query], None]:
+            return lambda query: self._take_query(name, service, query)
+
+        # declared one by one, so that access control can tell them apart
+        services: list[Any] = [
+            session.declare_queryable(f"omnibench/{name}/{service}", _direct(asked_for(service)))
+            for service in _READING + _ORDERS
+        ]
+        put = _direct(lambda sample: self._take_sample(name, sample))
+        return [*services, session.declare_subscriber(f"omnibench/{name}/calibration", put)]
+
+    def _take_query(self, name: str, service: str, query: zenoh.Query) -> None:
+        if service in _ORDERS and str(query.key_expr) != f"omnibench/{name}/{service}":
+            return  # an order to whomever it may concern is one to nobody
+        size = _size(query.payload) + _size(query.attachment) + len(str(query.parameters))
+        reason = self._queued(lambda: self._answer(name, service, query), size)
+        if reason is not None:
+            _refuse(query, name, f"omnibench/{name}/{service}: {reason}")
+
+    def _take_sample(self, name: str, sample: zenoh.Sample) -> None:
+        """A calibration that is put: there is nobody to answer (unlike ``swap``), so health and log tell."""
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        size = _size(sample.payload) + _size(sample.attachment)
+        reason = self._queued(lambda: self._take_calibration(name, sample), size)
+        if reason is not None:
+            self._trackers[name].refuse_swap(f"omnibench/{name}/calibration: {reason}")
+
+    def _queued(self, work: Callable[[], None], size: int) -> str | None:
+        """None, or why a request of so many bytes is not taken."""
+        reason = None
+        if size > _LONGEST:
+            reason = f"{size} bytes are more than a request may have, {_LONGEST}"
+        else:
+            try:
+                self._work.put_nowait(work)
+            except queue.Full:
+                reason = f"{_MOST_WAITING} requests are waiting; ask again later"
+        if reason is not None:
+            self._refused += 1
+            if self._quiet.lets("refused"):
+                LOG.warning("requests refused so far: %d; the last: %s", self._refused, reason)
+        return reason
+
+    def _run(self) -> None:
+        while (work := self._work.get()) is not None:
+            try:
+                work()
+            except Exception as error:  # whatever was asked, the next one is answered
+                self._failed(error)
+            del work  # a query is over when nobody holds it any more
+
+    def _failed(self, error: Exception) -> None:
+        if self._quiet.lets(type(error).__name__):
+            LOG.error("a request failed: %s: %s", type(error).__name__, one_line(str(error)))
+
+    def _answer(self, name: str, service: str, query: zenoh.Query) -> None:
+        with query:
+            try:
+                answer = to_json(self._serve(name, service, query)).encode()
+            except OmnibenchError as error:
+                _refuse(query, name, str(error))
+            except Exception as error:
+                _refuse(query, name, f"omnibench/{name}/{service}: {type(error).__name__}: {error}")
+                self._failed(error)
+            else:
+                query.reply(f"omnibench/{name}/{service}", answer, encoding=zenoh.Encoding.APPLICATION_JSON)
+
+    def _serve(self, name: str, service: str, query: zenoh.Query) -> Mapping[str, Any] | Model:
+        tracker = self._trackers[name]
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        parameters = dict(cast(Iterable[tuple[str, str]], query.parameters))
+        if service == "info":
+            return self._info(tracker)
+        if service == "health":
+            return tracker.health(time.monotonic())
+        if service == "pose":
+            return _pose_answer(tracker, parameters)
+        if service == "calibration":
+            if payload:  # a right to read it must not be one to swap it
+                raise ConfigError(f"omnibench/{name}/calibration: put it there, or ask omnibench/{name}/swap with it")
+            return tracker.calibration
+        if service == "swap":
+            return self._swap(name, payload)
+        if service == "set_pose":
+            order = read_pose(payload, parameters)
+            deviations = np.array([order.position_sigma, order.position_sigma, order.heading_sigma])
+            tracker.set_pose(np.array([order.x, order.y, order.theta]), np.diag(deviations**2))
+            LOG.info("%s: pose set to %.3f m, %.3f m, %.1f deg", name, order.x, order.y, math.degrees(order.theta))
+            return {"robot": name, "done": "set_pose"}
+        tracker.reset()
+        LOG.info("%s: filter reset", name)
+        return {"robot": name, "done": "reset"}
+
+    def _take_calibration(self, name: str, sample: zenoh.Sample) -> None:
+        try:
+            self._swap(name, sample.payload.to_bytes())
+        except OmnibenchError:
+            return  # told already
+
+    def _swap(self, name: str, payload: bytes) -> Mapping[str, Any]:
+        tracker = self._trackers[name]
+        try:
+            calibration = read_sent_calibration(payload, f"omnibench/{name}/calibration")
+        except DataError as error:
+            tracker.refuse_swap(str(error))
+            self._tell_refusal(tracker, error)
+            raise
+        try:
+            tracker.swap(calibration)
+        except DataError as error:
+            self._tell_refusal(tracker, error)
+            raise
+        LOG.info("%s: calibration %r runs", name, calibration.name)
+        answer = {"robot": name, "accepted": True, "calibration": calibration.name, "kept": True}
+        reason = self._not_kept(name, calibration)
+        return answer if reason is None else answer | {"kept": False, "reason": reason}
+
+    def _tell_refusal(self, tracker: RobotTracker, error: DataError) -> None:
+        if self._quiet.lets(f"calibration of {tracker.name}"):
+            LOG.warning("%s: calibration refused, %s runs on: %s", tracker.name, tracker.calibration.name, error)
+
+    def _not_kept(self, name: str, calibration: Calibration) -> str | None:
+        """Keep a calibration that runs; None, or why the node's next start will not be with it."""
+        if name not in self._memories:
+            return "the node has no `state`, so that its next start is with the config's calibration"
+        try:
+            self._memories[name].keep_calibration(calibration)
+        except OmnibenchError as error:
+            LOG.warning("%s: calibration %r runs, but not after a restart: %s", name, calibration.name, error)
+            return str(error)
+        return None
+
+
+def _direct(callback: Callable[[Any], None]) -> Any:
+    return Callback(callback, indirect=False)
+
+
+def _size(content: zenoh.ZBytes | None) -> int:
+    return 0 if content is None else len(content)
+
+
+def _refuse(query: zenoh.Query, name: str, reason: str) -> None:
+    answer = to_json({"robot": name, "error": one_line(reason)})
+    query.reply_err(answer, encoding=zenoh.Encoding.APPLICATION_JSON)
+
+
+def _pose_answer(tracker: RobotTracker, parameters: dict[str, str]) -> Mapping[str, Any]:
+    found = tracker.pose_at(read_time(parameters["at"]) if "at" in parameters else None)
+    answer: dict[str, Any] = {"robot": tracker.name, "at": found.stamp / 1e9, "at_ns": found.stamp}
+    answer["odom"] = _planar(found.odometry)
+    answer["map"] = None
+    if found.in_map is not None:
+        pose, covariance = found.in_map
+        answer["map"] = _planar(pose) | {"covariance": covariance.tolist()}
+    return answer
+
+
+def _planar(pose: Array) -> dict[str, float]:
+    x, y, theta = pose.tolist()
+    return {"x": x, "y": y, "theta": theta}

@@ -1,0 +1,67 @@
+"""A robot that drives motions which its calibration was not fitted to: there the calibration's effects are a guess."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from omnibench.live.estimation.wheel_input import WheelStep
+from omnibench.robot.calibration import Calibration
+from omnibench.robot.kinematics import Array
+from omnibench.robot.training_domain import DrivenMotions, not_known_to_hold
+
+LOG = logging.getLogger("omnibench.live")
+_WINDOW = 0.5  # s over which a motion is averaged; it is judged no more often
+_TRANSITION = 1.0  # s; what lasts no longer is on the way from one motion to another
+
+
+class MotionWatch:
+    """Counts how long a robot has driven such motions with one calibration, and warns in the log the first time.
+
+    seconds: so far; None where the calibration has no effects, or does not say what it was fitted to.
+    """
+
+    def __init__(self, robot: str, calibration: Calibration) -> None:
+        self._robot, self._calibration = robot, calibration
+        self._known: DrivenMotions | None = None
+        self.seconds: float | None = None
+        if calibration.effects and calibration.driven:
+            self._known, self.seconds = DrivenMotions(calibration.robot, calibration.driven), 0.0
+        self._matrix = calibration.matrix_array
+        self._lasted = 0.0  # s of the motion that goes on
+        self._turned: Array = np.zeros(self._matrix.shape[1])  # rad, in the window that goes on
+        self._elapsed = 0.0  # s of it
+
+    def take(self, step: WheelStep) -> None:
+        """Take a wheel step."""
+        if self._known is None:
+            return
+        if step.blind:  # who knows what it did
+            self._begin()
+            return
+        self._turned = self._turned + step.angles
+        self._elapsed += step.duration
+        if self._elapsed >= _WINDOW:
+            self._judge(self._known, self._matrix @ self._turned / self._elapsed)
+            self._begin()
+
+    def _begin(self) -> None:
+        self._turned = np.zeros(self._matrix.shape[1])
+        self._elapsed = 0.0
+
+    def _judge(self, known: DrivenMotions, motion: Array) -> None:
+        if not known.is_new(motion):
+            self._lasted = 0.0
+            return
+        before, self._lasted = self._lasted, self._lasted + self._elapsed
+        if self._lasted <= _TRANSITION:
+            return
+        assert self.seconds is not None
+        if not self.seconds:
+            LOG.warning(
+                "%s: drives motions that %r was not fitted to, such as %s: %s; told once, then counted in health",
+                *(self._robot, self._calibration.name, known.in_words(motion[None])),
+                not_known_to_hold([term.name for term in self._calibration.effects]),
+            )
+        self.seconds += self._lasted if before <= _TRANSITION else self._elapsed

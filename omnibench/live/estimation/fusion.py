@@ -1,0 +1,241 @@
+"""Fusing SLAM poses at their own time: late ones are put where they belong and what came after is taken again."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+from scipy.stats import chi2
+
+from omnibench.config import Model
+from omnibench.live.estimation.counts import Counts
+from omnibench.live.estimation.live_odometry import Motion
+from omnibench.live.estimation.pose_filter import PoseFilter
+from omnibench.live.estimation.reference_correction import turned
+from omnibench.live.estimation.rejections import Rejections
+from omnibench.live.estimation.timeline import Entry, Fix, Timeline
+from omnibench.robot.kinematics import Array
+
+_SECOND = 1e9  # ns
+_NOWHERE = np.diag([100.0**2, 100.0**2, math.pi**2])  # before anybody said where the robot is
+_WAITING = 16  # poses that may wait for the wheel samples of their time
+_EVER = -(2**63)  # ns
+
+Outcome = Literal["fused", "located", "reacquired", "rejected", "too late", "ahead", "waiting", "duplicate"]
+
+
+class FusionSettings(Model):
+    """How SLAM poses are fused."""
+
+    history: float = Field(5.0, ge=2.0, le=600.0, description="how late a pose may come, s")
+    ahead: float = Field(1.0, ge=0.0, le=60.0, description="how far its stamp may lie in the future, s")
+    gate: float = Field(0.999, gt=0.0, lt=1.0, description="probability with which a true pose passes")
+    reacquire_after: int = Field(
+        10, ge=1, description="rejected poses that agree with each other: then SLAM is believed"
+    )
+    standstill: float = Field(0.01, gt=0.0, le=1.0, description="share of the wheels' noise while none turns")
+    stale_after: float = Field(2.0, gt=0.0, description="no pose for so long is told, s")
+
+
+class Fusion:
+    """The pose of one robot in the map.
+
+    located: whether anybody has said yet where the robot is. outcome: of the pose that was taken last. fused_at: when
+    the last pose came that was believed, s, monotonic; None since a reset.
+    """
+
+    def __init__(self, settings: FusionSettings, timeline: Timeline, counts: Counts) -> None:
+        self.settings = settings
+        self._timeline = timeline
+        self._counts = counts
+        self._filter = PoseFilter(np.zeros(3), _NOWHERE)
+        self._limit = float(chi2.ppf(settings.gate, 3))
+        self._rejections = Rejections(settings.reacquire_after, self._limit)
+        self._waiting: deque[Fix] = deque()
+        self._since = _EVER  # what was measured before has no meaning: the pose was set
+        self.located = False
+        self.outcome: Outcome | None = None
+        self.fused_at: float | None = None
+
+    @property
+    def pose(self) -> Array:
+        """(3,): m, m, rad in the map; the heading is not wrapped."""
+        return self._filter.pose
+
+    @property
+    def covariance(self) -> Array:
+        """(3, 3)."""
+        return self._filter.covariance
+
+    @property
+    def rejected_in_a_row(self) -> int:
+        """Poses that the gate rejected since one was believed."""
+        return self._rejections.in_a_row
+
+    def begin(self, pose: Array, covariance: Array | None) -> None:
+        """Where the robot is before the first wheel sample; None: nobody knows."""
+        self.located = covariance is not None
+        self._filter.set(pose, _NOWHERE if covariance is None else covariance)
+
+    def predict(self, motion: Motion) -> tuple[Array, Array]:
+        """Pose and covariance after a motion, for the entry of the timeline that is to be added."""
+        self._filter.predict(motion)
+        return self._filter.pose, self._filter.covariance
+
+    def take_waiting(self) -> None:
+        """Fuse poses that came before the wheel samples of their time, once these are there."""
+        if self._waiting and min(fix.latest for fix in self._waiting) <= self._timeline.newest:
+            waiting, self._waiting = self._waiting, deque()
+            for fix in waiting:
+                self.correct(fix)
+
+    def correct(self, fix: Fix) -> Outcome:
+        """Fuse a pose at its own time, or say why not; every outcome is counted."""
+        self.outcome = self._refused(fix) or self._judged(self._at_one_time(fix))
+        if self.outcome in ("fused", "located", "reacquired"):
+            self._counts.poses += 1
+            self._rejections.clear()
+            self.fused_at = fix.arrival
+        return self.outcome
+
+    def set_pose(self, pose: Array, covariance: Array) -> None:
+        """The robot is here, now; what was measured before counts no more."""
+        self._since = self._timeline.newest + 1
+        self._waiting.clear()
+        self._rejections.clear()
+        self.located = True
+        self._now(pose, covariance)
+
+    def reset(self) -> None:
+        """Forget where the robot is; the next pose of SLAM says it anew."""
+        self.set_pose(self.pose, _NOWHERE)
+        self.located, self.outcome, self.fused_at = False, None, None
+
+    def restart(self) -> None:
+        """The clock jumped: stamps of poses that are waiting, or of the past, have no meaning."""
+        self._waiting.clear()
+        self._rejections.clear()
+        self._since = _EVER
+
+    def at(self, stamp: int) -> tuple[Array, Array] | None:
+        """Pose and covariance at a time, between samples at constant twist; None outside of what is remembered."""
+        entries = self._timeline.entries
+        index = self._timeline.index(stamp)
+        if not entries or index == len(entries) or stamp < self._timeline.oldest:
+            return None
+        if entries[index].stamp == stamp:
+            return entries[index].pose, entries[index].covariance
+        self._to(index, stamp)
+        found = self._filter.pose, self._filter.covariance
+        self._filter.set(entries[-1].pose, entries[-1].covariance)
+        return found
+
+    def _refused(self, fix: Fix) -> Outcome | None:
+        """Why a pose cannot be fused now, whatever it says."""
+        timeline = self._timeline
+        if not timeline.entries or fix.latest > timeline.newest:
+            ahead = (fix.latest - timeline.newest) / _SECOND if timeline.entries else 0.0
+            if ahead > self.settings.ahead or len(self._waiting) >= _WAITING:
+                self._counts.pose_ahead += 1
+                return "ahead"
+            self._waiting.append(fix)
+            return "waiting"
+        if fix.earliest < timeline.oldest or fix.stamp < self._since:
+            self._counts.pose_too_late += 1
+            return "too late"
+        known = timeline.entries[timeline.index(fix.stamp)].fixes
+        if any(each.stamp == fix.stamp for each in known) or self._rejections.known(fix.stamp):
+            self._counts.pose_duplicates += 1
+            return "duplicate"
+        return None
+
+    def _at_one_time(self, fix: Fix) -> Fix:
+        """A pose whose heading is of another time, with the odometry's turn until its own."""
+        if fix.heading_stamp is None:
+            return fix
+        before, after = (self._timeline.odometry_at(each) for each in (fix.heading_stamp, fix.stamp))
+        assert before is not None
+        assert after is not None
+        return turned(fix, before, after)
+
+    def _judged(self, fix: Fix) -> Outcome:
+        """What becomes of a pose whose time is known to the timeline."""
+        index = self._timeline.index(fix.stamp)
+        self._to(index, fix.stamp)
+        if not self.located:
+            self._replace(index, fix)
+            self.located = True
+            return "located"
+        if self._filter.distance(fix.pose, fix.covariance) <= self._limit:
+            self._insert(index, fix)
+            return "fused"
+        odometry = self._timeline.odometry_at(fix.stamp)
+        assert odometry is not None
+        if self._rejections.add(fix, odometry):
+            self._replace(index, fix)
+            self._counts.reacquired += 1
+            return "reacquired"
+        self._counts.pose_rejected += 1
+        self._filter.set(self._timeline.entries[-1].pose, self._timeline.entries[-1].covariance)
+        return "rejected"
+
+    def _replace(self, index: int, fix: Fix) -> None:
+        """Believe a pose alone: what other poses said of the time around it and after is forgotten."""
+        for entry in self._timeline.entries[index:]:
+            entry.fixes = ()
+        self._insert(index, replace(fix, absolute=True))
+
+    def _insert(self, index: int, fix: Fix) -> None:
+        """Put a pose where it belongs and take what came after it again."""
+        entry = self._timeline.entries[index]
+        entry.fixes = tuple(sorted((*entry.fixes, fix), key=lambda each: each.stamp))
+        if index == 0:  # nothing is known of the motion up to the oldest entry: it is corrected as it stands
+            self._apply(fix)
+            entry.pose, entry.covariance = self._filter.pose, self._filter.covariance
+        self._replay(max(index, 1))
+
+    def _now(self, pose: Array, covariance: Array) -> None:
+        self._filter.set(pose, covariance)
+        newest = self._timeline.entries[-1]
+        newest.pose, newest.covariance = self._filter.pose, self._filter.covariance
+
+    def _replay(self, first: int) -> None:
+        """Take all motions and poses from entry ``first`` on again."""
+        entries = self._timeline.entries
+        self._filter.set(entries[first - 1].pose, entries[first - 1].covariance)
+        for index in range(first, len(entries)):
+            entry = entries[index]
+            if entry.fixes:
+                self._to(index, entry.stamp)
+            else:
+                self._filter.predict(entry.motion)
+            entry.pose, entry.covariance = self._filter.pose, self._filter.covariance
+
+    def _to(self, index: int, stamp: int) -> None:
+        """Bring the filter to a time within an entry's motion, with the entry's poses up to then."""
+        before, entry = self._timeline.entries[max(index - 1, 0)], self._timeline.entries[index]
+        self._filter.set(before.pose, before.covariance)
+        if index == 0:
+            return
+        done = 0.0
+        for fix in entry.fixes:
+            if fix.stamp > stamp:
+                break
+            done = self._drive(entry, done, self._timeline.share(index, fix.stamp))
+            self._apply(fix)
+        self._drive(entry, done, self._timeline.share(index, stamp))
+
+    def _apply(self, fix: Fix) -> None:
+        if fix.absolute:
+            self._filter.set(fix.pose, fix.covariance)
+        else:
+            self._filter.correct(fix.pose, fix.covariance)
+
+    def _drive(self, entry: Entry, done: float, to: float) -> float:
+        if to > done:
+            self._filter.predict(entry.motion.part(to - done))
+        return to

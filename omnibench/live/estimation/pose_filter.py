@@ -1,0 +1,73 @@
+"""The extended Kalman filter over (x, y, heading): filterpy's, behind what fusion needs of it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+
+from omnibench.live.estimation.live_odometry import Motion
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import advance
+
+_TURN = 2 * math.pi
+_POSE = np.eye(3)  # SLAM measures the pose itself
+
+
+class _Planar(ExtendedKalmanFilter):  # type: ignore[misc]
+    """A pose of the plane that motions in its own frame drive."""
+
+    x: Array
+
+    def predict_x(self, u: Motion) -> None:
+        before = self.x
+        self.x = advance(before, u.moved, u.integration)
+        self.F[0, 2] = before[1] - self.x[1]
+        self.F[1, 2] = self.x[0] - before[0]
+        self.Q[0, 0] = self.Q[1, 1] = u.position_variance
+        self.Q[2, 2] = u.heading_variance
+
+
+class PoseFilter:
+    """Pose (3,) and covariance (3, 3), which motions move and measured poses correct."""
+
+    def __init__(self, pose: Array, covariance: Array) -> None:
+        self._filter: Any = _Planar(dim_x=3, dim_z=3)
+        self._filter.Q = np.zeros((3, 3))
+        self.set(pose, covariance)
+
+    @property
+    def pose(self) -> Array:
+        """(3,): m, m, rad; the heading is not wrapped."""
+        return self._filter.x
+
+    @property
+    def covariance(self) -> Array:
+        return self._filter.P
+
+    def set(self, pose: Array, covariance: Array) -> None:
+        """Start from here, whatever was before."""
+        self._filter.x = np.array(pose, dtype=float)
+        self._filter.P = np.array(covariance, dtype=float)
+
+    def predict(self, motion: Motion) -> None:
+        """Carry pose and covariance along a motion."""
+        self._filter.predict(motion)
+
+    def distance(self, pose: Array, covariance: Array) -> float:
+        """Squared Mahalanobis distance of a measured pose from the expected one."""
+        innovation = innovation_of(pose, self.pose)
+        return float(innovation @ np.linalg.solve(self.covariance + covariance, innovation))
+
+    def correct(self, pose: Array, covariance: Array) -> None:
+        """Fuse a measured pose (3,) with its covariance (3, 3)."""
+        self._filter.update(pose, lambda _: _POSE, lambda x: x, R=covariance, residual=innovation_of)
+
+
+def innovation_of(measured: Array, expected: Array) -> Array:
+    """The difference of two poses (3,), the heading the shortest way."""
+    difference: Array = measured - expected
+    difference[2] -= _TURN * round(float(difference[2]) / _TURN)
+    return difference

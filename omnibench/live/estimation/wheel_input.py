@@ -1,0 +1,283 @@
+"""From wheel messages to wheel steps: what a real sender gets wrong is put right or refused, and counted."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from omnibench.config import Model
+from omnibench.live.estimation.counts import Counts
+from omnibench.live.estimation.wheel_angles import WheelAngles
+from omnibench.live.wire.messages import JointState, MessageError
+from omnibench.robot.kinematics import Array
+
+_SECOND = 1e9  # ns
+_CONFIRMATION = 3  # stamps in a row that make a new time of a stamp that cannot be
+_REORDERED = 0.2  # s; what is late by less is out of order, or a clock that was set back a little
+_SET_BACK = 3  # late samples in a row that cannot be out of order any more
+_SLACK = 0.1  # s by which arrivals may scatter
+_LEARNING = 10  # samples from which the period is learnt
+_SMOOTHING = 0.02  # share of a new period in the mean
+_IRREGULAR = 0.25  # of the mean period
+_MEMORY = 0.995  # of how fast stamps go on by our clock: 1 of a robot, more of a replay
+
+
+class WheelSettings(Model):
+    """How wheel messages are read."""
+
+    joints: tuple[str, ...] | None = Field(None, description="names in the messages, in the robot's order of wheels")
+    use: Literal["auto", "positions", "velocities"] = Field("auto", description="auto: positions where there are any")
+    wrap: float | None = Field(
+        None, gt=0, allow_inf_nan=False, description="angles start again after so much, rad; one turn is found out"
+    )
+    max_rate: float = Field(100.0, gt=0, allow_inf_nan=False, description="no wheel turns faster, rad/s")
+    max_gap: float = Field(1.0, gt=0, allow_inf_nan=False, description="a longer silence makes the path unknown, s")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WheelStep:
+    """What the wheels did from one sample to the next.
+
+    angles (N,): rad. rates (N,): at its end, rad/s. blind: s of the duration of whose motion nothing is known beyond
+    ``angles``. counted: angles are differences of counters, so that they hold the whole motion of blind times too.
+    restarted: the clock jumped, and stamps before have no meaning any more. positions (N,): what the counters say at
+    its end, rad; None where there are none.
+    """
+
+    stamp: int
+    duration: float
+    angles: Array
+    rates: Array
+    blind: float = 0.0
+    counted: bool = True
+    restarted: bool = False
+    positions: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sample:
+    stamp: int
+    arrival: float
+    positions: Array | None
+    velocities: Array | None
+
+
+class WheelInput:
+    """Takes the wheel messages of one robot in the order of their arrival.
+
+    last_refusal: why the latest refused message was refused, in words. period: s from sample to sample, on average.
+    """
+
+    def __init__(self, wheels: Sequence[str], settings: WheelSettings, period: float, counts: Counts) -> None:
+        self._joints = settings.joints or tuple(wheels)
+        self._settings = settings
+        self._counts = counts
+        self._places: dict[tuple[str, ...], NDArray[np.intp]] = {}
+        self._angles = WheelAngles(len(self._joints), settings.wrap, settings.max_rate, counts)
+        self._counting = settings.use == "positions"  # rather than integrating rates
+        self._last: _Sample | None = None
+        self._rates: Array = np.zeros(len(self._joints))
+        self._suspects: list[_Sample] = []
+        self._late_in_a_row = 0
+        self._learnt: list[float] = []
+        self._stamped, self._waited = 1.0, 1.0  # s by stamps and by our clock, the latest counting most
+        self.period = period
+        self.last_refusal = ""
+
+    @property
+    def last_sample(self) -> tuple[int, Array | None] | None:
+        """Stamp and wheel angles of the last sample taken, for a node that starts again."""
+        return None if self._last is None else (self._last.stamp, self._angles.known)
+
+    def resume(self, stamp: int, positions: Array | None, arrival: float) -> None:
+        """Go on after a sample that another process took."""
+        self._last = _Sample(stamp, arrival, positions, None)
+        self._counting = positions is not None and self._settings.use != "velocities"
+        self._angles.begin(positions if self._counting else None)
+
+    def take(self, message: JointState, arrival: float) -> list[WheelStep]:
+        """The steps that a message makes: mostly one; none when it is refused or has to be confirmed first.
+
+        arrival: s, by a clock of this machine that never jumps.
+        """
+        try:
+            sample = self._read(message, arrival)
+        except MessageError as error:
+            self.last_refusal = str(error)
+            return []
+        if self._last is None:
+            return [self._first(sample)]
+        elapsed = (sample.stamp - self._last.stamp) / _SECOND
+        if elapsed == 0 or (self._suspects and sample.stamp == self._suspects[-1].stamp):
+            self._counts.duplicates += 1
+            return []
+        if 0 < elapsed <= self._settings.max_gap:
+            if self._suspects:
+                self._drop_suspects()
+            return [self._step(sample, elapsed)]
+        if -_REORDERED <= elapsed < 0:
+            self._counts.late += 1
+            self._late_in_a_row += 1
+            return []
+        if elapsed > 0 and abs(elapsed - self._waited_for(sample)) <= 0.5 + 0.1 * elapsed:
+            return [self._after_silence(sample, elapsed)]
+        return self._suspect(sample)
+
+    def _read(self, message: JointState, arrival: float) -> _Sample:
+        places = self._places.get(message.names)
+        if places is None:
+            places = self._find(message.names)
+        use = self._settings.use
+        positions = None if message.positions is None or use == "velocities" else message.positions.take(places)
+        velocities = None if message.velocities is None or use == "positions" else message.velocities.take(places)
+        if positions is None and velocities is None:
+            self._counts.wrong_joints += 1
+            raise MessageError(f"it has no {'positions and no velocities' if use == 'auto' else use}")
+        for values in (positions, velocities):
+            if values is not None and not all(map(math.isfinite, values.tolist())):
+                self._counts.not_finite += 1
+                raise MessageError(f"wheels say {values.tolist()}")
+        if velocities is not None and not all(abs(rate) <= self._settings.max_rate for rate in velocities.tolist()):
+            if positions is None:
+                self._counts.too_fast += 1
+                raise MessageError(
+                    f"wheel rates {velocities.tolist()} rad/s exceed max_rate {self._settings.max_rate:g}"
+                )
+            velocities = None
+        return _Sample(message.stamp, arrival, positions, velocities)
+
+    def _find(self, names: tuple[str, ...]) -> NDArray[np.intp]:
+        missing = [joint for joint in self._joints if joint not in names]
+        if missing:
+            self._counts.wrong_joints += 1
+            raise MessageError(
+                f"no joint {missing[0]!r} among {', '.join(names[:12]) or 'no names'}; set wheels.joints"
+            )
+        if len(self._places) > 16:  # a sender that makes up names forever shall not fill the memory
+            self._places.clear()
+        places = self._places[names] = np.array([names.index(joint) for joint in self._joints])
+        return places
+
+    def _first(self, sample: _Sample) -> WheelStep:
+        """Where counting begins, and what is counted from now on: angles if there are any, else rates."""
+        self._counting = sample.positions is not None
+        self._angles.begin(sample.positions)
+        self._counts.samples += 1
+        self._last = sample
+        if sample.velocities is not None:
+            self._rates = sample.velocities
+        return WheelStep(sample.stamp, 0.0, np.zeros(len(self._joints)), self._rates, positions=self._angles.known)
+
+    def _step(self, sample: _Sample, elapsed: float) -> WheelStep:
+        """The step to the next sample, ``elapsed`` s after the last one by its stamp."""
+        assert self._last is not None
+        waited = self._waited_for(sample)
+        set_back = self._late_in_a_row >= _SET_BACK and waited > elapsed + 2 * self.period
+        set_ahead = elapsed > max(waited + _SLACK, 3 * self.period)
+        if set_back or set_ahead:  # by less than what makes another time of it: what passed is told by our clock
+            self._counts.clock_jumps += 1
+            elapsed = min(max(waited, self.period), self._settings.max_gap)
+        else:
+            self._learn(elapsed, sample.arrival - self._last.arrival)
+        self._late_in_a_row = 0
+        if self._counting and sample.positions is not None and self._angles.known is not None:
+            rates = self._rates if sample.velocities is None else sample.velocities
+            angles, counted = self._angles.turned(sample.positions, rates, elapsed)
+            return self._taken(sample, elapsed, angles, angles / elapsed, 0.0 if counted else elapsed, counted)
+        return self._by_rates(sample, elapsed, elapsed, blind=0.0)
+
+    def _after_silence(self, sample: _Sample, elapsed: float, *, restarted: bool = False) -> WheelStep:
+        """The step over a time of which nothing is known but its two ends."""
+        if not restarted:
+            self._counts.gaps += 1
+        self._late_in_a_row = 0
+        if self._counting and sample.positions is not None and self._angles.known is not None:
+            angles, counted = self._angles.turned_unseen(sample.positions, elapsed)
+            rates = angles / elapsed if sample.velocities is None else sample.velocities
+            return self._taken(sample, elapsed, angles, rates, elapsed, counted, restarted)
+        return self._by_rates(sample, elapsed, self.period, blind=elapsed, restarted=restarted)
+
+    def _by_rates(
+        self, sample: _Sample, elapsed: float, seen: float, *, blind: float, restarted: bool = False
+    ) -> WheelStep:
+        """A step of a sample without angles to compare with: its rates, or the last ones, for as long as was seen."""
+        rates = self._rates if sample.velocities is None else sample.velocities
+        angles = rates * min(seen, elapsed)
+        if sample.positions is not None and (self._counting or sample.velocities is None):
+            self._counting = True  # from here on
+            self._angles.begin(sample.positions)
+        else:
+            self._angles.drive(angles)
+        return self._taken(sample, elapsed, angles, rates, blind, False, restarted)
+
+    def _taken(
+        self,
+        sample: _Sample,
+        elapsed: float,
+        angles: Array,
+        rates: Array,
+        blind: float,
+        counted: bool,
+        restarted: bool = False,
+    ) -> WheelStep:
+        self._counts.samples += 1
+        self._last, self._rates = sample, rates
+        return WheelStep(sample.stamp, elapsed, angles, rates, blind, counted, restarted, self._angles.known)
+
+    def _learn(self, elapsed: float, waited: float) -> None:
+        """The period, what does not keep to it, and how fast stamps go on by our clock."""
+        self._stamped = _MEMORY * self._stamped + elapsed
+        self._waited = _MEMORY * self._waited + waited
+        if len(self._learnt) < _LEARNING:
+            self._learnt.append(elapsed)
+            self.period = statistics.median(self._learnt)
+            return
+        periods = elapsed / self.period
+        whole = max(math.floor(periods + 0.3), 1)
+        self._counts.missing += whole - 1
+        self._counts.irregular += abs(periods - whole) > _IRREGULAR
+        self.period += _SMOOTHING * (min(elapsed, 3 * self.period) - self.period)
+
+    def _waited_for(self, sample: _Sample) -> float:
+        """How much time our clock says has passed since the last sample, in the time of the stamps, s."""
+        assert self._last is not None
+        pace = self._stamped / self._waited if self._waited > 1e-6 else 1e6
+        return (sample.arrival - self._last.arrival) * (pace if not 0.5 < pace < 2 else 1.0)
+
+    def _suspect(self, sample: _Sample) -> list[WheelStep]:
+        """A stamp too far off: taken for the new time once others follow it, else dropped."""
+        assert self._last is not None
+        if self._suspects and not 0 < (sample.stamp - self._suspects[-1].stamp) / _SECOND <= self._settings.max_gap:
+            self._drop_suspects()
+        self._suspects.append(sample)
+        if len(self._suspects) < _CONFIRMATION:
+            self.last_refusal = f"its stamp is {(sample.stamp - self._last.stamp) / _SECOND:+.3f} s from the last one"
+            return []
+        first, *others = self._suspects
+        self._suspects = []
+        self._counts.clock_jumps += 1
+        elapsed = (first.stamp - self._last.stamp) / _SECOND
+        waited = max(self._waited_for(first), self.period)
+        if elapsed > 0:
+            waited = min(waited, elapsed)
+        if waited > self._settings.max_gap:
+            steps = [self._after_silence(first, waited, restarted=True)]
+        else:
+            steps = [replace(self._step(first, waited), restarted=True)]
+        for each in others:
+            steps.append(self._step(each, (each.stamp - self._last.stamp) / _SECOND))
+        return steps
+
+    def _drop_suspects(self) -> None:
+        assert self._last is not None
+        late = sum(each.stamp < self._last.stamp for each in self._suspects)
+        self._counts.late += late
+        self._counts.bad_stamps += len(self._suspects) - late
+        self._suspects = []

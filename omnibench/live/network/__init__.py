@@ -1,0 +1,1 @@
+"""Zenoh sessions: how they are opened, who may do what, who is there."""

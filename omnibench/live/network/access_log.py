@@ -1,0 +1,232 @@
+"""Telling who was refused: Zenoh refuses in silence, but its log can be made to tell, and is read here.
+
+Zenoh writes its log to file descriptor 1 and nowhere else, and of access control it tells what it refuses only along
+with all that it allows. So, while refusals are logged, descriptor 1 is a pipe, from which a thread picks what matters.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import re
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Final, TextIO
+
+import zenoh
+
+from omnibench.errors import one_line
+from omnibench.live.network.session_config import SessionConfig
+
+LOG = logging.getLogger("omnibench.live")
+
+_FILTER: Final = "error,zenoh_link_tls=warn,zenoh_link_quic=warn,zenoh_transport::unicast::establishment::accept=trace"
+_ACCESS_FILTER: Final = ",zenoh::net::routing::interceptor=trace"
+_LINE = re.compile(r"\d{4}-\S+Z +(?P<level>[A-Z]+) (?P<thread>.*?ThreadId\(\d+\)) (?P<target>[\w:]+): (?P<text>.*)")
+_DECISION = re.compile(
+    r"(?:Using cached result: )?(?P<zid>[0-9a-f]+)(?: on (?P<subject>.*?))? is unauthorized to (?P<action>.*?)"
+    r" \((?P<flow>ingress|egress)\) on (?P<key>.*)"
+)
+_HANDSHAKE = re.compile(r"Establishment Accept \w+: \S+ => (?P<address>\S+)\. ")
+_ACCEPTED = re.compile(r"New transport link accepted from (?P<zid>[0-9a-f]+) .*? dst: (?P<address>\S+?),")
+_REASONS: Final = (  # what Zenoh says of users, and what it means
+    ("Invalid password", "wrong password"),
+    ("Invalid user", "unknown user"),
+    ("Expected extension", "no user and password given"),
+)
+_CONSEQUENCES: Final = ("Unknown subscriber", "Unknown queryable", "Unknown token")  # undeclared, and never let in
+_IDENTITIES: Final = (("CertCommonName", "certificate"), ("Username", "user"))
+_PIPE_SIZE: Final = 1 << 20
+_PAUSE: Final = 0.02  # s; many lines at a time cost less than one by one
+_QUIET: Final = 10.0  # s in which the same refusal is not told again
+_MOST: Final = 20  # refusals told in that time
+_MOST_KNOWN: Final = 10_000  # peers; a node runs for long
+
+_one_at_a_time = threading.Lock()
+
+
+@contextmanager
+def log_refusals(config: SessionConfig) -> Iterator[Refusals]:
+    """While it is open, log a warning for everybody whom this process's sessions refuse, and for what.
+
+    For the main program of a node, around ``open_session``; no other session may be open. Does nothing when there is
+    nobody to refuse, or when RUST_LOG is set: then Zenoh's own log comes out as it is.
+    """
+    refusals = Refusals(LOG.warning)
+    guarded = config.users_file is not None or (config.tls is not None and bool(config.listening))
+    if "RUST_LOG" in os.environ:
+        zenoh.try_init_log_from_env()
+        guarded = False
+    if not guarded or sys.stdout is None or not _one_at_a_time.acquire(blocking=False):
+        yield refusals
+        return
+    try:
+        with _descriptor_1_read_by(refusals.take):
+            _start_log(_FILTER + (_ACCESS_FILTER if config.access is not None else ""))
+            yield refusals
+    finally:
+        _one_at_a_time.release()
+
+
+class Refusals:
+    """Picks refusals from the lines of Zenoh's log. count: so far, repetitions included."""
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self.count = 0
+        self._tell = tell
+        self._told: dict[str, float] = {}
+        self._untold = 0
+        self._since = 0.0
+        self._decisions: dict[str, re.Match[str]] = {}  # thread -> the refusal it wrote last
+        self._addresses: dict[str, str] = {}  # thread -> whom it talks to; Zenoh's id -> where it is
+        self._names: dict[str, str] = {}  # Zenoh's id -> certificate or user
+
+    def take(self, line: str) -> bool:
+        """Whether the line is of Zenoh's log; a refusal in it is told."""
+        found = _LINE.fullmatch(line)
+        if found is None:
+            return False
+        target, thread, text = found["target"], found["thread"], found["text"]
+        if target.startswith("zenoh::net::routing::interceptor"):
+            self._take_decision(thread, text)
+        elif target.endswith("::accept"):
+            self._take_handshake(thread, text)
+        elif target.startswith("zenoh_link"):
+            self._refuse(f"a connection: {text.split('. Hint:')[0]}")
+        elif found["level"] == "ERROR" and not text.startswith(_CONSEQUENCES):
+            self._refuse(f"zenoh: {text}", refused=False)
+        return True
+
+    def _take_decision(self, thread: str, text: str) -> None:
+        if (decision := _DECISION.fullmatch(text)) is not None:
+            self._decisions[thread] = decision
+            if decision["subject"]:
+                _remember(self._names, decision["zid"], _identity(decision["subject"]))
+        elif text == "Msg intercepted!" and (decision := self._decisions.pop(thread, None)) is not None:
+            # What was decided without a message being intercepted was only looked up beforehand.
+            zid = decision["zid"]
+            who = f"{self._names.get(zid, 'somebody')} at {self._addresses.get(zid, 'an unknown address')}"
+            self._refuse(f"{who}: may not {_described(decision)} {decision['key']}")
+
+    def _take_handshake(self, thread: str, text: str) -> None:
+        if (handshake := _HANDSHAKE.match(text)) is not None:
+            _remember(self._addresses, thread, handshake["address"])
+        elif (accepted := _ACCEPTED.match(text)) is not None:
+            _remember(self._addresses, accepted["zid"], accepted["address"])
+        elif "UsrPwd" in text:
+            reason = next((meaning for sign, meaning in _REASONS if sign in text), text)
+            self._refuse(f"{self._addresses.get(thread, 'a connection')}: {reason}")
+
+    def _refuse(self, text: str, *, refused: bool = True) -> None:
+        self.count += refused
+        now = time.monotonic()
+        if now - self._since > _QUIET:
+            if self._untold:
+                self._tell(f"refused: {self._untold} more in the last {now - self._since:.0f} s")
+            self._told, self._since, self._untold = {}, now, 0
+        # a port is another one with every connection
+        same = re.sub(r":\d+\b", "", text)
+        if same in self._told or len(self._told) >= _MOST:
+            self._untold += 1
+            return
+        self._told[same] = now
+        self._tell(one_line(f"refused: {text}" if refused else text))
+
+
+def _remember(known: dict[str, str], key: str, value: str) -> None:
+    known[key] = value
+    if len(known) > _MOST_KNOWN:
+        del known[next(iter(known))]
+
+
+def _identity(subject: str) -> str:
+    for name, kind in _IDENTITIES:
+        if (found := re.search(rf"{name}\((.*?)\)(?:\+|$)", subject)) is not None:
+            return f"{kind} {found[1]!r}"
+    return "somebody without certificate or user"
+
+
+def _described(decision: re.Match[str]) -> str:
+    action = decision["action"]
+    if decision["flow"] == "egress":
+        return "be told of" if "Declare" in action or "Liveliness" in action else "receive"
+    return {"Put": "write", "Delete": "delete", "Query": "ask", "Reply": "answer for"}.get(action, action.lower())
+
+
+def _start_log(directives: str) -> None:
+    """Zenoh's log, without colours."""
+    before = os.environ.get("NO_COLOR")
+    os.environ["NO_COLOR"] = "1"
+    try:
+        zenoh.init_log_from_env_or(directives)
+    finally:
+        if before is None:
+            del os.environ["NO_COLOR"]
+        else:
+            os.environ["NO_COLOR"] = before
+
+
+@contextmanager
+def _descriptor_1_read_by(take: Callable[[str], bool]) -> Iterator[None]:
+    """Give ``take`` the lines that are written to descriptor 1, and pass on those that it does not want.
+
+    Python's own output goes where it went before, not through the pipe.
+    """
+    sys.stdout.flush()
+    outside, (reading, writing) = os.dup(1), os.pipe()
+    with suppress(OSError, AttributeError):
+        fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
+    stdout, own = sys.stdout, _is_descriptor_1(sys.stdout)
+    if own:
+        sys.stdout = os.fdopen(
+            os.dup(outside), "w", encoding=stdout.encoding, errors=stdout.errors, buffering=1 if stdout.isatty() else -1
+        )
+    os.dup2(writing, 1)
+    os.close(writing)
+    thread = threading.Thread(target=_read, args=(reading, outside, take), name="zenoh log", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        if own:
+            sys.stdout.flush()
+            sys.stdout.close()
+            sys.stdout = stdout
+        else:
+            sys.stdout.flush()
+        os.dup2(outside, 1)  # the pipe has no writer any more, so that the thread ends
+        thread.join(timeout=1.0)
+        os.close(outside)
+
+
+def _is_descriptor_1(stream: TextIO) -> bool:
+    try:
+        return stream.fileno() == 1
+    except (OSError, ValueError):  # a stream without a file
+        return False
+
+
+def _read(reading: int, outside: int, take: Callable[[str], bool]) -> None:
+    rest = b""
+    while chunk := os.read(reading, _PIPE_SIZE):
+        *lines, rest = (rest + chunk).split(b"\n")
+        for line in lines:
+            if b" is authorized to " in line:  # most lines: cheap to pass over
+                continue
+            try:
+                known = take(line.decode(errors="replace"))
+            except Exception:  # whatever a line is: who does not read on holds up Zenoh
+                LOG.exception("a line of Zenoh's log could not be read")
+                continue
+            if not known:
+                with suppress(OSError):  # nobody reads the program's output any more
+                    os.write(outside, line + b"\n")
+        time.sleep(_PAUSE)
+    os.close(reading)
+    if rest:
+        with suppress(OSError):
+            os.write(outside, rest)

@@ -1,0 +1,182 @@
+"""A certificate authority for tests and small fleets, and certificates for its members."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import re
+import secrets
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Final
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from omnibench.errors import ConfigError
+from omnibench.files import replacing
+from omnibench.live.network.tls_files import read_certificate, read_key
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+_RESERVED: Final = ("ca", "users")
+_LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
+_SLACK: Final = timedelta(hours=1)  # clocks differ
+
+
+def make_keys(
+    folder: Path,
+    names: Sequence[str],
+    *,
+    hosts: Sequence[str] = (),
+    days: int = 365,
+    users: bool = False,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write a certificate (``<name>.pem``) and its private key (``<name>.key``, for its owner only) for every name.
+
+    The authority (``ca.pem``, ``ca.key``) is made where it is missing, else goes on: so robots are added to a fleet.
+    hosts: names and addresses that the certificates hold for, besides loopback; those of the router. days: validity.
+    users: add passwords (``<name>.password``, and ``users.txt`` for the router). overwrite: replace what is there, the
+    authority too. Returns the files written. ConfigError when a name cannot be, or a file is there already; DataError
+    when the disk refuses.
+    """
+    _check(names, days)
+    until = datetime.now(UTC) + timedelta(days=days)
+    new_authority = overwrite or not (folder / "ca.pem").exists()
+    contents: dict[Path, bytes] = {}
+    if new_authority:
+        authority, authority_key = _authority(until)
+        contents[folder / "ca.pem"] = authority.public_bytes(Encoding.PEM)
+        contents[folder / "ca.key"] = _pem(authority_key)
+    else:
+        authority, authority_key = _existing_authority(folder)
+    for name in names:
+        certificate, key = _member(name, hosts, min(until, authority.not_valid_after_utc), authority, authority_key)
+        contents[folder / f"{name}.pem"] = certificate.public_bytes(Encoding.PEM)
+        contents[folder / f"{name}.key"] = _pem(key)
+    if users:
+        contents |= _passwords(folder, names, keep=not overwrite)
+    there = [path for path in contents if path.exists() and path.name != "users.txt"]
+    if there and not overwrite:
+        raise ConfigError(
+            f"{there[0]}: is there already; choose other names, or --overwrite to replace all in {folder}"
+        )
+    for path, content in contents.items():
+        _write(path, content, private=path.suffix != ".pem")
+    return list(contents)
+
+
+def _check(names: Sequence[str], days: int) -> None:
+    for name in names:
+        if not _NAME.fullmatch(name) or name in _RESERVED:
+            raise ConfigError(f"{name!r} cannot name a certificate; take letters, digits, _ . and - as apr02")
+    if len(set(names)) < len(names):
+        raise ConfigError(f"a name is given twice: {', '.join(names)}")
+    if not 1 <= days <= 36500:
+        raise ConfigError(f"{days} days: a certificate is valid for 1 to 36500 days")
+
+
+def _authority(until: datetime) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = _common_name(f"omnibench test CA {secrets.token_hex(4)}")  # two authorities are told apart by it
+    builder = (
+        _builder(name, name, key, until)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_key_usage(key_cert_sign=True, crl_sign=True), critical=True)
+    )
+    return builder.sign(key, hashes.SHA256()), key
+
+
+def _member(
+    name: str,
+    hosts: Sequence[str],
+    until: datetime,
+    authority: x509.Certificate,
+    authority_key: ec.EllipticCurvePrivateKey,
+) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    key = ec.generate_private_key(ec.SECP256R1())
+    alternatives = [_general_name(host) for host in dict.fromkeys((*_LOOPBACK, *hosts))]
+    purposes = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
+    issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority_key.public_key())
+    builder = (
+        _builder(_common_name(name), authority.subject, key, until)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_key_usage(digital_signature=True), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+        .add_extension(x509.SubjectAlternativeName(alternatives), critical=False)
+        .add_extension(issuer, critical=False)
+    )
+    return builder.sign(authority_key, hashes.SHA256()), key
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, until: datetime
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(datetime.now(UTC) - _SLACK)
+        .not_valid_after(until)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    )
+
+
+def _key_usage(**granted: bool) -> x509.KeyUsage:
+    names = (
+        *("digital_signature", "content_commitment", "key_encipherment", "data_encipherment", "key_agreement"),
+        *("key_cert_sign", "crl_sign", "encipher_only", "decipher_only"),
+    )
+    return x509.KeyUsage(**{name: granted.get(name, False) for name in names})
+
+
+def _common_name(name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+
+
+def _general_name(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        pass
+    try:
+        return x509.DNSName(host)
+    except ValueError:
+        raise ConfigError(f"{host!r} is neither a host's name nor an address") from None
+
+
+def _existing_authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    certificate = read_certificate(folder / "ca.pem")
+    if not (folder / "ca.key").exists():
+        raise ConfigError(f"{folder}/ca.key is missing, so that ca.pem can sign nobody; choose another folder")
+    key = read_key(folder / "ca.key")
+    if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+        raise ConfigError(f"{folder}/ca.key is not the key of ca.pem; choose another folder")
+    return certificate, key
+
+
+def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+
+
+def _passwords(folder: Path, names: Sequence[str], *, keep: bool) -> dict[Path, bytes]:
+    """A password for each name, and the router's file with all of them; ``keep`` those that are in it."""
+    path = folder / "users.txt"
+    passwords = {name: secrets.token_urlsafe(18) for name in names}
+    lines = path.read_text(encoding="utf-8").splitlines() if keep and path.exists() else []
+    lines += [f"{name}:{password}" for name, password in passwords.items()]
+    files = {folder / f"{name}.password": f"{password}\n".encode() for name, password in passwords.items()}
+    return files | {path: "".join(f"{line}\n" for line in lines).encode()}
+
+
+def _write(path: Path, content: bytes, *, private: bool) -> None:
+    with replacing(path) as partial:
+        descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600 if private else 0o644)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)

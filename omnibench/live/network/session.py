@@ -1,0 +1,193 @@
+"""Opening Zenoh sessions: loopback only and no scouting unless told otherwise, and one clear line when it fails."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import zenoh
+
+from omnibench.errors import ConfigError, nearest
+from omnibench.live.network.access import access_control
+from omnibench.live.network.diagnosis import why_not_connected, why_not_listening
+from omnibench.live.network.session_config import Access, SessionConfig, Tls, User
+from omnibench.live.network.tls_files import check_files, common_name
+
+LOG = logging.getLogger("omnibench.live")
+
+_PRIORITIES: Final = (
+    *("control", "real_time", "interactive_high", "interactive_low"),
+    *("data_high", "data", "data_low", "background"),
+)
+_SETTINGS: Final[dict[str, Any]] = {
+    "timestamping/enabled": True,  # advanced publishers need it
+    # A client finds its router again within half a second of its return; Zenoh's own periods are 1 s to 4 s.
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
+    # Room for bursts: with Zenoh's 2 batches a healthy subscriber loses samples at 1 kHz. Then a message to one that
+    # does not read is given up soon, and holds up nobody.
+    "transport/link/tx/queue/size": dict.fromkeys(_PRIORITIES, 16),
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 200,  # us
+}
+_SCOUTING_DELAY: Final = 500  # ms; Zenoh's own
+_PATIENCE: Final = 3.0  # s, for the others of a router or peer
+_SOURCE = re.compile(r"\s+at /\S+\.rs:\d+\.?")  # where in its source Zenoh found an error
+
+
+def open_session(config: SessionConfig, purpose: str) -> zenoh.Session:
+    """Open a session. purpose: who opens it or what for, before the message of an error.
+
+    A client connects again by itself after its router was gone. ConfigError in one line when a file is missing or
+    wrong, the address is in use, nothing listens where to connect, or we are refused there.
+    """
+    try:
+        settings = zenoh_config(config)
+        try:
+            session = zenoh.open(settings)
+        except zenoh.ZError as error:
+            raise ConfigError(_why_not_open(config, error)) from None
+        try:
+            _check_connected(session, config)
+        except BaseException:
+            session.close()
+            raise
+    except ConfigError as error:
+        raise ConfigError(f"{purpose}: {error}") from None
+    if config.unprotected:
+        LOG.warning(
+            "%s listens at %s, where anybody on the network may connect; give users_file, or tls and access",
+            purpose,
+            ", ".join(config.unprotected),
+        )
+    return session
+
+
+def zenoh_config(config: SessionConfig) -> zenoh.Config:
+    """Zenoh's own settings. ConfigError when a file or a setting is wrong."""
+    settings = zenoh.Config()
+    for key, value in _settings(config):
+        settings.insert_json5(key, json.dumps(value))
+    for key, value in config.extra.items():
+        try:
+            settings.insert_json5(key, json.dumps(value))
+        except (zenoh.ZError, TypeError, ValueError) as error:
+            raise ConfigError(_wrong_setting(key, error)) from None
+    return settings
+
+
+def _settings(config: SessionConfig) -> Iterator[tuple[str, Any]]:
+    yield from _SETTINGS.items()
+    yield "mode", config.mode
+    yield "listen/endpoints", list(config.listening)
+    yield "connect/endpoints", list(config.connecting)
+    yield "scouting/multicast/enabled", config.scouting
+    yield "scouting/gossip/enabled", config.scouting
+    yield "scouting/delay", _SCOUTING_DELAY if config.scouting or config.connecting else 0
+    if config.mode == "client":
+        yield "connect/timeout_ms", round(config.wait * 1000)
+    if config.users_file is not None:
+        _check_users(config.users_file)
+        yield "transport/auth/usrpwd/dictionary_file", str(config.users_file)
+    if config.user is not None:
+        yield "transport/auth/usrpwd/user", config.user.name
+        yield "transport/auth/usrpwd/password", _password(config.user)
+    if config.tls is not None:
+        check_files(config.tls)
+        yield "transport/link/tls", _tls_settings(config.tls)
+    if config.access is not None:
+        yield "access_control", _access_settings(config.access, config)
+
+
+def _access_settings(access: Access, config: SessionConfig) -> Mapping[str, Any]:
+    if config.tls is not None and config.tls.mutual and config.tls.certificate is not None:
+        return access_control(access, by_certificate=True, own_name=common_name(config.tls.certificate))
+    return access_control(access, by_certificate=False, own_name=config.user.name if config.user else None)
+
+
+def _tls_settings(tls: Tls) -> Mapping[str, Any]:
+    settings: dict[str, Any] = {
+        "root_ca_certificate": str(tls.ca),
+        "enable_mtls": tls.mutual,
+        "verify_name_on_connect": tls.verify_name,
+        "close_link_on_expiration": True,
+    }
+    if tls.certificate is not None:
+        for side in ("listen", "connect"):
+            settings[f"{side}_certificate"], settings[f"{side}_private_key"] = str(tls.certificate), str(tls.key)
+    return settings
+
+
+def _password(user: User) -> str:
+    if user.password is not None:
+        return user.password.get_secret_value()
+    if user.password_env is not None:
+        try:
+            return os.environ[user.password_env]
+        except KeyError:
+            raise ConfigError(f"user: the environment variable {user.password_env} is not set") from None
+    assert user.password_file is not None  # User sees to it
+    lines = _lines(user.password_file, "user")
+    if not lines or not lines[0]:
+        raise ConfigError(f"user: {user.password_file} is empty; its first line is the password")
+    return lines[0]
+
+
+def _check_users(path: Path) -> None:
+    """Zenoh would refuse everybody when the file is empty, and name no line when one is wrong."""
+    lines = _lines(path, "users_file")
+    if not any(lines):
+        raise ConfigError(f"users_file: {path} names nobody; write lines of user:password")
+    for number, line in enumerate(lines, 1):
+        user, _, password = line.partition(":")
+        if line and not (user and password):
+            raise ConfigError(f"users_file: {path}, line {number}: expected user:password")
+
+
+def _lines(path: Path, what: str) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        raise ConfigError(f"{what}: {path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{what}: {path}: cannot be read: {error}") from None
+
+
+def _check_connected(session: zenoh.Session, config: SessionConfig) -> None:
+    """A router or a peer opens even if it is refused where it connects to, and tries for ever."""
+    if not config.connecting:
+        return
+    deadline = time.monotonic() + (0.0 if config.mode == "client" else max(_PATIENCE, config.wait))
+    while not (session.info.routers_zid() or session.info.peers_zid()):
+        if time.monotonic() >= deadline:
+            raise ConfigError(why_not_connected(config))
+        time.sleep(0.01)
+
+
+def _why_not_open(config: SessionConfig, error: zenoh.ZError) -> str:
+    text = _SOURCE.sub("", str(error)).strip()
+    if "Unable to connect" in text and config.connecting:
+        return why_not_connected(config)
+    found = why_not_listening(config.listening, text)
+    if found is None and config.mode == "client" and config.scouting:
+        return f"no router was found by scouting; start omnibench live, or give connect ({text})"
+    return found or text
+
+
+def _wrong_setting(key: str, error: Exception) -> str:
+    text = _SOURCE.sub("", str(error)).strip()
+    if "unknown key" not in text:
+        return f"extra: {key}: {text}"
+    known = list(_keys(json.loads(str(zenoh.Config()))))
+    return f"extra: Zenoh has no setting {key!r}; {nearest(key, known)}see its DEFAULT_CONFIG.json5"
+
+
+def _keys(tree: Mapping[str, Any], above: str = "") -> Iterator[str]:
+    for name, value in tree.items():
+        yield above + name
+        if isinstance(value, dict):
+            yield from _keys(value, f"{above}{name}/")

@@ -1,0 +1,90 @@
+"""Certificates and keys as files, checked before Zenoh is given them: it would only say that nobody could connect."""
+
+from __future__ import annotations
+
+import logging
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Final
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
+from cryptography.x509.oid import NameOID
+
+from omnibench.errors import ConfigError
+from omnibench.live.network.session_config import Tls
+
+LOG = logging.getLogger("omnibench.live")
+_SOON: Final = timedelta(days=14)
+
+
+def check_files(tls: Tls) -> None:
+    """ConfigError in one line when a file is missing, unreadable or expired, or a key is not the certificate's."""
+    authority = read_certificate(tls.ca)
+    if tls.certificate is None or tls.key is None:
+        return
+    certificate, key = read_certificate(tls.certificate), read_key(tls.key)
+    ours, its = (
+        each.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+        for each in (key.public_key(), certificate.public_key())
+    )
+    if ours != its:
+        raise ConfigError(f"tls: {tls.key} is not the key of {tls.certificate}; give the two that belong together")
+    _check_issuer(certificate, authority, tls)
+
+
+def _check_issuer(certificate: x509.Certificate, authority: x509.Certificate, tls: Tls) -> None:
+    """A warning when a lone certificate is not of a lone authority: whoever trusts that one alone will refuse it."""
+    chains = (x509.load_pem_x509_certificates(_content(path)) for path in (tls.ca, tls.certificate) if path is not None)
+    if any(len(chain) > 1 for chain in chains):
+        return
+    try:
+        certificate.verify_directly_issued_by(authority)
+    except (ValueError, TypeError, InvalidSignature):
+        LOG.warning("tls: %s was not issued by %s; whoever trusts that one alone refuses us", tls.certificate, tls.ca)
+
+
+def common_name(path: Path) -> str | None:
+    """The common name in a certificate, by which access rules call its holder. ConfigError as ``read_certificate``."""
+    names = read_certificate(path).subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(names[0].value) if names else None
+
+
+def read_certificate(path: Path) -> x509.Certificate:
+    """The first certificate of a PEM file. ConfigError when there is none, or it is not valid now."""
+    try:
+        certificate = x509.load_pem_x509_certificates(_content(path))[0]
+    except ValueError:
+        raise ConfigError(f"tls: {path} holds no certificate in PEM; omnibench keys DIR makes some") from None
+    now = datetime.now(UTC)
+    if now < certificate.not_valid_before_utc:
+        raise ConfigError(
+            f"tls: {path} is valid from {certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC on only, and it is "
+            f"{now:%Y-%m-%d %H:%M}; set the clock, or make a new one"
+        )
+    if now > certificate.not_valid_after_utc:
+        raise ConfigError(f"tls: {path} expired on {certificate.not_valid_after_utc:%Y-%m-%d}; make a new one")
+    if now > certificate.not_valid_after_utc - _SOON:
+        LOG.warning("tls: %s expires on %s", path, f"{certificate.not_valid_after_utc:%Y-%m-%d}")
+    return certificate
+
+
+def read_key(path: Path) -> PrivateKeyTypes:
+    """The private key of a PEM file. ConfigError when there is none, or it is encrypted."""
+    try:
+        return load_pem_private_key(_content(path), password=None)
+    except TypeError:
+        raise ConfigError(f"tls: {path} is encrypted, and Zenoh cannot ask for its password; decrypt it") from None
+    except (ValueError, UnsupportedAlgorithm):
+        raise ConfigError(f"tls: {path} holds no private key in PEM; omnibench keys DIR makes some") from None
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise ConfigError(f"tls: {path}: no such file; omnibench keys DIR makes certificates and keys") from None
+    except OSError as error:
+        raise ConfigError(f"tls: {path}: cannot be read: {error.strerror or error}") from None

@@ -1,0 +1,1 @@
+"""Recordings played onto Zenoh as a robot would send them."""

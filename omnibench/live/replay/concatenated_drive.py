@@ -1,0 +1,269 @@
+"""All runs of a recording one after another, as one drive: each starts at the pose where the one before ended.
+
+A run goes from its first reference pose to its last; what the wheels do after that is left out. Between two runs the
+robot rests. With S_i the pose at which run i starts and p(t) its reference, the chained pose is S_i p(0)^-1 p(t).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.data.dataset import Dataset, Split, Trajectory
+from omnibench.errors import ConfigError, DataError
+from omnibench.live.replay.played_recording import Recording
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.odometry import WheelLog
+from omnibench.robot.planar import moved_to, relative
+
+TURN = 2 * np.pi
+LONGEST_PAUSE = 3600.0  # s
+_SAME_TIME = 1e-9  # s, as stamps have it
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """n wheel samples and m reference poses of R runs on one time axis in s, which begins with 0.
+
+    wheel_times (n,) and angles (n, N) rad, continuous: the first are the baseline at 0. rates (n, N): mean over the
+    sample that ends then, rad/s, 0 for the baseline and in rests. run (n,): index of the run; a rest belongs to the
+    run before it. slam_times (m,), slam_poses (m, 3) in m, m, rad with continuous headings, slam_covariances
+    (m, 3, 3) if the data set has them, slam_run (m,). The first pose of a run is where the chain puts it and nothing
+    that was measured, so it is not among them, but for the very first. starts (R, 3) and begins (R,) of the runs.
+    """
+
+    robot: Robot
+    ids: tuple[str, ...]
+    wheel_times: Array
+    angles: Array
+    rates: Array
+    run: NDArray[np.intp]
+    slam_times: Array
+    slam_poses: Array
+    slam_covariances: Array | None
+    slam_run: NDArray[np.intp]
+    starts: Array
+    begins: Array
+
+    @property
+    def duration(self) -> float:
+        """From the first sample to the last, s."""
+        return float(max(self.wheel_times[-1], self.slam_times[-1]))
+
+    def log(self, stamps: Sequence[float] | Array | None = None, session: str | None = None) -> WheelLog:
+        """The wheel rates from the chain's start, for the batch odometry at ``stamps`` (s; default: every sample).
+
+        The chain is one session, from its start on; session: what it is called.
+        """
+        wanted = self.wheel_times if stamps is None else np.asarray(stamps, dtype=float)
+        return WheelLog(
+            self.wheel_times[1:], self.rates[1:], self.starts[0], wanted, self.angles[1:], 0.0, session or ""
+        )
+
+
+def chain_runs(
+    dataset: Dataset, *, pause: float = 1.0, split: Split | None = None, anchors: Array | None = None
+) -> Chain:
+    """The runs of a data set (or of one split) as one drive with ``pause`` s of rest between them.
+
+    Runs go session by session, in the order of ``started_at`` where it is known, else of the data set. anchors (R, 3):
+    the poses at which they start, in place of those that follow from the reference. ConfigError: a bad pause.
+    DataError: no run, a run with a single pose, anchors of another shape or not finite.
+    """
+    if not 0 <= pause <= LONGEST_PAUSE:
+        raise ConfigError(f"pause: {pause:g} s between runs is not within 0 and {LONGEST_PAUSE:g} s")
+    runs = _ordered(dataset, split)
+    moves = np.array([relative(each.start, each.final_pose) for each in runs])
+    starts = _composed(runs[0].start, moves)
+    if anchors is not None:
+        starts = _anchored(dataset, np.asarray(anchors, dtype=float), moves)
+    rests = [_rest_samples(each, pause, dataset.sample_period) for each in runs]
+    lengths = [each.times[-1] + count * dataset.sample_period for each, count in zip(runs, rests, strict=True)]
+    begins = np.concatenate([[0.0], np.cumsum(lengths)[:-1]])
+    rests[-1] = 0  # the drive ends with its last run
+    measured = [each.pose_times > 0 for each in runs]
+    measured[0] = np.ones(len(runs[0].pose_times), dtype=bool)
+    return Chain(
+        robot=dataset.robot,
+        ids=tuple(each.id for each in runs),
+        wheel_times=_wheel_times(runs, rests, begins, dataset.sample_period),
+        angles=_angles(runs, rests),
+        rates=_rates(runs, rests),
+        run=np.repeat(np.arange(len(runs)), _samples(runs, rests)),
+        slam_times=np.concatenate([b + each.pose_times[m] for b, each, m in zip(begins, runs, measured, strict=True)]),
+        slam_poses=np.concatenate(
+            [moved_to(start, each.poses)[m] for start, each, m in zip(starts, runs, measured, strict=True)]
+        ),
+        slam_covariances=_covariances(runs, starts, measured),
+        slam_run=np.repeat(np.arange(len(runs)), [np.count_nonzero(m) for m in measured]),
+        starts=starts,
+        begins=begins,
+    )
+
+
+def chain_recording(recording: Recording, *, pause: float = 1.0, split: Split | None = None) -> Chain:
+    """``chain_runs`` of a recording, on the anchors of its truth where that is known."""
+    anchors = None if recording.truth is None else true_anchors(recording, split)
+    return chain_runs(recording.dataset, pause=pause, split=split, anchors=anchors)
+
+
+def true_anchors(recording: Recording, split: Split | None = None) -> Array:
+    """Start poses (R, 3) with which a simulated robot truly goes on where it was. DataError without a truth.
+
+    The reference poses of a chain then err about the truth and do not drift away from it.
+    """
+    truth, runs = _TruthOfRuns(recording), _ordered(recording.dataset, split)
+    moves = [relative(each.start, truth.poses(each, each.times[-1:])[0]) for each in runs]
+    return _composed(runs[0].start, np.array(moves))
+
+
+def chained_truth(chain: Chain, recording: Recording) -> Array:
+    """True poses (n, 3) of a simulated robot at the chain's wheel times, each run from its start in the chain.
+
+    Continuous on true anchors; else it leaps from run to run by what the reference was wrong. DataError without a
+    truth.
+    """
+    truth = _TruthOfRuns(recording)
+    known = {each.id: each for each in recording.dataset.trajectories}
+    bounds = np.searchsorted(chain.run, np.arange(1, len(chain.ids)))
+    poses = []
+    for index, times in enumerate(np.split(chain.wheel_times, bounds)):
+        if chain.ids[index] not in known:
+            raise DataError(f"run {chain.ids[index]} is not in data set {recording.dataset.name}; chain that one")
+        run = _trimmed(known[chain.ids[index]])
+        driven = truth.poses(run, np.append(0.0, times - chain.begins[index]))
+        poses.append(moved_to(chain.starts[index], driven)[1:])
+    return np.concatenate(poses)
+
+
+def _ordered(dataset: Dataset, split: Split | None) -> list[Trajectory]:
+    """The runs in the order in which they are chained, each up to its last reference pose."""
+    chosen = dataset.trajectories if split is None else dataset.split(split)
+    if not chosen:
+        raise DataError(f"data set {dataset.name}: no run in its split {split!r}; choose the other, or none")
+    sessions: dict[str | None, list[Trajectory]] = {}
+    for each in chosen:
+        sessions.setdefault(each.session, []).append(each)
+    for runs in sessions.values():
+        if all(each.started_at is not None for each in runs):
+            runs.sort(key=lambda each: each.started_at or 0.0)
+    ordered = [each for runs in sessions.values() for each in runs]
+    for each in ordered:
+        if len(each.pose_times) < 2:
+            raise DataError(f"data set {dataset.name}: run {each.id} has a single reference pose; it cannot be chained")
+    return [_trimmed(each) for each in ordered]
+
+
+def _trimmed(run: Trajectory) -> Trajectory:
+    """A run without what the wheels did after the last reference pose, the sample in which that lies cut short."""
+    end = run.pose_times[-1]
+    if run.times[-1] <= end + _SAME_TIME:
+        return run
+    last = int(np.searchsorted(run.times, end - _SAME_TIME))  # the sample that reaches the end or passes it
+    times = np.append(run.times[:last], min(run.times[last], end))
+    kept = slice(0, last + 1)
+    angles = None
+    if run.angles is not None:
+        angles = run.angles[kept].copy()
+        angles[last] -= run.rates[last] * (run.times[last] - times[last])
+    targets = None if run.targets is None else run.targets[kept]
+    return replace(run, times=times, rates=run.rates[kept], angles=angles, targets=targets)
+
+
+def _rest_samples(run: Trajectory, pause: float, period: float) -> int:
+    """Samples at rest after a run, of which the first last until its last reference pose."""
+    missing = (run.pose_times[-1] - run.times[-1] - _SAME_TIME) / period
+    return max(0, int(np.ceil(missing))) + round(pause / period)
+
+
+def _samples(runs: Sequence[Trajectory], rests: Sequence[int]) -> list[int]:
+    """Samples of each run and the rest after it; the first has the baseline too."""
+    counts = [len(run.times) + rest for run, rest in zip(runs, rests, strict=True)]
+    return [counts[0] + 1, *counts[1:]]
+
+
+def _wheel_times(runs: Sequence[Trajectory], rests: Sequence[int], begins: Array, period: float) -> Array:
+    parts: list[Array] = [np.zeros(1)]
+    for run, rest, begin in zip(runs, rests, begins, strict=True):
+        parts += [begin + run.times, begin + run.times[-1] + period * np.arange(1, rest + 1)]
+    return np.concatenate(parts)
+
+
+def _rates(runs: Sequence[Trajectory], rests: Sequence[int]) -> Array:
+    wheels = runs[0].rates.shape[1]
+    parts: list[Array] = [np.zeros((1, wheels))]
+    for run, rest in zip(runs, rests, strict=True):
+        parts += [run.rates, np.zeros((rest, wheels))]
+    return np.concatenate(parts)
+
+
+def _angles(runs: Sequence[Trajectory], rests: Sequence[int]) -> Array:
+    """Recorded angles, or else rates integrated, each run moved to go on where the one before ended."""
+    parts: list[Array] = []
+    last: Array | None = None
+    for run, rest in zip(runs, rests, strict=True):
+        steps = run.rates * np.diff(run.times, prepend=0.0)[:, None]
+        angles = np.cumsum(steps, axis=0) if run.angles is None else run.angles
+        before = angles[0] - steps[0]
+        if last is None:
+            parts.append(before[None])
+        else:
+            angles = angles + (last - before)
+        last = angles[-1]
+        parts += [angles, np.tile(last, (rest, 1))]
+    return np.concatenate(parts)
+
+
+def _covariances(runs: Sequence[Trajectory], starts: Array, measured: Sequence[NDArray[np.bool_]]) -> Array | None:
+    """Covariances of the reference, turned with their runs; None unless every run has them."""
+    parts = []
+    for run, start, chosen in zip(runs, starts, measured, strict=True):
+        if run.pose_covariances is None:
+            return None
+        angle = start[2] - run.start[2]
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+        parts.append(turn @ run.pose_covariances[chosen] @ turn.T)
+    return np.concatenate(parts)
+
+
+def _composed(first: Array, moves: Array) -> Array:
+    """Where each of the moves (R, 3) starts that follow one another from the pose ``first``: (R, 3)."""
+    headings = first[2] + np.concatenate([[0.0], np.cumsum(moves[:-1, 2])])
+    steps = (moves[:-1, 0] + 1j * moves[:-1, 1]) * np.exp(1j * headings[:-1])
+    path = complex(first[0], first[1]) + np.concatenate([[0.0], np.cumsum(steps)])
+    return np.column_stack([path.real, path.imag, headings])
+
+
+def _anchored(dataset: Dataset, anchors: Array, moves: Array) -> Array:
+    """The anchors with whole turns added to their headings, so that those of the chain go on without any."""
+    if anchors.shape != moves.shape or not np.isfinite(anchors).all():
+        raise DataError(f"data set {dataset.name}: anchors have shape {anchors.shape}, expected {moves.shape}, finite")
+    leaps = np.diff(anchors[:, 2]) - moves[:-1, 2]
+    turns = np.concatenate([[0.0], np.cumsum(np.round(leaps / TURN))])
+    return np.column_stack([anchors[:, :2], anchors[:, 2] - TURN * turns])
+
+
+class _TruthOfRuns:
+    """Where a simulated robot truly was. DataError without a truth."""
+
+    def __init__(self, recording: Recording) -> None:
+        if recording.truth is None:
+            raise DataError(
+                f"data set {recording.dataset.name}: its truth is not known; simulate it from a comparison's config"
+            )
+        self._paths = recording.paths
+        self._robot = recording.truth.true_robot()
+
+    def poses(self, run: Trajectory, stamps: Array) -> Array:
+        """Its poses (K, 3) at stamps (K,) s of a run."""
+        if run.id in self._paths:
+            return moved_to(run.start, self._paths[run.id].at(np.append(0.0, stamps)))[1:]
+        if run.targets is None or run.angles is None:
+            raise DataError(f"run {run.id}: what the motors were told is not recorded, so its truth is not known")
+        rates = self._robot.driven(run.times, run.targets)
+        angles = run.angles[0] - run.rates[0] * run.times[0]  # before its first sample
+        log = self._robot.log(run.times, rates, run.start, stamps, angles, run.started_at, run.session)
+        return self._robot.model.poses([log])[0]

@@ -1,0 +1,239 @@
+"""The whole chain on one machine with no robot: a recording is played to a node and what comes out is judged."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+
+import numpy as np
+import zenoh
+
+from omnibench.errors import ConfigError
+from omnibench.live.config import LiveConfig, client_session, robot_called
+from omnibench.live.estimation.health import Health
+from omnibench.live.network.session import open_session
+from omnibench.live.node import LiveNode, load_effects
+from omnibench.live.replay.concatenated_drive import Chain, chain_recording, chained_truth
+from omnibench.live.replay.played_recording import Recording
+from omnibench.live.replay.replay_player import Player, PlayReport, Progress
+from omnibench.live.wire.messages import Odometry
+from omnibench.live.wire.subscriber import Subscription, subscribe
+from omnibench.live.wire.topics import GraphNode
+from omnibench.robot.calibration import Calibration, read_calibration
+from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.planar import moved_to
+
+_LAST_MESSAGES = 5.0  # s that they may take
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Of positions (m) and headings (rad), as root mean squares, and at the end."""
+
+    position: float
+    heading: float
+    final_position: float
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstration:
+    """What a replay showed.
+
+    against: what the estimates are compared with, in words. theoretical, calibrated: odometry with the design matrix
+    and with the calibration. fused: None without fusion. batch_difference: the most by which a published odom differs
+    from the batch odometry of the same recording, m or rad. lost: messages of odom that never arrived.
+    """
+
+    robot: str
+    calibration: str
+    simulated: bool
+    report: PlayReport
+    against: str
+    theoretical: Deviation
+    calibrated: Deviation
+    fused: Deviation | None
+    batch_difference: float
+    lost: int
+    health: Health
+
+
+class _Collector:
+    """Every message of one topic, in the order of arrival."""
+
+    def __init__(self, session: zenoh.Session, robot: str, topic: str, config: LiveConfig) -> None:
+        self.stamps: list[int] = []
+        self._poses: list[Array] = []
+        self._subscription: Subscription = subscribe(
+            robot,
+            topic=topic,
+            session=session,
+            profile=config.profile,
+            domain=config.domain,
+            callback=self._take,
+            lossless=True,
+        )
+
+    def _take(self, message: Odometry) -> None:
+        self._poses.append(message.pose)
+        self.stamps.append(message.stamp)
+
+    @property
+    def poses(self) -> Array:
+        return np.array(self._poses).reshape(-1, 3)
+
+    def close(self) -> None:
+        self._subscription.close()
+
+
+def demonstrate(
+    config: LiveConfig,
+    recording: Recording,
+    stop: threading.Event | None = None,
+    watch: Callable[[Progress, Health], None] | None = None,
+    beside: Callable[[LiveNode], AbstractContextManager[None]] | None = None,
+) -> Demonstration:
+    """Run the node of ``config``, play ``recording`` to it as the config's ``replay`` says, and judge what comes out.
+
+    The node begins afresh. beside: what is open while it runs, a recorder for example. ConfigError when the recording
+    is of other wheels than the robot's calibration; other errors as LiveNode's and Player's.
+    """
+    stop = stop or threading.Event()
+    robot = robot_called(config, config.replay.robot)
+    load_effects(config)
+    _check_wheels(recording, read_calibration(robot.calibration), robot.name)
+    chain = chain_recording(recording, pause=config.replay.pause, split=config.replay.split)
+    with LiveNode(config, remember=False) as node, beside(node) if beside else nullcontext():
+        tracker = node.trackers[robot.name]
+        guarded = config.zenoh.users_file is not None and config.zenoh.user is None
+        session = node.session if guarded else open_session(client_session(config.zenoh), "replay")
+        try:
+            odometry = _Collector(session, robot.name, "odom", config)
+            fused = None
+            if config.fusion_of(robot) is not None:
+                fused = _Collector(session, robot.name, "odometry/filtered", config)
+            player = Player(
+                GraphNode(session, node.keys, "replay"),
+                robot.name,
+                chain,
+                config.replay,
+                names=robot.wheels.joints,
+                noise=tracker.calibration.noise,
+            )
+
+            def progressed(progress: Progress) -> None:
+                if watch is not None:
+                    watch(progress, node.health(robot.name))
+
+            report = player.play(stop, progressed)
+            _wait_for_the_last(odometry, fused, node, robot.name, stop)
+            health = node.health(robot.name)
+            for collector in (odometry, fused):
+                if collector is not None:
+                    collector.close()
+        finally:
+            if not guarded:
+                session.close()
+        return _judged(chain, recording, tracker.calibration, report, odometry, fused, health)
+
+
+def _check_wheels(recording: Recording, calibration: Calibration, robot: str) -> None:
+    """The node knows wheels by name, and what is compared afterwards by place."""
+    recorded, calibrated = recording.dataset.robot.wheel_names, calibration.robot.wheel_names
+    if recorded != calibrated:
+        raise ConfigError(
+            f"recording {recording.dataset.name!r} has wheels {', '.join(recorded)}, calibration {calibration.name!r} "
+            f"of robot {robot!r} has {', '.join(calibrated)}; play one of that robot, or calibrate with this one"
+        )
+
+
+def _wait_for_the_last(
+    odometry: _Collector, fused: _Collector | None, node: LiveNode, robot: str, stop: threading.Event
+) -> None:
+    pause = threading.Event()
+    for _ in range(int(_LAST_MESSAGES / 0.02)):
+        taken = node.health(robot).counts["samples"]
+        arrived = len(odometry.stamps) >= taken and (fused is None or len(fused.stamps) >= taken)
+        if pause.wait(0.02 if not arrived else 0.1) or stop.is_set():
+            return
+        if arrived and node.health(robot).counts["samples"] == taken:
+            return
+
+
+def _judged(
+    chain: Chain,
+    recording: Recording,
+    calibration: Calibration,
+    report: PlayReport,
+    odometry: _Collector,
+    fused: _Collector | None,
+    health: Health,
+) -> Demonstration:
+    times = chain.wheel_times
+    batch = calibration.model.poses([chain.log(session=calibration.session)])[0]
+    design = OdometryModel.of_design(calibration.robot, calibration.integration).poses([chain.log()])[0]
+    origin = odometry.stamps[0] if odometry.stamps else 0
+    rows = _rows(odometry.stamps, origin, times)
+    # odom begins at its own origin, the recording anywhere
+    published = moved_to(chain.starts[0], odometry.poses) if odometry.stamps else odometry.poses
+    if recording.truth is not None:
+        against, reference = "the simulated truth", chained_truth(chain, recording)
+        chosen = rows
+    else:
+        against, reference = "the reference poses of the recording", _interpolated(chain)
+        chosen = rows[(times[rows] >= chain.slam_times[0]) & (times[rows] <= chain.slam_times[-1])]
+    return Demonstration(
+        robot=health.robot,
+        calibration=calibration.name,
+        simulated=recording.dataset.simulated,
+        report=report,
+        against=against,
+        theoretical=_deviation(design[chosen], reference[chosen]),
+        calibrated=_deviation(batch[chosen], reference[chosen]),
+        fused=None if fused is None else _fused_deviation(fused, origin, chain, reference, chosen),
+        batch_difference=_difference(published, batch[rows]),
+        lost=health.counts["samples"] - len(odometry.stamps),
+        health=health,
+    )
+
+
+def _rows(stamps: list[int], origin: int, times: Array) -> Array:
+    """The wheel sample of each stamp."""
+    seconds = (np.array(stamps, dtype=np.int64) - origin) / 1e9
+    return np.clip(np.searchsorted(times, seconds - 1e-6), 0, len(times) - 1)
+
+
+def _fused_deviation(fused: _Collector, origin: int, chain: Chain, reference: Array, chosen: Array) -> Deviation:
+    """From where SLAM has first been heard on: before that nobody knows where the robot is in the map."""
+    rows = _rows(fused.stamps, origin, chain.wheel_times)
+    known = np.isin(rows, chosen) & (chain.wheel_times[rows] > chain.slam_times[0] + 1.0)
+    return _deviation(fused.poses[known], reference[rows[known]])
+
+
+def _interpolated(chain: Chain) -> Array:
+    columns = [np.interp(chain.wheel_times, chain.slam_times, chain.slam_poses[:, axis]) for axis in range(3)]
+    return np.column_stack(columns)
+
+
+def _turned(difference: Array) -> Array:
+    """Differences of headings the shortest way."""
+    return (difference + np.pi) % (2 * np.pi) - np.pi
+
+
+def _difference(poses: Array, others: Array) -> float:
+    if not len(poses):
+        return math.nan
+    difference = poses - others
+    difference[:, 2] = _turned(difference[:, 2])
+    return float(np.abs(difference).max())
+
+
+def _deviation(poses: Array, reference: Array) -> Deviation:
+    if not len(poses):
+        return Deviation(math.nan, math.nan, math.nan)
+    distance = np.hypot(*(poses - reference)[:, :2].T)
+    heading = _turned(poses[:, 2] - reference[:, 2])
+    return Deviation(float(np.sqrt(np.mean(distance**2))), float(np.sqrt(np.mean(heading**2))), float(distance[-1]))

@@ -1,0 +1,46 @@
+"""A recording to replay: a data set's folder, or a comparison's config whose simulated data set is made on the spot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from omnibench.data.dataset import Dataset
+from omnibench.data.storage import load_dataset
+from omnibench.data.true_poses import TruePath
+from omnibench.data.watch import Watch, unwatched
+from omnibench.errors import ConfigError
+from omnibench.registry import load_plugins
+from omnibench.simulate.source import read_simulation
+from omnibench.simulate.truth import TruthRecord
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A data set and, where it was simulated on the spot, what is hidden from it.
+
+    paths: where the robot truly was in each run, if that is no matter of its targets alone.
+    """
+
+    dataset: Dataset
+    truth: TruthRecord | None = None
+    paths: Mapping[str, TruePath] = field(default_factory=dict)
+
+
+def load_recording(path: Path, dataset: str | None = None, watch: Watch = unwatched) -> Recording:
+    """The data set in a folder, or the simulated one of a comparison's config, with its truth.
+
+    dataset: which one, if the config has several. ConfigError or DataError in one line when there is no such thing.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise ConfigError(f"{path}: no such file or folder; name a data set folder or a comparison's config")
+    if not path.is_dir():
+        source = read_simulation(path, dataset)
+        load_plugins(source.effect_plugins, installed=False)
+        simulation = source.simulate(watch)
+        return Recording(simulation.dataset, simulation.truth, simulation.paths)
+    if dataset is not None:
+        raise ConfigError(f"--dataset {dataset}: {path} is a folder with one data set; leave --dataset out")
+    return Recording(load_dataset(path))

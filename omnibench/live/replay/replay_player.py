@@ -1,0 +1,237 @@
+"""Plays a recording onto Zenoh as the robot and its SLAM would have sent it, at any speed."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from omnibench.errors import ConfigError, OmnibenchError
+from omnibench.live.network.presence import checked_robot
+from omnibench.live.replay.arrivals import (
+    TOPICS_PLAYED,
+    WHEELS,
+    PoseDeviation,
+    ReplayConfig,
+    SlamChannel,
+    WheelChannel,
+    make_schedule,
+)
+from omnibench.live.replay.concatenated_drive import Chain
+from omnibench.live.wire.messages import JointState, PoseEstimate
+from omnibench.live.wire.topics import GraphNode
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Array
+
+__all__ = [
+    "Event",
+    "PlayReport",
+    "Player",
+    "PoseDeviation",
+    "Progress",
+    "ReplayConfig",
+    "SlamChannel",
+    "WheelChannel",
+    "events",
+]
+
+MAP = "map"
+_LEAST_DEVIATION = 1e-4  # m, rad: no covariance is singular
+_GRACE = 0.5  # s that a node has to subscribe to slam_pose, too, if it wants that
+_PROGRESS_PERIOD = 0.1  # s
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A message and when it arrives, s of the recording. It is stamped with when it was taken."""
+
+    arrival: float
+    topic: str
+    message: JointState | PoseEstimate
+
+
+def events(
+    chain: Chain,
+    config: ReplayConfig,
+    *,
+    origin: int | None = None,
+    noise: Noise | None = None,
+    names: Sequence[str] | None = None,
+) -> Iterator[Event]:
+    """Every message of a chain, by time of arrival.
+
+    origin: stamp of the chain's start, ns (default: the config's, or now). noise: of the reference, for poses whose
+    covariance neither the data set nor the config tells. names (N,) of the joints; default: the robot's wheels.
+    """
+    return _Messages(chain, config, noise, names).stamped_from(origin)
+
+
+class _Messages:
+    """All messages of a chain but for their stamps, made ready so that playing them can start at once."""
+
+    def __init__(self, chain: Chain, config: ReplayConfig, noise: Noise | None, names: Sequence[str] | None) -> None:
+        self._chain = chain
+        self._origin = config.stamp_origin
+        self._joints = _joint_names(chain, names)
+        self._schedule = make_schedule(chain, config)
+        self._sampled, self._posed = (_nanoseconds(times) for times in (chain.wheel_times, chain.slam_times))
+        self._covariances = _pose_covariances(chain, config.slam, noise)
+        self._angles = None if config.wheels.use == "velocities" else chain.angles
+        self._rates = None if config.wheels.use == "positions" else chain.rates
+
+    def __len__(self) -> int:
+        return len(self._schedule)
+
+    def stamped_from(self, origin: int | None) -> Iterator[Event]:
+        start = origin or self._origin or time.time_ns()
+        schedule = self._schedule
+        return (
+            Event(float(arrival), TOPICS_PLAYED[topic], (self._sample if topic == WHEELS else self._pose)(start, row))
+            for arrival, topic, row in zip(schedule.arrivals, schedule.topics, schedule.rows, strict=True)
+        )
+
+    def _sample(self, start: int, row: int) -> JointState:
+        positions = None if self._angles is None else self._angles[row]
+        velocities = None if self._rates is None else self._rates[row]
+        return JointState(start + int(self._sampled[row]), self._joints, positions, velocities)
+
+    def _pose(self, start: int, row: int) -> PoseEstimate:
+        return PoseEstimate(start + int(self._posed[row]), MAP, self._chain.slam_poses[row], self._covariances[row])
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a replay is: messages, and s of the recording and of the wall clock."""
+
+    done: int
+    total: int
+    data_seconds: float
+    wall_seconds: float
+
+
+@dataclass(frozen=True)
+class PlayReport:
+    """What was played. sent: messages of each topic. late: the most that one went out after its time, s."""
+
+    sent: dict[str, int]
+    total: int
+    data_seconds: float
+    wall_seconds: float
+    late: float
+
+    @property
+    def complete(self) -> bool:
+        """Whether it was played to its end."""
+        return sum(self.sent.values()) == self.total
+
+    @property
+    def rate(self) -> float:
+        """Messages per second."""
+        return sum(self.sent.values()) / max(self.wall_seconds, 1e-9)
+
+
+class Player:
+    """Plays a chain as one robot. Its publishers go with the session of ``graph``.
+
+    A subscriber that does not keep up holds it up, so that nothing of the recording is lost at any speed. names, noise:
+    as for ``events``. ConfigError: a robot's name that cannot be, or not a name for each wheel.
+    """
+
+    def __init__(
+        self,
+        graph: GraphNode,
+        robot: str,
+        chain: Chain,
+        config: ReplayConfig,
+        names: Sequence[str] | None = None,
+        noise: Noise | None = None,
+    ) -> None:
+        self._robot = checked_robot(robot)
+        self._config = config
+        self._messages = _Messages(chain, config, noise, names)
+        self._publishers = {topic: graph.publisher(robot, topic, lossless=True) for topic in TOPICS_PLAYED}
+
+    def play(self, stop: threading.Event | None = None, watch: Callable[[Progress], None] | None = None) -> PlayReport:
+        """Play to the end, or until ``stop`` is set or Ctrl-C is pressed.
+
+        First it waits for a subscriber; ConfigError when none comes. watch: told of the progress ten times a second,
+        and at the end.
+        """
+        stop = stop or threading.Event()
+        total, sent = len(self._messages), dict.fromkeys(TOPICS_PLAYED, 0)
+        begin, arrival, late = time.perf_counter(), 0.0, 0.0
+        try:
+            self._wait_for_subscriber(stop)
+            begin = told = time.perf_counter()
+            for number, event in enumerate(self._messages.stamped_from(None), 1):
+                due = begin + event.arrival / self._config.speed
+                now = time.perf_counter()
+                if due > now:
+                    stop.wait(due - now)
+                    now = time.perf_counter()
+                if stop.is_set():
+                    break
+                self._publishers[event.topic].put(event.message)
+                sent[event.topic] += 1
+                arrival, late = event.arrival, max(late, now - due)
+                if watch is not None and now - told >= _PROGRESS_PERIOD:
+                    told = now
+                    watch(Progress(number, total, arrival, now - begin))
+        except KeyboardInterrupt:
+            pass
+        except zenoh.ZError as error:
+            if not stop.is_set():  # else who stopped it has closed the session, too
+                raise OmnibenchError(f"replay of {self._robot}: cannot publish any more: {error}") from None
+        seconds = time.perf_counter() - begin
+        if watch is not None:
+            watch(Progress(sum(sent.values()), total, arrival, seconds))
+        return PlayReport(sent, total, arrival, seconds, 0.0 if math.isinf(self._config.speed) else late)
+
+    def _wait_for_subscriber(self, stop: threading.Event) -> None:
+        """Until the wheel samples have a subscriber and, if one comes within a moment, the SLAM poses have."""
+        wheels, slam = (self._publishers[topic] for topic in TOPICS_PLAYED)
+        wait = self._config.wait
+        deadline = time.perf_counter() + wait
+        while wait and not wheels.matched and not stop.wait(0.01):
+            if time.perf_counter() > deadline:
+                raise ConfigError(
+                    f"nobody subscribes to {wheels.key} after {wait:g} s; start omnibench live for robot "
+                    f"{self._robot}, check robot, profile and endpoint of both, or wait longer"
+                )
+        deadline = time.perf_counter() + min(wait, _GRACE)
+        while not slam.matched and time.perf_counter() < deadline and not stop.wait(0.01):
+            pass
+
+
+def _nanoseconds(times: Array) -> NDArray[np.int64]:
+    return np.round(times * 1e9).astype(np.int64)
+
+
+def _pose_covariances(chain: Chain, slam: SlamChannel, noise: Noise | None) -> Array:
+    """Covariances (m, 3, 3) of the SLAM poses about where the robot was."""
+    if chain.slam_covariances is not None:
+        return chain.slam_covariances
+    count = len(chain.slam_times)
+    if slam.covariance is None and noise is not None:
+        seconds = chain.slam_times - chain.begins[chain.slam_run]  # that the walk has had since the run's start
+        position = np.sqrt(noise.pose_position**2 + noise.bias_position**2 + noise.walk_position**2 * seconds)
+        heading = np.sqrt(noise.pose_heading**2 + noise.bias_heading**2 + noise.walk_heading**2 * seconds)
+    else:
+        given = slam.covariance or PoseDeviation()
+        position, heading = np.full(count, given.position), np.full(count, given.heading)
+    deviations = np.maximum(np.column_stack([position, position, heading]), _LEAST_DEVIATION)
+    covariances: Array = deviations[:, :, None] ** 2 * np.eye(3)
+    return covariances
+
+
+def _joint_names(chain: Chain, names: Sequence[str] | None) -> tuple[str, ...]:
+    joints, wheels = tuple(chain.robot.wheel_names if names is None else names), chain.robot.wheel_names
+    if len(joints) != len(wheels) or len(set(joints)) != len(joints):
+        raise ConfigError(f"joints {', '.join(joints) or '(none)'}: give each of the wheels {', '.join(wheels)} a name")
+    return joints

@@ -1,0 +1,85 @@
+"""The robots' topics on a WebSocket that the Foxglove application opens (foxglove-sdk, the extra ``foxglove``)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import TracebackType
+from typing import TYPE_CHECKING, Final
+
+import zenoh
+
+from omnibench.errors import ConfigError
+from omnibench.live.wire.topic_listener import Arrival, Tap
+from omnibench.live.wire.topics import TOPICS, KeySpace
+
+if TYPE_CHECKING:
+    from foxglove import Channel
+
+PORT: Final = 8765  # which the application proposes
+
+
+class FoxgloveServer:
+    """Serves on ``host`` and ``port`` (0: any free one) what it is told to ``forward``, until ``close``.
+
+    Only programs of this machine reach it unless ``host`` says otherwise: the protocol has no password. A client that
+    does not keep up loses messages and holds up nobody.
+
+    ConfigError: foxglove-sdk is not installed, the port is taken, or the host is none of this machine's.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = PORT) -> None:
+        try:
+            import foxglove
+        except ImportError:
+            raise ConfigError(
+                "the Foxglove server needs the package foxglove-sdk: pip install 'omnibench[foxglove]'"
+            ) from None
+        if not 0 <= port <= 65535:
+            raise ConfigError(f"Foxglove server: port {port}: expected 0 to 65535")
+        self._context = foxglove.Context()
+        try:
+            self._server = foxglove.start_server(name="omnibench", host=host, port=port, context=self._context)
+        except (RuntimeError, OSError) as error:
+            reason = str(error).removeprefix("FoxgloveError: ")
+            raise ConfigError(
+                f"Foxglove server on {host}:{port}: {reason}; close what uses it or choose another host or port"
+            ) from None
+        self.address = f"ws://{host}:{self._server.port}"
+        self._channels: dict[str, Channel] = {}
+        self._taps: list[Tap] = []
+
+    def forward(
+        self, session: zenoh.Session, keys: KeySpace, robots: Sequence[str], topics: Sequence[str] = tuple(TOPICS)
+    ) -> None:
+        """Offer the robots' topics from now on; each message goes out as it came. ConfigError: no such topic."""
+        import foxglove
+
+        tap = Tap(session, keys, robots, topics, self._arrived)
+        for name, topic in tap.topics.items():
+            kind = TOPICS[topic]
+            schema = foxglove.Schema(name=kind.name, encoding="ros2msg", data=kind.definition.encode())
+            self._channels[name] = foxglove.Channel(name, schema=schema, message_encoding="cdr", context=self._context)
+        self._taps.append(tap)
+
+    def subscribed(self, name: str) -> bool:
+        """Whether a client wants the topic, as /apr02/odom, now."""
+        return name in self._channels and self._channels[name].has_sinks()
+
+    def close(self) -> None:
+        """Stop serving."""
+        for tap in self._taps:
+            tap.close()
+        self._server.stop()
+
+    def __enter__(self) -> FoxgloveServer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _arrived(self, arrival: Arrival) -> None:
+        channel = self._channels.get(arrival.name)
+        if channel is not None:
+            channel.log(arrival.payload, log_time=arrival.time)

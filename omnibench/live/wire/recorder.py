@@ -1,0 +1,180 @@
+"""Live topics into an MCAP file that Foxglove, rosbags and mcap-ros2-support open."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Event, Thread
+from types import TracebackType
+from typing import Any, Final
+
+import zenoh
+
+from omnibench.errors import DataError
+from omnibench.live.wire.mcap_file import McapFile
+from omnibench.live.wire.messages import MessageError, MessageType
+from omnibench.live.wire.topic_listener import Arrival, Tap
+from omnibench.live.wire.topics import TOPICS, KeySpace
+
+_FLUSH_PERIOD: Final = 1.0  # s; so much is lost when the process is killed
+_LOOK_PERIOD: Final = 0.02  # s; looking for each message as it comes would cost four times as much
+_WITHOUT_PAUSE: Final = 16  # messages, 0.2 ms
+_MOST_WAITING: Final = 200_000  # messages, some 150 MB, behind a disk that has stopped for a while
+
+_log = logging.getLogger(__name__)
+
+
+class Recorder:
+    """Records the robots' topics from ``start`` to ``stop`` (or as a context manager); each payload as it came.
+
+    Log times are those of arrival, publish times those in the messages' headers. A disk that refuses ends the
+    recording, and nothing else: ``failure`` and ``on_failure`` (by default the log) get one line, and what was recorded
+    stays readable.
+
+    counts: messages written, by ROS topic. undecodable: payloads that are not of their topic's type, left out, by ROS
+    topic. lost: messages that came while the disk stood still for too long.
+
+    ConfigError: a robot's name or a topic that cannot be. DataError: ``path`` exists already or cannot be written.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: KeySpace,
+        robots: Sequence[str],
+        path: Path,
+        topics: Sequence[str] = tuple(TOPICS),
+        on_failure: Callable[[str], object] = _log.error,
+    ) -> None:
+        self.path = path
+        self._on_failure = on_failure
+        self.counts: Counter[str] = Counter()
+        self.undecodable: Counter[str] = Counter()
+        self.lost = 0
+        self.failure: str | None = None
+        self._source = session, keys, tuple(robots), tuple(topics)
+        self._waiting: SimpleQueue[Arrival] = SimpleQueue()
+        self._stopping = Event()
+        self._file: McapFile | None = None
+        self._tap: Tap | None = None
+        self._thread = Thread(target=self._run, name="omnibench-recorder", daemon=True)
+
+    @property
+    def messages(self) -> int:
+        """Messages written."""
+        return self.counts.total()
+
+    @property
+    def bytes(self) -> int:
+        """The file's size so far."""
+        return self._file.size if self._file else 0
+
+    def start(self) -> None:
+        """Begin."""
+        session, keys, robots, topics = self._source
+        tap = Tap(session, keys, robots, topics, self._arrived)
+        try:
+            self._file = McapFile(self.path)
+        except DataError:
+            tap.close()
+            raise
+        self._tap = tap
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Write what has come, and complete the file. Stopping twice does no harm."""
+        if self._tap is None:
+            return
+        self._tap.close()
+        self._stopping.set()
+        self._thread.join()
+
+    def __enter__(self) -> Recorder:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _arrived(self, arrival: Arrival) -> None:
+        if self.failure is not None:
+            return
+        if self._waiting.qsize() < _MOST_WAITING:
+            self._waiting.put(arrival)
+        else:
+            self.lost += 1
+
+    def _run(self) -> None:
+        assert self._file is not None
+        try:
+            self._write(self._file)
+            self._file.complete()
+        except OSError as error:
+            reason = error.strerror or str(error)
+            self.failure = (
+                f"{self.path}: cannot be written: {reason}; the recording ends here, what it holds can be read"
+            )
+            self._file.close()
+            self._on_failure(self.failure)
+
+    def _write(self, file: McapFile) -> None:
+        file.flush()
+        flush_at = time.monotonic() + _FLUSH_PERIOD
+        stopping = False
+        while not stopping:
+            stopping = self._stopping.wait(_LOOK_PERIOD)
+            self._add_all(file)
+            if time.monotonic() >= flush_at:
+                file.flush()
+                flush_at = time.monotonic() + _FLUSH_PERIOD
+
+    def _add_all(self, file: McapFile) -> None:
+        for count in itertools.count(1):
+            try:
+                arrival = self._waiting.get_nowait()
+            except Empty:
+                return
+            self._add(file, arrival)
+            if count % _WITHOUT_PAUSE == 0:
+                time.sleep(0)  # the other threads of a node are in a hurry
+
+    def _add(self, file: McapFile, arrival: Arrival) -> None:
+        kind = TOPICS[arrival.topic]
+        try:
+            stamp = _stamp(kind, arrival.payload)
+        except MessageError:
+            self.undecodable[arrival.name] += 1
+            return
+        file.write(
+            arrival.name,
+            kind,
+            arrival.payload,
+            log_time=arrival.time,
+            publish_time=arrival.time if stamp is None or stamp < 0 else stamp,
+        )
+        self.counts[arrival.name] += 1
+
+
+def free_path(path: Path) -> Path:
+    """``path``, or the same with the time in its name where that is there: a node that starts again records on."""
+    if not path.exists():
+        return path
+    return path.with_name(f"{path.stem}-{time.strftime('%Y%m%d-%H%M%S')}{path.suffix}")
+
+
+def _stamp(kind: MessageType[Any], payload: bytes) -> int | None:
+    """The stamp in a payload's header, ns; None where it has none. MessageError: not of this type."""
+    content = kind.parse(payload)
+    if kind is TOPICS["tf"]:
+        if not content.transforms:
+            return None
+        content = content.transforms[0]
+    stamp = content.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)

@@ -1,0 +1,156 @@
+"""Where a robot's messages are in Zenoh's key space, so that other programs find them: three profiles.
+
+plain: the key is the topic, as the DDS bridge (zenoh-bridge-ros2dds) maps it. rmw: as a ROS 2 node on rmw_zenoh, with
+liveliness tokens (else the topic is missing from ``ros2 topic list``) and an attachment to each message (else it is
+dropped). humble: rmw with Humble's place-holder for type hashes.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable
+from itertools import count
+from typing import Any, Final, Generic, Literal, TypeVar
+
+import xxhash
+import zenoh
+from zenoh.handlers import Callback
+
+from omnibench.live.wire.messages import (
+    DIAGNOSTICS,
+    JOINT_STATE,
+    ODOMETRY,
+    POSE_ESTIMATE,
+    TRANSFORMS,
+    MessageType,
+)
+
+Profile = Literal["plain", "rmw", "humble"]
+M = TypeVar("M")
+
+# A robot's topics, below its name; tf is everybody's.
+TOPICS: Final[dict[str, MessageType[Any]]] = {
+    "joint_states": JOINT_STATE,
+    "slam_pose": POSE_ESTIMATE,
+    "odom": ODOMETRY,
+    "odometry/filtered": ODOMETRY,
+    "diagnostics": DIAGNOSTICS,
+    "tf": TRANSFORMS,
+}
+INPUTS: Final = ("joint_states", "slam_pose")
+
+_QOS = "::,10:,:,:,,"  # reliable, volatile, depth 10
+_HASH_OF_HUMBLE = "TypeHashNotSupported"
+
+
+def topic_name(robot: str, topic: str) -> str:
+    """The ROS 2 name of a robot's topic without its leading slash: ``apr02/odom``; ``tf`` stands alone."""
+    return topic if topic == "tf" else f"{robot}/{topic}"
+
+
+def dds_name(message_type: MessageType[Any]) -> str:
+    """nav_msgs/msg/Odometry as rmw_zenoh writes it: nav_msgs::msg::dds_::Odometry_."""
+    package, kind, name = message_type.name.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+class KeySpace:
+    """The keys of one profile (and ROS domain)."""
+
+    def __init__(self, profile: Profile = "plain", domain: int = 0) -> None:
+        self.profile: Profile = profile
+        self.domain = domain
+
+    def key(self, robot: str, topic: str) -> str:
+        """The key that a robot's topic is published to."""
+        name, kind = topic_name(robot, topic), TOPICS[topic]
+        return name if self.profile == "plain" else f"{self.domain}/{name}/{dds_name(kind)}/{self.type_hash(kind)}"
+
+    def expression(self, robot: str, topic: str) -> str:
+        """The key expression that finds a robot's topic, whatever version of its type the sender has."""
+        name, kind = topic_name(robot, topic), TOPICS[topic]
+        return name if self.profile == "plain" else f"{self.domain}/{name}/{dds_name(kind)}/*"
+
+    def type_hash(self, message_type: MessageType[Any]) -> str:
+        """The type hash that stands in keys and tokens."""
+        return _HASH_OF_HUMBLE if self.profile == "humble" else message_type.hash
+
+
+class GraphNode:
+    """A session's topics, and the session as a node of the ROS graph where the profile has one.
+
+    Undeclare what it made by closing the session. name: the node's, as ``ros2 node list`` shows it.
+    """
+
+    def __init__(self, session: zenoh.Session, keys: KeySpace, name: str) -> None:
+        self.session = session
+        self.keys = keys
+        self._name = name
+        self._numbers = count()
+        self._tokens: list[zenoh.LivelinessToken] = []  # a token that nobody holds vanishes
+        self._token("NN", next(self._numbers))
+
+    def publisher(self, robot: str, topic: str, *, lossless: bool = False) -> Publisher[Any]:
+        """A publisher of a robot's topic."""
+        token = self._token("MP", next(self._numbers), robot, topic)
+        return Publisher(self.session, TOPICS[topic], self.keys.key(robot, topic), token, lossless=lossless)
+
+    def subscribe(self, robot: str, topic: str, callback: Callable[[zenoh.Sample], None]) -> zenoh.Subscriber[None]:
+        """Call ``callback`` with every sample of a robot's topic, in Zenoh's own thread, which it must not hold up."""
+        self._token("MS", next(self._numbers), robot, topic)
+        direct: Any = Callback(callback, indirect=False)
+        return self.session.declare_subscriber(self.keys.expression(robot, topic), direct)
+
+    def _token(self, kind: str, number: int, robot: str = "", topic: str = "") -> str:
+        """Declare a liveliness token of rmw_zenoh; its key, or an empty text in the profile without any."""
+        if self.keys.profile == "plain":
+            return ""
+        zid = self.session.zid()
+        key = f"@ros2_lv/{self.keys.domain}/{zid}/0/{number}/{kind}/%/%/{self._name}"
+        if topic:
+            message_type = TOPICS[topic]
+            name = "%" + topic_name(robot, topic).replace("/", "%")
+            key += f"/{name}/{dds_name(message_type)}/{self.keys.type_hash(message_type)}/{_QOS}"
+        self._tokens.append(self.session.liveliness().declare_token(key))
+        return key
+
+
+class Publisher(Generic[M]):
+    """Publishes messages of one topic; a subscriber that does not keep up loses messages and holds up nobody.
+
+    lossless: such a subscriber loses nothing and holds up the publisher instead, as a recording that is replayed wants.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, message_type: MessageType[M], key: str, token: str, *, lossless: bool = False
+    ) -> None:
+        self.message_type = message_type
+        self.key = key
+        self._publisher = session.declare_publisher(
+            key,
+            encoding=f"application/cdr;{message_type.name}",
+            congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+        )
+        self._sequence = count(1)
+        # XXH3-128 of the token: its low 64 bits, then the high ones, little-endian
+        self._gid = xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little") if token else b""
+
+    @property
+    def matched(self) -> bool:
+        """Whether anybody subscribes to the topic now."""
+        status: Any = self._publisher.matching_status  # an object, and always true, whatever zenoh's stubs say
+        return bool(getattr(status, "matching", status))
+
+    def put(self, message: M) -> None:
+        """Encode and publish."""
+        self.put_encoded(self.message_type.encode(message))
+
+    def put_encoded(self, payload: bytes) -> None:
+        """Publish what is encoded already."""
+        if not self._gid:
+            self._publisher.put(payload)
+            return
+        attachment = struct.pack("<qqB", next(self._sequence), time.time_ns(), len(self._gid)) + self._gid
+        self._publisher.put(payload, attachment=attachment)

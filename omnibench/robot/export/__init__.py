@@ -1,0 +1,1 @@
+"""Calibrations for other software, one format a file."""

@@ -1,0 +1,54 @@
+"""Writing a calibration for other software: parameters of a ROS 2 controller, or a C header."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from omnibench.errors import UnknownNameError
+from omnibench.robot.calibration import Calibration
+from omnibench.robot.export.c_header import c_header
+from omnibench.robot.export.ros2_controllers import ros2_controllers
+
+
+@dataclass(frozen=True)
+class Export:
+    """The text of a file, what it could not hold, in words, and a name for the file."""
+
+    text: str
+    warnings: tuple[str, ...]
+    file_name: str
+
+
+def _ros2_controllers(calibration: Calibration) -> Export:
+    text, warnings = ros2_controllers(calibration)
+    return Export(text, warnings, f"{_stem(calibration.name)}_omni_wheel_drive.yaml")
+
+
+def _c_header(calibration: Calibration) -> Export:
+    stem = _stem(calibration.name)
+    text, warnings = c_header(calibration, stem)
+    return Export(text, warnings, f"{stem}_odometry.h")
+
+
+EXPORT_FORMATS: Mapping[str, Callable[[Calibration], Export]] = MappingProxyType(
+    {"c_header": _c_header, "ros2_controllers": _ros2_controllers}
+)
+
+
+def export_calibration(calibration: Calibration, format: str) -> Export:  # noqa: A002 (the command's own word)
+    """A calibration in another format: ``ros2_controllers`` or ``c_header``.
+
+    Raises UnknownNameError for another format and ConfigError when the format cannot describe this robot at all.
+    """
+    if format not in EXPORT_FORMATS:
+        raise UnknownNameError("export format", format, EXPORT_FORMATS)
+    return EXPORT_FORMATS[format](calibration)
+
+
+def _stem(name: str) -> str:
+    """The calibration's name as a C identifier and a file name."""
+    stem = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+    return stem if stem and not stem[0].isdigit() else f"robot_{stem}".rstrip("_")

@@ -1,0 +1,1 @@
+"""A robot simulated from command to SLAM: motors, encoders, room, LIDAR."""

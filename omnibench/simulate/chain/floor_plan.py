@@ -1,0 +1,198 @@
+"""Floor plans: the walls that a LIDAR sees and that a robot must not hit.
+
+In a config a room is the name of a ready-made plan or a drawing of one's own, in metres:
+
+    room: {plan: furnished_room}
+
+    room:
+      boundary: [[0, 0], [5, 0], [5, 4], [0, 4]]     # the walls, corner by corner, in either direction
+      obstacles:
+        - [[4, 3], [5, 3], [5, 4], [4, 4]]           # a cupboard in the corner
+        - [[1, 1], [1.4, 1], [1.2, 1.4]]
+      start: [2.5, 2, 90]                            # x (m), y (m) and heading (degrees) of the robot at rest
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from pydantic import Field, FiniteFloat, model_validator
+from shapely.geometry import LineString, MultiLineString, MultiPolygon, Point, Polygon
+
+from omnibench.config import Model
+from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.robot.kinematics import Array
+from omnibench.simulate.chain.floor_plans import PLANS, Drawing
+
+Corner = tuple[FiniteFloat, FiniteFloat]
+Pose = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+
+_LARGEST = 1000.0  # m; a larger plan is one in mm
+_SMALLEST_AREA = 1e-6  # m²
+_STEP = 0.01  # m: a path is looked at in steps of this length
+_OUTSIDE = 0.01  # m: by so much an obstacle may reach into the walls
+
+
+class RoomPlan(Model):
+    """A room: the name of a ready-made plan, or a boundary with obstacles."""
+
+    plan: str | None = Field(None, description=f"ready-made: one of {', '.join(PLANS)}")
+    boundary: tuple[Corner, ...] | None = Field(None, description="corners of the walls [x, y], m")
+    obstacles: tuple[tuple[Corner, ...], ...] = Field((), description="corners [x, y] of each, m")
+    start: Pose | None = Field(None, description="where the robot starts: x (m), y (m), heading (degrees)")
+
+    @model_validator(mode="after")
+    def _one_is_given(self) -> RoomPlan:
+        if (self.plan is None) == (self.boundary is None):
+            given = "both are" if self.plan is not None else "neither is"
+            raise ValueError(f"give plan, a ready-made one ({', '.join(PLANS)}), or boundary ({given} given)")
+        if self.plan is not None and self.obstacles:
+            raise ValueError("obstacles: a ready-made plan has its own; leave them out, or draw the boundary too")
+        if self.boundary is not None and self.start is None:
+            raise ValueError("start: say where the robot starts in this room: [x, y, heading in degrees]")
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class FloorPlan:
+    """A room as the robot meets it, in metres, in the room's frame.
+
+    obstacle_names: what messages call them. start (3,): m, m, rad. segments (S, 4): x, y of both ends of each wall of
+    boundary and obstacles. owners (S,): whose wall that is, the obstacle's index or -1 for the boundary. free: where
+    the boundary is not covered by obstacles.
+    """
+
+    name: str
+    boundary: Polygon
+    obstacles: tuple[Polygon, ...]
+    obstacle_names: tuple[str, ...]
+    start: Array
+    segments: Array
+    owners: NDArray[np.intp]
+    free: Polygon | MultiPolygon
+
+    def check_path(self, positions: Array, times: Array, radius: float, what: str) -> None:
+        """ConfigError in one line when a robot, a disc of ``radius`` m, does not keep inside the free area.
+
+        positions (K, 2), m, at times (K,), s: those of the robot's centre; ``what``: whose path it is, for the message.
+        What reaches less than 1 cm into a wall between two places looked at may go unseen.
+        """
+        way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(positions, axis=0).T))])
+        chosen = np.flatnonzero(np.diff(np.floor(way / _STEP), prepend=-1.0))
+        chosen = np.union1d(chosen, [len(positions) - 1])
+        places = positions[chosen]
+        steps = shapely.linestrings(np.stack([places[np.maximum(np.arange(len(places)) - 1, 0)], places], axis=1))
+        distances = shapely.distance(steps, MultiLineString(list(self.segments.reshape(-1, 2, 2))))
+        bad = (distances < radius - 1e-9) | ~shapely.contains_xy(self.free, places)
+        for step in np.flatnonzero(bad)[:1]:
+            raise ConfigError(
+                f"{what}: at {times[chosen[step]]:.2f} s the robot at ({_place(places[step])}) m, radius {radius:g} m, "
+                f"{self._met(steps[step], radius)} of the room {self.name}; shorten the way, move the start or choose "
+                "a larger room"
+            )
+
+    def place_of(self, position: Array) -> str | None:
+        """What a position (2,) lies in, if that is not the free area; a wall belongs to what it is the wall of."""
+        if self.free.contains(Point(position)):
+            return None
+        for name, obstacle in zip(self.obstacle_names, self.obstacles, strict=True):
+            if obstacle.intersects(Point(position)):
+                return f"in {name}"
+        return "outside the boundary"
+
+    def _met(self, step: LineString, radius: float) -> str:
+        """What a robot meets that is not in the free area with all its disc."""
+        distances = shapely.distance(shapely.linestrings(self.segments.reshape(-1, 2, 2)), step)
+        nearest = int(np.argmin(distances))
+        if distances[nearest] >= radius:
+            return f"is {self.place_of(np.array(step.coords[-1]))}"
+        owner = self.owners[nearest]
+        name = "the boundary" if owner < 0 else self.obstacle_names[owner]
+        return f"hits {name}"
+
+
+def make_plan(room: RoomPlan, where: str) -> FloorPlan:
+    """The floor plan of a config's room, ``where`` in the config.
+
+    ConfigError in one line names the polygon and what is wrong with it: fewer than three corners, no area, it crosses
+    itself, it is an obstacle outside the boundary or covers all of it; or the plan is unknown, or the start not free.
+    """
+    drawing, name = _drawing(room, where)
+    start = drawing.start
+    walls = _polygon(drawing.boundary, f"{where}.boundary")
+    inner = {each: _polygon(corners, f"{where}.{each}") for each, corners in drawing.obstacles.items()}
+    room_and_wall = walls.buffer(_OUTSIDE, join_style="mitre")
+    for each, polygon in inner.items():
+        outside = polygon.difference(room_and_wall)
+        if not polygon.intersects(walls):
+            raise ConfigError(f"{where}.{each}: lies outside the boundary; move or remove it")
+        if polygon.covers(walls):
+            raise ConfigError(f"{where}.{each}: covers the whole room; make it smaller, or the boundary larger")
+        if not outside.is_empty:
+            place = _place(outside.representative_point().coords[0])
+            raise ConfigError(f"{where}.{each}: reaches outside the boundary, at ({place}) m; cut it off at the wall")
+    free = walls.difference(shapely.union_all(list(inner.values())))
+    if free.area < _SMALLEST_AREA:
+        raise ConfigError(f"{where}.obstacles: they cover the whole room together; leave the robot some floor")
+    edges = [_edges(polygon) for polygon in (walls, *inner.values())]
+    shapely.prepare(free)
+    plan = FloorPlan(
+        name,
+        walls,
+        tuple(inner.values()),
+        tuple(inner),
+        np.array([start[0], start[1], math.radians(start[2])]),
+        np.concatenate(edges),
+        np.repeat(np.arange(len(edges)) - 1, [len(each) for each in edges]),
+        free,
+    )
+    blocked = plan.place_of(plan.start[:2])
+    if blocked is not None:
+        raise ConfigError(f"{where}.start: ({_place(plan.start)}) m is {blocked}; start where the floor is free")
+    return plan
+
+
+def _drawing(room: RoomPlan, where: str) -> tuple[Drawing, str]:
+    """What a config's room looks like, and its name."""
+    if room.plan is None:
+        obstacles = {f"obstacles[{index}]": corners for index, corners in enumerate(room.obstacles)}
+        return Drawing(room.boundary or (), room.start or (0.0, 0.0, 0.0), obstacles), "drawn in the config"
+    if room.plan not in PLANS:
+        raise UnknownNameError("plan", room.plan, PLANS, where)
+    ready = PLANS[room.plan]
+    return replace(ready, start=room.start or ready.start), room.plan
+
+
+def _polygon(corners: Sequence[Corner], where: str) -> Polygon:
+    different = len(set(corners))
+    if different < 3:
+        raise ConfigError(f"{where}: has {different} of the 3 different corners that a polygon needs at least")
+    points = np.array(corners)
+    size = float(np.ptp(points, axis=0).max())
+    if size > _LARGEST:
+        raise ConfigError(f"{where}: is {size:g} m wide, more than {_LARGEST:g} m; corners are in m, are these in mm?")
+    polygon = Polygon(points)
+    if shapely.MultiPoint(points).convex_hull.area < _SMALLEST_AREA:
+        raise ConfigError(f"{where}: has no area, its corners lie on one line from ({_place(points[0])}) m; move one")
+    if not polygon.is_valid:
+        found = re.fullmatch(r"(.*)\[(\S+) (\S+)\]", shapely.is_valid_reason(polygon))
+        place = f" at ({_place((float(found[2]), float(found[3])))}) m" if found else ""
+        raise ConfigError(f"{where}: crosses or touches itself{place}; give its corners in their order along the walls")
+    return polygon
+
+
+def _edges(polygon: Polygon) -> Array:
+    """Both ends (E, 4) of each edge, those between repeated corners left out."""
+    corners = shapely.get_coordinates(polygon.exterior)
+    edges = np.hstack([corners[:-1], corners[1:]])
+    return edges[(edges[:, :2] != edges[:, 2:]).any(axis=1)]
+
+
+def _place(position: Sequence[float] | Array) -> str:
+    return f"{position[0]:.2f}, {position[1]:.2f}"

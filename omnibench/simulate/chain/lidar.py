@@ -1,0 +1,160 @@
+"""A planar LIDAR: ranges from where the robot truly is, ray by ray as the mirror turns."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from pydantic import Field, FiniteFloat, model_validator
+
+from omnibench.config import Model
+from omnibench.data.scans import Mount, Scanner, TrajectoryScans
+from omnibench.errors import DataError
+from omnibench.robot.kinematics import Array
+from omnibench.simulate.chain.floor_plan import FloorPlan
+
+_SHORTEST_PERIOD = 0.001  # s
+
+
+class LidarMount(Model):
+    """Where the LIDAR sits: its pose in the robot's frame."""
+
+    x: FiniteFloat = Field(0.1, description="m, forward")
+    y: FiniteFloat = Field(0.0, description="m, left")
+    yaw_deg: FiniteFloat = Field(0.0, description="degrees, counter-clockwise")
+
+
+class Lidar(Model):
+    """A planar LIDAR; the defaults are those of the Hokuyo UTM-30LX of the paper's robot.
+
+    Its data sheet (Hokuyo Automatic, UTM-30LX specification): 0.1 to 30 m, 270 degrees in steps of 1/1440 of a turn,
+    25 ms a turn, sigma of a range below 10 mm up to 10 m and below 30 mm beyond; its protocol gives whole mm. It has
+    1081 ranges from -135 to 135 degrees; the paper's Table 1 keeps 1080.
+    """
+
+    name: str = "Hokuyo UTM-30LX"
+    rays: int = Field(1080, gt=0, le=100_000, description="ranges of a scan")
+    field_of_view_deg: float = Field(
+        270.0, gt=0, le=360, description="degrees, ahead in the middle; rays are field_of_view_deg / rays apart"
+    )
+    turn_time: float = Field(0.025, ge=0, le=10, description="s for a whole turn of the mirror")
+    range_min: float = Field(0.1, ge=0, allow_inf_nan=False, description="m; nearer walls are not seen")
+    range_max: float = Field(30.0, gt=0, allow_inf_nan=False, description="m; walls farther off are not seen")
+    noise: float = Field(0.01, ge=0, le=10, description="standard deviation of a range, m")
+    far_noise: float = Field(0.03, ge=0, le=10, description="the same beyond far, m")
+    far: float = Field(10.0, gt=0, allow_inf_nan=False, description="m")
+    resolution: float = Field(0.001, ge=1e-6, le=1, description="step of the ranges, m")
+    mount: LidarMount = LidarMount()
+    period: tuple[float, float] = Field((0.2, 0.3), description="shortest and longest time between scans, s")
+    latency: float = Field(0.0, ge=0, le=1, description="a scan's stamp is so much later than its first ray, s")
+    dropouts: float = Field(0.001, ge=0, lt=1, description="chance that a ray returns nothing")
+    distortion: bool = Field(True, description="the robot moves during a scan; false: all rays at the same time")
+
+    @model_validator(mode="after")
+    def _scans_follow_each_other(self) -> Lidar:
+        if self.range_min >= self.range_max:
+            raise ValueError(f"range_min {self.range_min:g} m is not below range_max {self.range_max:g} m")
+        low, high = self.period
+        if not (_SHORTEST_PERIOD <= low <= high < math.inf):
+            raise ValueError(
+                f"period: expected the shortest and the longest time between scans, from {_SHORTEST_PERIOD:g} s on "
+                f"(given: {low:g}, {high:g})"
+            )
+        if low < self.sweep:
+            raise ValueError(
+                f"period: {low:g} s; a scan alone takes {self.sweep:g} s, give more or a shorter turn_time"
+            )
+        return self
+
+    @property
+    def sweep(self) -> float:
+        """How long a scan takes, s."""
+        return self.turn_time * self.field_of_view_deg / 360 if self.distortion else 0.0
+
+    @property
+    def scanner(self) -> Scanner:
+        """What the data set says of it."""
+        increment = math.radians(self.field_of_view_deg) / self.rays
+        rounding = self.resolution / math.sqrt(12)
+        return Scanner(
+            name=self.name,
+            rays=self.rays,
+            angle_min=-math.radians(self.field_of_view_deg) / 2,
+            angle_increment=increment,
+            time_increment=self.sweep / self.rays,
+            range_min=self.range_min,
+            range_max=self.range_max,
+            noise=max(self.noise, rounding),
+            far_noise=max(self.far_noise, rounding),
+            far=self.far,
+            mount=Mount(x=self.mount.x, y=self.mount.y, yaw=math.radians(self.mount.yaw_deg)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTrack:
+    """Where the robot truly is. times (M,): increasing, s. poses (M, 3): m, m, rad in the room, headings continuous."""
+
+    times: Array
+    poses: Array
+
+    def at(self, times: Array) -> Array:
+        """Poses at times of any shape, with a last axis of 3: linear between the track's, at rest before and after."""
+        return np.stack([np.interp(times, self.times, column) for column in self.poses.T], axis=-1)
+
+
+def scan_stamps(lidar: Lidar, end: float, rng: np.random.Generator) -> Array:
+    """Stamps (S,) of scans, s: the first 0, all of the last one measured by ``end``; the time between them jitters.
+
+    DataError in one line: there is no time for a single scan.
+    """
+    last = end - max(lidar.sweep - lidar.latency, 0.0)
+    if last < 0:
+        raise DataError(
+            f"the run ends at {end:g} s, before the LIDAR's first scan is over; drive longer or let it rest"
+        )
+    low, high = lidar.period
+    between = rng.uniform(low, high, size=math.ceil(last / low))
+    stamps = np.concatenate([[0.0], np.cumsum(between)])
+    return stamps[stamps <= last]
+
+
+def measure_scans(
+    plan: FloorPlan, lidar: Lidar, track: PoseTrack, stamps: Array, rng: np.random.Generator
+) -> TrajectoryScans:
+    """What the LIDAR sees of a room: a scan for each stamp (S,), s, as recorded, that is, with its latency.
+
+    Each ray starts where the scanner is when it is measured. DataError in one line: the scanner is in a wall, or there
+    is a scan in which nothing is seen.
+    """
+    from omnibench.simulate.chain.ray_casting import cast_rays  # numba takes half a second to load
+
+    scanner = lidar.scanner
+    measured = stamps - lidar.latency
+    _check_places(plan, scanner.mount, track, measured)
+    true = cast_rays(plan.segments, scanner, track.times, track.poses, measured)
+    ranges = true + rng.standard_normal(true.shape) * np.where(true > lidar.far, lidar.far_noise, lidar.noise)
+    ranges = lidar.resolution * np.round(ranges / lidar.resolution)
+    seen = (true <= lidar.range_max) & (ranges <= lidar.range_max) & (ranges >= lidar.range_min)
+    seen &= rng.uniform(size=true.shape) >= lidar.dropouts
+    for row in np.flatnonzero(~seen.any(axis=1))[:1]:
+        x, y, _ = track.at(measured[row])
+        raise DataError(
+            f"the LIDAR sees nothing at {stamps[row]:g} s, the robot at ({x:.2f}, {y:.2f}) m: no wall from "
+            f"{lidar.range_min:g} to {lidar.range_max:g} m; choose a smaller room, or more range or fewer dropouts"
+        )
+    return TrajectoryScans(stamps, np.where(seen, ranges, np.inf).astype(np.float32))
+
+
+def _check_places(plan: FloorPlan, mount: Mount, track: PoseTrack, times: Array) -> None:
+    x, y, heading = track.at(times).T
+    x = x + np.cos(heading) * mount.x - np.sin(heading) * mount.y
+    y = y + np.sin(heading) * mount.x + np.cos(heading) * mount.y
+    for row in np.flatnonzero(~shapely.contains_xy(plan.free, x, y))[:1]:
+        place = plan.place_of(np.array([x[row], y[row]]))
+        raise DataError(
+            f"the LIDAR at ({x[row]:.2f}, {y[row]:.2f}) m is {place} of the room {plan.name} at {times[row]:g} s; "
+            "check lidar.mount, the robot's radius and the way it drives"
+        )

@@ -1,0 +1,178 @@
+"""Motion commands as the APR-02 gets them: refreshed over a link with a watchdog, slewed, turned into target rates.
+
+Palacin et al. 2023, section 2.1: the planner sends (v, alpha, omega, t_r) every 300 ms, and no command is valid for
+longer than 500 ms, so that the robot stops when its computer does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import count
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from omnibench.config import Model
+from omnibench.errors import ConfigError
+from omnibench.robot.kinematics import Array, Robot, wheel_equations
+from omnibench.simulate.chain.set_point import SetPoint, SlewLimits
+from omnibench.simulate.config import Positive
+from omnibench.simulate.flower import Command
+
+_NOTHING = 1e-9  # s; less than this is not worth a command
+
+
+class MotionProfile(Model):
+    """How fast the set point may change. All parts of the twist change in step: direction and curvature stay.
+
+    Accelerations are of the set point in the robot's frame; what a curve adds across the motion is not in them.
+    """
+
+    shape: Literal["trapezoid", "jerk_limited"] = Field("trapezoid", description="jerk_limited: S-curves")
+    acceleration: Positive = Field(0.5, description="m/s2")
+    turn_acceleration: Positive = Field(1.0, description="rad/s2")
+    jerk: Positive = Field(2.5, description="m/s3; of jerk_limited")
+    turn_jerk: Positive = Field(5.0, description="rad/s3; of jerk_limited")
+
+    def limits(self, command: Command) -> SlewLimits:
+        """How fast the share of the command's full twist may change."""
+        slope = _slower(command, self.acceleration, self.turn_acceleration)
+        return SlewLimits(slope, math.inf if self.shape == "trapezoid" else _slower(command, self.jerk, self.turn_jerk))
+
+
+class CommandLink(Model):
+    """How commands come to the robot."""
+
+    refresh: float = Field(0.3, ge=0.01, allow_inf_nan=False, description="from one command to the next, s")
+    watchdog: Positive = Field(0.5, description="longest validity of a command, s")
+    lost: float = Field(0.0, ge=0, le=0.9, description="chance that a command is lost on the way")
+    stalls_at: float | None = Field(
+        None, ge=0, allow_inf_nan=False, description="from this time of a run on no command is sent, s"
+    )
+
+    @model_validator(mode="after")
+    def _goes_on(self) -> CommandLink:
+        if self.watchdog < self.refresh:
+            raise ValueError(
+                f"watchdog {self.watchdog:g} s is shorter than refresh {self.refresh:g} s; "
+                "the robot would stop before every command"
+            )
+        return self
+
+
+@dataclass(frozen=True)
+class SentCommand:
+    """When a command was sent (s), for how long it is valid (t_r, s), and whether it came to the robot."""
+
+    time: float
+    duration: float
+    arrived: bool
+
+
+@dataclass(frozen=True, eq=False)
+class CommandedMotion:
+    """The set point of one run. times (F,): ends of the samples, s. twists (F, 3): means over each, m/s and rad/s.
+
+    stopped_by_watchdog: from when no command was valid to when one came again, or to the end of the run; s.
+    """
+
+    times: Array
+    twists: Array
+    commands: tuple[SentCommand, ...]
+    stopped_by_watchdog: tuple[tuple[float, float], ...]
+
+    @property
+    def distance(self) -> float:
+        """The way of the set point, m."""
+        return float(np.hypot(self.twists[:, 0], self.twists[:, 1]) @ np.diff(self.times, prepend=0.0))
+
+
+def command_motion(
+    command: Command,
+    way: float | None,
+    turn_duration: float,
+    profile: MotionProfile,
+    link: CommandLink,
+    sample_period: float,
+    settle: float,
+    rng: np.random.Generator,
+) -> CommandedMotion:
+    """The set point of a run over ``way`` (m), or of ``turn_duration`` (s) at full speed where there is no way.
+
+    The planner knows how far the set point has come. It refreshes the command until the way is covered; the last
+    command is valid for just so long that the robot comes to rest there. Where commands are lost, the planner goes on
+    until the way is covered; where none is sent any more, it is not. ``settle`` s of rest follow.
+
+    ConfigError: a command that moves nothing.
+    """
+    if not command.speed and not command.turn_rate:
+        raise ConfigError(f"command {command.name} moves nothing; give it a speed or a rate of turn")
+    seconds = way / command.speed if way is not None and command.speed else turn_duration
+    set_point, sent, stops = _planned(seconds, SetPoint(profile.limits(command)), link, rng)
+    samples = max(1, math.ceil((set_point.end + settle) / sample_period - 1e-9))
+    times: Array = sample_period * np.arange(1, samples + 1)
+    shares = np.diff(set_point.ways(np.append(0.0, times))) / sample_period
+    ended = tuple((since, min(until, float(times[-1]))) for since, until in stops)
+    return CommandedMotion(times, shares[:, None] * command.twist, sent, ended)
+
+
+def target_rates(robot: Robot, motion: CommandedMotion) -> Array:
+    """Target wheel rates (F, N) by the robot's design values, rad/s."""
+    rates: Array = motion.twists @ wheel_equations(robot.wheels).T
+    return rates
+
+
+def _slower(command: Command, straight: float, turning: float) -> float:
+    """The smaller of two limits as shares of the command's speed and rate of turn."""
+    return min(
+        straight / command.speed if command.speed else math.inf,
+        turning / abs(command.turn_rate) if command.turn_rate else math.inf,
+    )
+
+
+def _planned(
+    seconds: float, set_point: SetPoint, link: CommandLink, rng: np.random.Generator
+) -> tuple[SetPoint, tuple[SentCommand, ...], tuple[tuple[float, float], ...]]:
+    """The set point over the whole run, the commands sent and the watchdog's stops; seconds: the way at full speed."""
+    sent: list[SentCommand] = []
+    stops: list[tuple[float, float]] = []
+    expires, reached = 0.0, False
+    for number in count():
+        now = number * link.refresh
+        if link.stalls_at is not None and now >= link.stalls_at:
+            break
+        if expires <= now:
+            set_point = set_point.towards(0.0, expires)
+        needed = _needed(set_point, now, seconds, link.refresh)
+        if expires <= now and needed is not None and needed < _NOTHING:
+            break
+        sent.append(SentCommand(now, link.watchdog if needed is None else needed, bool(rng.random() >= link.lost)))
+        if sent[-1].arrived:
+            if 0.0 < expires < now:
+                stops.append((expires, now))
+            set_point, expires = set_point.towards(1.0, now), now + sent[-1].duration
+            reached = needed is not None
+            if reached:
+                break
+    set_point = set_point.towards(0.0, expires)
+    if expires > 0.0 and not reached:
+        stops.append((expires, math.inf))
+    return set_point, tuple(sent), tuple(stops)
+
+
+def _needed(set_point: SetPoint, now: float, seconds: float, longest: float) -> float | None:
+    """For how long a command sent now must be valid so that the set point comes to rest on its way; None: longer."""
+    driving = set_point.towards(1.0, now)
+
+    def missing(duration: float) -> float:
+        return seconds - driving.towards(0.0, now + duration).way
+
+    if missing(0.0) <= 0:
+        return 0.0
+    if missing(longest + _NOTHING) > 0:
+        return None
+    from scipy.optimize import brentq  # which loads slowly
+
+    return float(brentq(missing, 0.0, longest + _NOTHING, xtol=1e-14))

@@ -1,0 +1,216 @@
+"""Brushed DC motors under PID with magnetic encoders: what wheels do when they are told rates, and what is measured.
+
+The wheels are told apart: each motor moves its own share of the robot's inertia. Wheel angles are continuous within
+a session; between its runs the robot stands.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from omnibench.config import Model
+from omnibench.errors import ConfigError
+from omnibench.robot.kinematics import Array, Robot, wheel_equations
+from omnibench.simulate.config import Positive
+from omnibench.simulate.flower import Command
+
+if TYPE_CHECKING:  # it is compiled, and loads slowly: for those who drive, not for those who read a config
+    from omnibench.simulate.chain.motor_loop import TRUE_STEP, MotorSteps, Pid
+
+_RESERVE = 0.1  # share of the fastest rate that is left to the controller
+
+
+class Motor(Model):
+    """A brushed DC motor with its gear and its share of the robot.
+
+    Palacin et al. give no data sheet of the APR-02's motors; the defaults stand in for one: a 24 V motor with a gear
+    of 50 for a robot of some 30 kg on three wheels of 0.148 m radius. The gear's losses are in the frictions.
+    """
+
+    supply_voltage: Positive = Field(24.0, description="V")
+    resistance: Positive = Field(0.8, description="of the winding, ohm")
+    inductance: Positive = Field(0.0008, description="of the winding, H")
+    torque_constant: Positive = Field(0.045, description="N m/A, and of the back-EMF V s/rad, at the motor")
+    gear_ratio: Positive = Field(50.0, description="turns of the motor per turn of the wheel")
+    inertia: Positive = Field(0.5, description="of rotor, gear, wheel and share of the robot, at the wheel, kg m2")
+    static_friction: float = Field(0.6, ge=0, allow_inf_nan=False, description="at the wheel, N m")
+    coulomb_friction: float = Field(0.5, ge=0, allow_inf_nan=False, description="at the wheel, N m")
+    viscous_friction: float = Field(0.1, ge=0, allow_inf_nan=False, description="at the wheel, N m s/rad")
+
+    @model_validator(mode="after")
+    def _turns(self) -> Motor:
+        if self.coulomb_friction > self.static_friction:
+            raise ValueError(
+                f"coulomb_friction {self.coulomb_friction:g} N m is above static_friction {self.static_friction:g} "
+                "N m; a wheel needs at least as much torque to start as to go on"
+            )
+        stalled = self.wheel_torque_constant * self.supply_voltage / self.resistance
+        if stalled <= self.static_friction:
+            raise ValueError(
+                f"the motor never turns: {stalled:.3g} N m at the full voltage do not beat static_friction "
+                f"{self.static_friction:g} N m"
+            )
+        return self
+
+    @property
+    def wheel_torque_constant(self) -> float:
+        """Torque at the wheel per current, N m/A; voltage per wheel rate, V s/rad."""
+        return self.torque_constant * self.gear_ratio
+
+    @property
+    def fastest_rate(self) -> float:
+        """Wheel rate in steady state at the full voltage against friction, rad/s."""
+        constant = self.wheel_torque_constant
+        pull = constant * self.supply_voltage / self.resistance - self.coulomb_friction
+        return pull / (constant**2 / self.resistance + self.viscous_friction)
+
+
+class Controller(Model):
+    """PID on the wheel rate once a sample; the output is limited to the supply voltage.
+
+    The integral does not grow against that limit. The derivative is of the measured rate. A wheel that is to stand and
+    turns by no more than a tick in a sample is braked by its own motor: no voltage, no integral.
+    """
+
+    proportional: float = Field(3.0, ge=0, allow_inf_nan=False, description="V per rad/s")
+    integral: float = Field(50.0, ge=0, allow_inf_nan=False, description="V per rad")
+    derivative: float = Field(0.005, ge=0, allow_inf_nan=False, description="V per rad/s2")
+
+    @model_validator(mode="after")
+    def _acts(self) -> Controller:
+        if not self.proportional and not self.integral:
+            raise ValueError("proportional and integral are both 0; no wheel would ever turn")
+        return self
+
+
+class Encoder(Model):
+    """An incremental encoder. The default is a magnetic one with 64 pulses, x 4, at the motor, before a gear of 50."""
+
+    ticks: int = Field(12_800, gt=0, le=10**9, description="quadrature counts per turn of the wheel")
+
+    @property
+    def tick(self) -> float:
+        """Wheel angle of a count, rad."""
+        return 2 * math.pi / self.ticks
+
+
+@dataclass(frozen=True, eq=False)
+class DrivenRun:
+    """What the N wheels did in a run of F samples.
+
+    wheel_angles (M F + 1, N): true absolute angles at every millisecond from the begin, rad; M ms are a sample.
+    rates (F, N): measured mean rates, rad/s. angles (F, N): measured absolute angles at the samples' ends, rad.
+    voltages (F, N): of the motors, V.
+    """
+
+    wheel_angles: Array
+    rates: Array
+    angles: Array
+    voltages: Array
+
+
+def drive_session(
+    motor: Motor | Sequence[Motor],
+    controller: Controller,
+    encoder: Encoder,
+    targets: Sequence[Array],
+    sample_period: float,
+    start_angles: Array,
+) -> list[DrivenRun]:
+    """The runs of a session, one after the other, each from rest at the angles where the one before has ended.
+
+    motor: of all wheels, or one for each. targets: rates of each run (F, N), rad/s. start_angles: (N,), rad.
+    ConfigError: a sample period that is not a whole number of milliseconds, or not as many motors as wheels.
+    """
+    from omnibench.simulate.chain.motor_loop import drive_wheel
+
+    steps = round(sample_period / TRUE_STEP)
+    if steps < 1 or abs(sample_period - steps * TRUE_STEP) > 1e-9:
+        raise ConfigError(f"sample_period {sample_period:g} s: the motors need a whole number of milliseconds")
+    drives = [(_steps_of(each), _pid_of(controller, each)) for each in _of_wheels(motor, len(start_angles))]
+    angles, runs = np.asarray(start_angles, float), []
+    for rates in targets:
+        wheels = [
+            drive_wheel(*drive, encoder.tick, told, angle, steps)
+            for drive, told, angle in zip(drives, rates.T, angles, strict=True)
+        ]
+        true, counts, voltages = (np.column_stack(columns) for columns in zip(*wheels, strict=True))
+        seen = np.vstack([np.floor(angles / encoder.tick), counts])
+        measured = np.diff(seen, axis=0) * encoder.tick / sample_period
+        runs.append(DrivenRun(true, measured, counts * encoder.tick, voltages))
+        angles = true[-1]
+    return runs
+
+
+def _steps_of(motor: Motor) -> MotorSteps:
+    from omnibench.simulate.chain.motor_loop import motor_steps
+
+    return motor_steps(
+        motor.resistance,
+        motor.inductance,
+        motor.wheel_torque_constant,
+        motor.inertia,
+        motor.static_friction,
+        motor.coulomb_friction,
+        motor.viscous_friction,
+    )
+
+
+def _pid_of(controller: Controller, motor: Motor) -> Pid:
+    from omnibench.simulate.chain.motor_loop import Pid
+
+    return Pid(controller.proportional, controller.integral, controller.derivative, motor.supply_voltage)
+
+
+def check_reach(robot: Robot, commands: Sequence[Command], motor: Motor | Sequence[Motor]) -> None:
+    """ConfigError in one line for a command that asks more of a wheel than its motor gives.
+
+    A tenth of the fastest rate is left to the controller.
+    """
+    motors = _of_wheels(motor, len(robot.wheels))
+    limits = (1 - _RESERVE) * np.array([each.fastest_rate for each in motors])
+    for command in commands:
+        rates = wheel_equations(robot.wheels) @ command.twist
+        wheel = int(np.argmax(np.abs(rates) / limits))
+        if abs(rates[wheel]) > limits[wheel]:
+            raise ConfigError(
+                f"command {command.name} (speed {command.speed:g} m/s, direction {math.degrees(command.direction):g} "
+                f"deg, turn rate {command.turn_rate:g} rad/s) is faster than the motors can go: wheel "
+                f"{robot.wheels[wheel].name} would need {abs(rates[wheel]):.4g} rad/s, its motor reaches "
+                f"{motors[wheel].fastest_rate:.4g} rad/s, of which the controller keeps {_RESERVE:.0%}; "
+                f"{_way_out(robot, command, limits)}"
+            )
+
+
+def _way_out(robot: Robot, command: Command, limits: Array) -> str:
+    """The greatest speed that fits with this rate of turn; where none does, the greatest rate of turn, too."""
+    straight, across, turn = (wheel_equations(robot.wheels) * command.twist).T
+    travel = straight + across
+    left = limits - np.abs(turn)
+    if command.speed and (left > 0).all():
+        rooms = np.where(travel * turn >= 0, left, limits + np.abs(turn))
+        share = np.min(rooms[travel != 0] / np.abs(travel[travel != 0]))
+        return f"give it a speed of at most {_rounded_down(share * command.speed)} m/s"
+    greatest = _rounded_down(abs(command.turn_rate) * np.min(limits[turn != 0] / np.abs(turn[turn != 0])))
+    return f"turning at more than {greatest} rad/s alone is too fast; give it a lower turn rate" + (
+        " and speed" if command.speed else ""
+    )
+
+
+def _rounded_down(value: float) -> str:
+    """With three digits, not above the value."""
+    digits = 2 - math.floor(math.log10(value))
+    return f"{math.floor(value * 10.0**digits) / 10.0**digits:g}"
+
+
+def _of_wheels(motor: Motor | Sequence[Motor], wheels: int) -> list[Motor]:
+    motors = [motor] * wheels if isinstance(motor, Motor) else list(motor)
+    if len(motors) != wheels:
+        raise ConfigError(f"{len(motors)} motors for {wheels} wheels; give one for each, or one for all")
+    return motors

@@ -1,0 +1,226 @@
+"""A robot from command to SLAM: target wheel rates, motors, encoders, true motion, LIDAR in a room, reference poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from omnibench.data.dataset import Split, Trajectory, make_dataset
+from omnibench.data.scans import ScansInMemory, TrajectoryScans
+from omnibench.data.true_poses import TruePath
+from omnibench.data.watch import Watch, unwatched
+from omnibench.errors import DataError
+from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import WheelLog
+from omnibench.simulate.chain.floor_plan import FloorPlan, make_plan
+from omnibench.simulate.chain.lidar import PoseTrack, measure_scans, scan_stamps
+from omnibench.simulate.chain.motion_commands import CommandedMotion, command_motion, target_rates
+from omnibench.simulate.chain.motor_loop import TRUE_STEP
+from omnibench.simulate.chain.motors import DrivenRun, check_reach, drive_session
+from omnibench.simulate.chain.robot_config import Placement, RobotConfig, RobotSession
+from omnibench.simulate.flower import PAUSE, Command, grid_of, runs_of
+from omnibench.simulate.simulation import Simulation
+from omnibench.simulate.truth import TrueRobot, true_record
+from omnibench.slam.slam_dataset import slam_dataset
+
+_FOLLOWED = 0.1  # of what wheels were told: so much they may miss
+_STEP = 0.05  # m along a way that is checked beforehand
+_DENSE = 0.01  # s, at most, between true poses that are kept
+
+
+def simulate_robot(
+    config: RobotConfig, name: str = "robot", description: str = "", watch: Watch = unwatched
+) -> Simulation:
+    """Simulate the training session and, if there is one, the validation session.
+
+    ConfigError or DataError in one line: an effect of the truth is not known or lacks a parameter, a polygon of the
+    room is none, a command is faster than the motors, or leads out of the room.
+    """
+    plan = make_plan(config.room, f"data set {name}: room")
+    commands = grid_of(config.commands)
+    check_reach(config.robot, commands, config.motor)
+    sessions: dict[Split, RobotSession] = {"train": config.train}
+    if config.validation is not None:
+        sessions["validation"] = config.validation
+    for command in commands:
+        for session in sessions.values():
+            _check_way(config, plan, command, session)
+    truth = true_record(config.truth, config.robot, config.sample_period, tuple(sessions), name)
+    chain = _Chain(config, truth.true_robot(TRUE_STEP), plan, commands)
+    runs: list[_Recorded] = []
+    for split, session in sessions.items():
+        for run in chain.session(split, session):
+            runs.append(run)
+            watch("driving and scanning", len(runs), len(sessions) * len(commands) * config.repetitions)
+    recorded = make_dataset(
+        name,
+        config.robot,
+        config.sample_period,
+        [run.trajectory for run in runs],
+        description=description,
+        source="simulated by omnibench from command to SLAM",
+        simulated=True,
+        scans=ScansInMemory(config.lidar.scanner, {run.trajectory.id: run.scans for run in runs}),
+    )
+    found = slam_dataset(recorded, config.slam, watch=watch)
+    found = replace(found, warnings=(*found.warnings, *_stopped(runs), *_astray(runs)))
+    paths = {run.trajectory.id: run.path for run in runs}
+    return Simulation(found, truth, paths, plan, {run.trajectory.id: run.start for run in runs})
+
+
+def _check_way(config: RobotConfig, plan: FloorPlan, command: Command, session: RobotSession) -> None:
+    """ConfigError: the command leads the robot out of the room, were it as designed."""
+    if not command.speed:
+        return
+    times = np.linspace(0.0, session.distance / command.speed, max(2, math.ceil(session.distance / _STEP)))
+    turned = 1j * command.turn_rate * times
+    way = np.expm1(turned) / (1j * command.turn_rate) if command.turn_rate else times.astype(complex)
+    way *= complex(command.twist[0], command.twist[1])
+    poses = np.column_stack([way.real, way.imag, turned.imag])
+    plan.check_path(_in_room(plan.start, poses)[:, :2], times, config.radius, f"command {command.name}")
+
+
+@dataclass(frozen=True, eq=False)
+class _Recorded:
+    """A run as it was recorded, but for its reference poses, and where the robot truly was, from its start (3,) on."""
+
+    trajectory: Trajectory
+    scans: TrajectoryScans
+    path: TruePath
+    start: Array
+    stops: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Chain:
+    """The robot, its room and its commands."""
+
+    config: RobotConfig
+    robot: TrueRobot
+    plan: FloorPlan
+    commands: Sequence[Command]
+
+    def session(self, split: Split, session: RobotSession) -> Iterator[_Recorded]:
+        """The runs of a session one after the other; the wheels go on turning from where they were."""
+        config, rng = self.config, np.random.default_rng(session.seed)
+        runs = runs_of(self.commands, config.repetitions, config.order, rng)
+        motions = [self._motion(command, session, rng) for command, _ in runs]
+        targets = [target_rates(config.robot, motion) for motion in motions]
+        told = [self.robot.driven(motion.times, each) for motion, each in zip(motions, targets, strict=True)]
+        driven = drive_session(
+            config.motor,
+            config.controller,
+            config.encoder,
+            told,
+            config.sample_period,
+            np.zeros(len(config.robot.wheels)),
+        )
+        started_at = 0.0
+        for number, ((command, repetition), motion, target, wheels) in enumerate(
+            zip(runs, motions, targets, driven, strict=True), 1
+        ):
+            run = Trajectory(
+                id=f"{split}-{number:03d}",
+                split=split,
+                command=command.name,
+                repetition=repetition,
+                session=split,
+                started_at=started_at,
+                v=command.speed,
+                alpha=command.direction,
+                omega=command.turn_rate,
+                duration=float(motion.times[-1]),
+                distance=session.distance if command.speed else 0.0,
+                times=motion.times,
+                rates=wheels.rates,
+                pose_times=np.zeros(1),
+                poses=np.zeros((1, 3)),
+                angles=wheels.angles,
+                targets=target,
+            )
+            yield self._scanned(run, wheels, motion, rng)
+            started_at += float(motion.times[-1]) + PAUSE
+
+    def _motion(self, command: Command, session: RobotSession, rng: np.random.Generator) -> CommandedMotion:
+        config = self.config
+        way = session.distance if command.speed else None
+        return command_motion(
+            command, way, config.commands.turn_duration, config.profile, config.link, config.sample_period,
+            config.settle, rng,
+        )  # fmt: skip
+
+    def _scanned(
+        self, run: Trajectory, wheels: DrivenRun, motion: CommandedMotion, rng: np.random.Generator
+    ) -> _Recorded:
+        """The run with its scans; its poses are the design odometry's until SLAM has found better ones."""
+        config, plan = self.config, self.plan
+        log = _true_log(run, wheels.wheel_angles)
+        (path,) = self.robot.model.poses([log])
+        (seen,) = self.robot.model.reported([log])  # the LIDAR sees the room from where the reference is to report
+        start = _placed(plan.start, config.placement, rng)
+        plan.check_path(_in_room(start, path)[:, :2], log.stamps, config.radius, f"run {run.id}")
+        stamps = scan_stamps(config.lidar, float(run.times[-1]), rng)
+        try:
+            scans = measure_scans(plan, config.lidar, PoseTrack(log.stamps, _in_room(start, seen)), stamps, rng)
+        except DataError as error:
+            raise DataError(f"run {run.id}: {error}") from None
+        every = round(min(config.sample_period, _DENSE) / TRUE_STEP)
+        design = OdometryModel.of_design(config.robot, "arc")
+        (odometry,) = design.poses([replace(run.log(stamps), start=np.zeros(3))])
+        true = TruePath(log.stamps[::every], path[::every])
+        return _Recorded(
+            replace(run, pose_times=stamps, poses=odometry), scans, true, start, motion.stopped_by_watchdog
+        )
+
+
+def _stopped(runs: Sequence[_Recorded]) -> tuple[str, ...]:
+    """A warning where the watchdog stopped the robot."""
+    stopped = [run for run in runs if run.stops]
+    if not stopped:
+        return ()
+    first = stopped[0]
+    return (
+        f"no command was valid for a while, and the watchdog stopped the robot, in {len(stopped)} of {len(runs)} runs, "
+        f"e.g. {first.trajectory.id} at {first.stops[0][0]:.2f} s",
+    )
+
+
+def _astray(runs: Sequence[_Recorded]) -> tuple[str, ...]:
+    """A warning where wheels turned otherwise than they were told."""
+    missed = {}
+    for run in runs:
+        rates, targets = run.trajectory.rates, run.trajectory.targets
+        assert targets is not None
+        turned, wanted = (np.abs(each.sum(axis=0)).sum() for each in (rates, targets))
+        if wanted and abs(turned / wanted - 1) > _FOLLOWED:
+            missed[run.trajectory.id] = turned / wanted
+    if not missed:
+        return ()
+    name, share = next(iter(missed.items()))
+    return (
+        f"in {len(missed)} of {len(runs)} runs the wheels do not follow their targets: in {name} they turn "
+        f"{share:.0%} of what they were told; check motor and controller",
+    )
+
+
+def _true_log(run: Trajectory, wheel_angles: Array) -> WheelLog:
+    """What the true wheels did, from absolute angles (M + 1, N) every millisecond, with a stamp at each of these."""
+    stamps = TRUE_STEP * np.arange(len(wheel_angles))
+    rates = np.diff(wheel_angles, axis=0) / TRUE_STEP
+    return WheelLog(stamps[1:], rates, np.zeros(3), stamps, wheel_angles[1:], run.started_at, run.session)
+
+
+def _placed(mark: Array, placement: Placement, rng: np.random.Generator) -> Array:
+    """Where the robot really stands (3,) when it was put on its mark."""
+    spread = [placement.position, placement.position, math.radians(placement.heading_deg)]
+    return mark + spread * rng.standard_normal(3)
+
+
+def _in_room(start: Array, poses: Array) -> Array:
+    """Poses (K, 3) of the frame that has the pose ``start`` in the room."""
+    path = (poses[:, 0] + 1j * poses[:, 1]) * np.exp(1j * start[2])
+    return np.column_stack([start[0] + path.real, start[1] + path.imag, start[2] + poses[:, 2]])

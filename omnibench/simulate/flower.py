@@ -1,0 +1,211 @@
+"""The flower benchmark: a robot of known truth drives every command, wheels and reference are recorded with noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
+
+import numpy as np
+
+from omnibench.data.dataset import Split, Trajectory, make_dataset
+from omnibench.robot.kinematics import Array, Robot, wheel_equations
+from omnibench.simulate.config import Commands, FlowerConfig, MotionGrid, Session
+from omnibench.simulate.pose_noise import reference_noise
+from omnibench.simulate.simulation import Simulation
+from omnibench.simulate.truth import TrueRobot, true_record
+
+PAUSE = 10.0  # s between runs
+
+
+@dataclass(frozen=True)
+class Command:
+    """A motion command: speed (m/s), direction (rad, robot's frame), rate of turn (rad/s)."""
+
+    speed: float
+    direction: float
+    turn_rate: float
+
+    @property
+    def name(self) -> str:
+        return f"v{self.speed:g}_a{math.degrees(self.direction):g}_w{self.turn_rate:g}"
+
+    @property
+    def twist(self) -> Array:
+        """(vx, vy, w)."""
+        x, y = self.speed * math.cos(self.direction), self.speed * math.sin(self.direction)
+        return np.array([x, y, self.turn_rate])
+
+
+def simulate_flower(config: FlowerConfig, name: str = "flower", description: str = "") -> Simulation:
+    """Simulate the training session and, if there is one, the validation session.
+
+    ConfigError or DataError in one line: an effect of the truth, or a parameter of one, is not known or is missing.
+    """
+    sessions: dict[Split, Session] = {"train": config.train}
+    if config.validation is not None:
+        sessions["validation"] = config.validation
+    truth = true_record(
+        config.truth,
+        config.robot,
+        config.sample_period,
+        tuple(sessions),
+        name,
+        integration=config.integration,
+        noise=config.noise,
+    )
+    robot = truth.true_robot()
+    trajectories = [run for split, session in sessions.items() for run in _session(config, robot, split, session)]
+    dataset = make_dataset(
+        name,
+        config.robot,
+        config.sample_period,
+        trajectories,
+        description=description,
+        source="simulated by omnibench",
+        simulated=True,
+    )
+    return Simulation(dataset, truth)
+
+
+def commands_of(config: FlowerConfig) -> list[Command]:
+    """The commands of a config, in its order."""
+    return grid_of(config.commands)
+
+
+def grid_of(chosen: MotionGrid) -> list[Command]:
+    """Every direction with every rate of turn, at each speed; the direction of a turn on the spot is 0."""
+    return [
+        Command(speed, math.radians(direction), turn_rate)
+        for speed, turn_rate in product(chosen.speeds, chosen.turn_rates)
+        for direction in (chosen.directions_deg if speed > 0 else (0.0,))
+        if speed or turn_rate
+    ]
+
+
+def runs_of(
+    commands: Sequence[Command], repetitions: int, order: Literal["shuffled", "sorted"], rng: np.random.Generator
+) -> list[tuple[Command, int]]:
+    """Every command with the number of each of its repetitions, in the order in which they are driven."""
+    runs = [(command, repetition) for command in commands for repetition in range(1, repetitions + 1)]
+    return [runs[index] for index in rng.permutation(len(runs))] if order == "shuffled" else runs
+
+
+def duration_of(command: Command, session: Session, chosen: Commands) -> float:
+    """How long a command is driven in a session, s; ramps lengthen a run so that the way stays."""
+    driven = session.distance / command.speed if command.speed else chosen.turn_duration
+    return driven + chosen.ramp
+
+
+def commanded_rates(robot: Robot, command: Command, times: Array, ramp: float) -> Array:
+    """Mean wheel rates (F, N) by the design values, rad/s, in samples that end at times (F,), s.
+
+    ramp: s in which they rise and fall, linearly.
+    """
+    rates: Array = np.tile(wheel_equations(robot.wheels) @ command.twist, (len(times), 1))
+    return rates if not ramp else rates * _mean_shares(times, ramp)[:, None]
+
+
+def _mean_shares(times: Array, ramp: float) -> Array:
+    """The share of its full speed (F,) that a robot has on average in each sample, from rest to rest."""
+    ends = np.append(0.0, times)
+    ramp = min(ramp, times[-1] / 2)
+    rising, falling = np.minimum(ends, ramp), np.maximum(ends - (times[-1] - ramp), 0.0)
+    driven = rising**2 / (2 * ramp) + (ends - rising) - falling**2 / (2 * ramp)  # s at full speed
+    return np.diff(driven) / np.diff(ends)
+
+
+def _session(config: FlowerConfig, robot: TrueRobot, split: Split, session: Session) -> Iterator[Trajectory]:
+    rng = np.random.default_rng(session.seed)
+    runs = runs_of(commands_of(config), config.repetitions, config.order, rng)
+    started_at, angles = 0.0, np.zeros(len(config.robot.wheels))
+    for number, (command, repetition) in enumerate(runs, 1):
+        before = _Before(split, started_at, angles)
+        run = _drive(config, robot, command, session, rng, before)
+        yield Trajectory(
+            id=f"{split}-{number:03d}",
+            split=split,
+            command=command.name,
+            repetition=repetition,
+            session=split,
+            started_at=started_at,
+            v=command.speed,
+            alpha=command.direction,
+            omega=command.turn_rate,
+            duration=float(run.times[-1]),
+            distance=command.speed * (float(run.times[-1]) - config.commands.ramp),
+            times=run.times,
+            rates=run.rates,
+            pose_times=run.pose_times,
+            poses=run.poses,
+            angles=run.angles,
+            targets=run.targets,
+        )
+        started_at += float(run.times[-1]) + PAUSE
+        angles = run.angles[-1]
+
+
+@dataclass(frozen=True)
+class _Before:
+    """What a run begins with: session, s since its start, and wheel angles (N,), rad."""
+
+    session: str
+    started_at: float
+    angles: Array
+
+
+@dataclass(frozen=True)
+class _Run:
+    times: Array
+    rates: Array
+    angles: Array
+    targets: Array
+    pose_times: Array
+    poses: Array
+
+
+def _drive(
+    config: FlowerConfig,
+    robot: TrueRobot,
+    command: Command,
+    session: Session,
+    rng: np.random.Generator,
+    before: _Before,
+) -> _Run:
+    """One run: the design values turn the command into targets, motors these into rates, the truth these into motion.
+
+    Encoders are exact between runs: their noise does not part the true wheel angles from the recorded ones.
+    """
+    duration = duration_of(command, session, config.commands)
+    times, pose_times = stamps_of_run(duration, config.sample_period, config.pose_period)
+    targets = commanded_rates(config.robot, command, times, config.commands.ramp)
+    start = _start(config, rng)
+    driven = robot.driven(times, targets)
+    rates = driven + config.noise.encoder * rng.standard_normal(targets.shape)
+    log = robot.log(times, driven, start, pose_times, before.angles, before.started_at, before.session)
+    (poses,) = robot.model.reported([log])
+    return _Run(
+        times=times,
+        rates=rates,
+        angles=before.angles + np.cumsum(rates * config.sample_period, axis=0),
+        targets=targets,
+        pose_times=pose_times,
+        poses=poses + session.noise_scale * reference_noise(config.noise, pose_times, rng),
+    )
+
+
+def _start(config: FlowerConfig, rng: np.random.Generator) -> Array:
+    if config.start == "fixed":
+        return np.zeros(3)
+    half = config.start_area / 2
+    return rng.uniform((-half, -half, -math.pi), (half, half, math.pi))
+
+
+def stamps_of_run(duration: float, sample_period: float, pose_period: float) -> tuple[Array, Array]:
+    """Ends of the wheel samples (F,) and stamps of the reference poses (K,), the first at 0, the last at the end; s."""
+    samples = max(1, round(duration / sample_period))
+    times: Array = sample_period * np.arange(1, samples + 1)
+    between = pose_period * np.arange(1, math.ceil(times[-1] / pose_period))
+    return times, np.concatenate([[0.0], between[between < times[-1] - 1e-9], times[-1:]])

@@ -1,0 +1,46 @@
+"""Simulated data sets of every kind that a config can ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from pydantic import Discriminator, Tag
+
+from omnibench.config import CHOSEN
+from omnibench.data.watch import Watch, unwatched
+from omnibench.simulate.chain.robot_config import RobotConfig
+from omnibench.simulate.config import FlowerConfig
+from omnibench.simulate.flower import simulate_flower
+from omnibench.simulate.simulation import Simulation
+
+_FLOWER, _ROBOT = CHOSEN + FlowerConfig.__name__, CHOSEN + RobotConfig.__name__
+
+
+def _generator(config: Any) -> str | None:
+    """Which config is meant; None where none is."""
+    found = config.get("generator", "flower") if isinstance(config, Mapping) else getattr(config, "generator", "flower")
+    return {"flower": _FLOWER, "robot": _ROBOT}.get(str(found))
+
+
+SimulatedConfig = Annotated[
+    Annotated[FlowerConfig, Tag(_FLOWER)] | Annotated[RobotConfig, Tag(_ROBOT)],
+    Discriminator(
+        _generator, custom_error_type="generator", custom_error_message="generator must be 'flower' or 'robot'"
+    ),
+]
+
+
+def simulate_dataset(
+    config: FlowerConfig | RobotConfig, name: str = "flower", description: str = "", watch: Watch = unwatched
+) -> Simulation:
+    """Simulate the training session and, if there is one, the validation session.
+
+    ConfigError or DataError in one line: an effect of the truth, or a parameter of one, is not known or is missing; a
+    command is faster than the motors, or leads out of the room.
+    """
+    if isinstance(config, FlowerConfig):
+        return simulate_flower(config, name, description)
+    from omnibench.simulate.chain.robot_chain import simulate_robot  # and what it takes a second to load
+
+    return simulate_robot(config, name, description, watch)

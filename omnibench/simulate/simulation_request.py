@@ -1,0 +1,127 @@
+"""What ``omnibench simulate`` is asked for: a config's data set, or a recording simulated again, into a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from omnibench.config import to_json, to_yaml
+from omnibench.data.dataset import Dataset
+from omnibench.data.storage import check_folder, load_dataset, save_dataset
+from omnibench.data.true_poses import write_true_poses
+from omnibench.data.watch import Watch, unwatched
+from omnibench.errors import ConfigError
+from omnibench.files import TableFormat, write_text
+from omnibench.robot.calibration import read_calibration
+from omnibench.simulate.like import simulate_like
+from omnibench.simulate.simulation import Simulation
+from omnibench.simulate.source import SimulationSource, read_simulation
+from omnibench.simulate.truth import TRUTH_FILE
+from omnibench.slam.accuracy import SlamAccuracy, slam_accuracy
+
+ACCURACY_FILE = "slam_accuracy.json"
+
+
+@dataclass(frozen=True)
+class Made:
+    """A data set that was written. simulation: with what is hidden in it, if a config said that. accuracy: of SLAM."""
+
+    dataset: Dataset
+    simulation: Simulation | None = None
+    accuracy: SlamAccuracy | None = None
+
+
+@dataclass(frozen=True)
+class SimulationRequest:
+    """Either ``config`` or ``like`` with ``model``; the other options are for one of the two.
+
+    effects: hidden beside those of the config, each as YAML. noise, seed: whether the calibration's noise is added, and
+    from which seed (default: 0). ConfigError in one line: options that do not go together.
+    """
+
+    output: Path
+    config: Path | None = None
+    truth: Path | None = None
+    dataset: str | None = None
+    effects: tuple[str, ...] = ()
+    like: Path | None = None
+    model: Path | None = None
+    noise: bool = False
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.like is None and self.model is None:
+            if self.config is None:
+                raise ConfigError(
+                    "name a CONFIG with a simulated data set, or a recording with --like DATASET --model CALIBRATION"
+                )
+            why = "is for --like; a config has its own noise and seeds"
+            _refuse((("--noise", self.noise), ("--seed", self.seed is not None)), why)
+        elif self.like is None:
+            raise ConfigError(f"--model {self.model}: say with --like DATASET which recording it is to drive again")
+        elif self.model is None:
+            raise ConfigError(f"--like {self.like}: say with --model CALIBRATION by which model")
+        else:
+            self._check_like()
+        if self.truth is not None and self.truth.resolve().is_relative_to(self.output.resolve()):
+            raise ConfigError("--truth: must be a folder apart from the data set's")
+
+    @cached_property
+    def source(self) -> SimulationSource:
+        """The config's data set, with the effects. ConfigError as for ``read_simulation``."""
+        assert self.config is not None
+        return read_simulation(self.config, self.dataset).with_effects(self.effects)
+
+    @property
+    def plugins(self) -> tuple[Path, ...]:
+        """Folders of plug-ins that the config names for its effects."""
+        return () if self.config is None else self.source.effect_plugins
+
+    def write(self, table_format: TableFormat = "parquet", watch: Watch = unwatched) -> Made:
+        """Simulate, and write the data set, and the truth to its own folder if one is named.
+
+        OmnibenchError in one line: the config, the recording or the calibration is wrong, or the disk refuses.
+        """
+        check_folder(self.output)
+        if self.config is None:
+            assert self.like is not None
+            assert self.model is not None
+            calibration = read_calibration(self.model)
+            made = simulate_like(load_dataset(self.like), calibration, (self.seed or 0) if self.noise else None)
+            save_dataset(made, self.output, table_format)
+            return Made(made)
+        simulation = self.source.simulate(watch)
+        save_dataset(simulation.dataset, self.output, table_format)
+        accuracy = slam_accuracy(simulation.dataset, simulation.paths) if simulation.paths else None
+        if self.truth is not None:
+            self._write_truth(self.truth, simulation, accuracy)
+        return Made(simulation.dataset, simulation, accuracy)
+
+    def _write_truth(self, folder: Path, simulation: Simulation, accuracy: SlamAccuracy | None) -> None:
+        write_text(folder / TRUTH_FILE, to_yaml(simulation.truth))
+        if accuracy is None:
+            return
+        write_true_poses(folder, simulation.paths)
+        write_text(folder / ACCURACY_FILE, to_json(accuracy) + "\n")
+
+    def _check_like(self) -> None:
+        assert self.like is not None
+        given = (
+            (f"CONFIG {self.config}", self.config is not None),
+            ("--truth", self.truth is not None),
+            ("--dataset", self.dataset is not None),
+            ("--effect", bool(self.effects)),
+        )
+        _refuse(given, "does not go with --like, which takes all from the recording and the calibration")
+        if self.seed is not None and not self.noise:
+            raise ConfigError("--seed: is for --noise, which is not asked for; add --noise, or leave --seed out")
+        if self.output.resolve() == self.like.resolve():
+            raise ConfigError(f"-o {self.output}: is the recording itself; name another folder")
+
+
+def _refuse(options: Iterable[tuple[str, bool]], why: str) -> None:
+    for name, given in options:
+        if given:
+            raise ConfigError(f"{name}: {why}; leave it out")

@@ -1,0 +1,116 @@
+"""Simulated data sets in the YAML of a comparison, or of a simulation alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, Field
+
+from omnibench.config import Model, parse_yaml, read_yaml, validate
+from omnibench.data.watch import Watch, unwatched
+from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.robot.calibration import EffectTerm
+from omnibench.simulate.chain.robot_config import RobotConfig
+from omnibench.simulate.config import FlowerConfig, Truth
+from omnibench.simulate.simulate import SimulatedConfig, simulate_dataset
+from omnibench.simulate.simulation import Simulation
+
+
+class _Source(Model):
+    """What a config says of one data set; only ``simulate`` is used here."""
+
+    path: Any = None
+    simulate: SimulatedConfig | None = None
+    import_: Any = Field(default=None, alias="import")
+
+
+class SimulationConfig(Model):
+    """A config of simulated data sets and nothing else."""
+
+    name: str = ""
+    description: str = ""
+    notes: tuple[str, ...] = Field((), description="what a reader must know")
+    plugins: tuple[Path, ...] = Field((), description="folders of effects; relative to the config file")
+    datasets: dict[Annotated[str, Field(min_length=1, max_length=60)], _Source]
+
+
+class _Comparison(SimulationConfig):
+    """The same of a comparison, the rest of which does not matter here."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+@dataclass(frozen=True)
+class SimulationSource:
+    """A simulated data set of a config. plugins: folders that its effects may come from."""
+
+    name: str
+    config: FlowerConfig | RobotConfig
+    description: str = ""
+    plugins: tuple[Path, ...] = ()
+
+    @property
+    def effect_plugins(self) -> tuple[Path, ...]:
+        """The folders, if there are effects to be found there."""
+        return self.plugins if self.config.truth.effects else ()
+
+    def with_effects(self, given: Sequence[str]) -> SimulationSource:
+        """The same with more effects hidden in it, each as YAML ``name: {parameter: value}``. ConfigError names it."""
+        if not given:
+            return self
+        truth = self.config.truth
+        effects = [*truth.effects, *map(_effect, given)]
+        changed = validate(Truth, {**truth.model_dump(), "effects": effects}, "--effect")
+        return replace(self, config=self.config.model_copy(update={"truth": changed}))
+
+    def simulate(self, watch: Watch = unwatched) -> Simulation:
+        """Simulate it. ConfigError or DataError as for ``simulate_dataset``."""
+        return simulate_dataset(self.config, self.name, self.description, watch)
+
+
+def read_simulation(path: Path | str, dataset: str | None = None) -> SimulationSource:
+    """The simulated data set of a comparison's YAML, or of one with nothing but data sets.
+
+    dataset: which one, if there are several. ConfigError in one line when there is no such thing.
+    """
+    path = Path(path)
+    content = read_yaml(path)
+    if not isinstance(content, dict) or "datasets" not in content:
+        raise ConfigError(f"{path}: no data sets in it; name a data set folder or a comparison's config")
+    model = _Comparison if "calibrators" in content else SimulationConfig
+    config = validate(model, content, str(path))
+    sources = {name: source.simulate for name, source in config.datasets.items()}
+    name, chosen = _chosen(sources, dataset, str(path))
+    folder = path.resolve().parent
+    plugins = tuple((folder / each).resolve() for each in config.plugins)
+    return SimulationSource(name, chosen, config.description, plugins)
+
+
+def _chosen(
+    sources: Mapping[str, FlowerConfig | RobotConfig | None], name: str | None, place: str
+) -> tuple[str, FlowerConfig | RobotConfig]:
+    simulated = {key: config for key, config in sources.items() if config is not None}
+    if name is not None and name in sources and name not in simulated:
+        raise ConfigError(f"{place}: data set {name!r} is not simulated; name its folder in place of the config")
+    if name is not None and name not in simulated:
+        raise UnknownNameError("simulated data set", name, simulated, place)
+    if not simulated:
+        raise ConfigError(f"{place}: no simulated data set in it; name the folder of a data set")
+    if name is None and len(simulated) > 1:
+        known = ", ".join(sorted(simulated))
+        raise ConfigError(f"{place}: several simulated data sets; choose one with --dataset: {known}")
+    name = name or next(iter(simulated))
+    return name, simulated[name]
+
+
+def _effect(text: str) -> EffectTerm:
+    place = f"--effect {text}"
+    content = parse_yaml(text, place)
+    if isinstance(content, dict) and len(content) == 1:
+        ((name, parameters),) = content.items()
+        if isinstance(parameters, dict):
+            return validate(EffectTerm, {"name": name, "parameters": parameters}, place)
+    raise ConfigError(f"{place}: expected 'name: {{parameter: value}}'")

@@ -1,0 +1,151 @@
+"""The truth behind simulated recordings: what the robot really is, and what is written down of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from omnibench.config import Model
+from omnibench.errors import UnknownNameError
+from omnibench.registry import effects
+from omnibench.robot.calibration import EffectTerm, Row, matrix_rows
+from omnibench.robot.effects.effect import ActuatorEffect
+from omnibench.robot.effects.term import make_term
+from omnibench.robot.kinematics import Array, Robot, Wheel, inverse_kinematic_matrix
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import Integration, WheelLog
+from omnibench.robot.published_matrices import published_matrix
+from omnibench.simulate.config import EncoderNoise, Truth
+
+TRUTH_FILE = "truth.yaml"  # of the truth's folder
+
+
+@dataclass(frozen=True, eq=False)
+class TrueRobot:
+    """A simulated robot as it really is: its own matrix, and effects of any stage."""
+
+    model: OdometryModel
+
+    def driven(self, times: Array, targets: Array) -> Array:
+        """What the motors make of targets (F, N) in samples that end at times (F,): true mean wheel rates (F, N)."""
+        rates = targets
+        for term in self.model.terms:
+            if isinstance(term.effect, ActuatorEffect):
+                rates = term.effect.driven(np.diff(times, prepend=0.0), rates, term.values)
+        return rates
+
+    def log(
+        self,
+        times: Array,
+        rates: Array,
+        start: Array,
+        stamps: Array,
+        angles: Array,
+        started_at: float | None,
+        session: str | None,
+    ) -> WheelLog:
+        """What the true wheels did from a pose (3,) and wheel angles (N,) rad on; rates (F, N): their true ones."""
+        turned = np.cumsum(rates * np.diff(times, prepend=0.0)[:, None], axis=0)
+        return WheelLog(times, rates, start, stamps, angles + turned, started_at, session)
+
+
+class TruthRecord(Model):
+    """What was hidden: goes to its own folder, which fitting and comparing never read."""
+
+    dataset: str
+    robot: Robot
+    sample_period: float
+    matrix: tuple[Row, Row, Row]
+    integration: Integration
+    noise: EncoderNoise
+    effects: tuple[EffectTerm, ...] = ()
+    wheels: tuple[Wheel, ...] | None = Field(None, description="as they truly are, if they were drawn about the design")
+
+    def true_robot(self, step: float | None = None) -> TrueRobot:
+        """The robot, moving in steps of so many s (default: the sample period).
+
+        OmnibenchError in one line: an effect of it or a parameter is not known, or one is missing.
+        """
+        where = _place(self.dataset)
+        terms = tuple(make_term(each.name, each.parameters, self.robot, where) for each in self.effects)
+        return TrueRobot(
+            OdometryModel(self.robot, np.array(self.matrix), self.integration, terms, step or self.sample_period)
+        )
+
+
+def true_record(
+    truth: Truth,
+    robot: Robot,
+    sample_period: float,
+    sessions: tuple[str, ...],
+    dataset: str,
+    *,
+    integration: Integration = "arc",
+    noise: EncoderNoise | None = None,
+) -> TruthRecord:
+    """What is hidden in a data set. UnknownNameError as for ``complete_effects``."""
+    return TruthRecord(
+        dataset=dataset,
+        robot=robot,
+        sample_period=sample_period,
+        matrix=matrix_rows(true_matrix(truth, robot)),
+        integration=integration,
+        noise=noise or EncoderNoise(),
+        effects=complete_effects(truth, robot, sessions, dataset),
+        wheels=true_wheels(truth, robot),
+    )
+
+
+def complete_effects(truth: Truth, robot: Robot, sessions: tuple[str, ...], dataset: str) -> tuple[EffectTerm, ...]:
+    """The effects with 0 for parameters that are not given beside others: one wheel of several may be eccentric.
+
+    sessions: that are driven. UnknownNameError: no such effect, or no such parameter for this robot and these sessions.
+    """
+    return tuple(_complete(term, robot, sessions, _place(dataset)) for term in truth.effects)
+
+
+def true_wheels(truth: Truth, robot: Robot) -> tuple[Wheel, ...] | None:
+    """The wheels drawn about the design, if the truth says so."""
+    if truth.tolerances is None:
+        return None
+    rng = np.random.default_rng(truth.tolerances.seed)
+    draws = rng.standard_normal((3, len(robot.wheels)))
+    drawn = []
+    for wheel, (radius, distance, angle) in zip(robot.wheels, draws.T.tolist(), strict=True):
+        changes = {
+            "radius": wheel.radius * (1 + truth.tolerances.radius * radius),
+            "distance": wheel.distance * (1 + truth.tolerances.distance * distance),
+            "angle": wheel.angle + math.radians(truth.tolerances.angle_deg) * angle,
+        }
+        drawn.append(wheel.model_copy(update=changes))
+    return tuple(drawn)
+
+
+def true_matrix(truth: Truth, robot: Robot) -> Array:
+    """The hidden inverse kinematic matrix (3, N)."""
+    if truth.published is not None:
+        return published_matrix(truth.published)
+    if truth.matrix is not None:
+        return np.array(truth.matrix)
+    wheels = true_wheels(truth, robot)
+    assert wheels is not None  # one of the three is given
+    return inverse_kinematic_matrix(wheels)
+
+
+def _complete(term: EffectTerm, robot: Robot, sessions: tuple[str, ...], where: str) -> EffectTerm:
+    found = effects.create(term.name, where=where).parameters(robot, sessions)
+    known = {parameter.name for parameter in found}
+    for given in term.parameters:
+        if given not in known:
+            raise UnknownNameError("parameter", given, known, f"{where}: effect {term.name!r}")
+    unchanged = {parameter.name: 0.0 for parameter in found if not parameter.choices}
+    if unchanged.keys().isdisjoint(term.parameters):
+        return term  # and what it lacks is told
+    return term.model_copy(update={"parameters": unchanged | term.parameters})
+
+
+def _place(dataset: str) -> str:
+    return f"data set {dataset}: truth.effects"

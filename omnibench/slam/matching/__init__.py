@@ -1,0 +1,1 @@
+"""Scan matching: one scan against a growing map."""

@@ -1,0 +1,101 @@
+"""What ``omnibench slam`` is asked for: reference poses of a recording from its scans, and how good they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from omnibench.config import read_model
+from omnibench.data.dataset import Dataset
+from omnibench.data.storage import check_folder, load_dataset, save_dataset
+from omnibench.data.true_poses import TruePath, read_true_poses
+from omnibench.data.watch import Watch
+from omnibench.errors import ConfigError, DataError
+from omnibench.files import TableFormat
+from omnibench.robot.calibration import read_calibration
+from omnibench.robot.model import OdometryModel
+from omnibench.simulate.truth import TRUTH_FILE, TruthRecord
+from omnibench.slam.accuracy import SlamAccuracy, slam_accuracy
+from omnibench.slam.slam_dataset import slam_paths, with_paths
+from omnibench.slam.slam_options import SlamOptions
+from omnibench.slam.summary import SlamSummary, summarise
+
+_WORKERS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class SlamResult:
+    """The data set with its new poses, what is said of them, and the true paths, if they are known."""
+
+    dataset: Dataset
+    summary: SlamSummary
+    truth: Mapping[str, TruePath] | None
+
+    @property
+    def accuracy(self) -> SlamAccuracy | None:
+        return self.summary.accuracy
+
+
+@dataclass(frozen=True)
+class SlamRequest:
+    """A recording, and where it goes with its new poses (None: nowhere).
+
+    model: a calibration file, whose odometry the search starts from; None: the design values. truth: the folder that
+    ``simulate --truth`` wrote. ConfigError in one line: the recording would be written over.
+    """
+
+    dataset: Path
+    output: Path | None = None
+    options: SlamOptions = field(default_factory=SlamOptions)
+    model: Path | None = None
+    truth: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.output is not None and self.output.resolve() == self.dataset.resolve():
+            raise ConfigError(f"-o {self.output}: is the recording itself; name another folder")
+        if self.model is not None and self.options.start != "odometry":
+            raise ConfigError(f"--model {self.model}: is for --start odometry; leave one of the two out")
+
+    def run(self, watch: Watch | None = None, table_format: TableFormat = "parquet") -> SlamResult:
+        """Find the poses and write the data set. DataError in one line, before the work where that can be."""
+        recorded = load_dataset(self.dataset)
+        truth = self._truth_of(recorded)
+        model = self._model_of(recorded)
+        if self.output is not None:
+            check_folder(self.output)
+        paths = slam_paths(recorded, self.options, model=model, workers=_workers(model), watch=watch)
+        found = with_paths(recorded, paths)
+        if self.output is not None:
+            save_dataset(found, self.output, table_format)
+        accuracy = None if truth is None else slam_accuracy(found, truth)
+        return SlamResult(found, summarise(recorded, found, paths, accuracy), truth)
+
+    def _truth_of(self, recorded: Dataset) -> Mapping[str, TruePath] | None:
+        if self.truth is None:
+            return None
+        truth = read_true_poses(self.truth)
+        record = self.truth / TRUTH_FILE
+        if record.is_file() and read_model(TruthRecord, record).robot != recorded.robot:
+            raise DataError(f"--truth {self.truth}: it is another robot's; name the truth of this data set")
+        for trajectory in recorded.trajectories:
+            if trajectory.id not in truth:
+                raise DataError(
+                    f"--truth {self.truth}: trajectory {trajectory.id} is not in it; name the truth of this data set"
+                )
+        return truth
+
+    def _model_of(self, recorded: Dataset) -> OdometryModel | None:
+        if self.model is None:
+            return None
+        calibration = read_calibration(self.model)
+        if calibration.robot.wheel_names != recorded.robot.wheel_names:
+            ours, theirs = (", ".join(robot.wheel_names) for robot in (calibration.robot, recorded.robot))
+            raise DataError(f"--model {self.model}: wheels are {ours}, but the data set's are {theirs}")
+        return calibration.model
+
+
+def _workers(model: OdometryModel | None) -> int:
+    """How many processes: other processes do not know the classes of plug-ins."""
+    terms = () if model is None else model.terms
+    return _WORKERS if all(type(term.effect).__module__.startswith("omnibench.") for term in terms) else 1

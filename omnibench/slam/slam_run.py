@@ -1,0 +1,178 @@
+"""SLAM of one run: its scans, one after another, become poses and a map."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from omnibench.data.scans import Ranges, Scanner, TrajectoryScans
+from omnibench.errors import DataError
+from omnibench.robot.kinematics import Array
+from omnibench.slam.doubts import Doubt, doubts_of
+from omnibench.slam.matching.map import ScanMap
+from omnibench.slam.matching.points import ScanPoints, noise_factor, scan_points
+from omnibench.slam.matching.scan_matching import Match, refine, search
+from omnibench.slam.motion_prior import Motion, OdometryMotion, UnknownMotion
+from omnibench.slam.motion_within_scan import WithinScan
+from omnibench.slam.pose_errors import PoseErrors
+from omnibench.slam.slam_options import SlamOptions
+
+_SKEWED = 1e-3  # m or rad, from the first ray of a scan to its last
+_CORRECTIONS = 4  # of the motion within a scan, at most
+_KEYFRAMES = 300  # whose errors are told apart
+_SAMPLE = 100  # scans that tell the noise
+_NEEDED = 0.6  # of the points: when fewer match, the map needs more
+
+
+@dataclass(frozen=True, eq=False)
+class SlamPath:
+    """Poses of the robot at the stamps of its scans.
+
+    times (S,): s. poses (S, 3): m, m, rad, in the run's frame, headings continuous. covariances (S, 3, 3).
+    matched (S,): share of each scan's points that lie on the map. doubts: what went wrong.
+    """
+
+    times: Array
+    poses: Array
+    covariances: Array
+    matched: Array
+    doubts: tuple[Doubt, ...] = ()
+
+
+def run_slam(
+    scans: TrajectoryScans,
+    scanner: Scanner,
+    options: SlamOptions,
+    start: Array,
+    odometry: Callable[[Array], Array] | None = None,
+    deviations: Array | None = None,
+) -> SlamPath:
+    """The poses at which a run's scans lie best on the map that they make.
+
+    start (3,): the robot's pose at the first scan. odometry: poses (K, 3) at times (K,) >= 0 in s, in any frame, of
+    which only the increments are used, to begin the search, to deskew, and where scans tell nothing; needed unless the
+    search starts from the last pose. deviations (3,): standard deviations of the start, along the robot's axes, m, m,
+    rad; default: it is exact. DataError in one line: no scan, or one without returns.
+    """
+    _check(scans, scanner, options, odometry)
+    duration = float(scanner.delays[-1])
+    motion: Motion = UnknownMotion(scans.times, duration, options)
+    if options.start == "odometry" and odometry is not None:
+        motion = OdometryMotion(odometry, scans.times, duration, options)
+    noise = noise_factor(scans.ranges[:: 1 + len(scans.times) // _SAMPLE], scanner)
+    errors = PoseErrors(start, deviations)
+    slam = _Slam(scanner, noise, options, motion, np.asarray(start, dtype=float), errors)
+    located = [slam.begin(scans.ranges[0])]
+    located += [slam.go_on(number, ranges) for number, ranges in enumerate(scans.ranges[1:], 1)]
+    return SlamPath(
+        scans.times,
+        np.array([match.pose for match, _ in located]),
+        np.array([covariance for _, covariance in located]),
+        np.array([match.matched for match, _ in located]),
+        doubts_of([match for match, _ in located], options, _at(odometry, scans.times)),
+    )
+
+
+class _Slam:
+    """A run on its way: the map so far, and how wrong it is."""
+
+    def __init__(
+        self,
+        scanner: Scanner,
+        noise: float,
+        options: SlamOptions,
+        motion: Motion,
+        start: Array,
+        errors: PoseErrors,
+    ) -> None:
+        self._scanner, self._noise, self._options, self._motion = scanner, noise, options, motion
+        self._map = ScanMap(options.spacing)
+        self._errors = errors
+        self._pose = self._keyframe = start
+
+    def begin(self, ranges: Ranges) -> tuple[Match, Array]:
+        """The first scan, with which the map begins, at the start pose; its covariance (3, 3)."""
+        within, doubt = self._motion.first()
+        if not self._options.deskew:
+            doubt = within.mean
+        scan = self._points(ranges, within)
+        self._add(scan, doubt)
+        match = replace(refine(self._map, scan, self._pose, self._pose, self._options), pose=self._pose)
+        # To what the start is known come the errors that scans which are matched to this one see.
+        seen = np.linalg.inv(match.information + np.diag(self._options.limits**-2.0))
+        return match, self._errors.covariance + seen
+
+    def go_on(self, number: int, ranges: Ranges) -> tuple[Match, Array]:
+        """The next scan: its match and the covariance of its pose (3, 3)."""
+        options, motion, last = self._options, self._motion, self._pose
+        expected = motion.expected(number, last)
+        scan = self._points(ranges, expected.within)
+        found = search(self._map, scan, expected.start, options)
+        raw = scan
+        correction: Array = np.zeros(3)
+        for _ in range(_CORRECTIONS):
+            found = refine(self._map, scan, found, expected.start, options, steps=1).pose
+            before = correction
+            correction, doubt = motion.corrected(number, last, found, before)
+            if not options.deskew:
+                doubt = expected.within.mean + correction
+                break
+            scan = raw.deskewed(correction)
+            if not self._skews(correction - before):
+                break
+        match = refine(self._map, scan, found, expected.start, options)
+        covariance = self._errors.step(match, expected.deviations, doubt)
+        self._pose = match.pose
+        if self._is_keyframe(match, doubt):
+            self._add(scan, doubt)
+        return match, covariance
+
+    def _is_keyframe(self, match: Match, doubt: Array) -> bool:
+        """Whether the robot has come far enough for new surfaces; a scan that may be skewed waits while it can."""
+        x, y, turned = match.pose - self._keyframe
+        far = np.hypot(x, y) > self._options.keyframe_distance or abs(turned) > self._options.keyframe_angle
+        return bool(far and (match.matched < _NEEDED or not self._skews(doubt))) or not self._map.is_usable
+
+    def _skews(self, twist: Array) -> bool:
+        """Whether a twist (3,) more or less during a scan matters."""
+        return bool(np.abs(twist).max() * self._scanner.delays[-1] > _SKEWED)
+
+    def _points(self, ranges: Ranges, within: WithinScan) -> ScanPoints:
+        still = WithinScan.steady(np.zeros(3), within.duration)
+        return scan_points(ranges, self._scanner, self._noise, within if self._options.deskew else still)
+
+    def _add(self, scan: ScanPoints, doubt: Array) -> None:
+        """The last pose becomes a keyframe, if its scan saw something new. doubt (3,): of the twist within the scan."""
+        self._keyframe = self._pose
+        if not self._map.add(scan.lines, self._pose, self._errors.keyframes):
+            return
+        self._errors.keep(doubt * self._scanner.delays[-1] / 2)
+        if self._errors.keyframes > _KEYFRAMES:
+            self._map.merge_oldest()
+            self._errors.merge_oldest()
+
+
+def _at(odometry: Callable[[Array], Array] | None, times: Array) -> Array | None:
+    """The odometry at times (S,), of which several may be the same."""
+    stamps, place = np.unique(times, return_inverse=True)
+    return None if odometry is None else odometry(stamps)[place]
+
+
+def _check(
+    scans: TrajectoryScans, scanner: Scanner, options: SlamOptions, odometry: Callable[[Array], Array] | None
+) -> None:
+    if len(scans.times) == 0:
+        raise DataError("SLAM: there is no scan")
+    if scans.ranges.shape != (len(scans.times), scanner.rays):
+        raise DataError(
+            f"SLAM: ranges have shape {scans.ranges.shape}, expected {(len(scans.times), scanner.rays)}: scans, rays"
+        )
+    for index in np.flatnonzero(~scanner.valid(scans.ranges).any(axis=1))[:1]:
+        raise DataError(
+            f"SLAM: the scan at {scans.times[index]:g} s is empty: no range from {scanner.range_min:g} to "
+            f"{scanner.range_max:g} m; leave it out"
+        )
+    if options.start == "odometry" and odometry is None:
+        raise DataError("SLAM: start is odometry, but there is none; choose start: last_pose")

@@ -1,0 +1,100 @@
+"""What SLAM of a data set came to, in numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydantic import Field
+
+from omnibench.config import Model
+from omnibench.data.dataset import Dataset
+from omnibench.robot.kinematics import Array
+from omnibench.slam.accuracy import SlamAccuracy
+from omnibench.slam.slam_run import SlamPath
+
+_SAME_TIME = 1e-6  # s
+
+
+class Distances(Model):
+    """How far poses are from others of the same runs and times, the start poses left out."""
+
+    poses: int
+    position_mean_m: float
+    position_p95_m: float
+    heading_mean_rad: float
+    heading_p95_rad: float
+
+
+class SlamSummary(Model):
+    """SLAM of a data set. Deviations are standard deviations that SLAM states at the end of the runs."""
+
+    dataset: str
+    simulated: bool
+    runs: int
+    scans: int
+    matched_mean: float = Field(description="share of a scan's points that lie on the map, mean over all scans")
+    matched_min: float = Field(description="the same of the worst scan")
+    position_deviation_mean_m: float = Field(description="along the direction that is known worst; mean over runs")
+    position_deviation_max_m: float = Field(description="the same of the worst run")
+    heading_deviation_mean_rad: float
+    heading_deviation_max_rad: float
+    recorded: Distances | None = Field(description="from the poses that the data set held before; None: not comparable")
+    accuracy: SlamAccuracy | None = Field(description="against the truth of a simulation, if that is known")
+    warnings: tuple[str, ...]
+
+
+def summarise(
+    before: Dataset, after: Dataset, paths: Sequence[SlamPath], accuracy: SlamAccuracy | None = None
+) -> SlamSummary:
+    """What SLAM made of a data set's runs. before: with the poses recorded; after: with those of ``paths``."""
+    matched = np.concatenate([path.matched for path in paths])
+    last = np.array([path.covariances[-1] for path in paths])
+    position = np.sqrt(np.linalg.eigvalsh(last[:, :2, :2])[:, -1])
+    heading = np.sqrt(last[:, 2, 2])
+    return SlamSummary(
+        dataset=after.name,
+        simulated=after.simulated,
+        runs=len(paths),
+        scans=sum(len(before.scans.times(run.id)) for run in before.trajectories) if before.scans else 0,
+        matched_mean=float(matched.mean()),
+        matched_min=float(matched.min()),
+        position_deviation_mean_m=float(position.mean()),
+        position_deviation_max_m=float(position.max()),
+        heading_deviation_mean_rad=float(heading.mean()),
+        heading_deviation_max_rad=float(heading.max()),
+        recorded=distances(before, after),
+        accuracy=accuracy,
+        warnings=after.warnings,
+    )
+
+
+def distances(one: Dataset, other: Dataset) -> Distances | None:
+    """How far the reference poses of two data sets of the same runs are apart; None when no times are common to both.
+
+    Compared at the stamps of the one that has fewer poses, between poses of the other by a straight line.
+    """
+    found = [
+        _apart((mine.pose_times, mine.poses), (theirs.pose_times, theirs.poses))
+        for mine, theirs in zip(one.trajectories, other.trajectories, strict=True)
+    ]
+    errors = np.concatenate(found)
+    if not len(errors):
+        return None
+    position = np.hypot(errors[:, 0], errors[:, 1])
+    heading = np.abs((errors[:, 2] + np.pi) % (2 * np.pi) - np.pi)
+    return Distances(
+        poses=len(errors),
+        position_mean_m=float(position.mean()),
+        position_p95_m=float(np.quantile(position, 0.95)),
+        heading_mean_rad=float(heading.mean()),
+        heading_p95_rad=float(np.quantile(heading, 0.95)),
+    )
+
+
+def _apart(one: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
+    """Differences (K, 3) at the common times after the start; headings not wrapped."""
+    (times, poses), (dense_times, dense) = sorted((one, other), key=lambda path: len(path[0]))
+    common = (times > _SAME_TIME) & (times >= dense_times[0] - _SAME_TIME) & (times <= dense_times[-1] + _SAME_TIME)
+    between = [np.interp(times[common], dense_times, column) for column in dense.T]
+    return np.asarray(poses[common] - np.column_stack(between))

@@ -1,0 +1,119 @@
+"""Plug-ins from their authors' side: writing the first version of one, and checking one."""
+
+from __future__ import annotations
+
+import importlib.util
+import keyword
+import re
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any, Literal, get_args
+
+from omnibench.config import validate
+from omnibench.errors import ConfigError, PluginError, UnknownNameError
+from omnibench.files import write_text
+from omnibench.registry import REGISTRIES, Entry, Registry, calibrators, costs, effects, importers, registered_from
+from omnibench.testing.calibrator_cases import CalibratorConformance
+from omnibench.testing.conformance import CaseOutcome, CaseResult, Conformance, load_plugin, run_cases
+from omnibench.testing.cost_cases import CostConformance
+from omnibench.testing.effect_cases import EffectConformance
+from omnibench.testing.importer_cases import ImporterConformance
+
+PluginKind = Literal["calibrator", "importer", "cost", "effect"]
+PLUGIN_KINDS: tuple[PluginKind, ...] = get_args(PluginKind)
+_TEMPLATES = files("omnibench.testing") / "plugin_templates"
+_SUITES: dict[Registry[Any], type[Conformance]] = {
+    calibrators: CalibratorConformance,
+    costs: CostConformance,
+    effects: EffectConformance,
+    importers: ImporterConformance,
+}
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What the conformance cases say of one plug-in file."""
+
+    path: Path
+    results: tuple[CaseResult, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether no case failed."""
+        return all(result.passed for result in self.results)
+
+    @property
+    def failures(self) -> tuple[CaseResult, ...]:
+        """The cases that failed."""
+        return tuple(result for result in self.results if not result.passed)
+
+
+def new_plugin(name: str, kind: str = "calibrator", folder: Path | str = "plugins") -> list[Path]:
+    """Write a working plug-in ``<name>.py`` and its test ``test_<name>.py`` into ``folder``; the files written.
+
+    ConfigError: ``kind`` is unknown, ``name`` is no identifier in lower case or is taken, or a file is there already.
+    DataError: the disk refuses.
+    """
+    if kind not in PLUGIN_KINDS:
+        raise UnknownNameError("kind of plug-in", kind, PLUGIN_KINDS)
+    _check_identifier(name)
+    targets = {
+        Path(folder) / f"{name}.py": f"{kind}.py.txt",
+        Path(folder) / f"test_{name}.py": f"test_{kind}.py.txt",
+    }
+    for path in targets:
+        if path.exists():
+            raise ConfigError(f"{path} is there already; choose another name or folder, or remove it")
+    _check_free(name, kind)
+    texts = {path: (_TEMPLATES / template).read_text(encoding="utf-8") for path, template in targets.items()}
+    title = "".join(part.capitalize() for part in name.split("_"))
+    if any(re.search(rf"\b{title}\b", text) for text in texts.values()):  # it would hide an import
+        title += kind.capitalize()
+    for path, text in texts.items():
+        write_text(path, Template(text).substitute(name=name, title=title))
+    return list(targets)
+
+
+def check_plugin(path: Path | str, sample: Path | str | None = None) -> CheckReport:
+    """Load a plug-in file and run the conformance cases on everything that it registers.
+
+    sample: recordings that an importer among them reads; without it an importer's refusals alone are tried.
+    PluginError, in one line: there is no such file, it cannot be imported, or it registers nothing.
+    """
+    path = Path(path)
+    load_plugin(path)
+    found = registered_from(path)
+    if not found:
+        raise PluginError(f"{path} registers nothing; decorate a class with @calibrators.register(...), for example")
+    source = None if sample is None else Path(sample)
+    return CheckReport(path, tuple(result for registry, entry in found for result in _check(registry, entry, source)))
+
+
+def _check(registry: Registry[Any], entry: Entry[Any], source: Path | None) -> list[CaseResult]:
+    try:
+        validate(entry.options, {}, f"{registry.kind} {entry.name!r}")
+    except ConfigError as error:
+        message = f"{error}; give every option a default, or subclass the conformance class and set options there"
+        return [CaseResult(registry.kind, entry.name, "can be made without options", CaseOutcome.FAILED, message)]
+    base = _SUITES.get(registry, Conformance)
+    suite = type("Checked", (base,), {"name": entry.name, "registry": registry, "source": source})
+    return run_cases(suite())
+
+
+def _check_identifier(name: str) -> None:
+    if not name.isidentifier() or not name.isascii() or keyword.iskeyword(name) or name != name.lower():
+        raise ConfigError(f"{name!r} cannot name a plug-in; use lower-case letters, digits and _, as in my_search")
+    if name.startswith(("_", "test_", "conftest")):
+        raise ConfigError(f"{name!r} cannot name a plug-in; files that begin with _, test_ or conftest are not loaded")
+
+
+def _check_free(name: str, kind: str) -> None:
+    for registry in REGISTRIES:
+        for entry in registry.entries() if registry.kind == kind else ():
+            if entry.name == name:
+                raise ConfigError(f"there is a {kind} {name!r} already ({entry.origin}); choose another name")
+    # pytest puts the folder first on Python's path, where the file would hide the module from everyone.
+    if importlib.util.find_spec(name) is not None:
+        raise ConfigError(f"{name}.py would hide the Python module {name!r}; choose another name")

@@ -1,0 +1,319 @@
+"""What each command prints and leaves behind: documents on standard output, files, plug-ins."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from commands import (
+    COMMAND,
+    CONFIGS,
+    ENVIRONMENT,
+    RECORDINGS,
+    Command,
+    Prepared,
+    Printed,
+    assert_refused,
+    write_config,
+    write_plugin,
+)
+
+from omnibench.data.storage import load_dataset
+from omnibench.robot.calibration import read_calibration
+from omnibench.robot.published_matrices import published_matrix
+
+pytestmark = pytest.mark.usefixtures("registries_as_before")
+
+
+def document(printed: Printed) -> Any:
+    """Standard output as one strict JSON document."""
+    assert printed.returncode == 0, printed.stderr
+
+    def no_constant(name: str) -> None:
+        raise AssertionError(f"{name} is not JSON")
+
+    return json.loads(printed.stdout, parse_constant=no_constant)
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["compare", "--help"], ["plugin", "--help"]])
+def test_help_is_shown_on_standard_output(arguments: list[str], command: Command) -> None:
+    printed = command(*arguments)
+    assert printed.returncode == 0
+    assert printed.stdout.startswith("Usage: omnibench")
+
+
+def test_evaluate_prints_the_documented_document(command: Command, prepared: Prepared) -> None:
+    found = document(command("evaluate", prepared.calibration, prepared.data, "--json"))
+    assert [*found] == ["dataset", "trajectories", "splits", "warnings"]
+    assert found["warnings"] == []
+    assert (found["dataset"], found["trajectories"]) == ("flower", 12)
+    assert [*found["splits"]] == ["train", "validation", "all"]
+    for split in found["splits"].values():
+        assert [*split] == ["cost", "position_mean_m", "position_max_m", "heading_mean_rad", "heading_max_rad"]
+        assert {type(value) for value in split.values()} == {float}
+        assert split["position_mean_m"] <= split["position_max_m"]
+    both = [found["splits"][name]["cost"] for name in ("train", "validation")]
+    assert found["splits"]["all"]["cost"] == pytest.approx(np.mean(both))
+
+
+def test_evaluate_shows_the_design_values_beside_the_calibration(command: Command, prepared: Prepared) -> None:
+    shown = command("evaluate", prepared.calibration, prepared.data).stdout
+    assert shown.count("calibration") == shown.count("design") == 3
+    assert "(simulated data)" in shown
+
+
+def test_calibrate_prints_what_it_would_write(command: Command, prepared: Prepared, tmp_path: Path) -> None:
+    found = document(command("calibrate", prepared.data, "--json", "-o", tmp_path / "c.yaml"))
+    assert found == json.loads(read_calibration(tmp_path / "c.yaml").model_dump_json())
+    assert found["format"] == "omnibench-calibration/1"
+    assert np.shape(found["matrix"]) == (3, 3)
+
+
+def test_a_calibration_comes_close_to_the_truth_and_says_where_it_is_from(prepared: Prepared) -> None:
+    calibration = read_calibration(prepared.calibration)
+    assert np.abs(calibration.matrix_array - published_matrix("palacin2023_eq8")).max() < 0.005
+    assert calibration.provenance is not None
+    assert calibration.provenance.dataset_hash == load_dataset(prepared.data).hash
+    assert (calibration.provenance.simulated, calibration.provenance.calibrator) == (True, "closed_form")
+
+
+def test_settings_reach_the_calibrator(command: Command, prepared: Prepared) -> None:
+    options = ("--set", "population=20", "--set", "generations=2", "--set", "tolerance=1e-3", "--seed", "5")
+    found = document(command("calibrate", prepared.data, "--json", "--calibrator", "genetic", *options))
+    recorded = found["provenance"]["options"]
+    assert (recorded["population"], recorded["generations"], recorded["tolerance"]) == (20, 2, 0.001)
+    assert found["provenance"]["seed"] == 5
+
+
+def test_infinity_in_an_option_is_null_in_json(command: Command, prepared: Prepared) -> None:
+    arguments = ("--calibrator", "crs", "--set", "tolerance=.inf")
+    found = document(command("calibrate", prepared.data, "--json", *arguments))
+    assert found["provenance"]["options"]["tolerance"] is None
+
+
+@pytest.mark.parametrize("name", ["raises", "says_nan"])
+def test_a_calibrator_without_an_answer_is_one_line(
+    name: str, command: Command, prepared: Prepared, tmp_path: Path
+) -> None:
+    body = {"raises": "raise ValueError('oh')", "says_nan": "return Solution(np.full(problem.size, np.nan), 'x')"}[name]
+    text = f"@calibrators.register('{name}')\nclass A(Calibrator):\n    def calibrate(self, problem):\n        {body}\n"
+    plugins = write_plugin(tmp_path / "p", name, text)
+    printed = command("calibrate", prepared.data, "-o", "x.yaml", "--plugins", plugins, "--calibrator", name)
+    assert_refused(printed, f"calibrator '{name}' gave no answer")
+    assert not Path("x.yaml").exists()
+
+
+CHATTY = """
+print("on import")
+
+@calibrators.register("chatty")
+class Chatty(Calibrator):
+    "Talks."
+
+    def calibrate(self, problem):
+        print("while it works")
+        return Solution(problem.start, "done")
+"""
+
+
+def test_what_a_plugin_prints_does_not_spoil_the_document(command: Command, prepared: Prepared, tmp_path: Path) -> None:
+    plugins = write_plugin(tmp_path / "p", "chatty", CHATTY)
+    printed = command("calibrate", prepared.data, "--json", "--plugins", plugins, "--calibrator", "chatty")
+    assert document(printed)["provenance"]["calibrator"] == "chatty"
+    assert "on import" in printed.stderr
+    assert "while it works" in printed.stderr
+
+
+def test_inspect_prints_one_document(command: Command, prepared: Prepared) -> None:
+    found = document(command("inspect", prepared.data, "--json"))
+    assert (found["dataset"], found["trajectories"], found["simulated"]) == ("flower", 12, True)
+    assert found["splits"]["train"]["trajectories"] == 6
+    assert found["undriven"] == found["warnings"] == []
+
+
+def test_a_terminal_without_a_letter_shows_another(prepared: Prepared, tmp_path: Path) -> None:
+    for file in prepared.data.iterdir():
+        shutil.copy(file, tmp_path)
+    header = (tmp_path / "dataset.yaml").read_text()
+    (tmp_path / "dataset.yaml").write_text(header.replace("name: flower", "name: Größe"))
+    run = subprocess.run(
+        [*COMMAND, "inspect", str(tmp_path)],
+        env=ENVIRONMENT | {"PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (run.returncode, run.stderr) == (0, "")
+    assert run.stdout.startswith("Gr??e: simulated data")
+
+
+def test_inspect_warns_of_units_that_cannot_be_right(command: Command, prepared: Prepared, tmp_path: Path) -> None:
+    assert command("simulate", prepared.config, "-o", tmp_path / "data", "--format", "csv").returncode == 0
+    lines = [line.split(",") for line in (tmp_path / "data" / "poses.csv").read_text().splitlines()]
+    x, y = lines[0].index("x"), lines[0].index("y")
+    for line in lines[1:]:
+        line[x], line[y] = str(1000 * float(line[x])), str(1000 * float(line[y]))
+    (tmp_path / "data" / "poses.csv").write_text("".join(",".join(line) + "\n" for line in lines))
+    printed = command("inspect", tmp_path / "data")
+    assert printed.returncode == 0
+    assert "warning: positions look like mm; x and y must be m" in printed.stderr
+
+
+def test_list_names_everything_that_a_config_can_name(command: Command) -> None:
+    found = document(command("list", "--plugins", CONFIGS.parent / "plugins", "--json"))
+    assert {*found} == {"calibrators", "costs", "effects", "importers", "failures"}
+    names = {kind: {row["name"] for row in found[kind]} for kind in ("calibrators", "costs", "importers")}
+    assert names["calibrators"] >= {
+        "closed_form",
+        "crs",
+        "genetic",
+        "isres",
+        "parametric",
+        "published",
+        "random_search",
+    }
+    assert names["calibrators"] >= {"theoretical", "cmaes", "differential_evolution", "maddahi"}
+    assert names["costs"] >= {"final_pose", "final_position", "final_heading", "trajectory"}
+    assert names["importers"] >= {"optiodom", "table1", "csv", "robotino"}
+    origins = {row["name"]: row["from"] for row in found["calibrators"]}
+    assert origins["crs"] == "built in"
+    assert origins["cmaes"] == str(CONFIGS.parent / "plugins" / "cmaes.py")
+    assert found["failures"] == []
+
+
+def test_list_takes_the_plugins_of_the_folder_one_is_in(command: Command, tmp_path: Path) -> None:
+    write_plugin(tmp_path / "plugins", "chatty", CHATTY)
+    assert "chatty" in command("list").stdout
+
+
+def test_list_goes_on_past_a_plugin_that_cannot_be_imported(command: Command, tmp_path: Path) -> None:
+    plugins = write_plugin(tmp_path / "p", "aaa_broken", "import nothing_of_the_kind\n")
+    write_plugin(plugins, "chatty", CHATTY)
+    printed = command("list", "--plugins", plugins, "--json")
+    found = document(printed)
+    assert {"chatty", "closed_form", "theoretical"} <= {row["name"] for row in found["calibrators"]}
+    assert [row["error"] for row in found["failures"]] == ["ModuleNotFoundError: No module named 'nothing_of_the_kind'"]
+    assert f"warning: plug-in {plugins / 'aaa_broken.py'} cannot be imported" in printed.stderr
+
+
+def test_export_writes_to_standard_output_or_to_a_file(command: Command, prepared: Prepared, tmp_path: Path) -> None:
+    shown = command("export", prepared.calibration, "--to", "c_header")
+    assert shown.returncode == 0
+    written = command("export", prepared.calibration, "--to", "c_header", "-o", tmp_path / "m.h")
+    assert (tmp_path / "m.h").read_text() == shown.stdout
+    assert written.stdout == f"c_header: {tmp_path / 'm.h'}\n"
+
+
+def test_export_to_ros2_says_what_its_parameters_cannot_hold(command: Command, prepared: Prepared) -> None:
+    printed = command("export", prepared.calibration, "--to", "ros2_controllers")
+    assert "wheel_radius" in str(yaml.safe_load(printed.stdout))
+    assert printed.stderr.startswith("warning: ")
+
+
+def test_simulate_writes_the_truth_to_its_own_folder_only(prepared: Prepared) -> None:
+    truth = yaml.safe_load((prepared.truth / "truth.yaml").read_text())
+    assert np.array_equal(truth["matrix"], published_matrix("palacin2023_eq8"))
+    assert {file.name for file in prepared.data.iterdir()} == {
+        *("dataset.yaml", "trajectories.parquet", "wheels.parquet", "poses.parquet")
+    }
+    assert "palacin" not in (prepared.data / "dataset.yaml").read_text()
+
+
+def test_import_turns_recordings_into_a_data_set(command: Command, tmp_path: Path) -> None:
+    source = RECORDINGS / "optiodom" / "omni3"
+    if not source.is_dir():
+        pytest.skip(f"the recordings are not there: {source}")
+    split = ("--set", "train=circular", "--set", "validation=square")
+    printed = command("import", "optiodom", source, "-o", tmp_path / "data", *split)
+    assert printed.returncode == 0, printed.stderr
+    assert printed.stdout == f"67 trajectories: {tmp_path / 'data'}\n"
+    dataset = load_dataset(tmp_path / "data")
+    assert (len(dataset.split("train")), len(dataset.split("validation"))) == (44, 23)
+
+
+def test_a_new_plugin_is_checked_and_compared(command: Command, tmp_path: Path) -> None:
+    new = command("plugin", "new", "my_search")
+    assert new.stdout.splitlines() == [
+        "written: plugins/my_search.py",
+        "written: plugins/test_my_search.py",
+        "check it: omnibench plugin check plugins/my_search.py",
+    ]
+    check = command("plugin", "check", "plugins/my_search.py")
+    assert check.returncode == 0, check.stdout
+    assert " passed" in check.stdout.splitlines()[-1]
+    assert "failed" not in check.stdout
+    config = write_config(tmp_path / "c", calibrators=["closed_form", "my_search"])
+    compared = command("compare", config, "--plugins", "plugins", "--output", tmp_path / "out")
+    assert compared.returncode == 0
+    assert "flower my_search seed 1: budget, cost 0.0" in compared.stderr
+
+
+def test_a_plugin_that_breaks_the_contract_fails_its_check_with_exit_code_1(command: Command, tmp_path: Path) -> None:
+    text = "@calibrators.register('outside')\nclass Outside(Calibrator):\n    'Outside.'\n"
+    text += "    def calibrate(self, problem):\n        return Solution(problem.upper + 1, 'x')\n"
+    write_plugin(tmp_path, "outside", text)
+    printed = command("plugin", "check", tmp_path / "outside.py")
+    assert printed.returncode == 1
+    assert "failed  calibrator outside: bounds are kept" in printed.stdout
+
+
+def test_certify_prints_the_documented_document(command: Command, prepared: Prepared) -> None:
+    found = document(command("certify", prepared.calibration, prepared.data, "--gap", 0.05, "--seconds", 30, "--json"))
+    assert [*found] == ["cost", "lower_bound", "gap", "box", "seconds"]
+    assert 0 < found["lower_bound"] <= found["cost"]
+    assert found["gap"] == pytest.approx(1 - found["lower_bound"] / found["cost"])
+    assert found["box"] == "row"
+
+
+def test_certify_says_in_words_what_is_proven(command: Command, prepared: Prepared) -> None:
+    printed = command("certify", prepared.calibration, prepared.data, "--seconds", 0.01)
+    assert "(simulated data), training split, cost final_pose" in printed.stdout
+    assert "No matrix in the box 'row' costs less than that" in printed.stdout
+    assert "the time was up" in printed.stdout
+
+
+def test_design_prints_one_document_and_writes_its_report(command: Command, tmp_path: Path) -> None:
+    config = write_config(tmp_path)
+    found = document(command("design", config, "--output", tmp_path / "out", "--json"))
+    assert json.loads((tmp_path / "out" / "design.json").read_text(encoding="utf-8")) == found
+    assert found["sets"][0]["step"]["efficiency"] > 0.99
+    assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
+
+
+def test_a_calibration_comes_with_its_noise_and_covariance(prepared: Prepared) -> None:
+    calibration = read_calibration(prepared.calibration)
+    assert calibration.noise is not None
+    assert calibration.covariance is not None
+    deviations = np.sqrt(np.diag(calibration.covariance))
+    assert (deviations > 0).all()
+    assert (deviations < 0.05).all()
+
+
+def test_a_motion_that_was_hardly_driven_keeps_the_design_unless_it_is_to_be_fitted(
+    command: Command, tmp_path: Path
+) -> None:
+    recordings = RECORDINGS / "robotino"
+    if not recordings.is_dir():
+        pytest.skip(f"{recordings} is not there")
+    data = tmp_path / "data"
+    plugins = CONFIGS.parent / "plugins"
+    assert command("import", "robotino", recordings, "-o", data, "--plugins", plugins).returncode == 0
+    told = command("inspect", data).stdout
+    assert "turning on the spot" in told
+    assert "cannot be identified" in told
+    turned = {}
+    for choice in ("keep", "fit"):
+        file = tmp_path / f"{choice}.yaml"
+        printed = command("calibrate", data, "-o", file, "--unidentified", choice)
+        assert "do not identify" in printed.stderr
+        calibration = read_calibration(file)
+        turned[choice] = (calibration.matrix_array - calibration.robot.inverse_kinematic_matrix).sum(axis=1)
+    assert np.abs(turned["keep"]).max() < 1e-9
+    assert np.abs(turned["fit"]).max() > 1e-4

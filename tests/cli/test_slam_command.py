@@ -1,0 +1,306 @@
+"""``omnibench slam`` as a user runs it: poses from the scans of a data set, and how good they are."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import subprocess
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import polars as pl
+import pytest
+import yaml
+from commands import COMMAND, ENVIRONMENT, Command, assert_refused
+
+from omnibench.data.dataset import make_dataset
+from omnibench.data.scans import ScansInMemory
+from omnibench.data.storage import load_dataset, save_dataset
+from omnibench.data.true_poses import TruePath, write_true_poses
+from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
+from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
+from omnibench.simulate.chain.lidar import Lidar, PoseTrack, measure_scans, scan_stamps
+from omnibench.slam.summary import distances
+from omnibench.testing.synthetic import PERIOD, synthetic_robot, synthetic_trajectories, true_robot
+
+ROBOT = synthetic_robot()
+LIDAR = Lidar(rays=540)
+
+pytestmark = pytest.mark.usefixtures("registries_as_before")
+
+
+class Driven(NamedTuple):
+    """A data set with scans, in which the poses recorded are wrong, and its truth."""
+
+    data: Path
+    truth: Path
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Driven:
+    """Three runs of the synthetic robot in the furnished room; the poses recorded are 5 cm and 1 deg off."""
+    folder, rng = tmp_path_factory.mktemp("driven"), np.random.default_rng(4)
+    plan = make_plan(RoomPlan(plan="furnished_room"), "test")
+    model = OdometryModel(ROBOT, true_robot(ROBOT).inverse_kinematic_matrix, "arc")
+    runs, scans, truth = [], {}, {}
+    for run in synthetic_trajectories(ROBOT)[:3]:
+        times = np.arange(0.0, run.times[-1] + 1e-9, 0.002)
+        (path,) = model.poses([run.log(times)])
+        stamps = scan_stamps(LIDAR, float(run.times[-1]), rng)
+        scans[run.id] = measure_scans(plan, LIDAR, PoseTrack(times, _in_room(plan.start, path)), stamps, rng)
+        truth[run.id] = TruePath(times, path)
+        wrong = run.poses + np.where(run.pose_times[:, None] > 0, [0.03, 0.04, math.radians(1.0)], 0.0)
+        runs.append(replace(run, poses=wrong))
+    data = make_dataset("driven", ROBOT, PERIOD, runs, simulated=True, scans=ScansInMemory(LIDAR.scanner, scans))
+    save_dataset(data, folder / "data")
+    write_true_poses(folder / "truth", truth)
+    return Driven(folder / "data", folder / "truth")
+
+
+def _in_room(start: Array, path: Array) -> Array:
+    place = (path[:, 0] + 1j * path[:, 1]) * np.exp(1j * start[2])
+    return np.column_stack([start[0] + place.real, start[1] + place.imag, start[2] + path[:, 2]])
+
+
+def test_the_poses_are_those_of_the_truth_and_the_rest_is_as_it_was(command: Command, driven: Driven) -> None:
+    run = command("slam", driven.data, "-o", "found")
+    assert run.returncode == 0, run.stderr
+    before, found = load_dataset(driven.data), load_dataset("found")
+    assert before.scans is not None
+    assert found.scans is not None
+    assert (found.name, found.simulated, found.scans.scanner) == ("driven", True, before.scans.scanner)
+    true = pl.read_parquet(driven.truth / "poses.parquet")
+    for old, new in zip(before.trajectories, found.trajectories, strict=True):
+        assert (old.id, old.split) == (new.id, new.split)
+        np.testing.assert_array_equal(old.rates, new.rates)
+        np.testing.assert_array_equal(found.scans.of(new.id).ranges, before.scans.of(old.id).ranges)
+        np.testing.assert_array_equal(new.pose_times, before.scans.times(old.id))
+        path = true.filter(pl.col("trajectory") == new.id)
+        ends = [np.interp(new.pose_times[-1], path["t"], path[name]) for name in ("x", "y", "theta")]
+        np.testing.assert_allclose(new.final_pose, ends, rtol=0, atol=0.01)
+        assert new.pose_covariances is not None
+
+
+def test_the_table_says_how_sure_the_poses_are_and_how_far_from_the_recorded_reference(
+    command: Command, driven: Driven
+) -> None:
+    run = command("slam", driven.data, "-o", "found")
+    scans = sum(len(load_dataset(driven.data).scans.times(name)) for name in ("01", "02", "03"))  # type: ignore[union-attr]
+    assert f"driven: simulated data; 3 runs, {scans} scans, " in run.stdout
+    assert "deviation stated at the end of a run" in run.stdout
+    assert "from the recorded reference (12 poses)" in run.stdout
+    assert "3 trajectories: found" in run.stdout
+    assert "truth" not in run.stdout
+    assert run.stderr == "SLAM: 3\n"
+
+
+def test_json_holds_the_same_figures(command: Command, driven: Driven) -> None:
+    run = command("slam", driven.data, "--json", "--truth", driven.truth)
+    document = json.loads(run.stdout)
+    assert (document["dataset"], document["simulated"], document["runs"]) == ("driven", True, 3)
+    assert 0.2 < document["matched_min"] <= document["matched_mean"] <= 1
+    assert 1e-4 < document["position_deviation_mean_m"] <= document["position_deviation_max_m"] < 0.01
+    recorded, accuracy = document["recorded"], document["accuracy"]
+    assert recorded["position_mean_m"] == pytest.approx(0.05, abs=0.01)
+    assert recorded["heading_mean_rad"] == pytest.approx(math.radians(1.0), abs=0.005)
+    assert accuracy["final"]["position_mean_m"] < 0.01
+    assert accuracy["final"]["heading_mean_rad"] < math.radians(0.3)
+    assert not list(Path().iterdir())
+
+
+def test_the_truth_gives_errors_bias_and_drift(command: Command, driven: Driven) -> None:
+    run = command("slam", driven.data, "-o", "found", "--truth", driven.truth)
+    assert "errors of the reference poses against the simulated truth" in run.stdout
+    assert "at the end of a run (3 poses)" in run.stdout
+    assert "mm forward" in run.stdout
+    assert "deg a metre, over 3 m in 3 runs" in run.stdout
+
+
+def test_the_search_can_start_from_the_last_pose_and_leave_scans_distorted(command: Command, driven: Driven) -> None:
+    figures = {}
+    for name, arguments in {
+        "odometry": [],
+        "last": ["--start", "last_pose"],
+        "skewed": ["--no-deskew"],
+        "set": ["--set", "deskew=false"],
+    }.items():
+        run = command("slam", driven.data, "--json", "--truth", driven.truth, *arguments)
+        figures[name] = json.loads(run.stdout)["accuracy"]["every"]["position_mean_m"]
+    assert figures["last"] < 0.01
+    assert figures["last"] != figures["odometry"]
+    assert figures["skewed"] == figures["set"] != figures["odometry"]
+
+
+def test_a_calibration_can_give_the_odometry(command: Command, driven: Driven) -> None:
+    assert command("slam", driven.data, "-o", "first").returncode == 0
+    assert command("calibrate", "first", "-o", "calibration.yaml").returncode == 0
+    run = command("slam", driven.data, "-o", "second", "--model", "calibration.yaml")
+    assert run.returncode == 0, run.stderr
+    apart = distances(load_dataset("first"), load_dataset("second"))
+    assert apart is not None
+    assert apart.position_p95_m < 0.001
+
+
+def test_an_effect_of_a_plug_in_works_in_the_calibration(command: Command, driven: Driven) -> None:
+    assert command("plugin", "new", "swerve", "--effect").returncode == 0
+    assert command("calibrate", driven.data, "-o", "calibration.yaml").returncode == 0
+    calibration = yaml.safe_load(Path("calibration.yaml").read_text())
+    calibration["covariance"] = None
+    shown = command("list", "--plugins", "plugins", "--json")
+    (effect,) = [each for each in json.loads(shown.stdout)["effects"] if each["name"] == "swerve"]
+    calibration["effects"] = [{"name": effect["name"], "parameters": _parameters("swerve")}]
+    Path("calibration.yaml").write_text(yaml.safe_dump(calibration))
+    run = command("slam", driven.data, "-o", "found", "--model", "calibration.yaml", "--plugins", "plugins")
+    assert run.returncode == 0, run.stderr
+    assert len(load_dataset("found").trajectories) == 3
+
+
+def _parameters(name: str) -> dict[str, float]:
+    """Small values of a plug-in effect's parameters."""
+    from omnibench.registry import effects
+
+    effect = effects.entry(name, "test").cls
+    return {parameter.name: 0.0 for parameter in effect().parameters(ROBOT)}
+
+
+def test_csv_can_be_written(command: Command, driven: Driven) -> None:
+    assert command("slam", driven.data, "-o", "found", "--format", "csv").returncode == 0
+    assert {file.suffix for file in Path("found").iterdir()} == {".yaml", ".csv"}
+    assert load_dataset("found").hash == _hash_of_parquet(command, driven)
+
+
+def _hash_of_parquet(command: Command, driven: Driven) -> str:
+    assert command("slam", driven.data, "-o", "other").returncode == 0
+    return load_dataset("other").hash
+
+
+def test_the_report_is_written(command: Command, driven: Driven) -> None:
+    run = command("slam", driven.data, "--report", "slam.html", "--truth", driven.truth)
+    assert run.returncode == 0, run.stderr
+    assert "report: slam.html" in run.stdout
+    assert "SIMULATED DATA" in Path("slam.html").read_text(encoding="utf-8")
+    assert [file.name for file in Path().iterdir()] == ["slam.html"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["DATA"], ["say where the poses go: -o DATASET"]),
+        (["DATA", "-o", "DATA"], ["is the recording itself; name another folder"]),
+        (["nowhere", "-o", "found"], ["nowhere: no such folder"]),
+        (["BARE", "-o", "found"], ["data set driven: it has no scans (scans.parquet), which SLAM needs"]),
+        (["PART", "-o", "found"], ["trajectory 02 has no scans"]),
+        (["EMPTY", "-o", "found"], ["scans.parquet, row 2: the scan of trajectory 01 at ", " is empty: no range from"]),
+        (["DATA", "-o", "EMPTY/dataset.yaml"], ["is a file; name a folder"]),
+        (["DATA", "-o", "PLUGINS"], ["holds other files; name an empty or new folder"]),
+        (["DATA", "-o", "found", "--start", "lastpose"], ["--start", "'lastpose' is not one of"]),
+        (["DATA", "-o", "found", "--set", "spacng=1"], ["slam --set: unknown key 'spacng'; did you mean 'spacing'"]),
+        (["DATA", "-o", "found", "--set", "spacing=-1"], ["slam --set: spacing: ", "given: -1"]),
+        (["DATA", "-o", "found", "--truth", "nowhere"], ["nowhere: no poses.parquet"]),
+        (["DATA", "-o", "found", "--truth", "OTHER"], ["trajectory 01 is not in it; name the truth of this data set"]),
+        (["DATA", "-o", "found", "--model", "nowhere"], ["nowhere: no such file"]),
+        (
+            ["DATA", "-o", "found", "--model", "nowhere", "--start", "last_pose"],
+            ["--model nowhere: is for --start odometry"],
+        ),
+        (["DATA", "-o", "found", "--model", "FOUR"], ["wheels are fl, fr, rl, rr, but the data set's are a, b, c"]),
+    ],
+)
+def test_a_mistake_is_one_line_and_writes_nothing(
+    command: Command, driven: Driven, tmp_path: Path, arguments: list[str], parts: list[str]
+) -> None:
+    places = _places(tmp_path.with_name(f"{tmp_path.name}_places"), driven)
+    named = [_placed(argument, places) for argument in arguments]
+    before = load_dataset(driven.data).hash
+    assert_refused(command("slam", *named), *parts)
+    assert not Path("found").exists()
+    assert load_dataset(driven.data).hash == before
+
+
+def _placed(argument: str, places: dict[str, Path]) -> str:
+    first, _, rest = argument.partition("/")
+    return str(places[first] / rest) if first in places else argument
+
+
+def _places(folder: Path, driven: Driven) -> dict[str, Path]:
+    """Data sets with one thing wrong in each, and other things that are none."""
+    data = load_dataset(driven.data)
+    assert data.scans is not None
+    places = {name: folder / name.lower() for name in ("BARE", "PART", "EMPTY", "OTHER", "PLUGINS")}
+    save_dataset(replace(data, scans=None), places["BARE"])
+    one = ScansInMemory(data.scans.scanner, {"01": data.scans.of("01")})
+    save_dataset(replace(data, scans=one), places["PART"])
+    broken = data.scans.of("01")
+    broken.ranges[1] = np.inf
+    save_dataset(
+        replace(data, trajectories=data.trajectories[:1], scans=ScansInMemory(one.scanner, {"01": broken})),
+        places["EMPTY"],
+    )
+    write_true_poses(places["OTHER"], {"99": TruePath(np.array([0.0, 1.0]), np.zeros((2, 3)))})
+    places["PLUGINS"].mkdir()
+    (places["PLUGINS"] / "notes.txt").write_text("mine")
+    four = synthetic_robot(4)
+    calibration = {
+        "format": "omnibench-calibration/1",
+        "name": "four",
+        "robot": four.model_dump(mode="json"),
+        "sample_period": PERIOD,
+        "matrix": four.inverse_kinematic_matrix.tolist(),
+        "integration": "arc",
+    }
+    (folder / "four.yaml").write_text(yaml.safe_dump(calibration))
+    return places | {"DATA": driven.data, "FOUR": folder / "four.yaml"}
+
+
+def test_ctrl_c_leaves_nothing(driven: Driven, tmp_path: Path) -> None:
+    data = load_dataset(driven.data)
+    assert data.scans is not None
+    (first,) = data.trajectories[:1]
+    names = [f"{number:04d}" for number in range(150)]
+    many = replace(
+        data,
+        trajectories=tuple(replace(first, id=name) for name in names),
+        scans=ScansInMemory(data.scans.scanner, dict.fromkeys(names, data.scans.of(first.id))),
+    )
+    save_dataset(many, tmp_path / "many")
+    process = subprocess.Popen(
+        [*COMMAND, "slam", "many", "-o", "found"],
+        cwd=tmp_path,
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    assert process.stderr.readline() == "SLAM: 150\n"  # it is at work
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, out, err) == (130, "", "interrupted\n")
+    assert [file.name for file in tmp_path.iterdir()] == ["many"]
+
+
+def test_inspect_says_what_scans_there_are(command: Command, driven: Driven) -> None:
+    run = command("inspect", driven.data)
+    assert "540 rays over 270 deg up to 30 m, of which 100% measured something" in run.stdout
+    document = json.loads(command("inspect", driven.data, "--json").stdout)["scans"]
+    scans = load_dataset(driven.data).scans
+    assert scans is not None
+    assert document["scans"] == sum(len(scans.times(name)) for name in scans.trajectories)
+    assert (document["trajectories"], document["rays"]) == (3, 540)
+    assert 0.2 <= document["scan_period_s"] <= 0.3
+    assert 0.99 < document["seen_share"] < 1
+
+
+def test_inspect_names_runs_without_scans_and_refuses_broken_ones(
+    command: Command, driven: Driven, tmp_path: Path
+) -> None:
+    places = _places(tmp_path.with_name(f"{tmp_path.name}_places"), driven)
+    assert json.loads(command("inspect", places["BARE"], "--json").stdout)["scans"] is None
+    assert "2 trajectories have no scans, e.g. 02, 03: SLAM needs them" in command("inspect", places["PART"]).stdout
+    assert_refused(command("inspect", places["EMPTY"]), "row 2: the scan of trajectory 01", "is empty")

@@ -1,0 +1,100 @@
+"""Small comparisons, really run, for the tests of the report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from report_page import Page
+
+from omnibench.compare.certificates import certify
+from omnibench.compare.config import CompareConfig
+from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
+from omnibench.compare.report.comparison_report import write_report
+from omnibench.compare.result import ComparisonResult, EntryStatistics
+from omnibench.compare.run_problem import make_problem
+from omnibench.compare.scoring import score
+from omnibench.compare.statistics import entry_statistics
+from omnibench.data.dataset import Dataset
+from omnibench.environment import environment
+from omnibench.fit.calibrator import RunResult, run_calibrator
+from omnibench.registry import calibrators
+
+APR02 = {
+    "name": "APR-02",
+    "wheels": [
+        {"name": name, "radius": 0.148, "distance": 0.195, "angle": math.radians(degrees)}
+        for name, degrees in zip("abc", (60, 180, 300), strict=True)
+    ],
+}
+
+
+def flower(**changes: Any) -> dict[str, Any]:
+    """A small flower experiment: what a config's ``simulate`` says."""
+    return {
+        "robot": APR02,
+        "sample_period": 0.05,
+        "commands": {"directions_deg": [30, 120, 210, 300], "turn_rates": [-0.35, 0.35]},
+        "repetitions": 2,
+        "truth": {"published": "palacin2023_eq8"},
+        "noise": {"encoder": 0.02, "pose_position": 0.005, "pose_heading": 0.005, "bias_position": 0.008},
+        "train": {"seed": 1, "distance": 1.2},
+        "validation": {"seed": 2, "distance": 1.2},
+        **changes,
+    }
+
+
+def config(**changes: Any) -> CompareConfig:
+    """A small comparison."""
+    return CompareConfig.model_validate(
+        {
+            "name": "small",
+            "description": "A small comparison.",
+            "datasets": {"flower": {"simulate": flower()}},
+            "budget": {"evaluations": 2000},
+            "calibrators": ["theoretical", "closed_form", {"name": "random_search", "options": {"candidates": 1000}}],
+            "seeds": [1, 2],
+            "certificate": {"gap": 0.05, "seconds": 5},
+            **changes,
+        }
+    )
+
+
+def run(chosen: CompareConfig, datasets: Mapping[str, Dataset] | None = None) -> ComparisonResult:
+    """The comparison of a config, in this process; ``datasets`` in place of the config's own."""
+    loaded = dict(datasets or load_datasets(chosen))
+    plan = make_plan(chosen, loaded)
+    scored, certificates = certify(plan, score(plan, [solve(planned) for planned in plan], loaded))
+    return ComparisonResult(
+        config=chosen,
+        output=Path("results"),
+        datasets=loaded,
+        runs=scored,
+        statistics=entry_statistics(scored, chosen.bootstrap),
+        certificates=certificates,
+        uncertainties={},
+        environment=environment(),
+        warnings=(),
+    )
+
+
+def solve(planned: PlannedRun) -> RunResult:
+    """One planned run, in this process."""
+    dataset = planned.dataset
+    problem = make_problem(
+        planned.config, planned.entry, dataset.robot, dataset.split("train"), planned.parameterisation, planned.seed
+    )
+    return run_calibrator(calibrators.create(planned.entry.name, planned.entry.options), problem)
+
+
+def page(result: ComparisonResult, folder: Path) -> Page:
+    """The comparison's report as its reader sees it."""
+    write_report(result, folder / "report.html")
+    return Page((folder / "report.html").read_text(encoding="utf-8"))
+
+
+def statistics(result: ComparisonResult, label: str) -> EntryStatistics:
+    """Statistics of an entry."""
+    return next(entry for entry in result.statistics if entry.label == label)

@@ -1,0 +1,114 @@
+"""What the report says first: who is best, how sure that is, and what speaks against it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from report_page import Page
+from report_samples import APR02, config, flower, page, run, statistics
+
+from omnibench.compare.result import ComparisonResult, Interval
+from omnibench.robot.kinematics import Robot
+
+
+@pytest.fixture(scope="module")
+def result() -> ComparisonResult:
+    """Two calibrators and the design values, on a simulated flower."""
+    return run(config())
+
+
+@pytest.fixture(scope="module")
+def report(result: ComparisonResult, tmp_path_factory: pytest.TempPathFactory) -> Page:
+    return page(result, tmp_path_factory.mktemp("report"))
+
+
+def test_the_headline_names_the_best_and_the_improvement_with_its_interval(
+    result: ComparisonResult, report: Page
+) -> None:
+    best = next(entry for entry in result.statistics if entry.is_best)
+    fell = best.validation_improvement
+    assert f"{best.label} is best." in report.text
+    assert f"the error fell by {100 * fell.value:.1f} %" in report.text
+    assert f"(95 % interval {100 * fell.low:.1f} to {100 * fell.high:.1f} %)" in report.text
+
+
+def test_without_a_validation_split_the_training_data_are_judged(tmp_path: Path) -> None:
+    datasets = {"flower": {"simulate": flower(validation=None)}}
+    told = page(run(config(datasets=datasets, calibrators=["theoretical", "closed_form"])), tmp_path)
+    assert "There is no validation split" in told.text
+    assert "closed_form is the only calibrator with an answer. On the training data" in told.text
+    assert not [caption for caption in told.tables if "validation" in caption]
+
+
+def test_the_design_values_alone_are_no_calibration(tmp_path: Path) -> None:
+    assert "Only the design values gave an answer" in page(run(config(calibrators=["theoretical"])), tmp_path).text
+
+
+def test_a_robot_that_is_as_designed_gains_nothing_that_noise_could_not_explain(tmp_path: Path) -> None:
+    design = {"matrix": Robot.model_validate(APR02).inverse_kinematic_matrix.tolist()}
+    datasets = {"flower": {"simulate": flower(truth=design)}}
+    told = page(run(config(datasets=datasets, calibrators=["theoretical", "closed_form"], seeds=[1])), tmp_path)
+    assert "No calibrator did better than the design values" in told.text or "noise alone could explain" in told.text
+
+
+def test_a_search_that_won_without_finding_the_minimum_is_doubted(result: ComparisonResult, tmp_path: Path) -> None:
+    lucky = [replace(e, is_best=e.label == "random_search") for e in result.statistics]
+    assert "random_search has not found the minimum" in page(replace(result, statistics=tuple(lucky)), tmp_path).text
+
+
+def test_entries_that_noise_could_swap_are_level_and_the_training_cost_decides(tmp_path: Path) -> None:
+    twins = [{"name": "closed_form", "label": name} for name in ("one", "other")]
+    result = run(config(calibrators=["theoretical", *twins], seeds=[1]))
+    told = page(result, tmp_path)
+    best = next(entry.label for entry in result.statistics if entry.is_best)
+    assert f"Two entries are level on the validation data: one and other; {best} has the lowest" in told.text
+    assert "is best." not in told.text
+    assert told.row("Entries over their seeds", best)[-1] == "best | of 2 that are level"
+
+
+def test_an_entry_below_the_best_by_more_than_noise_is_not_called_worse(
+    result: ComparisonResult, tmp_path: Path
+) -> None:
+    below = Interval(-0.01, -0.02, -0.005)
+    lower = [
+        replace(e, difference=below, practically_equal=False) if e.label == "random_search" else e
+        for e in result.statistics
+    ]
+    told = page(replace(result, statistics=tuple(lower)), tmp_path)
+    assert "Below closed_form in validation cost" in told.text
+    assert told.row("Entries over their seeds", "random_search")[-1] == "lower cost here | higher training cost"
+
+
+def test_commands_that_the_best_makes_worse_are_listed_with_both_costs(
+    result: ComparisonResult, tmp_path: Path
+) -> None:
+    (dataset,) = result.datasets.values()
+    commands = [trajectory.command for trajectory in dataset.split("validation")]
+    typical = statistics(result, "closed_form").typical
+    spoilt = np.array([command == commands[0] for command in commands])
+    costs = np.where(spoilt, typical.theoretical_validation_costs + 0.01, typical.validation_costs)
+    changed = [
+        replace(e, typical=replace(typical, validation_costs=costs)) if e.label == "closed_form" else e
+        for e in result.statistics
+    ]
+    was = typical.theoretical_validation_costs[spoilt].mean()
+    told = page(replace(result, statistics=tuple(changed)), tmp_path).text
+    assert f"worse than the design values on 1 of {len(set(commands))} commands of the validation data" in told
+    assert f"{commands[0]} {was:.4f} → {was + 0.01:.4f}." in told
+
+
+def test_no_command_is_listed_where_the_best_is_better_on_all(report: Page) -> None:
+    assert "worse than the design values" not in report.text
+
+
+def test_repeated_commands_are_said_to_make_the_intervals_too_narrow_for_others(report: Page) -> None:
+    assert report.text.count("for commands that were not driven here the spread is larger") == 1
+
+
+def test_commands_driven_once_make_no_such_remark(tmp_path: Path) -> None:
+    datasets = {"flower": {"simulate": flower(repetitions=1)}}
+    told = page(run(config(datasets=datasets, calibrators=["closed_form"], seeds=[1])), tmp_path)
+    assert "commands that were not driven here" not in told.text

@@ -1,0 +1,187 @@
+"""What a design says on a page and on a terminal."""
+
+from __future__ import annotations
+
+import json
+import re
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+from report_page import Page
+from report_samples import APR02, flower
+from rich.console import Console
+
+from omnibench.cli.terminal.design_summary import print_design
+from omnibench.design.candidates import candidates_of_config, candidates_of_dataset
+from omnibench.design.config import DesignConfig
+from omnibench.design.design import design_experiment
+from omnibench.design.report.design_report import write_design_report
+from omnibench.design.result import Design
+from omnibench.simulate.config import FlowerConfig
+from omnibench.simulate.simulate import simulate_dataset
+
+STAR = {"speeds": [0.2], "directions_deg": [0, 90, 180, 270], "turn_rates": [-0.35, 0, 0.35], "distance": 1}
+SPOT = {"speed": 0, "turn_rate": 1.0, "duration": 6}
+
+
+def designed(sets: dict[str, Any] | None = None, **arguments: Any) -> Design:
+    chosen = sets or {"star": STAR, "more": [{"set": "star"}, SPOT]}
+    config = DesignConfig.model_validate(
+        {
+            "name": "small",
+            "description": "A small design.",
+            "notes": ["Nobody has driven this."],
+            "robot": APR02,
+            "sample_period": 0.05,
+            "noise": {"pose_position": 0.005, "pose_heading": 0.005},
+            "sets": chosen,
+            "baseline": {"set": next(iter(chosen)), "repetitions": 2},
+        }
+    )
+    return design_experiment(candidates_of_config(config), **arguments)
+
+
+def page(design: Design, folder: Path) -> Page:
+    write_design_report(design, folder / "report.html")
+    return Page((folder / "report.html").read_text(encoding="utf-8"))
+
+
+def printed(design: Design, width: int = 100) -> str:
+    console = Console(file=StringIO(), width=width, markup=False, emoji=False, highlight=False)
+    print_design(console, design)
+    assert isinstance(console.file, StringIO)
+    return console.file.getvalue()
+
+
+def plots(told: Page) -> list[dict[str, Any]]:
+    found = re.findall(r'<script type="application/json" id="[^"]+">(.*?)</script>', told.html)
+    return [json.loads(each) for each in found]
+
+
+@pytest.fixture(scope="module")
+def design() -> Design:
+    return designed()
+
+
+@pytest.fixture(scope="module")
+def report(design: Design, tmp_path_factory: pytest.TempPathFactory) -> Page:
+    return page(design, tmp_path_factory.mktemp("report"))
+
+
+def test_an_assumed_noise_is_said_to_be_one(report: Page) -> None:
+    assert "ASSUMED NOISE, NO RECORDINGS" in report.text
+    assert "nothing recorded; noise assumed: as the config says" in report.text
+    assert "Nobody has driven this." in report.text
+
+
+def test_simulated_recordings_wear_a_badge_and_their_noise_is_estimated(tmp_path: Path) -> None:
+    config = FlowerConfig.model_validate(flower())
+    told = page(design_experiment(candidates_of_dataset(simulate_dataset(config).dataset)), tmp_path)
+    assert "SIMULATED DATA" in told.text
+    assert "of 8 commands" in told.text
+
+
+def test_the_chosen_commands_stand_in_tables(design: Design, report: Page) -> None:
+    for found in design.sets:
+        caption = next(name for name in report.tables if name.startswith(f"What to drive of {found.name}: "))
+        rows = report.tables[caption][1:]
+        assert [row[0].split(" | ")[1] for row in rows] == [each.command for each in found.chosen]
+        assert [int(row[4]) for row in rows] == [each.runs for each in found.chosen]
+
+
+def test_the_runs_that_equal_the_baseline_stand_in_a_table_for_either_use(design: Design, report: Page) -> None:
+    caption = next(name for name in report.tables if name.startswith("As good as the baseline"))
+    expected = [
+        [found.name, words, str(equal.effort.runs)]
+        for found in design.sets
+        for words, equal in zip(("final poses", "whole trajectories"), found.equivalents, strict=True)
+        if equal.effort is not None
+    ]
+    assert [row[:3] for row in report.tables[caption][1:]] == expected
+    assert len(expected) == 4
+
+
+def test_every_candidate_is_listed(design: Design, report: Page) -> None:
+    assert len(report.tables["All 13 candidates"]) == 1 + len(design.candidates)
+
+
+def test_plots_show_a_path_for_every_candidate_and_none_is_empty(design: Design, report: Page) -> None:
+    drawn = plots(report)
+    assert len(drawn) == report.plots == 2 + 4 + 1
+    for found, flower_plot in zip(design.sets, drawn, strict=False):
+        lines = [trace for trace in flower_plot["data"] if trace["mode"] == "lines"]
+        assert len(lines) == len(found.commands)
+        chosen = [trace for trace in lines if trace["legendgroup"] != "unused"]
+        assert len(chosen) == len(found.chosen)
+    for each in drawn:
+        assert all(len(trace["x"]) == len(trace["y"]) > 0 for trace in each["data"])
+
+
+def test_a_command_that_is_driven_more_often_has_a_wider_line_and_its_number(tmp_path: Path) -> None:
+    few, many = (plots(page(designed({"star": STAR}, runs=runs), tmp_path))[0] for runs in (6, 60))
+    widths = [max(t["line"]["width"] for t in each["data"] if t["mode"] == "lines") for each in (few, many)]
+    assert widths[0] < widths[1]
+    assert any("×" in str(trace.get("text")) for trace in many["data"])
+
+
+def test_a_turn_on_the_spot_is_drawn_as_an_arc(tmp_path: Path) -> None:
+    straight = {**STAR, "turn_rates": [0]}
+    design = designed({"cross": [straight, SPOT]})
+    assert any(each.command == "v0_a0_w1" for each in design.sets[0].chosen)
+    drawn = plots(page(design, tmp_path))[0]
+    arc = next(t for t in drawn["data"] if t["mode"] == "lines" and "on the spot" in t["hovertemplate"])
+    radii = [(x**2 + y**2) ** 0.5 for x, y in zip(arc["x"], arc["y"], strict=True)]
+    assert max(radii) - min(radii) < 1e-3 < min(radii)
+
+
+def test_axes_of_precision_are_logarithmic_and_their_labels_readable(report: Page) -> None:
+    for each in plots(report)[2:6]:
+        for axis in ("xaxis", "yaxis"):
+            assert each["layout"][axis]["type"] == "log"
+            assert not any("e+" in label for label in each["layout"][axis]["ticktext"])
+
+
+def test_four_wheels_have_a_report_without_physical_parameters(tmp_path: Path) -> None:
+    wheels = [
+        {"name": name, "radius": 0.05, "distance": 0.35, "angle": angle, "roller_angle": roller}
+        for name, angle, roller in (
+            ("fl", 1.57, 0.785), ("fr", -1.57, -0.785), ("rl", 1.57, -0.785), ("rr", -1.57, 0.785),
+        )
+    ]  # fmt: skip
+    config = flower(robot={"name": "mecanum", "wheels": wheels}, truth={"tolerances": {"radius": 0.02, "seed": 1}})
+    dataset = simulate_dataset(FlowerConfig.model_validate(config)).dataset
+    told = page(design_experiment(candidates_of_dataset(dataset)), tmp_path)
+    assert told.plots == 1 + 3 + 1
+
+
+def test_hostile_names_stay_words(tmp_path: Path) -> None:
+    name = "<script>alert(1)</script>"
+    told = page(designed({name: STAR}), tmp_path)
+    assert name in told.text
+    assert name not in told.html
+
+
+def test_limits_that_leave_no_equal_are_told(tmp_path: Path) -> None:
+    design = designed({"star": STAR}, repetitions=1)
+    told = page(design, tmp_path)
+    caption = next(name for name in told.tables if name.startswith("As good as the baseline"))
+    assert told.tables[caption][1][2] == "– | not within the repetitions allowed"
+    assert re.search(r"star +final poses +none", printed(design))
+
+
+def test_the_terminal_says_what_to_drive_how_good_it_is_and_what_it_rests_on(design: Design) -> None:
+    told = printed(design)
+    assert "small (assumed): robot APR-02" in told
+    assert "noise assumed: as the config says" in told
+    assert "within 1 % of the D-optimum" in told
+    assert "on the spot, 1 rad/s" in told or "0.2 m/s at" in told
+    assert "as good as the baseline (12 commands of star x 2)" in told
+    assert re.search(r"^ +24 +2.0 min +\d+\.\d+%", told, re.MULTILINE)
+
+
+def test_the_terminal_needs_100_columns_and_cuts_nothing(design: Design) -> None:
+    told = printed(design)
+    assert max(map(len, told.splitlines())) <= 100
+    assert "…" not in told

@@ -1,0 +1,98 @@
+"""A discovery's figures as people read them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from discovery_samples import held_out, named
+
+from omnibench.discover.report.before_after import round_down
+from omnibench.discover.report.wording import (
+    added,
+    chance,
+    closed_in_words,
+    floor_in_words,
+    gap_in_words,
+    held_out_in_words,
+    noise_in_words,
+    parameter_in_words,
+    reading,
+    weight_in_words,
+)
+from omnibench.discover.result import EstimatedParameter, Gap, Step
+from omnibench.robot.calibration import Noise
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "words"),
+    [
+        (0.0312, "s", "31.2 ms"),
+        (0.05, "m", "50.0 mm"),
+        (0.005, "rad/s", "0.286°/s"),
+        (0.01, "1", "1.00 %"),
+        (0.02, "s/rad", "0.0200 s/rad"),
+        (0.3, "s2/m", "0.300 s²/m"),
+        (2e-5, "1/s", "7.20 %/h"),
+    ],
+)
+def test_quantities_are_read_in_the_units_of_people(value: float, unit: str, words: str) -> None:
+    assert reading(unit).words(value) == words
+
+
+def test_a_parameter_shares_its_decimals_with_its_interval() -> None:
+    parameter = EstimatedParameter("tau", 0.0312, "s", 0.0301, 0.0323)
+    assert parameter_in_words(parameter) == "tau = +31.2 ms (+30.1 to +32.3)"
+
+
+def test_a_shape_is_chosen() -> None:
+    assert (
+        parameter_in_words(EstimatedParameter("rollers", 10.0, "1", 10.0, 10.0, shape=True)) == "rollers = 10 (chosen)"
+    )
+
+
+def test_a_length_that_was_chosen_keeps_its_unit() -> None:
+    assert (
+        parameter_in_words(EstimatedParameter("length", 0.1, "m", 0.1, 0.1, shape=True)) == "length = 100 mm (chosen)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("weight", "words"),
+    [(1.0, "> 99.9 %"), (0.9994, "> 99.9 %"), (0.951, "95.1 %"), (0.5, "50.0 %"), (0.0004, "< 0.1 %")],
+)
+def test_a_weight_is_never_certain(weight: float, words: str) -> None:
+    assert weight_in_words(weight) == words
+
+
+def test_a_chance_below_any_meaning_is_cut() -> None:
+    assert chance(0.0) == "< 10⁻⁹⁹"
+    assert chance(0.0123) == "0.012"
+    assert chance(4.4e-12) == "4 × 10⁻¹²"
+
+
+def test_no_gap_is_not_a_gap_that_stayed_open() -> None:
+    assert closed_in_words(Gap("eq6", 1.0, 1.0, 1.0, None, 0.1)) == "no gap to close"
+    assert gap_in_words(Gap("eq6", 0.0412, 0.0213, 0.0205, 0.961, 0.001)) == "0.0412 → 0.0213 (floor 0.0205), 96.1 %"
+
+
+def test_a_step_names_the_effect_it_added() -> None:
+    assert added(Step("+ floor_drift", 1.0, None, 1.0, None)) == "floor_drift"
+
+
+def test_noise_that_is_not_there_is_not_told() -> None:
+    assert noise_in_words(Noise(pose_position=0.01)) == ("white 10 mm", "none")
+
+
+@pytest.mark.parametrize(("value", "step"), [(7.3, 5), (5.0, 5), (1.0, 1), (0.37, 0.2), (99.0, 50)])
+def test_enlargements_are_round(value: float, step: float) -> None:
+    assert round_down(value) == pytest.approx(step)
+
+
+def test_runs_of_which_none_is_repeated_are_not_called_repetitions() -> None:
+    found = named()
+    repetitions = held_out(found, "repetitions")
+    assert held_out_in_words(found, repetitions) == "held-out repetitions"
+    alone = replace(found, noise=replace(found.noise, source="within runs"))
+    assert held_out_in_words(alone, repetitions) == "held-out runs"
+    assert "No command is repeated" in floor_in_words(alone)

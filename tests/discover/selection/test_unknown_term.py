@@ -1,0 +1,196 @@
+"""Closing the gap without a name: on recordings with something in them that no catalogue has."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hidden.experiment import DESIGNS, ROBOT, Command, Design
+from hidden.sets import Kind, Truth, make_set
+
+from omnibench.discover.discover import discover_effects
+from omnibench.discover.extend import Extended, extend
+from omnibench.discover.model_fit import fit_matrix
+from omnibench.discover.regressors.covariate_bases import Basis
+from omnibench.discover.selection.candidate_groups import Group
+from omnibench.discover.selection.competing_models import Rivals
+from omnibench.discover.selection.screening import Look, look_at
+from omnibench.discover.selection.unknown_term import chosen_functions, close_without_name, step_name, steps_of
+from omnibench.discover.usable_runs import usable_runs
+from omnibench.fit.least_squares.noise import Whitener
+from omnibench.registry import effects
+from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from omnibench.data.dataset import Dataset
+    from omnibench.discover.result import Discovery
+
+SMALL = Design(
+    tuple(
+        Command(speed, angle, turn)
+        for speed, first in ((0.1, 0.0), (0.3, 1.0))
+        for turn in (-0.35, 0.35)
+        for angle in (first, first + 2.1, first + 4.2)
+    ),
+    scattered=True,
+)
+
+
+def recorded(kind: str, seed: int = 1000) -> tuple[Dataset, Truth]:
+    """60 + 60 runs with an effect that no catalogue has, of a non-centrality of 600."""
+    return small_set("outside", kind, seed)
+
+
+def small_set(kind: Kind, effect: str, seed: int) -> tuple[Dataset, Truth]:
+    DESIGNS["small"] = SMALL
+    try:
+        return make_set(kind, effect, 600.0, seed, design="small")
+    finally:
+        del DESIGNS["small"]
+
+
+@pytest.fixture(scope="module")
+def grooved() -> tuple[Dataset, Truth, Discovery]:
+    dataset, truth = recorded("turning_by_heading")
+    return dataset, truth, discover_effects(dataset, unknown_term=True)
+
+
+def error(calibration: Calibration, dataset: Dataset, truth: Truth, found: Discovery) -> float:
+    """Whitened chi2 of a calibration against the poses of the validation without their noise."""
+    true = {run.id: run for run in truth.clean}
+    runs = dataset.split("validation")
+    logs = [replace(run.reference_log, start=true[run.id].poses[0]) for run in runs]
+    return sum(
+        float(np.square(Whitener(found.noise.noise, run.pose_times[1:])(true[run.id].poses[1:] - poses)).sum())
+        for run, poses in zip(runs, calibration.model.reported(logs), strict=True)
+    )
+
+
+def test_most_of_the_gap_closes_on_a_session_that_was_held_out(grooved: tuple[Dataset, Truth, Discovery]) -> None:
+    dataset, truth, found = grooved
+    before, after = (error(each, dataset, truth, found) for each in (found.plain, found.extended))
+    assert after < 0.25 * before
+
+
+def test_it_is_no_name_and_the_verdict_stays_unknown(grooved: tuple[Dataset, Truth, Discovery]) -> None:
+    found = grooved[2]
+    assert found.verdict == "unknown"
+    assert found.effects == ()
+    assert {term.name for term in found.extended.effects} <= {"smooth_heading", "smooth_course"}
+
+
+def test_it_is_a_step_and_the_notes_tell_what_it_gains(grooved: tuple[Dataset, Truth, Discovery]) -> None:
+    found = grooved[2]
+    assert [step.name for step in found.steps] == ["plain matrix", "+ smooth term over heading (no name)"]
+    assert found.steps[1].held_out is not None
+    assert found.steps[0].held_out is not None
+    assert found.steps[1].held_out < found.steps[0].held_out
+    told = [note for note in found.notes if "smooth term" in note]
+    assert len(told) == 1
+    assert "no name: on runs held out it gains" in told[0]
+
+
+def test_the_calibration_file_predicts_the_same(grooved: tuple[Dataset, Truth, Discovery], tmp_path: Path) -> None:
+    dataset, _, found = grooved
+    write_calibration(found.extended, tmp_path / "extended.yaml")
+    log = dataset.split("validation")[0].reference_log
+    again = read_calibration(tmp_path / "extended.yaml").model.reported([log])[0]
+    np.testing.assert_array_equal(again, found.extended.model.reported([log])[0])
+
+
+def test_it_is_added_only_when_asked_for(grooved: tuple[Dataset, Truth, Discovery]) -> None:
+    found = discover_effects(grooved[0])
+    assert found.extended.effects == ()
+    assert not any("smooth" in note for note in found.notes)
+
+
+def test_where_nothing_is_missing_none_is_tried() -> None:
+    dataset, _ = small_set("null", "", 1003)
+    found = discover_effects(dataset, unknown_term=True)
+    assert found.verdict == "none"
+    assert found.extended.effects == ()
+    assert not any("smooth" in note for note in found.notes)
+
+
+def test_of_two_waves_the_one_that_is_there_is_chosen() -> None:
+    base = plain(recorded("oval_wheel")[0])
+    found = chosen_functions(base, [group("smooth_wheel_angle", harmonic=3.5), group("smooth_wheel_angle", harmonic=2)])
+    largest = max(found, key=lambda each: len(each.parameters))
+    assert largest.shapes["harmonic"] == 2
+
+
+def test_functions_that_are_not_chosen_are_zero(grooved: tuple[Dataset, Truth, Discovery]) -> None:
+    (found,) = chosen_functions(plain(grooved[0]), [group("smooth_heading")])
+    chosen = {each.name for each in found.parameters}
+    assert chosen & {"turn_cos2", "turn_sin2"}  # what is there
+    every = {each.name for each in effects.create("smooth_heading").parameters(grooved[0].robot)}
+    assert found.shapes == dict.fromkeys(every - chosen, 0.0)
+
+
+def test_a_function_that_the_matrix_explains_is_not_chosen(grooved: tuple[Dataset, Truth, Discovery]) -> None:
+    assert chosen_functions(plain(grooved[0]), [group("smooth_elapsed_time", duration=1e6)]) == []  # cosines of 0
+
+
+def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
+    grooved: tuple[Dataset, Truth, Discovery],
+) -> None:
+    bare, look = looked_at(grooved[0])
+    closed = close_without_name(bare.fit, look, with_names(bare, look, group("heading_drift")))
+    used = closed.rivals.used
+    assert used.groups[0].name == "heading_drift"
+    assert {each.name for each in used.groups[1:]} <= {"smooth_heading", "smooth_course"}
+    assert closed.rivals.models[0][1] is used
+    assert "no name" in closed.note
+    calibrated = calibration_terms(used)
+    assert calibrated["heading_drift"]["b"] == used.values[0]
+
+
+def test_nothing_is_added_to_a_model_that_leaves_nothing_of_it(grooved: tuple[Dataset, Truth, Discovery]) -> None:
+    bare, look = looked_at(grooved[0])
+    rivals = with_names(bare, look, group("smooth_heading"), group("smooth_course"))
+    closed = close_without_name(bare.fit, look, rivals)
+    assert closed.rivals is rivals
+    assert "smooth term" in closed.note
+    assert "was added" in closed.note or "left out" in closed.note
+
+
+def test_named_effects_come_one_by_one_and_what_has_no_name_at_once() -> None:
+    basis = Basis("place", "body", "where on the floor the robot is", np.zeros((0, 3, 0)))
+    named, nameless = group("heading_drift"), replace(group("smooth_place"), basis=basis)
+    assert steps_of([named, named, nameless, nameless]) == [1, 2, 4]
+    assert steps_of([named]) == [1]
+    assert steps_of([]) == []
+    assert step_name(nameless) == "smooth term over place (no name)"
+
+
+def plain(dataset: Dataset) -> Extended:
+    runs = usable_runs(dataset.split("train"))
+    start = dataset.robot.inverse_kinematic_matrix
+    return extend(fit_matrix(runs, dataset.robot, dataset.sample_period, start), ())
+
+
+def looked_at(dataset: Dataset) -> tuple[Extended, Look]:
+    bare = plain(dataset)
+    return bare, look_at(bare.fit, None, None, (), np.random.default_rng(0))
+
+
+def with_names(bare: Extended, look: Look, *groups: Group) -> Rivals:
+    """A model with these effects, whatever was found."""
+    used = extend(bare.fit, groups)
+    return Rivals(used, look.named, ((1.0, used),), ())
+
+
+def calibration_terms(extended: Extended) -> dict[str, dict[str, float]]:
+    return {term.name: dict(term.values) for term in extended.fit.model.terms}
+
+
+def group(name: str, **shapes: float) -> Group:
+    effect = effects.create(name)
+    parameters = effect.parameters(ROBOT)
+    linear = tuple(each for each in parameters if not each.choices)
+    usual = {each.name: each.choices[0] for each in parameters if each.choices}
+    return Group("effect", name, (), effect, linear, usual | shapes)

@@ -1,0 +1,238 @@
+"""The searches: how near they come on a small problem, and the options that they take."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from fit_samples import box_between, make_problem, noisy_trajectories
+
+from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
+from omnibench.fit.parameterisation import GeometryLimits
+from omnibench.fit.problem import CalibrationProblem
+from omnibench.registry import calibrators
+from omnibench.robot.published_matrices import published_matrix
+from omnibench.testing.synthetic import synthetic_robot, synthetic_trajectories, true_robot
+
+RUNS = noisy_trajectories()
+
+
+def run(name: str, problem: CalibrationProblem, **options: Any) -> RunResult:
+    return run_calibrator(calibrators.create(name, options), problem)
+
+
+@pytest.fixture(scope="module")
+def optimum() -> float:
+    """The least cost of the small problem in the paper's box."""
+    cost = run("closed_form", make_problem(RUNS, box="paper")).cost
+    assert cost is not None
+    return cost
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "evaluations", "excess"),
+    [
+        ("crs", {}, 12_000, 1e-6),
+        ("isres", {}, 12_000, 1e-1),
+        ("genetic", {}, 12_000, 5e-2),
+        ("genetic", {"mutation": "gaussian", "generations": 60}, 12_000, 1e-1),
+        ("random_search", {"candidates": 2_000}, 12_000, 2.0),
+    ],
+)
+def test_a_search_comes_near_the_exact_optimum_and_not_below(
+    name: str, options: dict[str, Any], evaluations: int, excess: float, optimum: float
+) -> None:
+    problem = make_problem(RUNS, box="paper", evaluations=evaluations)
+    result = run(name, problem, **options)
+    assert result.cost is not None
+    assert optimum - 1e-9 <= result.cost <= (1 + excess) * optimum
+
+
+@pytest.mark.parametrize("name", ["crs", "isres", "genetic", "random_search"])
+def test_a_search_starts_from_the_design(name: str) -> None:
+    problem = make_problem(RUNS, evaluations=1 if name in ("crs", "random_search") else 200)
+    result = run(name, problem)
+    start = float(problem.values(problem.start[None])[0])
+    assert result.cost is not None
+    assert result.cost <= start * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("name", ["crs", "isres", "genetic", "random_search"])
+@pytest.mark.parametrize("box", ["design only", "one element"])
+def test_a_box_with_little_freedom_is_searched_without_complaint(name: str, box: str) -> None:
+    design = synthetic_robot().inverse_kinematic_matrix
+    width = np.zeros((3, 3))
+    width[2, 1] = 0.0 if box == "design only" else 0.02
+    result = run(name, make_problem(RUNS, box=box_between(design - width, design + width), evaluations=2_000))
+    assert result.vector is not None
+    np.testing.assert_array_equal(result.vector[:7], design.ravel()[:7])
+
+
+class TestGenetic:
+    """The paper's search."""
+
+    def test_it_stops_when_the_best_has_stalled(self) -> None:
+        result = run("genetic", make_problem(RUNS), stall_generations=5, tolerance=0.05)
+        assert result.outcome is Outcome.CONVERGED
+        assert result.reason == "best changed by 0.05 or less on average over 5 generations"
+
+    def test_generations_that_run_out_are_no_convergence(self) -> None:
+        result = run("genetic", make_problem(RUNS), generations=3)
+        assert (result.outcome, result.reason) == (Outcome.BUDGET, "3 generations")
+
+    def test_the_population_is_200_for_more_than_five_variables(self) -> None:
+        result = run("genetic", make_problem(RUNS), generations=1, elite=0.05)
+        assert result.evaluations == 200 + 190
+
+    def test_the_population_is_50_for_up_to_five(self) -> None:
+        design = synthetic_robot().inverse_kinematic_matrix
+        width = np.zeros((3, 3))
+        width[2] = 0.02
+        result = run("genetic", make_problem(RUNS, box=box_between(design - width, design + width)), generations=1)
+        assert result.evaluations == 50 + 47
+
+    def test_the_elite_is_not_evaluated_again(self) -> None:
+        result = run("genetic", make_problem(RUNS), population=20, elite=0.5, generations=4)
+        assert result.evaluations == 20 + 4 * 10
+
+    @pytest.mark.parametrize("crossover", [0.0, 1.0])
+    def test_children_may_be_all_of_one_kind(self, crossover: float) -> None:
+        problem = make_problem(RUNS, evaluations=3_000)
+        result = run("genetic", problem, crossover=crossover, population=40)
+        assert result.cost is not None
+        assert result.cost < problem.values(problem.start[None])[0]
+
+
+class TestNlopt:
+    """Controlled random search and ISRES."""
+
+    @pytest.mark.parametrize("name", ["crs", "isres"])
+    def test_a_wider_tolerance_ends_the_search_earlier(self, name: str) -> None:
+        evaluations = [run(name, make_problem(RUNS), tolerance=each).evaluations for each in (1e-1, 1e-3)]
+        assert evaluations[0] < evaluations[1]
+
+    def test_the_reason_names_the_tolerance_that_was_met(self) -> None:
+        result = run("crs", make_problem(RUNS), tolerance=1e-2)
+        assert result.outcome is Outcome.CONVERGED
+        assert result.reason == "relative change of the cost below 0.01"
+
+    def test_the_step_may_end_a_search_too(self) -> None:
+        result = run("crs", make_problem(RUNS), tolerance=0.0, step=0.2)
+        assert (result.outcome, result.reason) == (Outcome.CONVERGED, "change of the candidates below 0.2 of the box")
+
+    def test_a_larger_population_takes_longer(self) -> None:
+        evaluations = [
+            run("crs", make_problem(RUNS), tolerance=1e-3, population=each).evaluations for each in (20, 200)
+        ]
+        assert evaluations[0] < evaluations[1]
+
+    @pytest.mark.parametrize("name", ["crs", "isres"])
+    def test_another_seed_takes_another_course(self, name: str) -> None:
+        courses = [run(name, make_problem(RUNS, evaluations=2_000, seed=seed)).history for seed in (1, 1, 2)]
+        costs = [[step.cost for step in course] for course in courses]
+        assert costs[0] == costs[1] != costs[2]
+
+
+class TestParametric:
+    """Section 4.2: the physical parameters of every wheel."""
+
+    def test_without_noise_it_finds_the_hidden_geometry(self) -> None:
+        hidden = true_robot(synthetic_robot())
+        problem = make_problem(
+            synthetic_trajectories(synthetic_robot()), parameterisation="geometry", evaluations=25_000
+        )
+        result = run("parametric", problem)
+        assert result.vector is not None
+        radii, distances, angles = result.vector.reshape(3, 3)
+        np.testing.assert_allclose(radii, [wheel.radius for wheel in hidden.wheels], rtol=1e-5)
+        np.testing.assert_allclose(distances, [wheel.distance for wheel in hidden.wheels], rtol=1e-5)
+        np.testing.assert_allclose(angles, [wheel.angle for wheel in hidden.wheels], atol=1e-5)
+
+    def test_it_reports_the_matrix_of_its_geometry(self) -> None:
+        problem = make_problem(RUNS, parameterisation="geometry", evaluations=500)
+        result = run("parametric", problem)
+        assert result.vector is not None
+        assert result.matrix is not None
+        assert result.matrix.shape == (3, 3)
+        np.testing.assert_array_equal(result.matrix, problem.matrix(result.vector))
+
+    def test_its_limits_are_kept_and_said(self) -> None:
+        limits = GeometryLimits(radius=0.01, distance=0.01, angle_deg=0.0)
+        result = run("parametric", make_problem(RUNS, parameterisation="geometry", limits=limits, evaluations=6_000))
+        assert result.vector is not None
+        assert "radius_a" in result.at_bounds
+        assert not [name for name in result.at_bounds if name.startswith("angle")]
+
+    @pytest.mark.parametrize("search", ["genetic", "isres", "random_search"])
+    def test_any_search_will_do(self, search: str) -> None:
+        problem = make_problem(RUNS, parameterisation="geometry", evaluations=3_000)
+        result = run("parametric", problem, search=search)
+        assert result.cost is not None
+        assert result.cost < 0.9 * problem.values(problem.start[None])[0]
+
+    def test_options_reach_the_search_and_its_name_the_reason(self) -> None:
+        problem = make_problem(RUNS, parameterisation="geometry")
+        result = run("parametric", problem, search="random_search", search_options={"candidates": 30})
+        assert result.evaluations == 31
+        assert result.reason == "random_search: 30 candidates tried"
+
+    def test_it_refuses_matrix_elements_in_words(self) -> None:
+        result = run("parametric", make_problem(RUNS))
+        assert result.outcome is Outcome.FAILED
+        assert result.reason.startswith("parametric searches the geometry parameterisation")
+
+    def test_it_cannot_search_by_itself(self) -> None:
+        with pytest.raises(ConfigError, match="parametric: search must be another calibrator"):
+            calibrators.create("parametric", {"search": "parametric"})
+
+    def test_an_unknown_search_is_answered_with_the_nearest(self) -> None:
+        with pytest.raises(UnknownNameError, match="parametric: search: unknown calibrator 'csr'; did you mean 'crs'"):
+            calibrators.create("parametric", {"search": "csr"})
+
+    def test_an_unknown_option_of_the_search_is_named(self) -> None:
+        with pytest.raises(ConfigError, match="unknown key 'populaton'; did you mean 'population'"):
+            calibrators.create("parametric", {"search_options": {"populaton": 5}})
+
+
+class TestBaselines:
+    """What the others are measured against."""
+
+    def test_theoretical_is_the_design(self) -> None:
+        problem = make_problem(RUNS)
+        result = run("theoretical", problem)
+        np.testing.assert_array_equal(result.matrix, synthetic_robot().inverse_kinematic_matrix)
+        assert result.cost == problem.values(problem.start[None])[0]
+        assert result.evaluations == 1
+
+    def test_random_search_tries_as_many_as_it_says(self) -> None:
+        result = run("random_search", make_problem(RUNS), candidates=257, batch=50)
+        assert (result.evaluations, result.reason) == (258, "257 candidates tried")
+
+    @pytest.mark.parametrize("name", ["palacin2023_eq8", "palacin2023_eq9"])
+    def test_published_is_the_matrix_as_printed_even_outside_the_box(self, name: str) -> None:
+        result = run("published", make_problem(RUNS, box="paper"), matrix=name)
+        assert result.outcome is Outcome.CONVERGED
+        np.testing.assert_array_equal(result.matrix, published_matrix(name))
+        assert result.at_bounds == ()
+
+    def test_a_matrix_may_be_given_by_its_rows(self) -> None:
+        rows = [[-0.09, 0.0, 0.09], [0.05, -0.1, 0.05], [0.24, 0.24, 0.24]]
+        np.testing.assert_array_equal(run("published", make_problem(RUNS), matrix=rows).matrix, rows)
+
+    def test_a_published_matrix_for_other_wheels_fails_in_words(self) -> None:
+        result = run("published", make_problem(wheels=4))
+        assert result.outcome is Outcome.FAILED
+        assert result.reason == "a published (3, 3) matrix does not fit a problem of 12 values"
+
+    @pytest.mark.parametrize("rows", [[[1.0, 2.0, 3.0]] * 2, [[1.0, 2.0], [1.0, 2.0, 3.0], [1.0]], [[1.0] * 9]])
+    def test_rows_that_are_no_matrix_are_refused_in_one_line(self, rows: Any) -> None:
+        lengths = str([len(row) for row in rows])
+        with pytest.raises(ConfigError) as refusal:
+            calibrators.create("published", {"matrix": rows})
+        assert str(refusal.value).endswith(f"matrix must have 3 rows of N values, found {lengths}")
+
+    def test_an_unknown_published_matrix_is_answered_with_the_known(self) -> None:
+        with pytest.raises(ConfigError, match="'palacin2023_eq7' is not one of palacin2023_eq8, palacin2023_eq9"):
+            calibrators.create("published", {"matrix": "palacin2023_eq7"})

@@ -1,0 +1,98 @@
+"""The steps of a trajectory fit: right derivatives, nuisances eliminated, within the box, weighted as asked."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fit_samples import make_problem
+from hypothesis import given
+from hypothesis import strategies as st
+
+from omnibench.fit.cost_weights import cost_weightings
+from omnibench.fit.least_squares.gauss_newton import bounded_step
+from omnibench.fit.least_squares.trajectory_fit import OFFSET, SLOPE, TURN, Estimate, TrajectoryFit
+from omnibench.registry import costs
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Array
+
+NOISE = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.005, walk_heading=0.005, bias_position=0.01)
+PROBLEM = make_problem()
+FIT = TrajectoryFit(PROBLEM.trajectories, PROBLEM.parameterisation, PROBLEM.integration)
+WEIGHTINGS = FIT.whiteners(NOISE)
+START = Estimate(PROBLEM.start, np.zeros((len(FIT.trajectories), 3)))
+
+
+def chi2(estimate: Estimate, deviations: Array) -> float:
+    return float(FIT.chi2(estimate, WEIGHTINGS, deviations).sum())
+
+
+def test_the_scores_are_the_slopes_of_the_objective() -> None:
+    held = np.zeros(3)
+    found = FIT.linearise(START, WEIGHTINGS, held)
+    assert found.chi2.sum() == pytest.approx(chi2(START, held))
+    for index, step in enumerate(1e-6 * np.eye(PROBLEM.size)):
+        after, before = (chi2(Estimate(PROBLEM.start + sign * step, START.nuisances), held) for sign in (1, -1))
+        assert found.scores.sum(axis=0)[index] == pytest.approx((after - before) / 4e-6, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("nuisance", "deviation", "kinks"),
+    # The recorded path has a kink at every sample, and so has the objective as a function of a clock.
+    [(TURN, 0.05, 0.0), (OFFSET, 0.2, 1e-3), (SLOPE, 0.01, 1e-3)],
+    ids=["turn", "offset", "slope"],
+)
+def test_steps_of_a_nuisance_lead_to_where_no_run_can_do_better(nuisance: int, deviation: float, kinks: float) -> None:
+    deviations = np.where(np.arange(3) == nuisance, deviation, 0.0)
+    now = START
+    for _ in range(4):
+        steps = FIT.linearise(now, WEIGHTINGS, deviations).nuisance_steps(np.zeros(PROBLEM.size))
+        now = Estimate(now.vector, now.nuisances + steps)
+    assert not np.delete(now.nuisances, nuisance, axis=1).any()
+    there = FIT.chi2(now, WEIGHTINGS, deviations)
+    assert there.sum() < 0.9 * chi2(START, deviations)
+    for away in (-0.05, 0.05):
+        moved = now.nuisances + away * (np.abs(now.nuisances) + deviations)
+        assert (FIT.chi2(Estimate(now.vector, moved), WEIGHTINGS, deviations) > (1 - kinks) * there).all()
+
+
+def test_what_nuisances_take_up_is_no_information() -> None:
+    held = FIT.linearise(START, WEIGHTINGS, np.zeros(3)).information.sum(axis=0)
+    free = FIT.linearise(START, WEIGHTINGS, np.array([0.05, 0.2, 0.01])).information.sum(axis=0)
+    assert np.linalg.eigvalsh(held - free).min() >= -1e-9 * np.linalg.eigvalsh(held).max()
+    assert np.trace(free) < 0.99 * np.trace(held)
+
+
+@given(seed=st.integers(0, 2**31), reach=st.floats(0.01, 10.0))
+def test_a_step_within_the_box_is_the_best_there_is(seed: int, reach: float) -> None:
+    rng = np.random.default_rng(seed)
+    unit = PROBLEM.upper - PROBLEM.lower
+    slopes = rng.standard_normal((20, PROBLEM.size)) / unit
+    information, score = slopes.T @ slopes, reach * 20 * rng.standard_normal(PROBLEM.size) / unit
+    vector = PROBLEM.lower + rng.uniform(0, 1, PROBLEM.size) * unit
+    step = bounded_step(PROBLEM, vector, information, score)
+    room = 1e-8 * unit
+    assert (vector + step >= PROBLEM.lower - room).all()
+    assert (vector + step <= PROBLEM.upper + room).all()
+    slope = (information @ step + score) * unit  # of the objective: > 0 only at a lower bound, < 0 only at an upper one
+    small = 1e-5 * np.abs(score * unit).max()
+    assert (slope[vector + step > PROBLEM.lower + 10 * room] < small).all()
+    assert (slope[vector + step < PROBLEM.upper - 10 * room] > -small).all()
+
+
+@pytest.mark.parametrize("name", ["final_pose", "final_position", "final_heading"])
+def test_final_errors_are_weighted_as_the_cost_weighs_them(name: str) -> None:
+    cost = costs.create(name)
+    residuals = FIT.residuals(START)
+    weightings = cost_weightings(cost, FIT.trajectories, residuals)
+    lengths = np.array([np.linalg.norm(weigh(own)) for weigh, own in zip(weightings, residuals, strict=True)])
+    of_each = cost.of_each(np.array([own[-1] for own in residuals]), np.arange(len(residuals)))
+    assert lengths / lengths.mean() == pytest.approx(of_each / of_each.mean())
+    assert np.square(lengths).mean() == pytest.approx(1.0)
+
+
+def test_errors_along_the_way_count_the_same_for_every_run_whatever_its_number_of_stamps() -> None:
+    residuals = FIT.residuals(START)
+    weightings = cost_weightings(costs.create("trajectory"), FIT.trajectories, residuals)
+    squares = [np.square(weigh(own)).sum() for weigh, own in zip(weightings, residuals, strict=True)]
+    mean_squares = np.array([np.square(own).sum(axis=1).mean() for own in residuals])
+    assert squares == pytest.approx(mean_squares / mean_squares.mean())

@@ -1,0 +1,82 @@
+"""What is said of runs that drive motions which a calibration's effects were not fitted to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.fit.domain_check import unfitted_motions
+from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows
+from omnibench.simulate.like import simulate_like
+from omnibench.testing import synthetic_robot
+
+ROBOT = synthetic_robot()
+MATRIX = ROBOT.inverse_kinematic_matrix
+FORWARDS, SIDEWAYS, ON_THE_SPOT = (0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.8)
+SLIP = EffectTerm(name="centripetal_slip", parameters={"k": 0.03})
+
+
+def calibration(*effects: EffectTerm, **changes: Any) -> Calibration:
+    """Fitted to driving forwards, unless it is changed."""
+    plain: dict[str, Any] = {"name": "mine", "robot": ROBOT, "sample_period": 0.05, "integration": "arc"}
+    plain |= {"matrix": matrix_rows(MATRIX), "effects": effects or (SLIP,), "driven": (FORWARDS,)}
+    return Calibration(**(plain | changes))
+
+
+def run(name: str, *twists: tuple[float, float, float], command: str | None = None) -> Trajectory:
+    """Two seconds of each twist, with poses at the ends."""
+    times = 0.05 * np.arange(1, 40 * len(twists) + 1)
+    rates = np.repeat([np.linalg.solve(MATRIX, twist) for twist in twists], 40, axis=0)
+    plain = Trajectory(name, "train", times, rates, np.array([0.0, times[-1]]), np.zeros((2, 3)), command=command)
+    (driven,) = calibration(effects=()).model.poses([plain.log(plain.pose_times)])
+    return replace(plain, poses=driven)
+
+
+def test_runs_commands_motions_and_effects_are_told_in_one_line() -> None:
+    runs = [run("1", FORWARDS), run("2", FORWARDS, SIDEWAYS, command="corner"), run("3", SIDEWAYS, command="side")]
+    other = EffectTerm(name="heading_drift", parameters={"b": 0.001})
+    assert unfitted_motions(calibration(SLIP, other), runs) == (
+        "2 of 3 runs drive motions that calibration 'mine' was not fitted to (side, corner), such as driving straight "
+        "at 0.20 m/s: centripetal_slip, heading_drift are not known to hold there, and errors may be larger than stated"
+    )
+
+
+def test_repetitions_of_a_command_count_as_runs_and_are_named_once() -> None:
+    runs = [run(str(number), ON_THE_SPOT, command="turn") for number in range(4)]
+    told = unfitted_motions(calibration(), runs)
+    assert told is not None
+    assert told.startswith(
+        "4 of 4 runs drive motions that calibration 'mine' was not fitted to (turn), such as turning"
+    )
+
+
+def test_three_commands_are_named_and_the_others_counted() -> None:
+    runs = [run(name, SIDEWAYS) for name in "abcde"]
+    told = unfitted_motions(calibration(), runs)
+    assert told is not None
+    assert "(a, b, c and 2 more)" in told
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"driven": (FORWARDS, SIDEWAYS, ON_THE_SPOT)}, {"driven": None}, {"driven": ()}, {"effects": ()}],
+    ids=["all driven", "not known", "none", "no effects"],
+)
+def test_nothing_is_told_of_what_was_driven_or_where_nothing_is_at_stake(changes: dict[str, Any]) -> None:
+    runs = [run("1", FORWARDS), run("2", SIDEWAYS), run("3", ON_THE_SPOT)]
+    assert unfitted_motions(calibration(), runs) is not None
+    assert unfitted_motions(calibration(**changes), runs) is None
+
+
+def recorded(*runs: Trajectory) -> Dataset:
+    return make_dataset("recorded", ROBOT, 0.05, runs)
+
+
+def test_a_recording_simulated_again_is_warned_of_too() -> None:
+    (warning,) = simulate_like(recorded(run("1", FORWARDS), run("2", SIDEWAYS)), calibration()).warnings
+    assert warning.startswith("1 of 2 runs drive motions that calibration 'mine' was not fitted to (2)")
+    assert simulate_like(recorded(run("1", FORWARDS)), calibration()).warnings == ()

@@ -1,0 +1,215 @@
+"""What recordings can tell before anything is fitted, and what they leave open."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fit_samples import make_problem
+from motions import FLOWER, RING, SPEED, TURNS, Twist, driven
+
+from omnibench.data.dataset import Dataset
+from omnibench.data.importer import import_dataset
+from omnibench.errors import DataError
+from omnibench.fit.calibrate import calibrate
+from omnibench.fit.calibrators.closed_form import linear_start
+from omnibench.fit.inspect import inspect_dataset
+from omnibench.fit.span import driven_span
+from omnibench.fit.uncertainty.identifiability import Identifiability, identifiability
+from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
+from omnibench.registry import load_plugin_file
+from omnibench.testing.synthetic import synthetic_robot
+
+ROOT = Path(__file__).resolve().parents[3]
+OMNI3 = ROOT.parent / "shared" / "data" / "optiodom" / "omni3"
+TABLE = ROOT.parent / "shared" / "data" / "robotino"
+ROBOT = synthetic_robot()
+DISTANCES = ("distance_a", "distance_b", "distance_c")
+
+
+def told_of(twists: tuple[Twist, ...], slip: float = 0.0, **changes: float) -> Identifiability:
+    return identifiability(ROBOT, driven(twists, slip=slip, **changes))
+
+
+def states(found: Identifiability) -> dict[str, str]:
+    return {each.motion: each.state for each in found.directions}
+
+
+def untold(found: Identifiability) -> tuple[str, ...]:
+    return tuple(each.name for each in found.parameters if not each.told)
+
+
+@pytest.fixture(scope="module")
+def robotino() -> Dataset:
+    """The table recordings: translation only."""
+    if not TABLE.is_dir():
+        pytest.skip(f"the recordings are not at {TABLE}")
+    assert load_plugin_file(ROOT / "plugins" / "robotino.py") is None
+    return import_dataset("robotino", TABLE)
+
+
+class TestDirections:
+    """Every direction of wheel rates, with its motion and how well it is told."""
+
+    def test_runs_that_turn_and_drive_tell_everything(self) -> None:
+        found = told_of(FLOWER)
+        assert states(found) == dict.fromkeys(("turning on the spot", "moving along x", "moving along y"), "driven")
+        assert (found.sentences, untold(found)) == ((), ())
+
+    def test_runs_that_never_reverse_are_fine(self) -> None:
+        forward = ((SPEED, 0.0, 0.4), (0.0, SPEED, 0.4), (SPEED, SPEED, 0.4))
+        assert told_of(forward).sentences == ()
+
+    @pytest.mark.parametrize("slip", [0.0, 0.02])
+    def test_translation_alone_leaves_the_turn_and_the_distances(self, slip: float) -> None:
+        found = told_of(RING, slip)
+        assert states(found)["turning on the spot"] == ("weak" if slip else "undriven")
+        assert untold(found) == DISTANCES
+        assert found.sentences[-1] == f"of the wheels' geometry these recordings do not tell {', '.join(DISTANCES)}"
+
+    def test_turns_alone_leave_both_translations_and_every_parameter(self) -> None:
+        found = told_of(TURNS, slip=0.02)
+        assert states(found)["turning on the spot"] == "driven"
+        assert {states(found)[f"moving along {axis}"] for axis in "xy"} <= {"weak", "undriven"}
+        assert len(untold(found)) == 9
+
+    def test_runs_along_x_leave_y_and_the_turn(self) -> None:
+        found = told_of(((SPEED, 0.0, 0.0), (-SPEED, 0.0, 0.0)), slip=0.002)
+        assert states(found) == {
+            "moving along x": "driven",
+            "moving along y": "undriven",
+            "turning on the spot": "undriven",
+        }
+
+    def test_one_command_is_one_direction(self) -> None:
+        found = told_of(((SPEED, 0.0, 0.3),))
+        assert [each.state for each in found.directions] == ["driven", "undriven", "undriven"]
+        assert found.directions[0].motion == "moving along x while turning"
+        assert all("record" in sentence for sentence in found.sentences[:2])
+
+    def test_four_wheels_name_the_slipping_direction_apart_from_the_turn(self) -> None:
+        found = identifiability(synthetic_robot(4), driven(RING, wheels=4))
+        assert [(each.direction, each.motion) for each in found.directions[2:]] == [
+            ("fl + fr + rl + rr", "turning on the spot"),
+            ("fl - fr - rl + rr", ""),
+        ]
+
+    def test_slip_does_not_pass_for_a_motion(self) -> None:
+        found = identifiability(synthetic_robot(4), driven(FLOWER, wheels=4, slip=0.02))
+        assert [each.state for each in found.directions] == ["driven"] * 3 + ["weak"]
+        assert found.sentences == (
+            "the wheels go along fl - fr - rl + rr, which only slips, with "
+            f"{100 * found.directions[3].share:.1f} % of the strongest motion: slip cannot be identified, and "
+            "calibration keeps the design values there",
+        )
+
+
+class TestPrediction:
+    """The standard deviations that the noise allows."""
+
+    def test_noise_is_estimated_from_the_repetitions(self) -> None:
+        found = told_of(FLOWER)
+        assert found.noise.pose_position == pytest.approx(0.003, rel=0.1)
+        assert "48 runs of 16 commands" in found.noise_source
+
+    def test_deviations_grow_with_the_noise_and_shrink_with_the_repetitions(self) -> None:
+        once, noisy, often = told_of(FLOWER), told_of(FLOWER, noise=0.03), told_of(FLOWER, repetitions=12)
+        for one, more, less in zip(once.directions, noisy.directions, often.directions, strict=True):
+            assert one.deviations is not None
+            assert np.divide(more.deviations, one.deviations) == pytest.approx(10, rel=0.2)
+            assert np.divide(less.deviations, one.deviations) == pytest.approx(0.5, rel=0.2)
+
+    def test_a_row_that_is_told_badly_is_named_with_its_deviation(self) -> None:
+        found = told_of(((SPEED, 0.0, 0.4), (0.0, SPEED, 0.4), (SPEED, SPEED, -0.4)), noise=0.2, repetitions=2)
+        rough = next(sentence for sentence in found.sentences if sentence.startswith("of a + b + c"))
+        assert "row 1 (x) to " in rough
+        assert rough.endswith("record more or longer runs")
+
+    def test_the_calibrations_of_many_recordings_scatter_as_predicted(self) -> None:
+        # The bound is of the best estimator; least squares at every pose is close to it under white noise.
+        found = told_of(FLOWER)
+        matrices = []
+        for seed in range(25):
+            problem = make_problem(driven(FLOWER, seed=seed), cost="trajectory")
+            matrices.append(problem.matrix(linear_start(problem)))
+        turn = np.ones(3) / math.sqrt(3)
+        seen = np.std(np.array(matrices) @ turn, axis=0) / np.abs(ROBOT.inverse_kinematic_matrix).max(axis=1)
+        predicted = next(each.deviations for each in found.directions if each.motion == "turning on the spot")
+        assert predicted is not None
+        # Of 25 values the standard deviation is uncertain by 14 %.
+        assert (seen > 0.65 * np.array(predicted)).all()
+        assert (seen < 1.8 * np.array(predicted)).all()
+
+    def test_runs_without_reference_poses_are_refused(self) -> None:
+        blind = [replace(run, pose_times=run.pose_times[:1], poses=run.poses[:1]) for run in driven(TURNS)]
+        with pytest.raises(DataError, match="no trajectory has a reference pose after its start"):
+            identifiability(ROBOT, blind)
+
+
+class TestWarnings:
+    """What a calibration says of the directions it could not tell."""
+
+    def test_fine_data_give_none(self) -> None:
+        assert warnings_of_calibration(ROBOT, driven(FLOWER), "matrix", "keep") == ()
+
+    def test_what_slips_on_any_four_wheels_gives_none(self) -> None:
+        assert warnings_of_calibration(synthetic_robot(4), driven(FLOWER, wheels=4), "matrix", "keep") == ()
+
+    @pytest.mark.parametrize(
+        ("parameterisation", "unidentified", "end"),
+        [
+            ("matrix", "keep", "kept at the design values"),
+            ("matrix", "fit", "what was fitted there rests on slip and noise"),
+            (
+                "geometry",
+                "keep",
+                "the geometry cannot keep design values there, so what was fitted to it rests on slip and noise",
+            ),
+        ],
+    )
+    def test_each_way_to_go_on_is_said(self, parameterisation: str, unidentified: str, end: str) -> None:
+        runs = driven(RING, slip=0.02)
+        share = 100 * driven_span(runs).shares[2]
+        assert warnings_of_calibration(ROBOT, runs, parameterisation, unidentified) == (
+            "these data do not identify what wheel rates along a + b + c (turning on the spot) do: "
+            f"{share:.1f} % of the strongest motion, which slip alone can make; {end}",
+        )
+
+    def test_what_is_not_driven_at_all_is_kept_whatever_is_asked(self) -> None:
+        (warning,) = warnings_of_calibration(ROBOT, driven(RING), "matrix", "fit")
+        assert warning.endswith("do; kept at the design values")
+
+
+class TestRecordings:
+    """The Robotino's table recordings translate only; omni3 drives everything."""
+
+    def test_inspection_of_the_table_recordings_names_the_turn(self, robotino: Dataset) -> None:
+        found = inspect_dataset(robotino)
+        turning = found.findings[0]
+        assert turning.startswith("these recordings hardly turn the robot: they drive the wheels along 1 + 2 + 3")
+        assert "row 3 (heading)" in turning
+        assert turning.endswith("record turns, on the spot or while driving")
+        assert states(found.identifiability)["turning on the spot"] == "weak"
+        assert untold(found.identifiability) == ("distance_1", "distance_2", "distance_3")
+
+    def test_calibration_on_them_keeps_the_turn_of_the_design_and_says_so(self, robotino: Dataset) -> None:
+        design = robotino.robot.inverse_kinematic_matrix
+        run = calibrate(robotino)
+        np.testing.assert_allclose((run.calibration.matrix_array - design).sum(axis=1), 0, atol=1e-15)
+        assert run.warnings[0].startswith("these data do not identify what wheel rates along 1 + 2 + 3")
+        assert run.warnings[0].endswith("kept at the design values")
+
+    def test_told_to_fit_it_the_calibration_does_and_says_what_it_rests_on(self, robotino: Dataset) -> None:
+        design = robotino.robot.inverse_kinematic_matrix
+        run = calibrate(robotino, unidentified="fit")
+        assert np.abs((run.calibration.matrix_array - design).sum(axis=1)).max() > 1e-3
+        assert run.warnings[0].endswith("what was fitted there rests on slip and noise")
+
+    def test_omni3_leaves_nothing_open(self) -> None:
+        if not OMNI3.is_dir():
+            pytest.skip(f"the recordings are not at {OMNI3}")
+        dataset = import_dataset("optiodom", OMNI3)
+        assert warnings_of_calibration(dataset.robot, dataset.split("train"), "matrix", "keep") == ()

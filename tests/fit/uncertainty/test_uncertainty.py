@@ -1,0 +1,309 @@
+"""How sure a calibration is: covariance of the elements and of the geometry behind them."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from fit_samples import make_problem
+from hypothesis import given
+from hypothesis import strategies as st
+from motions import FLOWER, RING, driven
+
+from omnibench.data.dataset import Trajectory
+from omnibench.errors import DataError
+from omnibench.fit.calibrator import RunResult, run_calibrator
+from omnibench.fit.parameterisation import WheelGeometry
+from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
+from omnibench.fit.uncertainty.bootstrap import bootstrap_intervals
+from omnibench.fit.uncertainty.information import information_of_run, information_of_runs
+from omnibench.fit.uncertainty.physical import geometry_of, matrix_slopes, told_parameters
+from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
+from omnibench.registry import calibrators, costs
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Array, inverse_kinematic_matrices
+from omnibench.robot.odometry import OdometryBatch
+from omnibench.simulate.simulate import simulate_dataset
+from omnibench.simulate.source import read_simulation
+from omnibench.testing.synthetic import synthetic_robot, true_robot
+
+STUDY = Path(__file__).parents[2] / "benchmarks" / "uncertainty_coverage.py"
+ROBOT = synthetic_robot()
+TRUTH = true_robot(ROBOT).inverse_kinematic_matrix
+NOISE = Noise(pose_position=0.004, pose_heading=0.006, walk_position=0.002, bias_heading=0.003)
+
+
+def study() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("uncertainty_coverage", STUDY)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # its dataclass looks itself up
+    spec.loader.exec_module(module)
+    return module
+
+
+def solved(problem: CalibrationProblem, calibrator: str = "closed_form") -> RunResult:
+    result = run_calibrator(calibrators.create(calibrator), problem)
+    assert result.vector is not None, result.reason
+    return result
+
+
+def found(runs: list[Trajectory], **changes: str) -> Uncertainty:
+    problem = make_problem(runs, **changes)
+    return uncertainty_of(problem, solved(problem))
+
+
+def shares(uncertainty: Uncertainty) -> Array:
+    """Standard deviations (3, N) as a share of the row's largest element."""
+    return uncertainty.standard_deviations / np.abs(ROBOT.inverse_kinematic_matrix).max(axis=1, keepdims=True)
+
+
+class TestInformation:
+    """Fisher information of the elements."""
+
+    @pytest.mark.parametrize("stamps", ["reference", "final"])
+    def test_it_is_that_of_the_residuals_covariance(self, stamps: str) -> None:
+        run = driven(FLOWER[:1], repetitions=1)[0]
+        log = run.final_log if stamps == "final" else run.reference_log
+        jacobian = OdometryBatch([log], "arc").jacobian(TRUTH).reshape(len(log.stamps), 3, 9)
+        steps = np.minimum.outer(log.stamps, log.stamps)
+        position = 0.004**2 * np.eye(len(steps)) + 0.002**2 * steps
+        heading = 0.006**2 * np.eye(len(steps)) + 0.003**2
+        expected = sum(
+            jacobian[:, row].T @ np.linalg.solve(covariance, jacobian[:, row])
+            for row, covariance in enumerate((position, position, heading))
+        )
+        information = information_of_run(run, TRUTH, "arc", NOISE, stamps=stamps)
+        np.testing.assert_allclose(information, expected, rtol=1e-9, atol=1e-6)
+
+    def test_that_of_many_runs_is_each_one_s(self) -> None:
+        runs = driven(FLOWER[:3], repetitions=1)
+        each = information_of_runs(runs, TRUTH, "arc", NOISE)
+        assert each.shape == (3, 9, 9)
+        np.testing.assert_array_equal(each[1], information_of_run(runs[1], TRUTH, "arc", NOISE))
+
+    def test_a_log_without_recording_has_one_too(self) -> None:
+        run = driven(FLOWER[:1], repetitions=1)[0]
+        np.testing.assert_array_equal(
+            information_of_run(run.reference_log, TRUTH, "arc", NOISE), information_of_run(run, TRUTH, "arc", NOISE)
+        )
+
+    def test_no_runs_have_none(self) -> None:
+        assert information_of_runs([], TRUTH, "arc", NOISE).shape == (0, 9, 9)
+
+
+class TestCovariance:
+    """The sandwich of a sum of norms."""
+
+    def test_it_agrees_with_the_bootstrap_on_the_flower(self) -> None:
+        problem, result = flower_problem()
+        said = uncertainty_of(problem, result).standard_deviations
+        intervals = bootstrap_intervals(problem, result.vector, resamples=400, rng=np.random.default_rng(0))
+        drawn = (intervals.high - intervals.low) / (2 * 1.96)
+        # Of 400 resamples a 95 % range is uncertain by 5 %; of 180 runs each estimate by as much again.
+        np.testing.assert_allclose(said / drawn, 1, atol=0.2)
+        assert np.mean(said / drawn) == pytest.approx(1, abs=0.1)
+
+    def test_about_95_percent_of_the_intervals_hold_the_hidden_robot(self) -> None:
+        covered = [study().covered(seed, repetitions=2) for seed in range(8)]
+        hits = np.array([np.concatenate([each.elements, each.parameters]) for each in covered])
+        # 72 intervals of elements: 95 % of them leaves fewer than 61 inside with a probability of about 3e-4.
+        assert hits[:, :9].sum() >= 61
+        assert hits[:, 9:].sum() >= 61
+
+    def test_the_standard_deviations_are_those_of_many_calibrations(self) -> None:
+        matrices, said = [], []
+        for seed in range(20):
+            problem = make_problem(driven(FLOWER, seed=seed, noise=0.01))
+            result = solved(problem)
+            matrices.append(result.matrix)
+            said.append(uncertainty_of(problem, result).standard_deviations)
+        seen = np.sqrt(np.mean(np.square(np.array(matrices) - TRUTH), axis=0))
+        # Of 20 values a standard deviation is uncertain by 16 %, of nine less.
+        assert np.mean(np.sqrt(np.mean(np.square(said), axis=0)) / seen) == pytest.approx(1, abs=0.25)
+
+    def test_four_times_the_repetitions_halve_it(self) -> None:
+        few, many = (
+            np.mean([shares(found(driven(FLOWER, repetitions=n, seed=seed))) for seed in range(4)]) for n in (3, 12)
+        )
+        assert many == pytest.approx(few / 2, rel=0.2)
+
+    @pytest.mark.parametrize("cost", ["final_pose", "final_position", "trajectory"])
+    def test_every_cost_that_is_a_sum_of_norms_has_one(self, cost: str) -> None:
+        deviations = shares(found(driven(FLOWER), cost=cost))
+        assert (deviations > 1e-5).all()
+        assert (deviations < 0.02).all()
+
+    def test_a_cost_of_headings_says_nothing_of_rows_1_and_2(self) -> None:
+        uncertainty = found(driven(FLOWER), cost="final_heading")
+        assert not uncertainty.covariance[:6].any()
+        assert (uncertainty.standard_deviations[2] > 0).all()
+
+    def test_an_element_that_the_box_holds_has_no_variance(self) -> None:
+        uncertainty = found(driven(FLOWER), box="paper")
+        assert uncertainty.standard_deviations[0, 1] == 0
+        assert np.count_nonzero(uncertainty.standard_deviations) == 8
+
+    def test_directions_that_are_kept_have_no_variance_and_their_parameters_none_at_all(self) -> None:
+        uncertainty = found(driven(RING, slip=0.02))
+        turn = np.kron(np.eye(3), np.ones(3))
+        np.testing.assert_allclose(turn @ uncertainty.covariance @ turn.T, 0, atol=1e-18)
+        assert (uncertainty.standard_deviations > 0).all()
+        assert uncertainty.parameters is not None
+        untold = [each.name for each in uncertainty.parameters if each.standard_deviation is None]
+        assert untold == ["distance_a", "distance_b", "distance_c"]
+
+    def test_the_calibrator_s_own_covariance_is_taken(self) -> None:
+        problem = make_problem(driven(FLOWER))
+        own = replace(solved(problem), covariance=np.diag(np.arange(1.0, 10.0)) * 1e-8, noise=NOISE)
+        uncertainty = uncertainty_of(problem, own)
+        np.testing.assert_allclose(uncertainty.standard_deviations.ravel() ** 2, np.arange(1.0, 10.0) * 1e-8)
+        assert (uncertainty.basis, uncertainty.noise) == ("likelihood", NOISE)
+
+
+class TestBasis:
+    """What the covariance rests on, chosen by rule and said in words."""
+
+    def test_repetitions_are_used_where_they_explain_everything(self) -> None:
+        uncertainty = found(driven(FLOWER))
+        assert uncertainty.source == "the scatter between repetitions (48 runs of 16 commands)"
+        assert uncertainty.degrees_of_freedom == 32
+
+    def test_without_repetitions_runs_scatter_about_zero(self) -> None:
+        uncertainty = found(driven(FLOWER, repetitions=1))
+        assert uncertainty.source.startswith("the scatter between 16 runs: no command is repeated")
+
+    def test_runs_without_commands_are_no_repetitions(self) -> None:
+        uncertainty = found([replace(run, command=None) for run in driven(FLOWER)])
+        assert "no command is repeated" in uncertainty.source
+
+    def test_commands_that_no_matrix_fits_at_once_scatter_as_a_whole(self) -> None:
+        hits = 0
+        for seed in range(5):
+            rng = np.random.default_rng(seed)
+            pulls = 0.02 * rng.standard_normal((16, 3))
+            uncertainty = found(
+                [
+                    replace(run, poses=run.poses + np.outer(run.pose_times, pulls[int(run.command or 0)]))
+                    for run in driven(FLOWER, seed=seed)
+                ]
+            )
+            assert uncertainty.source.startswith("the scatter between 16 commands, ")
+            assert uncertainty.source.endswith("the model does not fit all of them at once")
+            assert uncertainty.degrees_of_freedom == 15
+            hits += int(((uncertainty.intervals.low < TRUTH) & (uncertainty.intervals.high > TRUTH)).sum())
+        assert hits >= 38  # of 45; with the repetitions' scatter alone it would be a few
+
+    def test_sessions_that_differ_scatter_as_a_whole(self) -> None:
+        rng = np.random.default_rng(1)
+        runs = []
+        for session in range(8):
+            scale = 1 + 0.03 * rng.standard_normal()  # the reference's length, say
+            runs += [
+                replace(run, id=f"{session}-{run.id}", session=str(session), poses=run.poses * [scale, scale, 1.0])
+                for run in driven(FLOWER, repetitions=2, seed=session)
+            ]
+        uncertainty = found(runs)
+        assert uncertainty.source.startswith("the scatter between 8 sessions, ")
+        assert uncertainty.degrees_of_freedom == 7
+
+    def test_too_few_runs_are_told(self) -> None:
+        problem = make_problem(driven(RING[1:3], repetitions=1), cost="trajectory")
+        message = r"^no covariance: runs are too few \(2\) for the scatter of 6 fitted numbers$"
+        with pytest.raises(NoCovarianceError, match=message):
+            uncertainty_of(problem, solved(problem))
+
+    def test_data_without_any_error_are_told(self) -> None:
+        problem = make_problem(driven(FLOWER, noise=0.0))
+        with pytest.raises(NoCovarianceError, match="no error is left to judge by"):
+            uncertainty_of(problem, solved(problem))
+
+    def test_a_robot_that_never_moved_is_told(self) -> None:
+        still = [replace(run, rates=0 * run.rates) for run in driven(FLOWER)]
+        problem = make_problem(still)
+        with pytest.raises(NoCovarianceError, match="nothing was free to be fitted"):
+            uncertainty_of(problem, solved(problem))
+
+    def test_an_answer_that_is_no_minimum_is_told(self) -> None:
+        problem = make_problem(driven(FLOWER))
+        best = solved(problem)
+        assert best.vector is not None
+        off = replace(best, vector=best.vector * 1.02, matrix=problem.matrix(best.vector * 1.02))
+        with pytest.raises(NoCovarianceError, match="standard deviations or more from a better one"):
+            uncertainty_of(problem, off)
+
+
+class TestParameters:
+    """Radius, distance and angle of each wheel."""
+
+    def test_the_geometry_gives_back_the_matrix_and_the_matrix_the_geometry(self) -> None:
+        true = true_robot(ROBOT)
+        np.testing.assert_allclose(geometry_of(TRUTH, ROBOT), WheelGeometry(true).start, rtol=1e-12)
+
+    @given(seed=st.integers(0, 2**16))
+    def test_geometries_near_the_design_survive_the_way_there_and_back(self, seed: int) -> None:
+        design = WheelGeometry(ROBOT).start
+        geometry = design * (1 + 0.05 * np.random.default_rng(seed).standard_normal(9))
+        matrix = inverse_kinematic_matrices(*geometry.reshape(3, 1, 3))[0]
+        np.testing.assert_allclose(geometry_of(matrix, ROBOT), geometry, rtol=1e-9)
+
+    def test_the_slopes_are_those_of_the_way_back(self) -> None:
+        geometry = geometry_of(TRUTH, ROBOT)
+        step = 1e-6 * np.random.default_rng(0).standard_normal((3, 3))
+        moved = geometry_of(TRUTH + step, ROBOT) - geometry_of(TRUTH - step, ROBOT)
+        np.testing.assert_allclose(matrix_slopes(ROBOT, geometry) @ moved / 2, step.ravel(), rtol=1e-5, atol=1e-12)
+
+    @pytest.mark.parametrize("matrix", [np.zeros((3, 3)), np.ones((3, 3))])
+    def test_a_matrix_that_no_wheels_have_is_refused(self, matrix: Array) -> None:
+        with pytest.raises(DataError, match="no wheels have it"):
+            geometry_of(matrix, ROBOT)
+
+    def test_the_matrix_of_four_wheels_means_no_one_geometry(self) -> None:
+        problem = make_problem(driven(FLOWER, wheels=4), wheels=4)
+        assert uncertainty_of(problem, solved(problem)).parameters is None
+        with pytest.raises(DataError, match="three omni wheels"):
+            geometry_of(np.zeros((3, 4)), synthetic_robot(4))
+
+    def test_both_ways_to_the_geometry_agree(self) -> None:
+        runs = driven(FLOWER, noise=0.01)
+        by_matrix = found(runs).parameters
+        problem = make_problem(runs, parameterisation="geometry")
+        by_geometry = uncertainty_of(problem, solved(problem, "parametric")).parameters
+        assert by_matrix is not None
+        assert by_geometry is not None
+        for one, other in zip(by_matrix, by_geometry, strict=True):
+            assert one.name == other.name
+            assert one.value == pytest.approx(other.value, rel=1e-4)
+            assert one.standard_deviation == pytest.approx(other.standard_deviation, rel=1e-3)
+
+    def test_every_parameter_is_told_when_every_direction_is(self) -> None:
+        assert all(told_parameters(ROBOT, np.zeros((0, 3))))
+
+    def test_nothing_is_told_when_nothing_is_driven(self) -> None:
+        assert not any(told_parameters(ROBOT, np.eye(3)))
+
+    def test_without_turns_the_distances_are_not_told(self) -> None:
+        told = told_parameters(ROBOT, np.ones((1, 3)) / np.sqrt(3))
+        assert told == (True,) * 3 + (False,) * 3 + (True,) * 3
+
+
+def flower_problem() -> tuple[CalibrationProblem, RunResult]:
+    """The flower of the paper's comparison in a box that holds its truth."""
+    flower = read_simulation(study().CONFIG).config
+    dataset = simulate_dataset(flower.model_copy(update={"validation": None})).dataset
+    problem = CalibrationProblem(
+        dataset.robot,
+        dataset.split("train"),
+        costs.create("final_pose"),
+        make_parameterisation("matrix", dataset.robot, dataset.split("train"), box="row"),
+        integration="euler",
+        budget=Budget(),
+        seed=1,
+    )
+    return problem, solved(problem)

@@ -1,0 +1,232 @@
+"""What a node answers and which orders it takes, with real sessions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from drives import ORIGIN, SECOND, calibration, drive
+from heard import Heard
+from nodes import as_text, asked, config_of, running, sent
+from sessions import Loopback, until
+
+from omnibench.live.control.query_server import Desk
+from omnibench.live.estimation.tracker import RobotTracker
+from omnibench.live.wire.messages import ODOMETRY
+
+EVERY_REPLY = zenoh.QueryConsolidation(zenoh.ConsolidationMode.NONE)
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A node that has taken a drive of a second."""
+    path = drive(1.0)
+    with running(config_of(tmp_path_factory.mktemp("driven"))) as (node, session):
+        wheels = session.declare_publisher("apr/joint_states")
+        until(lambda: wheels.matching_status.matching, "the node's subscription")
+        sent(wheels, path.samples())
+        until(lambda: node.health("apr").counts["samples"] == 101, "the samples")
+        yield node, session, path
+
+
+def test_info_says_what_runs_and_where_its_topics_are(driven: Any) -> None:
+    answer = asked(driven[1], "omnibench/apr/info")
+    assert answer["calibration"] == "synthetic 1"
+    assert answer["topics"]["odom"] == "apr/odom"
+    assert answer["wheels"] == ["a", "b", "c"]
+
+
+def test_health_tells_the_counters(driven: Any) -> None:
+    answer = asked(driven[1], "omnibench/apr/health")
+    assert answer["counts"]["samples"] == 101
+    assert answer["status"] in ("degraded", "stale")
+
+
+def test_the_calibration_is_given_as_it_runs(driven: Any) -> None:
+    assert asked(driven[1], "omnibench/apr/calibration")["matrix"][0] == list(calibration().matrix[0])
+
+
+@pytest.mark.parametrize("form", ["{0}.505", "{0}505000000"])
+def test_the_pose_at_a_time_is_interpolated(driven: Any, form: str) -> None:
+    _, session, path = driven
+    answer = asked(session, "omnibench/apr/pose?at=" + form.format(ORIGIN // SECOND))
+    assert answer["at_ns"] == ORIGIN + 505_000_000
+    assert answer["odom"]["theta"] == pytest.approx(path.poses[50:52, 2].mean(), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("selector", "payload", "message"),
+    [
+        ("pose?at=yesterday", None, "at: 'yesterday' is not a time"),
+        *((f"pose?at={number}", None, "is not a time") for number in ("1e400", "1e3000000", "1e19", "-1e19")),
+        *((f"pose?at={number}", None, "is not a time") for number in ("nan", "snan", "-inf", "")),
+        ("pose?at=" + "7" * 5000, None, "777...' is not a time"),
+        ("pose?at=12", None, "at: 12.000000 s is not within"),
+        ("set_pose", '{"x": 1}', "set_pose: key 'y' is missing (and 1 more)"),
+        ("set_pose", '{"x": 1, "y": 2, "theta": 3, "z": 4}', "set_pose: unknown key 'z'"),
+        ("set_pose", b"\xff\xfe", "the payload is not text"),
+        ("calibration", "format: something", "put it there, or ask omnibench/apr/swap"),
+        ("swap", "format: something", "format is 'something', expected 'omnibench-calibration/1'"),
+        ("swap", "{", "not valid YAML"),
+        ("swap", b"\xff\xfe", "not a text in UTF-8"),
+        ("swap", "[" * 50_000, "nested too deeply"),
+        ("swap", "- " * 30_000, "nested too deeply"),
+        ("swap", "a: [" + "1, " * 20_000 + "1]", "more than 5000 values"),
+        ("swap", "a: &a [1, 1]\nb: &b [*a, *a]\nc: [*b, *b]", "write out what *a stands for"),
+        ("swap", as_text(calibration()).replace("session: null", r'session: "\ud800"'), "text that is not Unicode"),
+        ("swap", "#" * 70_000, "70000 bytes are more than a request may have, 65536"),
+        ("health?" + "x" * 70_000, None, "70000 bytes are more than a request may have"),
+    ],
+)
+def test_a_bad_order_is_refused_with_the_reason(driven: Any, selector: str, payload: Any, message: str) -> None:
+    answer = asked(driven[1], f"omnibench/apr/{selector}", payload)
+    assert message in answer["error"]
+
+
+def test_a_pose_can_be_set_and_reset(driven: Any) -> None:
+    _, session, _ = driven
+    assert asked(session, "omnibench/apr/set_pose", json.dumps({"x": 3, "y": 4, "theta": 1}))["done"] == "set_pose"
+    answer = asked(session, "omnibench/apr/pose")
+    assert (answer["map"]["x"], answer["map"]["y"], answer["map"]["theta"]) == (3, 4, 1)
+    assert asked(session, "omnibench/apr/reset")["done"] == "reset"
+    assert not asked(session, "omnibench/apr/health")["fusion"]["located"]
+
+
+@pytest.mark.parametrize("order", ["reset", "swap", "set_pose"])
+@pytest.mark.parametrize("robot", ["*", "a$*", "**"])
+def test_a_wildcard_orders_nobody(driven: Any, robot: str, order: str) -> None:
+    node, session, _ = driven
+    before = node.health("apr").counts
+    assert list(session.get(f"omnibench/{robot}/{order}", payload="{x: 1, y: 2, theta: 3}", timeout=2.0)) == []
+    assert node.health("apr").counts == before
+
+
+@pytest.mark.parametrize(
+    ("selector", "answers"), [("*/health", 10), ("*/*", 40), ("**", 40), ("r1/*", 4), ("r1/info", 1), ("*/reset", 0)]
+)
+def test_each_robot_and_service_that_a_question_is_for_answers_it_once(
+    tmp_path: Path, selector: str, answers: int
+) -> None:
+    names = [f"r{number}" for number in range(10)]
+    with running(config_of(tmp_path, *names, fusion="none")) as (_, session):
+        replies = list(session.get(f"omnibench/{selector}", consolidation=EVERY_REPLY, timeout=10.0))
+    assert len(replies) == answers
+    keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+    assert len(set(keys)) == len(keys)
+
+
+def test_a_failure_of_its_own_is_answered_in_one_line_and_logged(
+    loopback: Loopback, caplog: pytest.LogCaptureFixture
+) -> None:
+    def failing(_: RobotTracker) -> dict[str, Any]:
+        raise RuntimeError("a bug\nof two lines")
+
+    desk = Desk(loopback.client(), {"apr": RobotTracker("apr", calibration())}, failing, {})
+    session = loopback.client()
+    until(lambda: list(session.get("omnibench/apr/health", timeout=1.0)), "the desk")
+    answer = asked(session, "omnibench/apr/info")
+    again = asked(session, "omnibench/apr/health")
+    desk.close()
+    assert answer["error"] == "omnibench/apr/info: RuntimeError: a bug of two lines"
+    assert again["status"] == "waiting"
+    assert "a request failed: RuntimeError: a bug of two lines" in caplog.text
+
+
+def test_more_requests_than_the_desk_holds_are_refused_and_the_stream_goes_on(tmp_path: Path) -> None:
+    path = drive(1.0)
+    with running(config_of(tmp_path, "apr", "bob")) as (node, session):
+        heard = Heard(session, bob__odom=ODOMETRY)
+        wheels = session.declare_publisher("bob/joint_states")
+        until(lambda: wheels.matching_status.matching, "the node's subscription")
+        with node.trackers["apr"]._lock:  # the desk is held up by the first
+            waiting = [session.get("omnibench/apr/health", timeout=20.0) for _ in range(100)]
+            sent(wheels, path.samples())
+            until(lambda: len(heard["bob__odom"]) == 101, "the odometry")
+        replies = [reply for each in waiting for reply in each]
+    refused = [json.loads(reply.err.payload.to_bytes())["error"] for reply in replies if reply.err is not None]
+    assert len(replies) == 100
+    assert 30 <= len(refused) <= 40
+    assert set(refused) == {"omnibench/apr/health: 64 requests are waiting; ask again later"}
+
+
+def test_a_calibration_that_is_put_runs_from_the_next_sample_on_and_odom_does_not_jump(tmp_path: Path) -> None:
+    path, other = drive(1.0), calibration(scale=1.2)
+    with running(config_of(tmp_path)) as (node, session):
+        heard = Heard(session, apr__odom=ODOMETRY)
+        wheels = session.declare_publisher("apr/joint_states")
+        until(lambda: wheels.matching_status.matching, "the node's subscription")
+        sent(wheels, path.samples()[:51])
+        until(lambda: len(heard["apr__odom"]) == 51, "the first half")
+        session.put("omnibench/apr/calibration", as_text(other))
+        until(lambda: node.health("apr").counts["swaps"] == 1, "the swap")
+        sent(wheels, path.samples()[51:])
+        until(lambda: len(heard["apr__odom"]) == 101, "the second half")
+    poses = np.array([each.pose for each in heard["apr__odom"]])
+    steps = np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)
+    before = np.linalg.norm(np.diff(path.poses[:, :2], axis=0), axis=1)
+    np.testing.assert_allclose(steps[:50], before[:50], atol=1e-9)
+    np.testing.assert_allclose(steps[50:], 1.2 * before[50:], rtol=1e-3)
+
+
+def test_a_bad_calibration_that_is_put_is_refused_and_told_in_health(tmp_path: Path) -> None:
+    with running(config_of(tmp_path)) as (node, session):
+        session.put("omnibench/apr/calibration", as_text(calibration(wheels=4)))
+        until(lambda: node.health("apr").counts["swaps_refused"] == 1, "the refusal")
+        swap = asked(session, "omnibench/apr/health")["last_swap"]
+        assert not swap["accepted"]
+        assert "has wheels fl, fr, rl, rr; this robot has a, b, c" in swap["reason"]
+        assert asked(session, "omnibench/apr/info")["calibration"] == "synthetic 1"
+
+
+def test_a_flood_of_bad_calibrations_does_not_flood_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with running(config_of(tmp_path)) as (node, session):
+        for _ in range(20):
+            session.put("omnibench/apr/calibration", "format: something")
+        until(lambda: node.health("apr").counts["swaps_refused"] == 20, "the refusals")
+    assert caplog.text.count("apr: calibration refused, synthetic 1 runs on: ") == 1
+
+
+def test_a_calibration_too_long_to_be_put_is_refused_and_told_in_health(tmp_path: Path) -> None:
+    with running(config_of(tmp_path)) as (node, session):
+        session.put("omnibench/apr/calibration", "#" * 70_000)
+        until(lambda: node.health("apr").counts["swaps_refused"] == 1, "the refusal")
+        swap = node.health("apr").last_swap
+    assert swap is not None
+    assert swap.reason == "omnibench/apr/calibration: 70000 bytes are more than a request may have, 65536"
+
+
+def test_a_swap_is_kept_although_the_configs_file_went_elsewhere(tmp_path: Path) -> None:
+    config = config_of(tmp_path, state="state")
+    file = tmp_path / "calibration.yaml"
+    with running(config) as (_, session):
+        file.rename(tmp_path / "old.yaml")
+        answer = asked(session, "omnibench/apr/swap", as_text(calibration(scale=1.1)))
+        assert answer == {"robot": "apr", "accepted": True, "calibration": "synthetic 1.1", "kept": True}
+    (tmp_path / "old.yaml").rename(file)
+    with running(config) as (_, session):
+        assert asked(session, "omnibench/apr/info")["calibration"] == "synthetic 1.1"
+
+
+def test_a_swap_that_the_disk_refuses_runs_and_says_that_it_is_not_kept(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with running(config_of(tmp_path, state="state")) as (node, session):
+        (tmp_path / "state" / "apr.calibration.yaml").mkdir()
+        answer = asked(session, "omnibench/apr/swap", as_text(calibration(scale=1.1)))
+        assert node.trackers["apr"].calibration.name == "synthetic 1.1"
+    assert answer["accepted"]
+    assert not answer["kept"]
+    assert "apr.calibration.yaml: cannot be written: Is a directory" in answer["reason"]
+    assert "apr: calibration 'synthetic 1.1' runs, but not after a restart: " in caplog.text
+
+
+def test_without_a_state_a_swap_says_that_it_is_not_kept(tmp_path: Path) -> None:
+    with running(config_of(tmp_path)) as (_, session):
+        answer = asked(session, "omnibench/apr/swap", as_text(calibration(scale=1.1)))
+    assert answer["accepted"]
+    assert not answer["kept"]
+    assert "the node has no `state`" in answer["reason"]

@@ -1,0 +1,137 @@
+"""What a node remembers of a robot, on a real disk."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from drives import calibration
+from nodes import as_text
+
+from omnibench.errors import DataError
+from omnibench.live.estimation.saved_state import RobotMemory, SavedState
+from omnibench.robot.calibration import write_calibration
+
+AT = np.array([1.0, 2.0, 0.3]), np.diag([1e-4, 1e-4, 1e-5])
+STATE: dict[str, Any] = {
+    "sequence": 5,
+    "stamp": 10**18,
+    "wall": 1.8e9,
+    "positions": [1.0, 2.0, 3.0],
+    "pose": [1.0, 2.0, 0.3],
+    "covariance": [1e-4, 0, 0, 0, 1e-4, 0, 0, 0, 1e-5],
+}
+
+
+@pytest.fixture
+def memory(tmp_path: Path) -> Iterator[RobotMemory]:
+    opened = RobotMemory(tmp_path, "apr")
+    yield opened
+    opened.close()
+
+
+def loaded(folder: Path, content: str) -> SavedState | None:
+    """What a node makes of such a file."""
+    (folder / "apr.state.json").write_text(content)
+    memory = RobotMemory(folder, "apr")
+    try:
+        return memory.load()
+    finally:
+        memory.close()
+
+
+def test_a_state_comes_back_as_it_was(memory: RobotMemory) -> None:
+    memory.save(10**18, 1.8e9, np.array([1.0, 2.0, 3.0]), AT, None)
+    found = memory.load()
+    assert found is not None
+    assert found.pose == (1.0, 2.0, 0.3)
+    np.testing.assert_array_equal(np.reshape(found.covariance, (3, 3)), AT[1])
+
+
+def test_the_state_of_the_examples_below_is_taken(tmp_path: Path) -> None:
+    found = loaded(tmp_path, json.dumps(STATE))
+    assert found is not None
+    assert found.positions == (1.0, 2.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"covariance": [1e-4] * 8},
+        {"covariance": [float("nan")] * 9},
+        {"covariance": [-1e-4, 0, 0, 0, 1e-4, 0, 0, 0, 1e-5]},
+        {"map_covariance": [1e-4] * 10},
+        {"pose": [1.0, float("inf"), 0.3]},
+        {"pose": [1.0, 2.0]},
+        {"map_pose": [float("nan"), 0.0, 0.0]},
+        {"positions": [1.0, float("nan"), 3.0]},
+        {"stamp": 10**30},
+        {"wall": float("nan")},
+        {"more": 1},
+    ],
+)
+def test_a_damaged_state_is_left_aside_and_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, change: dict[str, Any]
+) -> None:
+    assert loaded(tmp_path, json.dumps(STATE | change)) is None
+    assert "apr.state.json: damaged; odom starts at its origin" in caplog.text
+
+
+@pytest.mark.parametrize("content", ["\x00" * 8192, "[" * 4096, '{"sequence": 1'])
+def test_what_is_no_state_at_all_is_left_aside(tmp_path: Path, content: str) -> None:
+    assert loaded(tmp_path, content) is None
+
+
+def test_a_robot_without_a_state_begins_without_a_word(memory: RobotMemory, caplog: pytest.LogCaptureFixture) -> None:
+    assert memory.load() is None
+    assert not caplog.text
+
+
+def test_a_swapped_calibration_is_kept_for_the_file_that_the_node_started_with(tmp_path: Path) -> None:
+    file, elsewhere = tmp_path / "calibration.yaml", tmp_path / "elsewhere.yaml"
+    write_calibration(calibration(), file)
+    memory = RobotMemory(tmp_path / "state", "apr")
+    memory.calibration(file)
+    file.rename(elsewhere)  # while the node runs
+    memory.keep_calibration(calibration(scale=1.1))
+    elsewhere.rename(file)
+    assert memory.calibration(file).name == "synthetic 1.1"
+    memory.close()
+
+
+def test_a_file_that_changed_takes_the_place_of_what_was_swapped_in(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    write_calibration(calibration(), file)
+    memory = RobotMemory(tmp_path / "state", "apr")
+    memory.calibration(file)
+    memory.keep_calibration(calibration(scale=1.1))
+    write_calibration(calibration(scale=0.9), file)
+    assert memory.calibration(file).name == "synthetic 0.9"
+    memory.close()
+
+
+def test_a_calibration_that_the_disk_refuses_is_one_line(tmp_path: Path, memory: RobotMemory) -> None:
+    (tmp_path / "apr.calibration.yaml").mkdir()
+    with pytest.raises(DataError, match=r"apr\.calibration\.yaml: cannot be written: Is a directory"):
+        memory.keep_calibration(calibration())
+
+
+def test_a_kept_calibration_that_is_damaged_says_which_file_to_remove(tmp_path: Path, memory: RobotMemory) -> None:
+    (tmp_path / "calibration.yaml").write_text(as_text(calibration()))
+    (tmp_path / "apr.calibration.yaml").write_text("instead_of: 1\n")
+    with pytest.raises(DataError, match=r"remove \S+apr\.calibration\.yaml to start with \S+/calibration\.yaml"):
+        memory.calibration(tmp_path / "calibration.yaml")
+
+
+def test_a_closed_memory_writes_nothing_more(tmp_path: Path) -> None:
+    memory = RobotMemory(tmp_path, "apr")
+    memory.save(1, 0.0, None, AT, None)
+    memory.close()
+    memory.close()
+    before = (tmp_path / "apr.state.json").read_bytes()
+    memory.save(2, 0.0, None, AT, None)  # of a sample that was on its way
+    assert (tmp_path / "apr.state.json").read_bytes() == before

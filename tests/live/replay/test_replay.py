@@ -1,0 +1,424 @@
+"""Replay: when messages arrive, what they hold, and that all of them do, over real sessions."""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from recordings import random_dataset
+from sessions import Loopback, until
+
+from omnibench.config import parse_yaml, to_yaml, validate
+from omnibench.errors import ConfigError
+from omnibench.live.replay.concatenated_drive import Chain, chain_runs
+from omnibench.live.replay.replay_player import Event, Player, PlayReport, Progress, ReplayConfig, events
+from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
+from omnibench.live.wire.topics import GraphNode, KeySpace, Profile
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Array
+
+ORIGIN = 1_700_000_000_000_000_000
+CHAIN = chain_runs(random_dataset(1))  # 2.4 s of motion and 2 s of rest, a pose every 0.1 s
+TOPICS = ("joint_states", "slam_pose")
+
+
+def config(**changes: Any) -> ReplayConfig:
+    return validate(ReplayConfig, {"stamp_origin": ORIGIN} | changes, "test")
+
+
+def played(chain: Chain = CHAIN, *, noise: Noise | None = None, **changes: Any) -> list[Event]:
+    return list(events(chain, config(**changes), noise=noise))
+
+
+def of(found: list[Event], topic: str) -> list[Event]:
+    return [each for each in found if each.topic == topic]
+
+
+def taken(found: list[Event]) -> Array:
+    """When the messages were taken, s of the recording."""
+    return np.array([each.message.stamp - ORIGIN for each in found]) / 1e9
+
+
+def arrivals(found: list[Event]) -> Array:
+    return np.array([each.arrival for each in found])
+
+
+def same(one: JointState | PoseEstimate, other: JointState | PoseEstimate) -> bool:
+    if isinstance(one, JointState) and isinstance(other, JointState):
+        return (
+            (one.stamp, one.names) == (other.stamp, other.names)
+            and np.array_equal(np.asarray(one.positions), np.asarray(other.positions))
+            and np.array_equal(np.asarray(one.velocities), np.asarray(other.velocities))
+        )
+    assert isinstance(one, PoseEstimate)
+    assert isinstance(other, PoseEstimate)
+    turn = (one.pose[2] - other.pose[2]) / (2 * math.pi)
+    return (
+        (one.stamp, one.frame) == (other.stamp, other.frame)
+        and np.array_equal(one.pose[:2], other.pose[:2])
+        and abs(turn - round(turn)) < 1e-12
+        and np.array_equal(one.covariance, other.covariance)
+    )
+
+
+class TestEvents:
+    @given(
+        st.integers(0, 100), st.floats(0, 0.5), st.floats(0, 0.5), st.floats(0, 1), st.floats(0, 1), st.floats(0, 0.5)
+    )
+    def test_they_come_by_time_of_arrival_and_never_before_they_were_taken(
+        self, seed: int, delay: float, jitter: float, drop: float, duplicate: float, period: float
+    ) -> None:
+        channel = {"delay": delay, "jitter": jitter, "drop": drop, "duplicate": duplicate}
+        found = played(seed=seed, wheels=channel, slam=channel | {"period": period})
+        assert (np.diff(arrivals(found)) >= 0).all()
+        assert (arrivals(found) - taken(found) >= delay - 1e-9).all()
+
+    def test_without_jitter_stamps_increase_and_delays_are_as_asked(self) -> None:
+        found = played(wheels={"delay": 0.03}, slam={"delay": 0.2, "jitter": 0, "period": 0})
+        for topic, delay in (("joint_states", 0.03), ("slam_pose", 0.2)):
+            messages = of(found, topic)
+            assert (np.diff([each.message.stamp for each in messages]) > 0).all()
+            np.testing.assert_allclose(arrivals(messages) - taken(messages), delay, atol=1e-8)
+
+    def test_every_sample_and_pose_of_the_chain_is_there(self) -> None:
+        found = played(slam={"period": 0})
+        samples, poses = of(found, "joint_states"), of(found, "slam_pose")
+        poses.sort(key=lambda each: each.message.stamp)
+        np.testing.assert_allclose(taken(samples), CHAIN.wheel_times, atol=1e-9)
+        np.testing.assert_array_equal([each.message.positions for each in samples], CHAIN.angles)
+        np.testing.assert_array_equal([each.message.velocities for each in samples], CHAIN.rates)
+        np.testing.assert_allclose(taken(poses), CHAIN.slam_times, atol=1e-9)
+        np.testing.assert_array_equal([each.message.pose for each in poses], CHAIN.slam_poses)
+        assert {each.message.frame for each in poses} == {"map"}
+
+    def test_jitter_is_half_normal(self) -> None:
+        times = 0.01 * np.arange(20_000.0)
+        long = replace(CHAIN, wheel_times=times, angles=np.zeros((20_000, 3)), rates=np.zeros((20_000, 3)))
+        samples = of(played(long, wheels={"delay": 1.0, "jitter": 0.05}), "joint_states")
+        late = arrivals(samples) - taken(samples) - 1.0
+        assert late.min() > -1e-9
+        assert late.mean() == pytest.approx(0.05 * math.sqrt(2 / math.pi), rel=0.05)
+        assert late.std() == pytest.approx(0.05 * math.sqrt(1 - 2 / math.pi), rel=0.05)
+
+    def test_jitter_of_more_than_the_period_brings_wheel_samples_out_of_order(self) -> None:
+        stamps = np.array([each.message.stamp for each in of(played(wheels={"jitter": 0.05}), "joint_states")])
+        assert np.count_nonzero(np.diff(stamps) < 0) > 10
+        assert len(np.unique(stamps)) == len(CHAIN.wheel_times)
+
+    def test_the_share_to_drop_is_dropped(self) -> None:
+        samples = of(played(wheels={"drop": 0.3}), "joint_states")
+        assert len(samples) == pytest.approx(0.7 * len(CHAIN.wheel_times), rel=0.2)
+        assert of(played(slam={"drop": 1}), "slam_pose") == []
+
+    def test_the_share_to_duplicate_comes_twice_with_the_same_content(self) -> None:
+        samples = of(played(wheels={"duplicate": 0.3, "jitter": 0.05}), "joint_states")
+        counts = Counter(each.message.stamp for each in samples)
+        assert set(counts.values()) == {1, 2}
+        assert sum(count == 2 for count in counts.values()) == pytest.approx(0.3 * len(CHAIN.wheel_times), rel=0.25)
+        stamp = next(stamp for stamp, count in counts.items() if count == 2)
+        first, second = (each for each in samples if each.message.stamp == stamp)
+        assert same(first.message, second.message)
+        assert first.arrival != second.arrival
+
+    def test_the_same_seed_gives_the_same_and_another_one_another(self) -> None:
+        channel = {"jitter": 0.01, "drop": 0.1, "duplicate": 0.1}
+        first, again, other = (played(seed=seed, wheels=channel, slam=channel) for seed in (3, 3, 4))
+        assert [(each.arrival, each.topic, each.message.stamp) for each in first] == [
+            (each.arrival, each.topic, each.message.stamp) for each in again
+        ]
+        assert all(same(one.message, two.message) for one, two in zip(first, again, strict=True))
+        assert not np.array_equal(arrivals(first), arrivals(other))
+
+    def test_what_befalls_the_slam_does_not_change_the_wheels(self) -> None:
+        wheels = {"jitter": 0.01, "drop": 0.1}
+        one = of(played(wheels=wheels), "joint_states")
+        two = of(played(wheels=wheels, slam={"drop": 0.5, "period": 1.0}), "joint_states")
+        np.testing.assert_array_equal(arrivals(one), arrivals(two))
+
+    @pytest.mark.parametrize("period", [0.1, 0.15, 0.25, 1.0])
+    def test_poses_are_thinned_to_the_period_and_no_more(self, period: float) -> None:
+        times = taken(of(played(slam={"period": period, "jitter": 0}), "slam_pose"))
+        assert times[0] == 0
+        assert (np.diff(times) >= period - 1e-6).all()
+        for before, after in pairwise(times):  # the next one is the first that was far enough
+            assert after == pytest.approx(CHAIN.slam_times[CHAIN.slam_times >= before + period - 1e-6][0])
+
+    @pytest.mark.parametrize(("use", "held"), [("positions", (1, 0)), ("velocities", (0, 1)), ("both", (1, 1))])
+    def test_wheel_messages_hold_what_is_asked_for(self, use: str, held: tuple[int, int]) -> None:
+        messages = [each.message for each in of(played(wheels={"use": use}), "joint_states")]
+        assert {(m.positions is not None, m.velocities is not None) for m in messages} == {held}
+
+    def test_joints_are_the_robots_wheels_or_as_named(self) -> None:
+        assert next(events(CHAIN, config())).message.names == ("a", "b", "c")
+        named = next(events(CHAIN, config(), names=("left", "right", "rear")))
+        assert named.message.names == ("left", "right", "rear")
+
+    @pytest.mark.parametrize("names", [("left", "right"), ("left", "left", "rear"), ()])
+    def test_names_that_are_not_one_for_each_wheel_are_refused(self, names: tuple[str, ...]) -> None:
+        with pytest.raises(ConfigError, match="give each of the wheels a, b, c a name"):
+            events(CHAIN, config(), names=names)
+
+    def test_stamps_begin_with_the_time_of_the_replay_unless_told(self) -> None:
+        before = time.time_ns()
+        first = next(events(CHAIN, ReplayConfig()))
+        assert before <= first.message.stamp <= time.time_ns()
+        assert next(events(CHAIN, config(), origin=5)).message.stamp == 5
+
+
+class TestCovariances:
+    @staticmethod
+    def covariances(chain: Chain = CHAIN, noise: Noise | None = None, **slam: Any) -> Array:
+        found = of(played(chain, noise=noise, slam={"period": 0, "jitter": 0} | slam), "slam_pose")
+        return np.array([each.message.covariance for each in found])
+
+    def test_those_of_the_data_set_come_first(self) -> None:
+        recorded = np.random.default_rng(1).normal(size=(len(CHAIN.slam_times), 3, 3))
+        found = self.covariances(
+            replace(CHAIN, slam_covariances=recorded), Noise(pose_position=1), covariance={"position": 1, "heading": 1}
+        )
+        np.testing.assert_array_equal(found, recorded)
+
+    def test_then_those_of_the_config(self) -> None:
+        found = self.covariances(noise=Noise(pose_position=1), covariance={"position": 0.03, "heading": 0.01})
+        np.testing.assert_allclose(found, np.tile(np.diag([9e-4, 9e-4, 1e-4]), (len(found), 1, 1)))
+
+    def test_then_what_the_noise_model_makes_of_the_time_since_the_run_began(self) -> None:
+        noise = Noise(
+            pose_position=0.03,
+            bias_position=0.04,
+            walk_position=0.02,
+            pose_heading=0.01,
+            bias_heading=0,
+            walk_heading=0.1,
+        )
+        found = self.covariances(noise=noise)
+        since = CHAIN.slam_times - CHAIN.begins[CHAIN.slam_run]
+        assert since.max() == pytest.approx(0.8)
+        np.testing.assert_allclose(found[:, 0, 0], 0.0025 + 0.0004 * since)
+        np.testing.assert_allclose(found[:, 1, 1], found[:, 0, 0])
+        np.testing.assert_allclose(found[:, 2, 2], 0.0001 + 0.01 * since)
+
+    def test_without_any_they_are_moderate_and_never_singular(self) -> None:
+        np.testing.assert_allclose(self.covariances()[0], np.diag([4e-4, 4e-4, 4e-4]))
+        assert np.linalg.eigvalsh(self.covariances(noise=Noise())).min() > 0
+
+
+class TestConfig:
+    def test_the_highest_speed_is_called_max(self) -> None:
+        assert config(speed="max").speed == math.inf
+        assert validate(ReplayConfig, parse_yaml("speed: max", "test"), "test").speed == math.inf
+
+    def test_it_comes_back_from_yaml(self) -> None:
+        for speed in (0.5, math.inf):
+            written = ReplayConfig(speed=speed)
+            assert validate(ReplayConfig, parse_yaml(to_yaml(written), "test"), "test") == written
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"speed": 0}, "speed: Input should be greater than 0"),
+            ({"speed": math.nan}, "speed: Input should be greater than 0"),
+            ({"speed": "fast"}, "speed: Input should be a valid number"),
+            ({"pause": -1}, "pause: Input should be greater than or equal to 0"),
+            ({"wheels": {"drop": 1.5}}, "wheels.drop: Input should be less than or equal to 1"),
+            ({"slam": {"delay": math.inf}}, "slam.delay: Input should be a finite number"),
+            ({"slam": {"covariance": {"position": 0}}}, "slam.covariance.position: Input should be greater than 0"),
+            ({"wheels": {"periot": 1}}, "unknown key 'wheels.periot'"),
+            ({"sped": 1}, "did you mean 'speed'"),
+        ],
+    )
+    def test_what_cannot_be_is_refused(self, changes: dict[str, Any], message: str) -> None:
+        with pytest.raises(ConfigError, match=message):
+            config(**changes)
+
+
+class Listener:
+    """Takes down what arrives on a robot's inputs, in a session of its own, as a node would."""
+
+    def __init__(
+        self, loopback: Loopback, profile: Profile = "plain", *, work: float = 0.0, stall: float = 0.0
+    ) -> None:
+        self._work = work  # s that it takes for a message
+        self._stall = stall  # s more for the first one
+        self.messages: dict[str, list[Any]] = {topic: [] for topic in TOPICS}
+        self.times: list[float] = []
+        node = GraphNode(loopback.client(), KeySpace(profile), "listener")
+        self._subscribers = [node.subscribe("apr02", topic, self._take(topic)) for topic in TOPICS]
+
+    @property
+    def count(self) -> int:
+        return sum(len(each) for each in self.messages.values())
+
+    def _take(self, topic: str) -> Callable[[Any], None]:
+        decode = {"joint_states": JOINT_STATE, "slam_pose": POSE_ESTIMATE}[topic].decode
+
+        def take(sample: Any) -> None:
+            self.times.append(time.perf_counter())
+            self.messages[topic].append(decode(sample.payload.to_bytes()))
+            seconds, self._stall = self._work + self._stall, 0.0
+            if seconds:
+                time.sleep(seconds)
+
+        return take
+
+
+def player(loopback: Loopback, chain: Chain = CHAIN, profile: Profile = "plain", **changes: Any) -> Player:
+    return Player(GraphNode(loopback.client(), KeySpace(profile), "replay"), "apr02", chain, config(**changes))
+
+
+class TestPlayer:
+    @pytest.mark.parametrize("profile", ["plain", "rmw", "humble"])
+    def test_everything_arrives_as_it_was_sent_and_in_that_order(self, loopback: Loopback, profile: Profile) -> None:
+        node = Listener(loopback, profile)
+        channel = {"jitter": 0.05, "drop": 0.1, "duplicate": 0.1}
+        changes = {"wheels": channel, "slam": channel | {"period": 0}}
+        report = player(loopback, profile=profile, speed="max", **changes).play()
+        expected = played(**changes)
+        until(lambda: node.count == len(expected), "all messages")
+        for topic in TOPICS:
+            sent = of(expected, topic)
+            assert report.sent[topic] == len(sent)
+            pairs = zip(node.messages[topic], sent, strict=True)
+            assert all(same(message, event.message) for message, event in pairs)
+        assert report.complete
+        assert report.data_seconds == expected[-1].arrival
+
+    def test_it_keeps_the_pace(self, loopback: Loopback) -> None:
+        node = Listener(loopback)
+        report = player(loopback, speed=4, slam={"delay": 0}).play()
+        until(lambda: node.count == report.total, "all messages")
+        assert report.wall_seconds == pytest.approx(report.data_seconds / 4, rel=0.1)
+        assert node.times[-1] - node.times[0] == pytest.approx(report.data_seconds / 4, rel=0.1)
+        halfway = node.times[node.count // 2] - node.times[0]
+        assert halfway == pytest.approx(report.data_seconds / 8, rel=0.15)
+
+    def test_twenty_times_the_speed_takes_a_twentieth_of_the_time(self, loopback: Loopback) -> None:
+        node = Listener(loopback)
+        chain = chain_runs(random_dataset(2, 5), pause=3.0)
+        report = player(loopback, chain, speed=20).play()
+        until(lambda: node.count == report.total, "all messages")
+        assert report.wall_seconds == pytest.approx(report.data_seconds / 20, rel=0.1)
+
+    def test_after_a_hiccup_it_catches_up(self, loopback: Loopback) -> None:
+        node = Listener(loopback)
+        stalled: list[Progress] = []
+
+        def stall_once(progress: Progress) -> None:
+            if not stalled:
+                time.sleep(0.3)
+            stalled.append(progress)
+
+        report = player(loopback, speed=4).play(watch=stall_once)
+        until(lambda: node.count == report.total, "all messages")
+        assert report.wall_seconds == pytest.approx(report.data_seconds / 4, rel=0.1)
+        assert report.late > 0.2
+
+    def test_nothing_is_lost_at_the_highest_speed_on_a_subscriber_that_stalls(self, loopback: Loopback) -> None:
+        node = Listener(loopback, stall=1.5)  # in which the buffers on the way fill up, with some 25,000 messages
+        chain = chain_runs(random_dataset(3, 10, samples=5000), pause=0.1)
+        report = player(loopback, chain, speed="max").play()
+        assert report.complete
+        assert report.total > 50_000
+        until(lambda: node.count == report.total, "all messages", 30)
+        stamps = [message.stamp for message in node.messages["joint_states"]]
+        assert (np.diff(stamps) > 0).all()
+
+    def test_nothing_is_lost_when_the_session_closes_right_after(self, loopback: Loopback) -> None:
+        node = Listener(loopback, work=2e-5)
+        session = loopback.client()
+        chain = chain_runs(random_dataset(4, 5, samples=1000))
+        report = Player(GraphNode(session, KeySpace(), "replay"), "apr02", chain, config(speed="max")).play()
+        session.close()
+        until(lambda: node.count == report.total, "all messages", 30)
+
+    def test_it_starts_when_a_subscriber_is_there_and_loses_nothing_of_the_beginning(self, loopback: Loopback) -> None:
+        reports: list[PlayReport] = []
+        waiting = player(loopback, speed="max")
+        thread = threading.Thread(target=lambda: reports.append(waiting.play()))
+        thread.start()
+        time.sleep(0.2)  # it would have played all of it by now
+        node = Listener(loopback)
+        thread.join(10)
+        until(lambda: node.count == reports[0].total, "all messages")
+        assert min(message.stamp for message in node.messages["joint_states"]) == ORIGIN
+
+    def test_a_node_without_fusion_is_enough(self, loopback: Loopback) -> None:
+        node = GraphNode(loopback.client(), KeySpace(), "wheels only")
+        samples: list[Any] = []
+        subscriber = node.subscribe("apr02", "joint_states", samples.append)
+        report = player(loopback, speed="max").play()
+        until(lambda: len(samples) == report.sent["joint_states"], "all wheel samples")
+        subscriber.undeclare()
+
+    def test_nobody_who_subscribes_is_told_in_one_line(self, loopback: Loopback) -> None:
+        begin = time.perf_counter()
+        with pytest.raises(ConfigError, match=r"nobody subscribes to apr02/joint_states after 0\.3 s; start omnibench"):
+            player(loopback, wait=0.3).play()
+        assert 0.3 <= time.perf_counter() - begin < 2
+
+    def test_without_waiting_it_plays_to_nobody(self, loopback: Loopback) -> None:
+        report = player(loopback, wait=0, speed="max").play()
+        assert report.complete
+
+    def test_a_robot_that_cannot_be_part_of_a_key_is_refused(self, loopback: Loopback) -> None:
+        with pytest.raises(ConfigError, match="robot 'a/\\*': a robot's name is one word"):
+            Player(GraphNode(loopback.client(), KeySpace(), "replay"), "a/*", CHAIN, config())
+
+
+class TestStopping:
+    @pytest.fixture
+    def progress(self) -> list[Progress]:
+        return []
+
+    @pytest.fixture
+    def node(self, loopback: Loopback) -> Listener:
+        return Listener(loopback)
+
+    @pytest.mark.usefixtures("node")
+    def test_progress_tells_messages_and_both_times(self, loopback: Loopback, progress: list[Progress]) -> None:
+        report = player(loopback, speed=4).play(watch=progress.append)
+        assert len(progress) >= 5
+        done = [each.done for each in progress]
+        assert done == sorted(done)
+        assert progress[-1] == Progress(report.total, report.total, report.data_seconds, report.wall_seconds)
+        middle = progress[len(progress) // 2]
+        assert middle.data_seconds == pytest.approx(4 * middle.wall_seconds, rel=0.2)
+
+    def test_it_stops_at_once_when_told(self, loopback: Loopback, node: Listener, progress: list[Progress]) -> None:
+        stop = threading.Event()
+        timer = threading.Timer(0.5, stop.set)
+        timer.start()
+        report = player(loopback, speed=1).play(stop, progress.append)
+        assert report.wall_seconds == pytest.approx(0.5, abs=0.2)
+        assert not report.complete
+        assert progress[-1].done == sum(report.sent.values()) < report.total
+        until(lambda: node.count == progress[-1].done, "what was sent")
+
+    def test_it_stops_at_once_at_ctrl_c(self, loopback: Loopback, node: Listener) -> None:
+        main = threading.main_thread().ident
+        assert main is not None
+        timer = threading.Timer(0.5, lambda: signal.pthread_kill(main, signal.SIGINT))
+        timer.start()
+        report = player(loopback, speed=0.1).play()
+        assert report.wall_seconds == pytest.approx(0.5, abs=0.2)
+        assert not report.complete
+        assert node.count > 0
+
+    def test_it_stops_while_it_waits_for_a_subscriber(self, loopback: Loopback) -> None:
+        stop = threading.Event()
+        timer = threading.Timer(0.2, stop.set)
+        timer.start()
+        report = player(loopback, wait=60).play(stop)
+        assert (sum(report.sent.values()), report.complete) == (0, False)
+        assert report.wall_seconds < 2

@@ -1,0 +1,299 @@
+"""Every message, published by real sessions in every profile, is read by decoders that are not ours."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from samples import COVARIANCE, sample
+from sessions import Loopback, open_loopback, until
+
+from omnibench.live.wire.recorder import Recorder
+from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace, Profile, Publisher
+
+PROFILES: tuple[Profile, ...] = ("plain", "rmw", "humble")
+QOS = "::,10:,:,:,,"
+
+HEADER = {"sec": 1_700_000_000, "nanosec": 123_456_789}
+
+
+def covariance_36(scale: float) -> list[float]:
+    """The samples' covariance of (x, y, heading) in ROS 2's order (x, y, z, roll, pitch, yaw), row by row."""
+    full = np.zeros((6, 6))
+    full[np.ix_([0, 1, 5], [0, 1, 5])] = scale * COVARIANCE
+    full[2, 2] = full[3, 3] = full[4, 4] = 1e-9
+    return full.ravel().tolist()
+
+
+def pose_36(x: float, y: float, heading: float) -> list[float]:
+    """Position, quaternion and covariance."""
+    return [x, y, 0.0, 0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2), *covariance_36(1.0)]
+
+
+def odometry_read(content: Any) -> list[Any]:
+    linear, angular = content.twist.twist.linear, content.twist.twist.angular
+    return [
+        content.header.frame_id,
+        content.child_frame_id,
+        *pose_read(content.pose),
+        *(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z),
+        *content.twist.covariance,
+    ]
+
+
+def pose_read(pose: Any) -> list[float]:
+    position, orientation = pose.pose.position, pose.pose.orientation
+    return [
+        *(position.x, position.y, position.z),
+        *(orientation.x, orientation.y, orientation.z, orientation.w),
+        *pose.covariance,
+    ]
+
+
+def transform_read(transform: Any) -> list[Any]:
+    moved, turned = transform.transform.translation, transform.transform.rotation
+    return [
+        *(transform.header.stamp.sec, transform.header.stamp.nanosec),
+        *(transform.header.frame_id, transform.child_frame_id),
+        *(moved.x, moved.y, moved.z, turned.x, turned.y, turned.z, turned.w),
+    ]
+
+
+def read(topic: str, content: Any) -> list[Any]:
+    """All that a decoded message holds, whichever decoder made the object."""
+    if topic == "tf":
+        return [value for transform in content.transforms for value in transform_read(transform)]
+    values: list[Any] = [content.header.stamp.sec, content.header.stamp.nanosec]
+    if topic == "joint_states":
+        return [*values, *content.name, *content.position, *content.velocity, *content.effort]
+    if topic == "slam_pose":
+        return [*values, content.header.frame_id, *pose_read(content.pose)]
+    if topic == "diagnostics":
+        for status in content.status:
+            values += [int(status.level), status.name, status.message, status.hardware_id]
+            values += [text for pair in status.values for text in (pair.key, pair.value)]
+        return values
+    return [*values, *odometry_read(content)]
+
+
+def turned(heading: float) -> list[float]:
+    return [0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2)]
+
+
+MOVED = [*pose_36(1.25, -2.5, 0.7), 0.31, -0.12, 0.0, 0.0, 0.0, 0.45, *covariance_36(2.0)]
+EXPECTED: dict[str, list[Any]] = {
+    "joint_states": [*HEADER.values(), "a", "b", "c", 0.1, 0.2, 0.3, 1.5, -2.5, 3.5],
+    "slam_pose": [*HEADER.values(), "map", *pose_36(3.5, -1.25, -2.1)],
+    "odom": [*HEADER.values(), "odom", "base_link", *MOVED],
+    "odometry/filtered": [*HEADER.values(), "map", "base_link", *MOVED],
+    "diagnostics": [*HEADER.values(), 1, "odometry", "late samples", "apr02", "late", "3", "rate_hz", "99.8"],
+    "tf": [
+        *(*HEADER.values(), "map", "odom", 0.5, 0.25, 0.0, *turned(0.125)),
+        *(*HEADER.values(), "odom", "base_link", 1.0, 2.0, 0.0, *turned(-3.0)),
+    ],
+}
+
+
+def ros_name(topic: str) -> str:
+    return "/tf" if topic == "tf" else f"/apr02/{topic}"
+
+
+@pytest.fixture(scope="module")
+def network() -> Iterator[Loopback]:
+    opened = open_loopback()
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="module", params=PROFILES)
+def profile(request: pytest.FixtureRequest) -> Profile:
+    found: Profile = request.param
+    return found
+
+
+@pytest.fixture(scope="module")
+def node(network: Loopback, profile: Profile) -> dict[str, Publisher[Any]]:
+    """A node's publishers of every topic."""
+    graph = GraphNode(network.client(), KeySpace(profile, domain=PROFILES.index(profile)), "omnibench")
+    return {topic: graph.publisher("apr02", topic) for topic in TOPICS}
+
+
+@contextmanager
+def samples_of(network: Loopback, publisher: Publisher[Any]) -> Iterator[Callable[[], zenoh.Sample]]:
+    """The next sample of a publisher, in another session, time after time; then nobody subscribes to it any more."""
+    with network.client().declare_subscriber(publisher.key) as subscriber:
+        until(lambda: publisher.matched, "the subscription")
+
+        def sample_that_comes() -> zenoh.Sample:
+            found: list[zenoh.Sample] = []
+
+            def comes() -> bool:
+                one = subscriber.try_recv()
+                found.extend([one] if one else [])
+                return bool(found)
+
+            until(comes, "a sample")
+            return found[0]
+
+        yield sample_that_comes
+    until(lambda: not publisher.matched, "the subscription to go")
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+def test_rosbags_reads_what_comes_over_zenoh(network: Loopback, node: dict[str, Publisher[Any]], topic: str) -> None:
+    with samples_of(network, node[topic]) as next_sample:
+        node[topic].put(sample(topic))
+        payload = next_sample().payload.to_bytes()
+    store = get_typestore(Stores.ROS2_HUMBLE)  # of the oldest ROS 2 that reads us
+    assert read(topic, store.deserialize_cdr(payload, TOPICS[topic].name)) == EXPECTED[topic]
+
+
+@pytest.fixture(scope="module")
+def recording(
+    network: Loopback, profile: Profile, node: dict[str, Publisher[Any]], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """One message of every topic, recorded."""
+    path = tmp_path_factory.mktemp("recording") / f"{profile}.mcap"
+    keys = KeySpace(profile, domain=PROFILES.index(profile))
+    with Recorder(network.client(), keys, ["apr02"], path) as recorder:
+        until(lambda: all(publisher.matched for publisher in node.values()), "the recorder's subscriptions")
+        for topic, publisher in node.items():
+            publisher.put(sample(topic))
+        until(lambda: recorder.messages == len(TOPICS), "all messages")
+    return path
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+def test_rosbags_reads_the_recording(recording: Path, topic: str) -> None:
+    with AnyReader([recording]) as reader:
+        (connection,) = [each for each in reader.connections if each.topic == ros_name(topic)]
+        ((_, _, payload),) = reader.messages([connection])
+        content = reader.deserialize(payload, connection.msgtype)
+    assert connection.msgtype == TOPICS[topic].name
+    assert read(topic, content) == EXPECTED[topic]
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+def test_mcap_ros2_support_reads_the_recording(recording: Path, topic: str) -> None:
+    decoder = pytest.importorskip("mcap_ros2.decoder", reason="mcap-ros2-support is not installed")
+    mcap = pytest.importorskip("mcap.reader")
+    with recording.open("rb") as file:
+        reader = mcap.make_reader(file, decoder_factories=[decoder.DecoderFactory()])
+        ((schema, _, _, content),) = reader.iter_decoded_messages(topics=[ros_name(topic)])
+    assert schema.name == TOPICS[topic].name
+    assert read(topic, content) == EXPECTED[topic]
+
+
+@pytest.fixture(scope="module")
+def sdk(network: Loopback) -> Iterator[Any]:
+    """zenoh-ros2-sdk, whose one session is connected to our router."""
+    package = pytest.importorskip("zenoh_ros2_sdk", reason="zenoh-ros2-sdk is not installed")
+    session = package.ZenohSession.get_instance("127.0.0.1", network.port)
+    yield package
+    session.close()
+
+
+@pytest.fixture(scope="module")
+def rmw_node(network: Loopback) -> Iterator[dict[str, Publisher[Any]]]:
+    """A node of another ROS domain."""
+    graph = GraphNode(network.client(), KeySpace("rmw", domain=42), "omnibench")
+    yield {topic: graph.publisher("apr02", topic) for topic in TOPICS}
+    graph.session.close()
+
+
+def definitions(topic: str) -> tuple[str, dict[str, str]]:
+    """The definition of a topic's type, and those of the types within it by name."""
+    own, *others = TOPICS[topic].definition.split("=" * 80 + "\n")
+    within = dict(text.removeprefix("MSG: ").split("\n", 1) for text in others)
+    return own, {"/msg/".join(name.split("/")): text for name, text in within.items()}
+
+
+def type_hash(topic: str) -> str:
+    """As zenoh-ros2-sdk computes it."""
+    utils = pytest.importorskip("zenoh_ros2_sdk.utils")
+    own, within = definitions(topic)
+    found: str = utils.get_type_hash(TOPICS[topic].name, own, within)
+    return found
+
+
+@pytest.mark.usefixtures("rmw_node")
+def test_another_ros_client_lists_the_topics_with_their_types(sdk: Any, network: Loopback) -> None:
+    listed: Callable[[], list[tuple[str, list[str]]]] = lambda: sdk.get_topic_names_and_types(  # noqa: E731
+        42, "127.0.0.1", network.port
+    )
+    expected = sorted((ros_name(topic), [kind.name]) for topic, kind in TOPICS.items())
+    until(lambda: len(listed()) == len(TOPICS), "all topics in the list")
+    assert listed() == expected
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+def test_another_ros_client_knows_publisher_type_hash_and_qos(
+    sdk: Any, network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str
+) -> None:
+    assert rmw_node
+    info = sdk.get_topic_info(ros_name(topic), 42, "127.0.0.1", network.port, verbose=True)
+    (publisher,) = info.publishers
+    assert (publisher.node_name, publisher.topic_type) == ("omnibench", TOPICS[topic].name)
+    assert publisher.type_hash == type_hash(topic)
+    qos = pytest.importorskip("zenoh_ros2_sdk.qos")
+    assert qos.QosProfile.decode(publisher.qos) == qos.QosProfile(
+        qos.QosReliability.RELIABLE, qos.QosDurability.VOLATILE, qos.QosHistoryKind.KEEP_LAST, 10
+    )
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+def test_another_ros_client_reads_the_content(
+    sdk: Any, network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str
+) -> None:
+    came, contents = threading.Event(), []
+
+    def callback(content: Any) -> None:
+        contents.append(content)
+        came.set()
+
+    subscriber = sdk.ROS2Subscriber(
+        ros_name(topic),
+        TOPICS[topic].name,
+        callback,
+        msg_definition=TOPICS[topic].definition,
+        domain_id=42,
+        router_ip="127.0.0.1",
+        router_port=network.port,
+        type_hash=type_hash(topic),
+    )
+    try:
+        until(lambda: rmw_node[topic].matched, "the subscription")
+        rmw_node[topic].put(sample(topic))
+        assert came.wait(10)
+    finally:
+        subscriber.close()
+    until(lambda: not rmw_node[topic].matched, "the subscription to go")
+    assert read(topic, contents[0]) == EXPECTED[topic]
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+def test_each_message_says_who_sent_it_when_and_which_one_it_is(
+    network: Loopback, rmw_node: dict[str, Publisher[Any]], topic: str
+) -> None:
+    package = pytest.importorskip("zenoh_ros2_sdk.attachment", reason="zenoh-ros2-sdk is not installed")
+    with samples_of(network, rmw_node[topic]) as next_sample:
+        attachments = []
+        for _ in range(2):
+            rmw_node[topic].put(sample(topic))
+            attachment = next_sample().attachment
+            assert attachment is not None
+            attachments.append(package.Attachment.from_bytes(attachment.to_bytes()))
+    first, second = attachments
+    assert second.sequence_id == first.sequence_id + 1
+    assert second.timestamp_ns > first.timestamp_ns
+    assert first.gid == second.gid
+    assert len(first.gid) == 16

@@ -1,0 +1,259 @@
+"""The LIDAR: exact geometry, motion within a scan, noise, and scans that cannot be."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from shapely.geometry import LineString, Point
+
+from omnibench.config import validate
+from omnibench.data.scans import TrajectoryScans
+from omnibench.errors import ConfigError, DataError
+from omnibench.robot.kinematics import Array
+from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
+from omnibench.simulate.chain.lidar import Lidar, LidarMount, PoseTrack, measure_scans, scan_stamps
+from omnibench.simulate.chain.ray_casting import cast_rays
+
+EXACT = Lidar(rays=360, noise=0.0, far_noise=0.0, dropouts=0.0, resolution=1e-6)
+FLOAT32 = 2e-6  # m: steps of float32 below 16 m, and of the resolution
+seeds = st.integers(0, 2**32 - 1)
+
+
+def square(half: float, obstacles: tuple[Any, ...] = ()) -> FloorPlan:
+    boundary = ((-half, -half), (half, -half), (half, half), (-half, half))
+    return make_plan(RoomPlan(boundary=boundary, obstacles=obstacles, start=(0, 0, 0)), "room")
+
+
+def standing(x: float, y: float, heading: float) -> PoseTrack:
+    return PoseTrack(np.array([0.0, 1.0]), np.array([[x, y, heading]] * 2))
+
+
+def look(
+    plan: FloorPlan, lidar: Lidar, track: PoseTrack, stamps: Array | None = None, seed: int = 0
+) -> TrajectoryScans:
+    return measure_scans(plan, lidar, track, np.zeros(1) if stamps is None else stamps, np.random.default_rng(seed))
+
+
+def to_the_walls(half: float, x: Array, y: Array, direction: Array) -> Array:
+    """From inside of a square to its walls, along directions."""
+    with np.errstate(divide="ignore", over="ignore"):
+        along_x = (half - np.sign(np.cos(direction)) * x) / np.abs(np.cos(direction))
+        along_y = (half - np.sign(np.sin(direction)) * y) / np.abs(np.sin(direction))
+    return np.minimum(along_x, along_y)
+
+
+@given(
+    x=st.floats(-3, 3), y=st.floats(-3, 3), heading=st.floats(-10, 10),
+    forward=st.floats(-0.5, 0.5), left=st.floats(-0.5, 0.5), yaw=st.floats(-180, 180),
+)  # fmt: skip
+def test_ranges_in_a_square_room_are_exact(
+    x: float, y: float, heading: float, forward: float, left: float, yaw: float
+) -> None:
+    lidar = EXACT.model_copy(update={"mount": LidarMount(x=forward, y=left, yaw_deg=yaw)})
+    found = look(square(4), lidar, standing(x, y, heading)).ranges[0]
+    scanner_x = x + forward * math.cos(heading) - left * math.sin(heading)
+    scanner_y = y + forward * math.sin(heading) + left * math.cos(heading)
+    directions = heading + math.radians(yaw) + lidar.scanner.angles
+    expected = to_the_walls(4, np.array(scanner_x), np.array(scanner_y), directions)
+    seen = expected > lidar.range_min + FLOAT32
+    assert np.abs(found - expected)[seen].max() < FLOAT32
+
+
+@given(seed=seeds)
+def test_ranges_agree_with_shapely_among_random_polygons(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    plan = make_plan(
+        RoomPlan(
+            boundary=_star(rng, 0, 0, 7, 10),
+            obstacles=tuple(_star(rng, 3 * math.cos(turn), 3 * math.sin(turn), 0.2, 1.0) for turn in (0, 2, 4)),
+            start=(0, 0, 0),
+        ),
+        "room",
+    )
+    x, y, heading = *rng.uniform(-0.5, 0.5, 2), rng.uniform(-math.pi, math.pi)
+    scanner = EXACT.model_copy(update={"rays": 30, "mount": LidarMount(x=0)}).scanner
+    found = cast_rays(plan.segments, scanner, np.zeros(1), np.array([[x, y, heading]]), np.zeros(1))[0]
+    walls = [plan.boundary.exterior, *(obstacle.exterior for obstacle in plan.obstacles)]
+    for direction, distance in zip(heading + scanner.angles, found, strict=True):
+        ray = LineString([(x, y), (x + 30 * math.cos(direction), y + 30 * math.sin(direction))])
+        nearest = min(
+            Point(x, y).distance(hit) for wall in walls for hit in [wall.intersection(ray)] if not hit.is_empty
+        )
+        assert distance == pytest.approx(nearest, abs=1e-9)
+
+
+def _star(rng: np.random.Generator, x: float, y: float, low: float, high: float) -> tuple[tuple[float, float], ...]:
+    """A polygon that is seen whole from (x, y)."""
+    corners = int(rng.integers(6, 13))
+    turns = (np.arange(corners) + rng.uniform(0.3, 0.7, corners)) * 2 * np.pi / corners
+    reach = rng.uniform(low, high, corners)
+    return tuple((x + r * math.cos(turn), y + r * math.sin(turn)) for r, turn in zip(reach, turns, strict=True))
+
+
+@given(seed=seeds)
+def test_no_ray_slips_through_a_corner(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    corners = np.array(_star(rng, 0, 0, 1, 5))
+    walls = np.hstack([corners, np.roll(corners, -1, axis=0)])
+    for corner in corners:
+        aimed = EXACT.model_copy(update={"rays": 1, "field_of_view_deg": 1e-9, "mount": LidarMount(x=0)}).scanner
+        heading = math.atan2(corner[1], corner[0])
+        found = cast_rays(walls, aimed, np.zeros(1), np.array([[0, 0, heading]]), np.zeros(1))
+        assert found[0, 0] == pytest.approx(np.hypot(*corner), rel=1e-6)
+
+
+def circling(vx: float, vy: float, turn_rate: float, times: Array) -> Array:
+    """Exact poses under a constant twist from the origin."""
+    turned = turn_rate * times
+    along = np.sin(turned) / turn_rate
+    across = (1 - np.cos(turned)) / turn_rate
+    return np.column_stack([vx * along - vy * across, vx * across + vy * along, turned])
+
+
+@given(
+    vx=st.floats(-1, 1),
+    vy=st.floats(-1, 1),
+    turn_rate=st.floats(0.1, 3) | st.floats(-3, -0.1),
+    latency=st.floats(0, 0.2),
+)
+def test_each_ray_starts_where_the_robot_then_is(vx: float, vy: float, turn_rate: float, latency: float) -> None:
+    lidar = EXACT.model_copy(update={"latency": latency})
+    times = np.arange(-300, 1200) * 0.001
+    stamps = np.array([0.0, 0.213, 0.5])
+    found = look(square(4), lidar, PoseTrack(times, circling(vx, vy, turn_rate, times)), stamps).ranges
+    measured = stamps[:, None] - latency + 0.025 * 270 / 360 * np.arange(360) / 360
+    x, y, heading = circling(vx, vy, turn_rate, measured.ravel()).T
+    x, y = x + 0.1 * np.cos(heading), y + 0.1 * np.sin(heading)
+    directions = heading + np.tile(lidar.scanner.angles, 3)
+    assert np.abs(found.ravel() - to_the_walls(4, x, y, directions)).max() < 5e-6
+
+
+def test_without_distortion_all_rays_start_where_the_robot_is_at_the_stamp() -> None:
+    times = np.arange(0, 1000) * 0.001
+    track = PoseTrack(times, circling(0.5, 0.2, 2.0, times))
+    lidar = EXACT.model_copy(update={"distortion": False})
+    assert lidar.scanner.time_increment == 0
+    at_rest = PoseTrack(np.zeros(1), track.at(np.array([0.3])))
+    found = look(square(4), lidar, track, np.array([0.3])).ranges
+    assert (found == look(square(4), lidar, at_rest).ranges).all()
+    assert (found != look(square(4), EXACT, track, np.array([0.3])).ranges).any()
+
+
+def test_a_robot_is_at_rest_before_and_after_its_track() -> None:
+    track = PoseTrack(np.array([0.0, 1.0]), np.array([[0.0, 0, 0], [1, 2, 3]]))
+    assert track.at(np.array([-1.0, 0.5, 7.0])).tolist() == [[0, 0, 0], [0.5, 1, 1.5], [1, 2, 3]]
+
+
+def test_the_defaults_are_the_data_sheet_s() -> None:
+    scanner = Lidar().scanner
+    assert scanner.rays == 1080
+    assert math.degrees(scanner.angle_min) == pytest.approx(-135)
+    assert math.degrees(scanner.angle_increment) == pytest.approx(0.25)
+    assert scanner.time_increment == pytest.approx(0.025 / 1440)
+    assert (scanner.range_min, scanner.range_max, scanner.noise, scanner.far_noise) == (0.1, 30.0, 0.01, 0.03)
+
+
+@pytest.mark.parametrize(("half", "sigma"), [(3.0, 0.01), (11.0, 0.03)])
+def test_noise_is_as_large_as_the_data_sheet_says(half: float, sigma: float) -> None:
+    lidar = Lidar(mount=LidarMount(x=0), dropouts=0)
+    ranges = look(square(half), lidar, standing(0, 0, 0), np.arange(300) * 0.25).ranges.astype(float)
+    errors = ranges - to_the_walls(half, np.array(0.0), np.array(0.0), lidar.scanner.angles)
+    several = 5 / math.sqrt(errors.size)  # standard errors
+    assert abs(errors.mean()) < several * sigma
+    assert errors.std() == pytest.approx(math.hypot(sigma, 0.001 / math.sqrt(12)), rel=several)
+
+
+def test_ranges_are_whole_millimetres() -> None:
+    ranges = look(make_plan(RoomPlan(plan="hall"), "room"), Lidar(dropouts=0), standing(12, 8, 0)).ranges
+    steps = ranges.astype(float) * 1000
+    assert np.abs(steps - np.round(steps)).max() < 2e-3  # of float32
+    assert len(np.unique(np.round(steps) % 10)) == 10
+
+
+def test_what_is_too_near_or_too_far_is_not_seen() -> None:
+    lidar = EXACT.model_copy(update={"range_min": 2.0, "range_max": 4.5})
+    ranges = look(square(4), lidar, standing(2.5, 0, 0.1)).ranges[0]
+    expected = look(square(4), EXACT, standing(2.5, 0, 0.1)).ranges[0]
+    seen = (expected >= 2.0) & (expected <= 4.5)
+    assert 0 < seen.sum() < len(seen)
+    assert (ranges[seen] == expected[seen]).all()
+    assert np.isposinf(ranges[~seen]).all()
+    assert (lidar.scanner.valid(ranges) == seen).all()
+
+
+def test_rays_are_lost_by_chance() -> None:
+    lidar = Lidar(dropouts=0.02)
+    ranges = look(square(3), lidar, standing(0, 0, 0), np.arange(200) * 0.25).ranges
+    share = np.isposinf(ranges).mean()
+    assert share == pytest.approx(0.02, abs=5 * math.sqrt(0.02 / ranges.size))
+
+
+def test_the_same_seed_gives_the_same_scans() -> None:
+    plan, stamps = make_plan(RoomPlan(plan="furnished_room"), "room"), np.array([0.0, 0.25])
+    first = look(plan, Lidar(), standing(3, 3, 0), stamps, seed=1).ranges
+    assert (first == look(plan, Lidar(), standing(3, 3, 0), stamps, seed=1).ranges).all()
+    assert (first != look(plan, Lidar(), standing(3, 3, 0), stamps, seed=2).ranges).mean() > 0.5
+
+
+@given(low=st.floats(0.02, 1), longer=st.floats(0, 1), end=st.floats(0.02, 30), latency=st.floats(0, 0.1), seed=seeds)
+def test_scans_follow_each_other_within_their_period_to_the_end(
+    low: float, longer: float, end: float, latency: float, seed: int
+) -> None:
+    lidar = Lidar(period=(low, low + longer), latency=latency)
+    stamps = scan_stamps(lidar, end, np.random.default_rng(seed))
+    assert stamps[0] == 0
+    assert np.diff(stamps).min(initial=low) >= low - 1e-12
+    assert np.diff(stamps).max(initial=low) <= low + longer + 1e-12
+    assert stamps[-1] <= end
+    assert stamps[-1] - latency + lidar.sweep <= end
+    assert stamps[-1] + low + longer > end - lidar.sweep - 1e-9
+
+
+def test_the_time_between_scans_jitters_all_over_its_bounds() -> None:
+    between = np.diff(scan_stamps(Lidar(), 500.0, np.random.default_rng(0)))
+    assert between.min() < 0.201
+    assert between.max() > 0.299
+    assert between.mean() == pytest.approx(0.25, abs=0.005)
+
+
+def test_a_run_too_short_for_a_scan_is_refused() -> None:
+    with pytest.raises(DataError, match="before the LIDAR's first scan is over"):
+        scan_stamps(Lidar(), 0.01, np.random.default_rng(0))
+
+
+def test_a_scan_that_sees_nothing_is_refused_with_time_and_place() -> None:
+    track = PoseTrack(np.array([0.0, 1.0]), np.array([[8.9, 0, 0], [0.0, 0, 0]]))
+    with pytest.raises(DataError, match=r"the LIDAR sees nothing at 0\.75 s, the robot at \(2\.2., 0\.00\) m: no wall"):
+        look(square(10), Lidar(range_max=5), track, np.array([0.0, 0.25, 0.75]))
+
+
+@pytest.mark.parametrize(("x", "told"), [(2.95, "outside the boundary"), (0.95, r"in obstacles\[0\]")])
+def test_a_scanner_in_a_wall_is_refused(x: float, told: str) -> None:
+    plan = square(3, (((1, -1), (2, -1), (2, 1), (1, 1)),))
+    with pytest.raises(DataError, match=rf"the LIDAR at \(.*, 0\.00\) m is {told} .* at 0 s; check lidar.mount"):
+        look(plan, Lidar(), standing(x, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"period": [0.3, 0.2]}, "period: expected the shortest and the longest"),
+        ({"period": [0.2, float("inf")]}, "period: expected the shortest and the longest"),
+        ({"period": [1e-9, 0.2], "turn_time": 0}, "from 0.001 s on"),
+        ({"period": [0.01, 0.2]}, "a scan alone takes 0.01875 s"),
+        ({"range_min": 40}, "range_min 40 m is not below range_max 30 m"),
+        ({"rays": 0}, "rays: .*greater than 0"),
+        ({"noise": -1}, "noise: .*greater than or equal to 0"),
+        ({"mount": {"yaw": 3}}, "did you mean 'yaw_deg'"),
+        ({"latency": float("nan")}, "latency"),
+    ],
+)
+def test_a_lidar_that_cannot_be_is_refused_in_one_line(given: dict[str, Any], told: str) -> None:
+    with pytest.raises(ConfigError, match=told) as error:
+        validate(Lidar, given, "lidar")
+    assert "\n" not in str(error.value)

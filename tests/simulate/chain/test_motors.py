@@ -1,0 +1,270 @@
+"""Motors under PID with encoders: against closed forms, at rest, at their limits, and what the encoder makes of it."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
+from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
+from omnibench.simulate.chain.motors import Controller, DrivenRun, Encoder, Motor, drive_session
+from omnibench.simulate.flower import Command
+
+PERIOD, STEP = 0.01, 0.001
+TICK = Encoder().tick
+FULL = 1e6  # rad/s; a target that asks for the full voltage
+APR_02 = Robot(
+    name="APR-02",
+    wheels=tuple(
+        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle))
+        for name, angle in (("a", 60), ("b", 180), ("c", 300))
+    ),
+)
+
+rates = st.one_of(st.floats(0.2, 3), st.floats(-3, -0.2))
+starts = st.floats(-100, 100)
+motors = st.builds(
+    Motor,
+    resistance=st.floats(0.3, 2),
+    inductance=st.floats(1e-4, 2e-3),
+    torque_constant=st.floats(0.03, 0.06),
+    inertia=st.floats(0.2, 1),
+    static_friction=st.floats(0.5, 1),
+    coulomb_friction=st.floats(0.1, 0.5),
+    viscous_friction=st.floats(0, 0.5),
+)
+
+
+def drive(
+    *pieces: tuple[float, float],
+    start: float = 0.0,
+    motor: Motor | None = None,
+    controller: Controller | None = None,
+) -> DrivenRun:
+    """One wheel that is told rates, each for so many s."""
+    told = np.concatenate([np.full(round(seconds / PERIOD), rate) for rate, seconds in pieces])
+    return session([told[:, None]], np.array([start]), motor, controller)[0]
+
+
+def session(
+    targets: list[Array], start: Array, motor: Motor | None = None, controller: Controller | None = None
+) -> list[DrivenRun]:
+    return drive_session(motor or Motor(), controller or Controller(), Encoder(), targets, PERIOD, start)
+
+
+def turning(run: DrivenRun) -> Array:
+    """True rates of the first wheel (M F,), rad/s, each the mean of a millisecond."""
+    return np.diff(run.wheel_angles[:, 0]) / STEP
+
+
+def petals(seed: int) -> list[Array]:
+    """Target rates of a few runs of the APR-02."""
+    rng = np.random.default_rng(seed)
+    commands = [Command(0.2, math.radians(30 * rng.integers(12)), 0.35 * rng.integers(-1, 2)) for _ in range(4)]
+    return [
+        target_rates(APR_02, command_motion(each, 0.3, 6.0, MotionProfile(), CommandLink(), PERIOD, 0.5, rng))
+        for each in commands
+    ]
+
+
+# Against closed forms
+
+
+@given(motors)
+def test_a_motor_without_friction_runs_up_as_its_closed_form_says(motor: Motor) -> None:
+    free = motor.model_copy(update={"static_friction": 0.0, "coulomb_friction": 0.0, "viscous_friction": 0.0})
+    run = drive((FULL, 0.5), motor=free)
+    times = STEP * np.arange(len(run.wheel_angles))
+    constant, supply = free.wheel_torque_constant, free.supply_voltage
+    # s1, s2: roots of s2 + R/L s + K2/(J L) = 0; the rate goes from 0 to V/K.
+    middle = free.resistance / free.inductance / 2
+    spread = np.emath.sqrt(middle**2 - constant**2 / (free.inertia * free.inductance))
+    s1, s2 = -middle + spread, -middle - spread
+    course = (s2 / s1 * np.expm1(s1 * times) - s1 / s2 * np.expm1(s2 * times)) / (s2 - s1)
+    expected = supply / constant * np.real(times - course)
+    assert np.abs(run.wheel_angles[:, 0] - expected).max() < 1e-9
+
+
+@given(motors)
+def test_the_fastest_rate_is_the_steady_state_at_full_voltage(motor: Motor) -> None:
+    slowest = motor.resistance * motor.inertia / motor.wheel_torque_constant**2  # time constant, s
+    assert turning(drive((FULL, 0.5 + 25 * slowest), motor=motor))[-1] == pytest.approx(motor.fastest_rate, rel=1e-6)
+
+
+def test_friction_acts_as_an_independent_integration_says() -> None:
+    motor = Motor()
+    constant, supply = motor.wheel_torque_constant, motor.supply_voltage
+
+    def standing(_: float, state: Array) -> list[float]:
+        return [(supply - motor.resistance * state[0]) / motor.inductance, 0.0, 0.0]
+
+    def moving(_: float, state: Array) -> list[float]:
+        current, rate, _angle = state
+        torque = constant * current - motor.coulomb_friction - motor.viscous_friction * rate
+        back = supply - motor.resistance * current - constant * rate
+        return [back / motor.inductance, torque / motor.inertia, rate]
+
+    def breaks_away(_: float, state: Array) -> float:
+        return constant * state[0] - motor.static_friction
+
+    breaks_away.terminal = True  # type: ignore[attr-defined]
+    first = solve_ivp(standing, (0, 1), [0, 0, 0], events=breaks_away, method="LSODA", rtol=1e-10, atol=1e-12)
+    then = solve_ivp(
+        moving, (first.t[-1], 0.3), first.y[:, -1], method="LSODA", rtol=1e-10, atol=1e-12, dense_output=True
+    )
+    times = np.arange(10, 301) * STEP
+    found = drive((FULL, 0.3)).wheel_angles[10:, 0]
+    fastest_step = motor.fastest_rate * 1e-4  # the breakaway is found to a step of 0.1 ms
+    assert np.abs(found - then.sol(times)[2]).max() < fastest_step
+
+
+# Following a target
+
+
+@given(rates, starts)
+def test_a_step_is_followed_quickly_and_with_little_overshoot(rate: float, start: float) -> None:
+    share = turning(drive((rate, 1.0), start=start)) / rate
+    assert np.argmax(share > 0.9) - np.argmax(share > 0.1) < 150  # ms
+    # One tick in a sample is 0.2 rad/s: the wheel ripples by that much less its inertia, so 50 ms are told.
+    assert np.convolve(share, np.full(50, 0.02), "valid").max() < 1.1
+
+
+@given(rates, starts)
+def test_the_mean_rate_in_steady_state_is_the_target_to_a_tick(rate: float, start: float) -> None:
+    run = drive((rate, 3.0), start=start)
+    turned = run.wheel_angles[3000, 0] - run.wheel_angles[1000, 0]
+    assert abs(turned - 2 * rate) < 1.5 * TICK
+
+
+@given(st.integers(0, 1000))
+def test_wheels_follow_the_ramps_of_a_command(seed: int) -> None:
+    for told in petals(seed):
+        (run,) = session([told], np.zeros(3))
+        turned = run.wheel_angles[10::10] - np.cumsum(told, axis=0) * PERIOD
+        lag = np.abs(told).max() * 0.15  # rad: what is missing at a lag of 150 ms
+        assert np.abs(turned).max() < lag + 3 * TICK
+        assert np.abs(turned[-1]).max() < 0.01
+
+
+# At rest
+
+
+@given(starts, st.integers(1, 300))
+def test_a_wheel_told_to_stand_stands(start: float, samples: int) -> None:
+    run = drive((0.0, samples * PERIOD), start=start)
+    assert (run.wheel_angles == start).all()
+    assert not run.rates.any()
+    assert not run.voltages.any()
+
+
+@given(rates, starts)
+def test_a_wheel_comes_to_rest_and_no_tick_follows(rate: float, start: float) -> None:
+    run = drive((rate, 0.5), (0.0, 1.0), start=start)
+    resting = run.wheel_angles[1000:, 0]
+    assert (resting == resting[0]).all()
+    assert not run.voltages[-50:].any()
+
+
+@given(rates, starts)
+def test_a_wheel_across_the_motion_rests_though_its_target_is_rounding(rate: float, start: float) -> None:
+    rounding = wheel_equations(APR_02.wheels)[1] @ Command(0.2, 0.0, 0.0).twist
+    assert 0 < abs(rounding) < 1e-12
+    resting = drive((rate, 0.5), (rounding, 1.0), start=start).wheel_angles[1000:, 0]
+    assert (resting == resting[0]).all()
+
+
+@given(motors, starts)
+def test_a_wheel_at_rest_moves_only_when_the_torque_beats_static_friction(motor: Motor, start: float) -> None:
+    enough = motor.static_friction * motor.resistance / motor.wheel_torque_constant  # V
+    only_proportional = Controller(proportional=1.0, integral=0.0, derivative=0.0)
+    held, moved = (
+        drive((share * enough, 0.2), start=start, motor=motor, controller=only_proportional) for share in (0.999, 1.001)
+    )
+    assert (held.wheel_angles == start).all()
+    assert moved.wheel_angles[-1, 0] > start
+
+
+@given(rates, st.floats(0.3, 1), st.floats(0.05, 0.3), st.floats(0, 0.5))
+def test_friction_brings_a_wheel_to_rest_and_never_turns_it_round(
+    rate: float, static: float, coulomb: float, viscous: float
+) -> None:
+    motor = Motor(static_friction=static, coulomb_friction=coulomb, viscous_friction=viscous)
+    run = drive((rate, 0.5), (0.0, 1.0), motor=motor)
+    braked = 10 * (np.flatnonzero(run.voltages[:, 0])[-1] + 2)  # ms; 10 ms later no current is left of the voltage
+    rest = turning(run)[braked:]
+    assert (rest >= 0).all() or (rest <= 0).all()
+    assert rest[-1] == 0
+
+
+# At the limits
+
+
+def test_voltages_stay_within_the_supply_and_the_integral_does_not_wind_up() -> None:
+    run = drive((30.0, 2.0), (3.0, 1.0))
+    assert np.abs(run.voltages).max() == Motor().supply_voltage
+    assert turning(run)[1999] == pytest.approx(Motor().fastest_rate, rel=1e-3)
+    assert turning(run)[2500:] == pytest.approx(np.full(500, 3.0), abs=0.1)
+
+
+def test_a_motor_of_its_own_for_each_wheel() -> None:
+    weak, strong = Motor(supply_voltage=12.0), Motor()
+    (run,) = drive_session([weak, strong], Controller(), Encoder(), [np.full((200, 2), 50.0)], PERIOD, np.zeros(2))
+    slow, fast = np.diff(run.wheel_angles, axis=0)[-1] / STEP
+    assert (slow, fast) == pytest.approx((weak.fastest_rate, strong.fastest_rate), rel=1e-3)
+
+
+# Encoders and sessions
+
+
+@given(st.integers(0, 1000), st.floats(-1e5, 1e5))
+def test_measured_angles_are_within_a_tick_of_the_true_ones_for_ever(seed: int, start: float) -> None:
+    for run in session(petals(seed), np.full(3, start)):
+        missing = run.wheel_angles[10::10] - run.angles
+        assert missing.min() >= -1e-6 * TICK
+        assert missing.max() <= TICK * (1 + 1e-6)
+
+
+@given(st.integers(0, 1000), st.floats(-1e3, 1e3))
+def test_measured_rates_are_whole_ticks_and_sum_to_the_measured_angles(seed: int, start: float) -> None:
+    seen = np.floor(np.full(3, start) / TICK) * TICK
+    for run in session(petals(seed), np.full(3, start)):
+        ticks = run.rates * PERIOD / TICK
+        assert np.abs(ticks - np.round(ticks)).max() < 1e-6
+        assert np.abs(seen + np.cumsum(run.rates, axis=0) * PERIOD - run.angles).max() < 1e-8
+        seen = run.angles[-1]
+
+
+@given(st.integers(0, 1000), starts)
+def test_wheel_angles_are_continuous_in_a_session(seed: int, start: float) -> None:
+    runs = session(petals(seed), np.full(3, start))
+    assert (runs[0].wheel_angles[0] == start).all()
+    for before, after in pairwise(runs):
+        assert np.array_equal(before.wheel_angles[-1], after.wheel_angles[0])
+
+
+def test_every_run_starts_from_rest_whatever_came_before() -> None:
+    moving, told = np.full((50, 3), 2.0), petals(1)[0]
+    _, after = session([moving, told], np.zeros(3))
+    (alone,) = session([told], after.wheel_angles[0])
+    assert np.array_equal(after.wheel_angles, alone.wheel_angles)
+    assert np.array_equal(after.rates, alone.rates)
+
+
+def test_a_session_is_the_same_to_the_bit_when_driven_again() -> None:
+    one, other = (session(petals(3), np.zeros(3)) for _ in range(2))
+    for first, second in zip(one, other, strict=True):
+        assert first.wheel_angles.tobytes() == second.wheel_angles.tobytes()
+        assert first.rates.tobytes() == second.rates.tobytes()
+
+
+def test_a_run_has_its_true_angles_at_every_millisecond() -> None:
+    told = petals(2)[0]
+    (run,) = session([told], np.zeros(3))
+    assert run.wheel_angles.shape == (10 * len(told) + 1, 3)
+    assert run.rates.shape == run.angles.shape == run.voltages.shape == told.shape

@@ -1,0 +1,303 @@
+"""Effects that are hidden in simulated recordings, ramps and random starts; and what was simulated before stays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from omnibench.config import validate
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.errors import ConfigError, DataError, OmnibenchError
+from omnibench.fit.evaluate import final_errors
+from omnibench.robot.calibration import EffectTerm
+from omnibench.robot.kinematics import Array, wheel_equations
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import WheelLog
+from omnibench.robot.planar import moved_to
+from omnibench.robot.published_matrices import published_matrix
+from omnibench.simulate.config import Commands, EncoderNoise, FlowerConfig
+from omnibench.simulate.flower import Command, commanded_rates, commands_of
+from omnibench.simulate.simulate import simulate_dataset
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+PUBLISHED = "palacin2023_eq8"
+QUIET = dict.fromkeys(EncoderNoise.model_fields, 0.0)
+
+
+def apr02(**changes: Any) -> FlowerConfig:
+    content = yaml.safe_load((CONFIGS / "apr02.yaml").read_text())["datasets"]["flower"]["simulate"]
+    return validate(FlowerConfig, {**content, **changes}, "flower.yaml")
+
+
+def few(effects: Mapping[str, Mapping[str, float]] | None = None, **changes: Any) -> FlowerConfig:
+    """Six short runs without noise, in the order of the commands, by a robot with these effects."""
+    hidden = [{"name": name, "parameters": dict(values)} for name, values in (effects or {}).items()]
+    commands = {"speeds": [0.2], "directions_deg": [0, 120, 240], "turn_rates": [-0.35, 0.35]}
+    plain = {
+        "truth": {"published": PUBLISHED, "effects": hidden},
+        "commands": commands | changes.pop("commands", {}),
+        "repetitions": 1,
+        "order": "sorted",
+        "noise": QUIET,
+        "train": {"seed": 1, "distance": 0.6},
+        "validation": None,
+    }
+    return apr02(**(plain | changes))
+
+
+def runs(effects: Mapping[str, Mapping[str, float]] | None = None, **changes: Any) -> tuple[Trajectory, ...]:
+    return simulate_dataset(few(effects, **changes)).dataset.trajectories
+
+
+def driven_before(config: FlowerConfig, seed: int, scale: float, way: float) -> list[tuple[Array, Array, Array]]:
+    """Rates, angles and poses of a session as they were simulated before there were effects, ramps and starts."""
+    rng = np.random.default_rng(seed)
+    commands = [command for command in commands_of(config) for _ in range(config.repetitions)]
+    commands = [commands[index] for index in rng.permutation(len(commands))]
+    model = OdometryModel(config.robot, published_matrix(PUBLISHED), config.integration)
+    noise, made = config.noise, []
+    angles: Array = np.zeros(3)
+    for command in commands:
+        times = 0.01 * np.arange(1, round(way / command.speed / 0.01) + 1)
+        between = 0.25 * np.arange(1, math.ceil(times[-1] / 0.25))
+        stamps = np.concatenate([[0.0], between[between < times[-1] - 1e-9], times[-1:]])
+        targets = np.tile(wheel_equations(config.robot.wheels) @ command.twist, (len(times), 1))
+        rates = targets + noise.encoder * rng.standard_normal(targets.shape)
+        (poses,) = model.poses([WheelLog(times, targets, np.zeros(3), stamps)])
+        kinds = ([noise.pose_position] * 2 + [noise.pose_heading], [noise.walk_position] * 2 + [noise.walk_heading])
+        white, walk = map(np.array, kinds)
+        bias = np.array([noise.bias_position] * 2 + [noise.bias_heading])
+        steps = np.sqrt(np.diff(stamps))[:, None] * rng.standard_normal((len(stamps) - 1, 3))
+        error = bias * rng.standard_normal(3) + walk * np.cumsum(steps, axis=0)
+        error = error + white * rng.standard_normal((len(stamps) - 1, 3))
+        angles = angles + np.cumsum(rates * 0.01, axis=0)
+        made.append((rates, angles, poses + scale * np.vstack([np.zeros(3), error])))
+        angles = angles[-1]
+    return made
+
+
+def test_the_benchmark_stays_what_it_was_to_the_bit() -> None:
+    config = apr02()
+    dataset = simulate_dataset(config).dataset
+    expected = driven_before(config, 2023, 0.993, 1.116) + driven_before(config, 2024, 1.069, 1.128)
+    assert len(expected) == len(dataset.trajectories) == 360
+    for run, (rates, angles, poses) in zip(dataset.trajectories, expected, strict=True):
+        assert np.array_equal(run.rates, rates)
+        assert run.angles is not None
+        assert np.array_equal(run.angles, angles)
+        # headings are unwrapped on loading: whole turns, of which there are none here, and rounding
+        assert np.array_equal(run.poses[:, :2], poses[:, :2])
+        np.testing.assert_allclose(run.poses[:, 2], poses[:, 2], rtol=0, atol=1e-15)
+
+
+class TestEffects:
+    def test_a_heading_drift_turns_every_run_by_as_much_more(self) -> None:
+        for drifting, plain in zip(runs({"heading_drift": {"b": 0.01}}), runs(), strict=True):
+            np.testing.assert_allclose(drifting.poses[:, 2] - plain.poses[:, 2], 0.01 * plain.pose_times, atol=1e-9)
+
+    def test_a_late_reference_reports_where_the_robot_was(self) -> None:
+        late, plain = (runs(each, pose_period=0.05) for each in ({"reference_time_offset": {"tau": 0.1}}, None))
+        for delayed, run in zip(late, plain, strict=True):
+            np.testing.assert_allclose(delayed.poses[3:-1], run.poses[1:-3], atol=1e-9)
+            np.testing.assert_array_equal(delayed.poses[:3], 0.0)
+
+    def test_motors_with_a_wrong_gain_turn_wheels_by_as_much_faster(self) -> None:
+        for run in runs({"motor_gain": {"g": 0.04}}):
+            assert run.targets is not None
+            np.testing.assert_allclose(run.rates, 1.04 * run.targets, rtol=1e-12)
+
+    def test_what_motors_lag_behind_is_seen_by_encoders_and_reference(self) -> None:
+        for lagging, plain in zip(runs({"motor_lag": {"tau": 0.2}}), runs(), strict=True):
+            missing = (plain.rates - lagging.rates).sum(axis=0) * 0.01
+            np.testing.assert_allclose(missing, 0.2 * plain.rates[0], rtol=1e-5)
+            turned = published_matrix(PUBLISHED)[2] @ missing
+            assert plain.poses[-1, 2] - lagging.poses[-1, 2] == pytest.approx(turned, rel=1e-6)
+
+    def test_a_thermal_drift_grows_from_run_to_run(self) -> None:
+        for drifting, plain in zip(runs({"thermal_radius_drift": {"k": 2e-5}}), runs(), strict=True):
+            assert plain.started_at is not None
+            growth = drifting.poses[-1, 2] / plain.poses[-1, 2] - 1
+            assert growth == pytest.approx(2e-5 * (plain.started_at + plain.times[-1] / 2), rel=1e-6)
+
+    def test_worn_tyres_change_their_session_alone(self) -> None:
+        sessions = {"validation": {"seed": 2, "distance": 0.6}}
+        worn, plain = (runs(each, **sessions) for each in ({"tyre_wear": {"radius_validation": -0.01}}, None))
+        for run, same in zip(worn, plain, strict=True):
+            growth = -0.01 if run.split == "validation" else 0.0
+            np.testing.assert_allclose(run.poses[:, 2], (1 + growth) * same.poses[:, 2], atol=1e-12)
+
+    def test_an_eccentric_wheel_follows_its_angle_through_the_session(self) -> None:
+        (first, *_), plain = runs({"wheel_eccentricity": {"a_b": 0.02}}), runs()[0]
+        assert plain.angles is not None
+        angle = np.append(0.0, plain.angles[:, 1])
+        turned = published_matrix(PUBLISHED)[2, 1] * 0.02 * np.sin(angle[-1])  # the integral of cos over the angle
+        assert first.poses[-1, 2] - plain.poses[-1, 2] == pytest.approx(turned, rel=1e-3)
+
+    @pytest.mark.parametrize(
+        "effects",
+        [
+            {"wheel_eccentricity": {"a_a": 0.02, "b_c": -0.01}},
+            {"acceleration_slip": {"k": 0.05}, "heading_latency": {"tau": 0.05}},
+            {"floor_drift": {"dx": 0.02, "dy": -0.01}, "thermal_radius_drift": {"k": 1e-5}},
+            {"start_transient": {"k": 0.2, "length": 0.1}, "lidar_lever_arm": {"x": 0.05, "y": 0.02}},
+            {"motor_lag": {"tau": 0.1}, "tyre_wear": {"radius_validation": 0.01}},
+        ],
+    )
+    def test_without_noise_the_recording_is_what_the_true_model_reports(self, effects: dict[str, Any]) -> None:
+        shape = {"start": "random", "commands": {"ramp": 0.3}, "validation": {"seed": 2, "distance": 0.5}}
+        made = simulate_dataset(few(effects, **shape))
+        model = made.truth.true_robot().model
+        assert {term.name for term in model.terms} == set(effects)
+        found = model.reported([run.reference_log for run in made.dataset.trajectories])
+        for run, poses in zip(made.dataset.trajectories, found, strict=True):
+            np.testing.assert_allclose(run.poses[1:], poses, atol=1e-12)
+
+    def test_encoder_noise_does_not_move_the_wheels_away_from_their_recorded_angles(self) -> None:
+        noisy = {"noise": QUIET | {"encoder": 0.02}, "repetitions": 20}
+        errors = []
+        for effects in ({"wheel_eccentricity": {"a_a": 0.02}}, {}):
+            made = simulate_dataset(few(effects, **noisy))
+            errors.append(final_errors(made.truth.true_robot().model, made.dataset.trajectories))
+        assert np.abs(errors[1]).max() > 1e-3  # what the noise itself does
+        assert np.abs(errors[0] - errors[1]).max() < 5e-5
+
+    def test_what_is_hidden_is_in_the_truth_with_all_its_parameters_and_not_in_the_data(self) -> None:
+        made = simulate_dataset(few({"wheel_eccentricity": {"a_b": 0.02}}))
+        zeros = dict.fromkeys(("a_a", "b_a", "a_b", "b_b", "a_c", "b_c"), 0.0)
+        assert made.truth.effects == (EffectTerm(name="wheel_eccentricity", parameters=zeros | {"a_b": 0.02}),)
+        said = (made.dataset.name, made.dataset.description, made.dataset.source, *made.dataset.warnings)
+        assert not any("eccentric" in text for text in said)
+
+
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "an unknown effect": (
+        {"heading_drft": {"b": 0.1}},
+        "data set flower: truth.effects: unknown effect 'heading_drft'; did you mean 'heading_drift'?",
+    ),
+    "an unknown parameter": (
+        {"heading_drift": {"bb": 0.1}},
+        "data set flower: truth.effects: effect 'heading_drift': unknown parameter 'bb'; did you mean 'b'?",
+    ),
+    "a wheel that is not there": ({"wheel_eccentricity": {"a_d": 0.1}}, "unknown parameter 'a_d'; did you mean 'a_"),
+    "a session that is not driven": (
+        {"tyre_wear": {"radius_validation": 0.01}},
+        "effect 'tyre_wear': unknown parameter 'radius_validation'; known: none",
+    ),
+    "no parameter": ({"heading_drift": {}}, "effect 'heading_drift': parameter 'b' (rad/s) is missing"),
+    "no shape": ({"start_transient": {"k": 0.1}}, "effect 'start_transient': parameter 'length' (m) is missing"),
+    "a shape out of range": ({"start_transient": {"k": 0.1, "length": 99}}, "parameter 'length' is 99"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_an_effect_that_cannot_be_hidden_is_refused_in_one_line(case: str) -> None:
+    effects, words = REFUSED[case]
+    with pytest.raises(OmnibenchError) as refusal:
+        simulate_dataset(few(effects))
+    assert words in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_an_effect_that_is_given_twice_is_refused() -> None:
+    term = {"name": "heading_drift", "parameters": {"b": 0.1}}
+    with pytest.raises(ConfigError, match=r"truth: effects: heading_drift is given twice"):
+        few(truth={"published": PUBLISHED, "effects": [term, term]})
+
+
+class TestRamps:
+    def ramped(self, **changes: Any) -> Dataset:
+        return simulate_dataset(few(commands={"ramp": 0.5}, **changes)).dataset
+
+    def test_wheels_start_and_end_at_rest_and_have_their_speed_between(self) -> None:
+        for run, plain in zip(self.ramped().trajectories, runs(), strict=True):
+            full = plain.rates[0]
+            np.testing.assert_allclose(run.rates[0], 0.01 * full, rtol=1e-9)  # mean of the first of 50 samples
+            np.testing.assert_allclose(run.rates[-1], 0.01 * full, rtol=1e-9)
+            np.testing.assert_allclose(run.rates[50:-50], np.tile(full, (len(run.rates) - 100, 1)), rtol=1e-9)
+
+    def test_rates_rise_linearly(self) -> None:
+        for run in self.ramped().trajectories:
+            steps = np.diff(run.rates[:50], axis=0)
+            np.testing.assert_allclose(steps, np.tile(steps[0], (49, 1)), rtol=1e-6)
+
+    def test_a_run_takes_longer_and_its_way_stays(self) -> None:
+        for run, plain in zip(self.ramped().trajectories, runs(), strict=True):
+            assert run.times[-1] == pytest.approx(plain.times[-1] + 0.5)
+            np.testing.assert_allclose((run.rates * 0.01).sum(axis=0), (plain.rates * 0.01).sum(axis=0), rtol=1e-9)
+            assert (run.distance, run.duration) == (pytest.approx(0.6), run.times[-1])
+
+    def test_turns_on_the_spot_are_ramped_too(self) -> None:
+        commands = {"speeds": [0.0], "turn_duration": 2.0, "ramp": 1.0}
+        for run in runs(commands=commands):
+            assert run.times[-1] == pytest.approx(3.0)
+            assert abs(run.omega or 0) == 0.35
+            heading = published_matrix(PUBLISHED)[2] @ wheel_equations(few().robot.wheels)[:, 2] * (run.omega or 0) * 2
+            assert run.poses[-1, 2] == pytest.approx(heading)
+
+    @given(
+        st.floats(0.05, 2.0),
+        st.floats(0.5, 5.0),
+        st.lists(st.floats(1e-3, 0.3), min_size=1, max_size=40),
+    )
+    def test_samples_of_any_length_add_up_to_the_same_way(self, ramp: float, full: float, lengths: list[float]) -> None:
+        end = 2 * ramp + full
+        times = np.append(np.cumsum(lengths)[np.cumsum(lengths) < end - 1e-3], end)
+        robot = few().robot
+        command = Command(0.2, 0.3, 0.1)
+        rates = commanded_rates(robot, command, times, ramp)
+        driven = (rates * np.diff(times, prepend=0.0)[:, None]).sum(axis=0)
+        np.testing.assert_allclose(driven, (full + ramp) * wheel_equations(robot.wheels) @ command.twist, rtol=1e-9)
+
+    def test_a_ramp_longer_than_the_shortest_run_is_refused(self) -> None:
+        with pytest.raises(ConfigError, match=r"commands.ramp: 3.5 s; .* give it less than 3 s"):
+            few(commands={"ramp": 3.5})
+        with pytest.raises(ConfigError, match=r"give it less than 1 s"):
+            few(commands={"ramp": 1.5, "speeds": [0.0, 0.2], "turn_duration": 1.0})
+
+    def test_a_negative_ramp_is_refused(self) -> None:
+        with pytest.raises(ConfigError, match=r"commands.ramp: "):
+            few(commands={"ramp": -1})
+
+    def test_there_is_none_unless_it_is_asked_for(self) -> None:
+        assert Commands(directions_deg=(0,), turn_rates=(0.1,)).ramp == 0.0
+
+
+class TestRandomStarts:
+    def test_starts_lie_anywhere_in_the_square_with_any_heading(self) -> None:
+        starts = np.array([run.start for run in runs(repetitions=60, start="random", start_area=3.0)])
+        assert np.abs(starts[:, :2]).max() <= 1.5
+        assert (np.abs(starts[:, :2]).max(axis=0) > 1.4).all()
+        assert (starts[:, 2].min(), starts[:, 2].max()) == (
+            pytest.approx(-math.pi, abs=0.1),
+            pytest.approx(3.1, abs=0.1),
+        )
+
+    def test_a_run_is_the_same_from_wherever_it_starts(self) -> None:
+        for moved, plain in zip(runs(start="random"), runs(), strict=True):
+            np.testing.assert_allclose(moved.poses, moved_to(moved.start, plain.poses), atol=1e-9)
+
+    def test_starts_are_those_of_the_seed(self) -> None:
+        again = [
+            simulate_dataset(few(start="random", train={"seed": seed, "distance": 0.6})).dataset for seed in (1, 1, 2)
+        ]
+        assert again[0].hash == again[1].hash != again[2].hash
+
+    @pytest.mark.parametrize("changes", [{"start": "anywhere"}, {"start": "random", "start_area": 0}])
+    def test_a_start_that_cannot_be_is_refused(self, changes: dict[str, Any]) -> None:
+        with pytest.raises(ConfigError, match=r"start"):
+            few(**changes)
+
+
+def test_a_record_of_the_truth_says_what_it_lacks() -> None:
+    truth = simulate_dataset(few()).truth
+    broken = truth.model_copy(update={"effects": (EffectTerm(name="heading_drift"),)})
+    with pytest.raises(DataError, match=r"data set flower: truth.effects: effect 'heading_drift': parameter 'b'"):
+        broken.true_robot()

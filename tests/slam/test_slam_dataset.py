@@ -1,0 +1,219 @@
+"""SLAM of whole data sets: what becomes of them, whatever the processes, and what is said of bad ones."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from slam_study import ROBOT, drive, flower_command
+
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.data.scans import ScansInMemory, TrajectoryScans
+from omnibench.data.true_poses import TruePath
+from omnibench.errors import DataError
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.published_matrices import published_matrix
+from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
+from omnibench.simulate.chain.lidar import Lidar
+from omnibench.slam.accuracy import run_errors, slam_accuracy
+from omnibench.slam.pose_errors import FLOOR
+from omnibench.slam.slam_dataset import slam_dataset
+from omnibench.slam.slam_options import SlamOptions
+
+LIDAR = Lidar()
+START = np.array([1.0, 2.0, 0.5])
+
+
+@cache
+def recorded(room: str = "furnished_room", runs: int = 3) -> tuple[Dataset, dict[str, TruePath]]:
+    """Short runs whose poses are not known but for the start, and where the robot truly was, from there on."""
+    plan = make_plan(RoomPlan(plan=room), room)
+    trajectories, scans, truth = [], {}, {}
+    for number in range(runs):
+        run = drive(plan, LIDAR, flower_command(number), np.random.default_rng([3, number]), distance=0.4)
+        name = f"run-{number}"
+        scans[name] = run.scans
+        poses = np.array([START, START])
+        last = float(run.log.times[-1])
+        trajectories.append(
+            Trajectory(name, "train", run.log.times, run.log.rates, np.array([0.0, last]), poses, command=f"{number}")
+        )
+        way = (run.true[:, 0] + 1j * run.true[:, 1]) * np.exp(1j * START[2])
+        true = np.column_stack([START[0] + way.real, START[1] + way.imag, START[2] + run.true[:, 2]])
+        truth[name] = TruePath(run.scans.times, true)
+    held = ScansInMemory(LIDAR.scanner, scans)
+    return make_dataset("rooms", ROBOT, 0.01, trajectories, simulated=True, scans=held), truth
+
+
+def with_scans(dataset: Dataset, **changed: TrajectoryScans | None) -> Dataset:
+    """The data set with other scans for some runs; None: with none."""
+    assert dataset.scans is not None
+    scans = dict(dataset.scans) | {name.replace("_", "-"): found for name, found in changed.items()}
+    kept = {name: found for name, found in scans.items() if found is not None}
+    return replace(dataset, scans=ScansInMemory(LIDAR.scanner, kept))
+
+
+class TestPoses:
+    def test_are_found_from_the_start_pose_on_at_the_stamps_of_the_scans(self) -> None:
+        dataset, truth = recorded()
+        found = slam_dataset(dataset, SlamOptions(), workers=1)
+        for run in found.trajectories:
+            np.testing.assert_array_equal(run.pose_times, truth[run.id].times)
+            np.testing.assert_array_equal(run.poses[0], START)
+            assert np.abs(run.poses - truth[run.id].poses).max() < 0.004
+            assert run.pose_covariances is not None
+            assert (np.linalg.eigvalsh(run.pose_covariances) > 0).all()
+
+    def test_all_else_stays(self) -> None:
+        dataset, _ = recorded()
+        found = slam_dataset(dataset, SlamOptions(), workers=1)
+        assert (found.name, found.robot, found.simulated, found.scans) == ("rooms", ROBOT, True, dataset.scans)
+        for before, after in zip(dataset.trajectories, found.trajectories, strict=True):
+            assert after.command == before.command
+            np.testing.assert_array_equal(after.rates, before.rates)
+
+    def test_do_not_depend_on_the_number_of_processes(self) -> None:
+        dataset, _ = recorded()
+        alone, together = (slam_dataset(dataset, SlamOptions(), workers=workers) for workers in (1, 3))
+        assert alone.hash == together.hash
+
+    def test_do_not_depend_on_the_odometry_that_the_search_starts_from(self) -> None:
+        dataset, _ = recorded()
+        better = OdometryModel(ROBOT, published_matrix("palacin2023_eq9"), "arc")
+        design, other = (slam_dataset(dataset, SlamOptions(), model=model, workers=1) for model in (None, better))
+        for one, two in zip(design.trajectories, other.trajectories, strict=True):
+            assert 0 < np.abs(one.poses - two.poses).max() < 0.0002
+
+    def test_begin_at_t_0_when_the_first_scan_comes_later(self) -> None:
+        dataset, truth = recorded()
+        assert dataset.scans is not None
+        scans = dataset.scans.of("run-1")
+        late = with_scans(dataset, run_1=TrajectoryScans(scans.times[1:], scans.ranges[1:]))
+        run = slam_dataset(late, SlamOptions(), workers=1).trajectories[1]
+        np.testing.assert_array_equal(run.pose_times, [0.0, *scans.times[1:]])
+        np.testing.assert_array_equal(run.poses[0], START)
+        assert run.pose_covariances is not None
+        assert len(run.pose_covariances) == len(run.poses)
+        assert np.abs(run.poses - truth["run-1"].poses).max() < 0.01  # as the odometry missed until then
+        np.testing.assert_array_equal(run.pose_covariances[0], FLOOR)
+
+    def test_are_as_uncertain_as_the_odometry_until_a_first_scan_that_comes_later(self) -> None:
+        dataset, truth = recorded()
+        assert dataset.scans is not None
+        late = {name: TrajectoryScans(scans.times[8:], scans.ranges[8:]) for name, scans in dataset.scans}
+        found = slam_dataset(replace(dataset, scans=ScansInMemory(LIDAR.scanner, late)), SlamOptions(), workers=1)
+        for run in found.trajectories:
+            way = np.hypot(*(run.poses[1] - START)[:2])
+            assert way > 0.2
+            assert run.pose_covariances is not None
+            stated = np.sqrt(np.linalg.eigvalsh(run.pose_covariances[:, :2, :2])[:, -1])
+            assert stated[0] == pytest.approx(1e-4)
+            assert (stated[1:] > 0.09 * way).all()
+        every = slam_accuracy(found, truth).every
+        assert every.nees_mean is not None
+        assert every.nees_mean < 5
+        (warning,) = found.warnings
+        assert warning.startswith("SLAM: the robot moves before the first scan, whose pose is therefore as uncertain")
+        assert "3 of 3 runs" in warning
+
+    def test_leave_scans_before_t_0_out(self) -> None:
+        dataset, _ = recorded()
+        assert dataset.scans is not None
+        scans = dataset.scans.of("run-1")
+        early = TrajectoryScans(np.concatenate([[-0.2], scans.times]), np.vstack([scans.ranges[:1], scans.ranges]))
+        run = slam_dataset(with_scans(dataset, run_1=early), SlamOptions(), workers=1).trajectories[1]
+        np.testing.assert_array_equal(run.pose_times, scans.times)
+
+    def test_progress_is_told_run_by_run(self) -> None:
+        told: list[tuple[str, int, int]] = []
+        dataset, _ = recorded()
+        slam_dataset(dataset, SlamOptions(), workers=2, watch=lambda *step: told.append(step))
+        assert told == [("SLAM", 1, 3), ("SLAM", 2, 3), ("SLAM", 3, 3)]
+
+
+class TestWhatIsSaid:
+    def test_a_corridor_is_named_with_its_direction_and_runs(self) -> None:
+        dataset, _ = recorded("corridor", 2)
+        (warning,) = slam_dataset(dataset, SlamOptions(), workers=1).warnings
+        # The robot stands along the corridor, within some degrees; its start pose is turned by 0.5 rad, or 29 deg.
+        said = (
+            r"SLAM: scans tell too little along (2[4-9]|3[0-4]) deg of the run's frame: 2 of 2 runs, e.g. run-0, run-1"
+        )
+        assert re.fullmatch(said, warning)
+
+    def test_a_furnished_room_is_fine(self) -> None:
+        assert slam_dataset(recorded()[0], SlamOptions(), workers=1).warnings == ()
+
+    def test_a_data_set_without_scans_is_one_line(self) -> None:
+        with pytest.raises(DataError, match=r"^data set rooms: it has no scans \(scans.parquet\), which SLAM needs$"):
+            slam_dataset(replace(recorded()[0], scans=None), SlamOptions())
+
+    def test_a_run_without_scans_is_one_line(self) -> None:
+        with pytest.raises(DataError, match="trajectory run-2 has no scans; leave it out"):
+            slam_dataset(with_scans(recorded()[0], run_2=None), SlamOptions())
+
+    @pytest.mark.parametrize("workers", [1, 2])
+    def test_an_empty_scan_names_the_run_whoever_found_it(self, workers: int) -> None:
+        dataset, _ = recorded()
+        assert dataset.scans is not None
+        scans = dataset.scans.of("run-1")
+        ranges = scans.ranges.copy()
+        ranges[2] = np.inf
+        blind = with_scans(dataset, run_1=TrajectoryScans(scans.times, ranges))
+        with pytest.raises(DataError, match=r"^data set rooms: trajectory run-1: SLAM: the scan at .* is empty"):
+            slam_dataset(blind, SlamOptions(), workers=workers)
+
+
+class TestAccuracy:
+    def test_is_that_of_the_poses(self) -> None:
+        dataset, truth = recorded()
+        found = slam_accuracy(slam_dataset(dataset, SlamOptions(), workers=1), truth)
+        assert found.runs == 3
+        assert found.distance_m == pytest.approx(3 * 0.4, rel=0.1)
+        assert found.final.poses == 3
+        assert found.every.poses == sum(len(path.times) - 1 for path in truth.values())
+        assert 0 < found.final.position_mean_m <= found.final.position_p95_m <= found.final.position_max_m < 0.004
+        assert 0 < found.every.heading_mean_rad < found.every.heading_max_rad < 0.002
+        assert found.every.nees_mean is not None
+        assert 1 < found.every.nees_mean < 6
+
+    def test_growing_errors_are_drift_and_bias_in_the_robots_frame(self) -> None:
+        dataset, truth = recorded()
+        runs = []
+        for run in dataset.trajectories:
+            path = truth[run.id]
+            way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path.poses[:, :2], axis=0).T))])
+            left = path.poses[:, 2] + np.pi / 2
+            poses = path.poses + 0.02 * way[:, None] * np.column_stack([np.cos(left), np.sin(left), 0.5 + 0 * left])
+            runs.append(replace(run, pose_times=path.times, poses=poses))
+        found = slam_accuracy(make_dataset("drifting", ROBOT, 0.01, runs), truth)
+        assert found.drift_position == pytest.approx(0.02, rel=1e-6)
+        assert found.drift_heading == pytest.approx(0.01, rel=1e-6)
+        assert found.final.bias_left_m == pytest.approx(found.final.position_mean_m, rel=1e-6)
+        assert found.final.bias_forward_m == pytest.approx(0, abs=1e-9)
+        assert found.final.position_mean_m == pytest.approx(0.02 * found.distance_m / 3, rel=1e-6)
+        assert found.every.nees_mean is None  # covariances are not known
+
+    def test_singular_covariances_of_a_foreign_data_set_are_left_out_of_the_nees(self) -> None:
+        dataset, truth = recorded(runs=1)
+        (run,) = dataset.trajectories
+        path = truth[run.id]
+        poses = path.poses + np.array([0.0, 0.002, 0.0])
+        poses[0] = START
+        flat = np.tile(np.diag([0.001, 0.001, 0.001]) ** 2, (len(poses), 1, 1))
+        none = replace(run, pose_times=path.times, poses=poses, pose_covariances=0 * flat)
+        assert slam_accuracy(replace(dataset, trajectories=(none,)), truth).every.nees_mean is None
+        flat[4, 2, 2] = 0.0
+        some = replace(none, pose_covariances=flat)
+        found = slam_accuracy(replace(dataset, trajectories=(some,)), truth)
+        assert found.every.nees_mean == pytest.approx(4.0)
+        assert np.isnan(run_errors(some, path).nees).sum() == 1
+
+    def test_another_truth_is_one_line(self) -> None:
+        dataset, truth = recorded()
+        others = {name: path for name, path in truth.items() if name != "run-1"}
+        with pytest.raises(DataError, match="trajectory run-1 is not in the truth"):
+            slam_accuracy(dataset, others)

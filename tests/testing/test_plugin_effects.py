@@ -1,0 +1,130 @@
+"""An effect of one's own, from its scaffold to every command that reads a calibration with it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from commands import Command, Printed, assert_refused, flower, omnibench
+
+from omnibench.data.storage import load_dataset
+from omnibench.registry import load_plugins
+from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
+from omnibench.robot.training_domain import motions_of, representatives
+
+TRUE_K = 0.15  # s/m
+COMMANDS = {"speeds": [0.1, 0.4], "directions_deg": [0, 120, 240], "turn_rates": [-0.5, 0.5], "ramp": 0.3}
+
+pytestmark = pytest.mark.usefixtures("registries_as_before")
+
+
+def told(run: Printed) -> Printed:
+    assert run.returncode == 0, run.stderr
+    return run
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the plug-in drag, which is hidden in data, and what discover made of them in out."""
+    folder = tmp_path_factory.mktemp("drag")
+    config = {"datasets": {"flower": {"simulate": flower(commands=COMMANDS, repetitions=2)}}}
+    (folder / "simulation.yaml").write_text(yaml.safe_dump(config))
+    for arguments in (
+        ("plugin", "new", "drag", "--effect"),
+        ("simulate", "simulation.yaml", "-o", "data", "--effect", f"drag: {{k: {TRUE_K}}}"),
+        ("discover", "data", "--output", "out"),
+    ):
+        run = omnibench(*arguments, cwd=folder)
+        assert run.returncode == 0, run.stderr
+    return folder
+
+
+def known_to(work: Path) -> Calibration:
+    """The calibration with the effect, as this process can read it."""
+    load_plugins([work / "plugins"], installed=False)
+    return read_calibration(work / "out" / "model.yaml")
+
+
+@pytest.fixture
+def extended(work: Path, tmp_path: Path) -> Path:
+    """The calibration with the effect, as discover wrote it, in a folder without plug-ins."""
+    file = tmp_path / "extended.yaml"
+    file.write_bytes((work / "out" / "model.yaml").read_bytes())
+    return file
+
+
+def test_it_is_found_by_name_where_it_was_hidden(work: Path) -> None:
+    found = json.loads((work / "out" / "discovery.json").read_text(encoding="utf-8"))
+    assert found["verdict"] == "named"
+    (effect,) = found["effects"]
+    assert effect["name"] == "drag"
+    assert effect["parameters"]["k"]["low"] < TRUE_K < effect["parameters"]["k"]["high"]
+
+
+def test_evaluate_takes_the_plugins_that_are_named(command: Command, work: Path, extended: Path) -> None:
+    run = told(command("evaluate", extended, work / "data", "--json", "--plugins", work / "plugins"))
+    with_it = json.loads(run.stdout)
+    without = json.loads(told(command("evaluate", work / "out" / "plain.yaml", work / "data", "--json")).stdout)
+    assert with_it["splits"]["validation"]["cost"] < 0.8 * without["splits"]["validation"]["cost"]
+    assert with_it["warnings"] == []
+
+
+def test_evaluate_takes_the_plugins_of_the_folder_one_is_in(
+    command: Command, work: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(work)
+    told(command("evaluate", "out/model.yaml", "data"))
+
+
+def test_evaluate_warns_of_runs_that_the_effect_was_not_fitted_to(command: Command, work: Path, extended: Path) -> None:
+    known = known_to(work)
+    slow = [run for run in load_dataset(work / "data").trajectories if run.v == 0.1]
+    motions = np.concatenate([motions_of(known.matrix_array, run.times, run.rates) for run in slow])
+    driven = tuple(map(tuple, representatives(known.robot, motions).tolist()))
+    write_calibration(known.model_copy(update={"driven": driven}), extended)
+    run = told(command("evaluate", extended, work / "data", "--json", "--plugins", work / "plugins"))
+    (warning,) = json.loads(run.stdout)["warnings"]
+    assert warning.startswith("24 of 48 runs drive motions that calibration 'flower extended' was not fitted to (")
+    assert "such as turning while driving at 0.4" in warning
+    assert "drag is not known to hold there, and errors may be larger than stated" in warning
+    assert run.stderr == f"warning: {warning}\n"
+    again = told(
+        command("simulate", "--like", work / "data", "--model", extended, "-o", "like", "--plugins", work / "plugins")
+    )
+    assert again.stderr == f"warning: {warning}\n"
+
+
+def test_a_calibration_whose_plugin_is_not_there_is_refused_in_one_line(
+    command: Command, work: Path, extended: Path
+) -> None:
+    for arguments in (
+        ("evaluate", extended, work / "data"),
+        ("certify", extended, work / "data"),
+        ("export", extended, "--to", "c_header"),
+        ("simulate", "--like", work / "data", "--model", extended, "-o", "like"),
+    ):
+        assert_refused(command(*arguments), "unknown effect 'drag'")
+
+
+def test_export_and_certify_know_the_effect_and_say_what_becomes_of_it(
+    command: Command, work: Path, extended: Path
+) -> None:
+    exported = told(command("export", extended, "--to", "c_header", "--plugins", work / "plugins"))
+    assert "effects of the calibration are left out: drag" in exported.stderr
+    refused = command("certify", extended, work / "data", "--plugins", work / "plugins")
+    assert_refused(refused, "has effects (drag), and a bound is proven for a matrix alone")
+
+
+def test_swap_knows_the_effect_before_it_asks_for_a_node(command: Command, work: Path, extended: Path) -> None:
+    nowhere = ("--connect", "tcp/127.0.0.1:1", "--plugins", work / "plugins")
+    assert_refused(command("swap", "apr", extended, *nowhere), "nothing listens there")
+
+
+def test_the_schema_of_a_simulations_config_is_printed(command: Command) -> None:
+    schema = json.loads(told(command("schema", "simulate")).stdout)
+    assert schema["title"] == "SimulationConfig"
+    assert schema["required"] == ["datasets"]
+    assert {"FlowerConfig", "EffectTerm"} <= {*schema["$defs"]}

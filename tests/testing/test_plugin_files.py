@@ -1,0 +1,176 @@
+"""Writing the first version of a plug-in, and checking one."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from omnibench.errors import ConfigError, DataError, OmnibenchError, PluginError
+from omnibench.testing import CaseOutcome
+from omnibench.testing.plugin_files import PLUGIN_KINDS, CheckReport, check_plugin, new_plugin
+
+pytestmark = pytest.mark.usefixtures("registries_as_before")
+
+FLAWED = """
+from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.registry import calibrators
+
+
+@calibrators.register("flawed_{number}")
+class Flawed(Calibrator):
+    '''Answers from outside the box.'''
+
+    def calibrate(self, problem):
+        problem.cost(problem.start[None])
+        return Solution(2 * problem.start + 1, "somewhere")
+"""
+
+
+def outcomes(report: CheckReport) -> dict[str, CaseOutcome]:
+    return {result.case: result.outcome for result in report.results}
+
+
+@pytest.mark.parametrize("kind", PLUGIN_KINDS)
+def test_a_new_plugin_passes_its_check(kind: str, tmp_path: Path) -> None:
+    written = new_plugin("my_first", kind, tmp_path / "made" / "for_it")
+    assert [path.name for path in written] == ["my_first.py", "test_my_first.py"]
+    report = check_plugin(written[0])
+    assert report.passed, report.failures
+    assert {(result.kind, result.name) for result in report.results} == {(kind, "my_first")}
+
+
+def test_the_tests_of_new_plugins_pass_in_pytest(tmp_path: Path) -> None:
+    for kind in PLUGIN_KINDS:
+        new_plugin(f"my_{kind}", kind, tmp_path)
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", "-v", "-p", "no:cacheprovider", str(tmp_path)],
+        cwd=tmp_path,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert run.returncode == 0, run.stdout + run.stderr
+    assert run.stdout.count("SKIPPED") == 3  # the seed of a calibrator that is stochastic, other kinds of effects
+    assert all(f"test_my_{kind}.py" in run.stdout for kind in PLUGIN_KINDS)
+
+
+def test_the_cases_run_where_pytest_is_not_installed(tmp_path: Path) -> None:
+    new_plugin("bare_search", "calibrator", tmp_path)
+    program = (
+        "import sys; sys.modules['pytest'] = None\n"
+        "from omnibench.testing.plugin_files import check_plugin\n"
+        f"print(check_plugin({str(tmp_path / 'bare_search.py')!r}).passed)"
+    )
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert run.stdout == "True\n", run.stderr
+
+
+@pytest.mark.parametrize("kind", PLUGIN_KINDS)
+def test_a_new_plugin_whose_class_would_hide_an_import_is_called_otherwise(kind: str, tmp_path: Path) -> None:
+    name = {"calibrator": "solution", "importer": "trajectory_", "cost": "cost_", "effect": "signals"}[kind]
+    assert check_plugin(new_plugin(name, kind, tmp_path)[0]).passed
+
+
+def test_a_file_that_is_there_is_not_written_over(tmp_path: Path) -> None:
+    (tmp_path / "test_mine.py").write_text("mine")
+    with pytest.raises(ConfigError, match=r"test_mine\.py is there already"):
+        new_plugin("mine", "calibrator", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["test_mine.py"]
+    assert (tmp_path / "test_mine.py").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["my-search", "2opt", "My", "class", "", "_private", "test_mine", "größe", "../x"])
+def test_a_name_that_python_cannot_import_is_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot name a plug-in"):
+        new_plugin(name, "calibrator", tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_name_that_is_taken_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"there is a calibrator 'theoretical' already \(built in\)"):
+        new_plugin("theoretical", "calibrator", tmp_path)
+    assert new_plugin("theoretical", "cost", tmp_path)
+
+
+def test_a_name_that_would_hide_a_python_module_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="would hide the Python module 'random'"):
+        new_plugin("random", "calibrator", tmp_path)
+
+
+def test_an_unknown_kind_gets_the_nearest_known(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"unknown kind of plug-in 'calibrater'; did you mean 'calibrator'\?"):
+        new_plugin("mine", "calibrater", tmp_path)
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="cannot be written"):
+        new_plugin("mine", "calibrator", tmp_path / "file")
+
+
+def test_a_flawed_plugin_fails_the_case_it_breaks(tmp_path: Path) -> None:
+    (tmp_path / "flawed.py").write_text(FLAWED.format(number=1))
+    report = check_plugin(tmp_path / "flawed.py")
+    assert not report.passed
+    assert outcomes(report)["bounds are kept"] is CaseOutcome.FAILED
+    assert outcomes(report)["it works in silence"] is CaseOutcome.PASSED
+    (failure,) = (result for result in report.failures if result.case == "bounds are kept")
+    assert (failure.kind, failure.name) == ("calibrator", "flawed_1")
+    assert failure.message.startswith("the answer is outside the box (m11")
+
+
+def test_everything_that_a_file_registers_is_checked(tmp_path: Path) -> None:
+    (tmp_path / "two.py").write_text(FLAWED.format(number=2) + FLAWED.format(number=3))
+    assert {result.name for result in check_plugin(tmp_path / "two.py").results} == {"flawed_2", "flawed_3"}
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("import nowhere_at_all\n", "ModuleNotFoundError: No module named 'nowhere_at_all'"),
+        ("def broken(:\n", "SyntaxError"),
+        ("raise SystemExit(3)\n", "SystemExit: 3"),
+        ("import numpy\n", "registers nothing"),
+        (FLAWED.format(number=4).replace("flawed_4", "genetic"), "calibrator 'genetic' is registered already"),
+    ],
+)
+def test_a_file_without_a_working_plugin_is_one_line(content: str, message: str, tmp_path: Path) -> None:
+    file = tmp_path / "faulty.py"
+    file.write_text(content)
+    with pytest.raises(PluginError) as failure:
+        check_plugin(file)
+    assert message in str(failure.value)
+    assert str(file) in str(failure.value)
+    assert "\n" not in str(failure.value)
+
+
+def test_a_file_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(OmnibenchError, match=r"nowhere\.py: no such file"):
+        check_plugin(tmp_path / "nowhere.py")
+
+
+def test_an_option_without_a_default_is_reported(tmp_path: Path) -> None:
+    file = tmp_path / "demanding.py"
+    file.write_text(
+        "from omnibench.registry import Options\n"
+        + FLAWED.format(number=5).replace(
+            "    def calibrate", "    class Options(Options):\n        rate: float\n\n    def calibrate"
+        )
+    )
+    (result,) = check_plugin(file).results
+    assert result.message.startswith("calibrator 'flawed_5': key 'rate' is missing; give every option a default")
+
+
+def test_an_importer_is_checked_on_the_sample_that_is_given(tmp_path: Path) -> None:
+    new_plugin("sampled", "importer", tmp_path)
+    rows = "\n".join(f"{0.1 * k:.1f},0,0,{0.05 * k:.2f},2,2,2" for k in range(11))
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "one.csv").write_text(f"t,x,y,heading,a,b,c\n{rows}\n")
+    report = check_plugin(tmp_path / "sampled.py", tmp_path / "runs")
+    assert set(outcomes(report).values()) == {CaseOutcome.PASSED}
