@@ -1,4 +1,4 @@
-"""True poses of simulated runs: written to the truth's folder, read only to judge a reference."""
+"""The truth's folder of simulated data: true poses of the runs, read only to judge reference poses."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from omnibench.config import read_yaml, validate
 from omnibench.data.table import read_table
 from omnibench.errors import DataError
 from omnibench.files import write_table
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, Robot
 
+TRUTH_FILE = "truth.yaml"
 _NAME = "poses"
 
 
@@ -54,3 +56,12 @@ def read_true_poses(folder: Path | str) -> dict[str, TruePath]:
         for name in table.frame["trajectory"].unique(maintain_order=True)
         for rows in [np.flatnonzero(names == name)]
     }
+
+
+def robot_of_truth(folder: Path | str) -> Robot | None:
+    """The robot, as designed, that ``truth.yaml`` of a truth folder names; None without that file. ConfigError."""
+    file = Path(folder) / TRUTH_FILE
+    if not file.is_file():
+        return None
+    record = read_yaml(file)
+    return validate(Robot, record.get("robot") if isinstance(record, dict) else None, f"{file}: robot")

@@ -10,7 +10,7 @@ from pathlib import Path
 from omnibench.config import to_json, to_yaml
 from omnibench.data.dataset import Dataset
 from omnibench.data.storage import check_folder, load_dataset, save_dataset
-from omnibench.data.true_poses import write_true_poses
+from omnibench.data.true_poses import TRUTH_FILE, write_true_poses
 from omnibench.data.watch import Watch, unwatched
 from omnibench.errors import ConfigError
 from omnibench.files import TableFormat, write_text
@@ -18,7 +18,6 @@ from omnibench.robot.calibration import read_calibration
 from omnibench.simulate.like import simulate_like
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.source import SimulationSource, read_simulation
-from omnibench.simulate.truth import TRUTH_FILE
 from omnibench.slam.accuracy import SlamAccuracy, slam_accuracy
 
 ACCURACY_FILE = "slam_accuracy.json"

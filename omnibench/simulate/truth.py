@@ -20,8 +20,6 @@ from omnibench.robot.odometry import Integration, WheelLog
 from omnibench.robot.published_matrices import published_matrix
 from omnibench.simulate.config import EncoderNoise, Truth
 
-TRUTH_FILE = "truth.yaml"  # of the truth's folder
-
 
 @dataclass(frozen=True, eq=False)
 class TrueRobot:

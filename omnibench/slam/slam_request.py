@@ -6,16 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from omnibench.config import read_model
 from omnibench.data.dataset import Dataset
 from omnibench.data.storage import check_folder, load_dataset, save_dataset
-from omnibench.data.true_poses import TruePath, read_true_poses
+from omnibench.data.true_poses import TruePath, read_true_poses, robot_of_truth
 from omnibench.data.watch import Watch
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import TableFormat
 from omnibench.robot.calibration import read_calibration
 from omnibench.robot.model import OdometryModel
-from omnibench.simulate.truth import TRUTH_FILE, TruthRecord
 from omnibench.slam.accuracy import SlamAccuracy, slam_accuracy
 from omnibench.slam.slam_dataset import slam_paths, with_paths
 from omnibench.slam.slam_options import SlamOptions
@@ -75,8 +73,7 @@ class SlamRequest:
         if self.truth is None:
             return None
         truth = read_true_poses(self.truth)
-        record = self.truth / TRUTH_FILE
-        if record.is_file() and read_model(TruthRecord, record).robot != recorded.robot:
+        if robot_of_truth(self.truth) not in (None, recorded.robot):
             raise DataError(f"--truth {self.truth}: it is another robot's; name the truth of this data set")
         for trajectory in recorded.trajectories:
             if trajectory.id not in truth:

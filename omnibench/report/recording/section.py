@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
@@ -27,10 +27,22 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.accuracy import SlamAccuracy, slam_accuracy
 
-if TYPE_CHECKING:  # shapely takes its time, and most recordings have no plan
-    from omnibench.simulate.chain.floor_plan import FloorPlan
 
 _SIMULATED = Badge("SIMULATED DATA", "warning")
+
+
+class RoomPlan(Protocol):
+    """A room whose walls are known.
+
+    start (3,): the robot's mark, m, m, rad. outlines: the walls, closed (n, 2) each, m, in the room's frame.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def start(self) -> Array: ...
+    @property
+    def outlines(self) -> Sequence[Array]: ...
 
 
 def write_recording_report(
@@ -38,7 +50,7 @@ def write_recording_report(
     file: Path,
     *,
     truth: Mapping[str, TruePath] | None = None,
-    plan: FloorPlan | None = None,
+    plan: RoomPlan | None = None,
     starts: Mapping[str, Array] | None = None,
     accuracy: SlamAccuracy | None = None,
     notes: Sequence[str] = (),
@@ -57,7 +69,7 @@ def write_recording_report(
 def recording_document(
     dataset: Dataset,
     truth: Mapping[str, TruePath] | None = None,
-    plan: FloorPlan | None = None,
+    plan: RoomPlan | None = None,
     starts: Mapping[str, Array] | None = None,
     accuracy: SlamAccuracy | None = None,
     notes: Sequence[str] = (),
@@ -117,7 +129,7 @@ def _pictures(
     dataset: Dataset,
     prefix: str,
     truth: Mapping[str, TruePath],
-    plan: FloorPlan | None,
+    plan: RoomPlan | None,
     starts: Mapping[str, Array],
 ) -> list[Section]:
     """The room, the wheels, and runs to be gone through."""
@@ -150,12 +162,11 @@ def _all_known(runs: Mapping[str, Trajectory], starts: Mapping[str, Array]) -> b
     return all(run.id in starts for run in runs.values())
 
 
-def _outlines(plan: FloorPlan | None, start: Array | None) -> list[Array]:
+def _outlines(plan: RoomPlan | None, start: Array | None) -> list[Array]:
     """The walls of a floor plan as seen from a start pose in it (its own, if that is not known): closed (n, 2) each."""
     if plan is None:
         return []
     x, y, heading = plan.start if start is None else start
     cosine, sine = np.cos(heading), np.sin(heading)
     turn = np.array([[cosine, -sine], [sine, cosine]])
-    corners = [np.array(shape.exterior.coords) for shape in (plan.boundary, *plan.obstacles)]
-    return [(outline - (x, y)) @ turn for outline in corners]
+    return [(outline - (x, y)) @ turn for outline in plan.outlines]

@@ -77,6 +77,11 @@ class FloorPlan:
     owners: NDArray[np.intp]
     free: Polygon | MultiPolygon
 
+    @property
+    def outlines(self) -> list[Array]:
+        """The walls of boundary and obstacles, closed (n, 2) each, m."""
+        return [np.array(shape.exterior.coords) for shape in (self.boundary, *self.obstacles)]
+
     def check_path(self, positions: Array, times: Array, radius: float, what: str) -> None:
         """ConfigError in one line when a robot, a disc of ``radius`` m, does not keep inside the free area.
 
