@@ -27,7 +27,6 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.accuracy import SlamAccuracy, slam_accuracy
 
-
 _SIMULATED = Badge("SIMULATED DATA", "warning")
 
 
