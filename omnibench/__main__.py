@@ -10,7 +10,8 @@ from contextlib import suppress
 from types import FrameType
 from typing import Any, NoReturn
 
-_COMMANDS = ("__main__.py", "app.py", "live_commands.py")  # whose imports go on while nothing is under way yet
+# Files whose imports go on while nothing is under way yet.
+_COMMANDS = ("__main__.py", "app.py", "guide_commands.py", "live_commands.py")
 
 
 def main() -> None:

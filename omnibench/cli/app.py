@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 import typer
 from pydantic import BaseModel
 
+from omnibench.cli.guide_commands import guide_app
 from omnibench.cli.live_commands import live_app
 from omnibench.cli.options import Plugins, load_given_plugins
 from omnibench.cli.terminal import calibration_tables as terminal
@@ -31,6 +32,7 @@ app = typer.Typer(
 plugin_app = typer.Typer(help="Write a plug-in, or check one.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(plugin_app, name="plugin")
 app.add_typer(live_app)
+app.add_typer(guide_app)
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
 Settings = Annotated[

@@ -1,0 +1,52 @@
+"""The handbook: Markdown files of the package, one a topic. Its README.md lists them, here and in a browser."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from omnibench.errors import UnknownNameError
+
+HANDBOOK = Path(__file__).with_name("handbook")
+
+_GROUP = re.compile(r"^## (.+)$")
+_ENTRY = re.compile(r"^- \[([a-z-]+)\]\(([a-z/-]+\.md)\): (.+)$")
+_LINK = re.compile(r"\[([^\]]+)\]\((?:[./a-z-]*/)?([a-z-]+)\.md(?:#[a-z-]+)?\)")
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One page of the handbook.
+
+    group: the heading it stands under in the list. summary: what it is about, in one line. file: its Markdown.
+    """
+
+    name: str
+    group: str
+    summary: str
+    file: Path
+
+    @property
+    def text(self) -> str:
+        """The page's Markdown, in which a link to another topic reads as the command that shows it."""
+        return _LINK.sub(r"`omnibench guide \2`", self.file.read_text(encoding="utf-8"))
+
+
+def topics() -> list[Topic]:
+    """All topics, in the order of the handbook's list."""
+    listed, group = [], ""
+    for line in (HANDBOOK / "README.md").read_text(encoding="utf-8").splitlines():
+        if heading := _GROUP.match(line):
+            group = heading[1]
+        elif entry := _ENTRY.match(line):
+            listed.append(Topic(entry[1], group, entry[3], HANDBOOK / entry[2]))
+    return listed
+
+
+def find_topic(name: str) -> Topic:
+    """The topic called ``name``. UnknownNameError names the nearest one and lists all."""
+    known = {topic.name: topic for topic in topics()}
+    if name not in known:
+        raise UnknownNameError("topic", name, known, "guide")
+    return known[name]
