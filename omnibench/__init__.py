@@ -60,7 +60,7 @@ _HOMES = {
     "fit.certify": ("certify_optimum",),
     "fit.evaluate": ("evaluate",),
     "fit.inspect": ("inspect_dataset",),
-    "live.subscriber": ("subscribe",),
+    "live.wire.subscriber": ("subscribe",),
     "robot.calibration": ("Calibration", "read_calibration", "write_calibration"),
     "robot.export.formats": ("export_calibration",),
 }

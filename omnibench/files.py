@@ -1,10 +1,11 @@
-"""Writing files so that each is complete or not there, with a disk's refusal as one line."""
+"""Writing results: files that are complete or not there, and folders that hold nothing else."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
+from datetime import datetime
 from errno import EACCES, EPERM, EROFS
 from io import BytesIO
 from pathlib import Path
@@ -14,8 +15,9 @@ import polars as pl
 
 from omnibench.errors import DataError
 
+RESULTS = Path("results")  # the folder of results, where the user names none
 TableFormat = Literal["parquet", "csv"]
-# What a file will hold, or what writes it to a path and raises OSError when the disk refuses.
+# The bytes of a file, or a function that writes it to a path and raises OSError when the disk refuses.
 FileContent = bytes | Callable[[Path], None]
 
 
@@ -69,7 +71,7 @@ def write_table(path: Path, table: pl.DataFrame) -> None:
 
 
 def encode_table(table: pl.DataFrame, table_format: TableFormat) -> bytes:
-    """The content of a table's file; polars itself would tell of a full disk in errors of its own."""
+    """The content of a table's file, in memory: polars would report a full disk in errors of its own."""
     content = BytesIO()
     if table_format == "parquet":
         table.write_parquet(content)
@@ -95,3 +97,47 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
     except OSError as error:
         raise DataError(f"{path}: cannot be removed: {error.strerror or error}; remove it by hand") from None
+
+
+def check_results_folder(folder: Path, mark: str, kind: str) -> None:
+    """DataError unless ``folder`` is new, empty, or holds earlier results of the same ``kind`` (comparison, discovery).
+
+    mark: first line of the config.yaml in such results, which tells it from somebody else's config.yaml.
+    """
+    if folder.is_file():
+        raise DataError(f"{folder}: is a file; name a folder for the results")
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    try:
+        ours = (folder / "config.yaml").read_text(encoding="utf-8").startswith(mark)
+    except (OSError, UnicodeDecodeError):
+        ours = False
+    if not ours:
+        raise DataError(f"{folder}: holds other files; name a new folder, or one of an earlier {kind}")
+
+
+def new_results_folder(parent: Path) -> Path:
+    """Make a folder in ``parent`` that is named by the time; runs of the same second get folders of their own."""
+    name = datetime.now().strftime("%Y-%m-%dT%H-%M-%S")
+    count = 1
+    while True:
+        folder = parent / (name if count == 1 else f"{name}-{count}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            count += 1
+        except OSError:
+            return folder  # the first file that is written there reports what is wrong
+        else:
+            return folder
+
+
+def link_latest(folder: Path) -> None:
+    """Make the link ``latest`` beside ``folder`` point to it; left out where the file system has no links."""
+    link = folder.parent / "latest"
+    temporary = link.with_name(f".{link.name}.{folder.name}")
+    try:
+        temporary.symlink_to(folder.name, target_is_directory=True)
+        temporary.replace(link)
+    except OSError:
+        temporary.unlink(missing_ok=True)

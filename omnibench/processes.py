@@ -1,4 +1,4 @@
-"""The same work on many things, in processes with one thread each: results in order, Ctrl-C and crashes end cleanly."""
+"""Many independent jobs in worker processes of one thread each: results in order, a clean end on Ctrl-C or a crash."""
 
 from __future__ import annotations
 
@@ -8,30 +8,47 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import cache
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from types import ModuleType
 from typing import Any, TypeVar
 
+from threadpoolctl import ThreadpoolController
+
 from omnibench.errors import OmnibenchError
-from omnibench.threads import one_thread
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
-_AHEAD = 4  # results of each worker that may wait for one before them
-_PATIENCE = 2.0  # s for a process to go by itself
+_AHEAD = 4  # results a worker may be ahead of the one that is yielded next (chosen)
+_PATIENCE = 2.0  # s that a process is given to end by itself (chosen)
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Limit NumPy's and SciPy's matrix products to the caller's thread while the block is open.
+
+    On small matrices more threads only wait for each other when the machine is busy.
+    """
+    limiter: AbstractContextManager[object] = _controller().limit(limits=1)
+    return limiter
+
+
+@cache
+def _controller() -> ThreadpoolController:
+    return ThreadpoolController().select(user_api="blas")
 
 
 def in_processes(
     work: Callable[[Job], Result], jobs: Iterable[Job], workers: int, preload: str | None = None
 ) -> Generator[Result, None, None]:
-    """``work`` of every job, in the jobs' order; jobs are taken as they are needed.
+    """Yield ``work(job)`` for every job, in the jobs' order; jobs are taken from the iterable as they are needed.
 
-    work: a function of a module; it, jobs and results are sent between processes. preload: the module that holds it.
-    One worker: in this process. What ``work`` raises is raised here; OmnibenchError in one line when a process dies.
+    work: a function at the top of a module; it, jobs and results are pickled. preload: name of the module that holds
+    it. workers: processes; with one, the work is done in this process. An error of ``work`` is raised here;
+    OmnibenchError in one line when a process dies.
     """
     if workers <= 1:
         for job in jobs:
@@ -41,7 +58,7 @@ def in_processes(
         return
     waiting = enumerate(jobs)
     done: dict[int, Result] = {}
-    following = 0
+    next_index = 0
     with _workers(work, workers, preload) as idle:
         busy: dict[Connection, int] = {}
         while True:
@@ -53,22 +70,22 @@ def in_processes(
                 assert isinstance(connection, Connection)
                 done[busy.pop(connection)] = _receive(connection)
                 idle.append(connection)
-            while following in done:
-                yield done.pop(following)
-                following += 1
+            while next_index in done:
+                yield done.pop(next_index)
+                next_index += 1
 
 
 def _send(connection: Connection, waiting: Iterator[tuple[int, Job]]) -> int | None:
-    """Give a worker the next job; its number, None if there is no more."""
+    """Give a worker the next job and return the job's number; None if there are no more jobs."""
     for index, job in waiting:
-        with _death_in_words():
+        with _death_as_error():
             connection.send(job)
         return index
     return None
 
 
 def _receive(connection: Connection) -> Any:
-    with _death_in_words():
+    with _death_as_error():
         good, answer = connection.recv()
     if not good:
         raise answer
@@ -76,7 +93,7 @@ def _receive(connection: Connection) -> Any:
 
 
 @contextmanager
-def _death_in_words() -> Iterator[None]:
+def _death_as_error() -> Iterator[None]:
     try:
         yield
     except (EOFError, OSError):
@@ -109,8 +126,8 @@ def _workers(work: Callable[[Any], Any], count: int, preload: str | None) -> Ite
 
 
 def _serve(connection: Connection, work: Callable[[Any], Any]) -> None:
-    """The worker process: jobs come, results go, until the parent closes or dies."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends, from whatever thread it asked
+    """The loop of a worker process: receive a job, send its result, until the parent closes the pipe or dies."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
     threading.Thread(target=end_with_parent, daemon=True).start()
     with suppress(EOFError, OSError), one_thread():
         while True:
@@ -123,7 +140,7 @@ def _serve(connection: Connection, work: Callable[[Any], Any]) -> None:
 
 
 def end_with_parent() -> None:
-    """End this worker when its parent dies, which it must not outlive."""
+    """Wait for the parent to die, then end this worker process."""
     parent = multiprocessing.parent_process()
     assert parent is not None  # this is a worker
     with suppress(OSError):
@@ -133,9 +150,10 @@ def end_with_parent() -> None:
 
 @contextmanager
 def one_thread_processes(preload: Sequence[str]) -> Iterator[Any]:
-    """A context whose processes start fast, with one thread each: two at a time should not fight for the cores.
+    """A multiprocessing context (forkserver) whose processes start fast and use one thread each.
 
-    preload: modules that they will need; those of the first who asks in a process are for all that follow.
+    preload: modules that the processes will need. The fork server is started once a process, so that the first
+    caller's modules count for all that follow.
     """
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
@@ -155,7 +173,7 @@ def one_thread_processes(preload: Sequence[str]) -> Iterator[Any]:
 
 @contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():  # others cannot, and need not
+    if threading.current_thread() is not threading.main_thread():  # signal handlers belong to the main thread
         yield
         return
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -167,7 +185,10 @@ def _interrupts_ignored() -> Iterator[None]:
 
 @contextmanager
 def main_module_hidden() -> Iterator[None]:
-    """A process started here does not run the user's script once more, which so needs no guard against that."""
+    """Keep processes that start in the block from running the user's script again.
+
+    So a script that calls omnibench needs no ``if __name__ == "__main__"``.
+    """
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:

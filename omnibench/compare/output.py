@@ -16,8 +16,15 @@ from omnibench.compare.result import ComparisonResult, EntryStatistics, Interval
 from omnibench.config import read_yaml, to_json, to_yaml
 from omnibench.data.dataset import Dataset
 from omnibench.errors import DataError
-from omnibench.files import remove, write_table, write_text
-from omnibench.results_folder import RESULTS, check_folder, link_latest, new_folder
+from omnibench.files import (
+    RESULTS,
+    check_results_folder,
+    link_latest,
+    new_results_folder,
+    remove,
+    write_table,
+    write_text,
+)
 from omnibench.robot.calibration import Calibration, Provenance, Row, covariance_rows, write_calibration
 
 # The first line of config.yaml tells a folder of results from a folder that happens to hold such a file.
@@ -30,8 +37,8 @@ def prepare_output(config: CompareConfig, folder: Path | None) -> Path:
     Default: ``results/<config name>/<time>``, with a link ``latest``. DataError when it cannot be written to, or
     holds another comparison.
     """
-    chosen = folder or new_folder(RESULTS / config.name)
-    check_folder(chosen, _MARK, "comparison")
+    chosen = folder or new_results_folder(RESULTS / config.name)
+    check_results_folder(chosen, _MARK, "comparison")
     _check_name(chosen, config)
     write_text(chosen / "config.yaml", f"{_MARK}\n{to_yaml(config)}")
     if folder is None:

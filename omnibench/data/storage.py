@@ -88,7 +88,7 @@ def load_dataset(path: Path | str) -> Dataset:
 def save_dataset(dataset: Dataset, path: Path | str, table_format: TableFormat = "parquet") -> None:
     """Write a data set folder. DataError when the disk refuses, or when the folder holds something else."""
     folder = Path(path)
-    check_folder(folder)
+    check_dataset_folder(folder)
     tables = {
         "trajectories": pl.DataFrame(
             [_run_row(trajectory) for trajectory in dataset.trajectories], infer_schema_length=None
@@ -113,7 +113,7 @@ def save_dataset(dataset: Dataset, path: Path | str, table_format: TableFormat =
         remove(folder / f"{name}.{'csv' if table_format == 'parquet' else 'parquet'}")
 
 
-def check_folder(folder: Path) -> None:
+def check_dataset_folder(folder: Path) -> None:
     """DataError in one line when a data set cannot be written there: something else is there, or nobody may write."""
     if folder.is_file():
         raise DataError(f"{folder}: is a file; name a folder for the data set")

@@ -13,9 +13,16 @@ from omnibench.config import Model, to_json, to_yaml
 from omnibench.discover.document import discovery_document, experiment_file
 from omnibench.discover.report.discovery_report import discovery_report
 from omnibench.discover.result import Discovery
-from omnibench.files import encode_table, remove, write_files
+from omnibench.files import (
+    RESULTS,
+    check_results_folder,
+    encode_table,
+    link_latest,
+    new_results_folder,
+    remove,
+    write_files,
+)
 from omnibench.report.render import render
-from omnibench.results_folder import RESULTS, check_folder, link_latest, new_folder
 from omnibench.robot.kinematics import Array
 
 # The first line of config.yaml tells a folder of results from a folder that happens to hold such a file.
@@ -36,7 +43,7 @@ class DiscoverOptions(Model):
 def check_output(folder: Path | None) -> None:
     """DataError when ``folder`` is a file, or holds something else than an earlier discovery; asked before the work."""
     if folder is not None:
-        check_folder(folder, _MARK, "discovery")
+        check_results_folder(folder, _MARK, "discovery")
 
 
 def write_discovery(discovery: Discovery, options: DiscoverOptions, folder: Path | None = None) -> Path:
@@ -46,7 +53,7 @@ def write_discovery(discovery: Discovery, options: DiscoverOptions, folder: Path
     holds other files; then all is as it was.
     """
     check_output(folder)
-    chosen = folder or new_folder(RESULTS / _plain(discovery.dataset.name))
+    chosen = folder or new_results_folder(RESULTS / _plain(discovery.dataset.name))
     try:
         write_files(_contents(discovery, options, chosen))
     except BaseException:

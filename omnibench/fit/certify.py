@@ -17,10 +17,10 @@ from omnibench.errors import DataError
 from omnibench.fit.bounds.lower_bound import LowerBounds, Node
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
+from omnibench.processes import one_thread
 from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
-from omnibench.threads import one_thread
 
 Watch = Callable[["Proof"], None]
 _NO_ERROR = 1e-9  # m, rad: below it a cost is rounding, and no share of it can be proven

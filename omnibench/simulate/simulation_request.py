@@ -9,7 +9,7 @@ from pathlib import Path
 
 from omnibench.config import to_json, to_yaml
 from omnibench.data.dataset import Dataset
-from omnibench.data.storage import check_folder, load_dataset, save_dataset
+from omnibench.data.storage import check_dataset_folder, load_dataset, save_dataset
 from omnibench.data.true_poses import TRUTH_FILE, write_true_poses
 from omnibench.data.watch import Watch, unwatched
 from omnibench.errors import ConfigError
@@ -83,7 +83,7 @@ class SimulationRequest:
 
         OmnibenchError in one line: the config, the recording or the calibration is wrong, or the disk refuses.
         """
-        check_folder(self.output)
+        check_dataset_folder(self.output)
         if self.config is None:
             assert self.like is not None
             assert self.model is not None

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.storage import check_folder, load_dataset, save_dataset
+from omnibench.data.storage import check_dataset_folder, load_dataset, save_dataset
 from omnibench.data.true_poses import TruePath, read_true_poses, robot_of_truth
 from omnibench.data.watch import Watch
 from omnibench.errors import ConfigError, DataError
@@ -61,7 +61,7 @@ class SlamRequest:
         truth = self._truth_of(recorded)
         model = self._model_of(recorded)
         if self.output is not None:
-            check_folder(self.output)
+            check_dataset_folder(self.output)
         paths = slam_paths(recorded, self.options, model=model, workers=_workers(model), watch=watch)
         found = with_paths(recorded, paths)
         if self.output is not None:

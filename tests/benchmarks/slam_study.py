@@ -20,6 +20,7 @@ from functools import partial
 import numpy as np
 
 from omnibench.data.scans import TrajectoryScans
+from omnibench.processes import one_thread
 from omnibench.robot.kinematics import Array, Robot, Wheel
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
@@ -30,7 +31,6 @@ from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile,
 from omnibench.simulate.flower import Command
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.slam_run import SlamPath, run_slam
-from omnibench.threads import one_thread
 
 ROBOT = Robot(
     name="APR-02",

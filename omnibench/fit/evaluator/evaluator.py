@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from omnibench.fit.bounds.expansion import Basis, degree_for
 from omnibench.fit.bounds.impulses import Path, Segment, cut, impulses, make_path, quadrature
 from omnibench.fit.parameterisation import Parameterisation
+from omnibench.processes import one_thread
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch, WheelLog
-from omnibench.threads import one_thread
 
 # What may be left out of a position by truncation, by quadrature, and by the decomposition, as a share of the longest
 # path (at least 1 m). The bounds are of absolute sums; what is really left out is about a thousand times less.

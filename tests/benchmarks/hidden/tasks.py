@@ -8,7 +8,7 @@ from typing import Literal
 
 from omnibench.config import Model
 from omnibench.discover.discover import discover_effects
-from omnibench.threads import one_thread
+from omnibench.processes import one_thread
 
 from .absorbed import ABSORBED, ACTUATORS, NUISANCES
 from .disturbances import NULL_KINDS
