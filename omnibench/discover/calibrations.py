@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.discover.extend import Extended
+from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.selection.extrapolation import driven_motions
 from omnibench.environment import package_versions
 from omnibench.errors import DataError

@@ -14,10 +14,10 @@ from scipy import stats
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.calibrations import Request, calibration_of
 from omnibench.discover.experiments import experiments_for
-from omnibench.discover.extend import Extended, extend
-from omnibench.discover.held_out import compared, errors_of_repetitions, errors_on, floor_of
-from omnibench.discover.model_fit import Fit, at_model, at_runs
-from omnibench.discover.regressors.actuators import Actuators
+from omnibench.discover.fitting.extend import Extended, extend
+from omnibench.discover.fitting.model_fit import Fit, at_model, at_runs
+from omnibench.discover.fitting.usable_runs import in_start_frames, usable_runs, without_jumps
+from omnibench.discover.held_out.gaps import compared, errors_of_repetitions, errors_on, floor_of
 from omnibench.discover.regressors.significance import Gains
 from omnibench.discover.result import (
     Candidate,
@@ -33,9 +33,9 @@ from omnibench.discover.selection.competing_models import Rivals
 from omnibench.discover.selection.detectability import absorbed_effects, classes_of, hidden_sizes, sums_of
 from omnibench.discover.selection.extrapolation import novelties_of
 from omnibench.discover.selection.model_selection import Named
+from omnibench.discover.selection.motor_effects import Actuators
 from omnibench.discover.selection.screening import Look
 from omnibench.discover.selection.unknown_term import close_without_name, step_name, steps_of
-from omnibench.discover.usable_runs import in_start_frames, usable_runs, without_jumps
 from omnibench.discover.verdict import headline_of, verdict_of
 from omnibench.fit.least_squares.noise import Whitener
 from omnibench.report.numbers import plural

@@ -11,14 +11,14 @@ import numpy as np
 from omnibench.data.dataset import Dataset
 from omnibench.discover.calibrations import Request
 from omnibench.discover.conclude import told
-from omnibench.discover.extend import Extended, extend
-from omnibench.discover.model_fit import Fit, fit_matrix
-from omnibench.discover.regressors.actuators import look_at_actuators
+from omnibench.discover.fitting.extend import Extended, extend
+from omnibench.discover.fitting.model_fit import Fit, fit_matrix
+from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.discover.result import Discovery
 from omnibench.discover.selection.candidate_groups import check_names
 from omnibench.discover.selection.competing_models import rivals_of
+from omnibench.discover.selection.motor_effects import look_at_actuators
 from omnibench.discover.selection.screening import Look, look_at
-from omnibench.discover.usable_runs import usable_runs
 from omnibench.errors import DataError
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array

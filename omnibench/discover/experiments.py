@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from omnibench.config import to_yaml
 from omnibench.data.dataset import Dataset
-from omnibench.discover.model_fit import Fit
+from omnibench.discover.fitting.model_fit import Fit
 from omnibench.discover.result import Experiment, NamedEffect
 from omnibench.robot.calibration import matrix_rows
 from omnibench.simulate.config import FlowerConfig

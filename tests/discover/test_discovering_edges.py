@@ -10,8 +10,8 @@ from discovery_samples import DELAY, shorn, simulated
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.model_fit import fit_matrix
-from omnibench.discover.usable_runs import usable_runs
+from omnibench.discover.fitting.model_fit import fit_matrix
+from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.errors import DataError
 
 

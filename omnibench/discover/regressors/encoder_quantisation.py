@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.model_fit import Fit
+from omnibench.discover.fitting.model_fit import Fit
 from omnibench.discover.regressors.whitened import given
 from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.robot.kinematics import Array

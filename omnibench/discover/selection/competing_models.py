@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.extend import Extended, extend
-from omnibench.discover.held_out import held_out_residuals
-from omnibench.discover.model_fit import Fit
+from omnibench.discover.fitting.extend import Extended, extend
+from omnibench.discover.fitting.model_fit import Fit
+from omnibench.discover.held_out.gaps import held_out_residuals
 from omnibench.discover.selection.candidate_groups import Group
 from omnibench.discover.selection.model_selection import Named
 from omnibench.discover.selection.screening import Look

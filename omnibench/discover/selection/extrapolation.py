@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.extend import Extended, columns_at
-from omnibench.discover.held_out import held_out_residuals
+from omnibench.discover.fitting.extend import Extended, columns_at
+from omnibench.discover.held_out.gaps import held_out_residuals
 from omnibench.discover.result import Novelty
 from omnibench.discover.selection.competing_models import folds_of_commands
 from omnibench.fit.least_squares.repetitions import grouped

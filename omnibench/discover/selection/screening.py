@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.discover.extend import Extended
-from omnibench.discover.held_out import confirmation, folds_of
-from omnibench.discover.model_fit import Fit, paths_of, split_runs
+from omnibench.discover.fitting.extend import Extended
+from omnibench.discover.fitting.model_fit import Fit, paths_of, split_runs
+from omnibench.discover.held_out.gaps import confirmation, folds_of
 from omnibench.discover.regressors.encoder_quantisation import Rounding
 from omnibench.discover.regressors.significance import Gains, gains_of
 from omnibench.discover.regressors.whitened import Whitened, given

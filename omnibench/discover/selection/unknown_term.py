@@ -8,9 +8,9 @@ from itertools import product
 
 import numpy as np
 
-from omnibench.discover.extend import Extended, columns_of, extend
-from omnibench.discover.held_out import HELD_OUT, folds_by_lot, gains_on_held_out
-from omnibench.discover.model_fit import Fit
+from omnibench.discover.fitting.extend import Extended, columns_of, extend
+from omnibench.discover.fitting.model_fit import Fit
+from omnibench.discover.held_out.gaps import HELD_OUT, folds_by_lot, gains_on_held_out
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Gains
 from omnibench.discover.regressors.whitened import given

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from discovery_samples import simulated
 
-from omnibench.discover.model_fit import fit_matrix, paths_of
-from omnibench.discover.usable_runs import usable_runs
+from omnibench.discover.fitting.model_fit import fit_matrix, paths_of
+from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect
 from omnibench.robot.effects.term import make_term

@@ -11,14 +11,14 @@ from hidden.experiment import DESIGNS, ROBOT, Command, Design
 from hidden.sets import Kind, Truth, make_set
 
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.extend import Extended, extend
-from omnibench.discover.model_fit import fit_matrix
+from omnibench.discover.fitting.extend import Extended, extend
+from omnibench.discover.fitting.model_fit import fit_matrix
+from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.selection.candidate_groups import Group
 from omnibench.discover.selection.competing_models import Rivals
 from omnibench.discover.selection.screening import Look, look_at
 from omnibench.discover.selection.unknown_term import chosen_functions, close_without_name, step_name, steps_of
-from omnibench.discover.usable_runs import usable_runs
 from omnibench.fit.least_squares.noise import Whitener
 from omnibench.registry import effects
 from omnibench.robot.calibration import Calibration, read_calibration, write_calibration

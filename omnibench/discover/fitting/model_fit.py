@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
+from omnibench.discover.fitting.usable_runs import Nuisances, deviations_of, in_start_frames, log_of, without_jumps
 from omnibench.discover.regressors.paths import Paths, make_paths
 from omnibench.discover.regressors.whitened import Whitened, given, whitened
-from omnibench.discover.usable_runs import Nuisances, deviations_of, in_start_frames, log_of, without_jumps
 from omnibench.fit.least_squares.noise import NoiseEstimate, Whitener, estimate_noise
 from omnibench.robot.calibration import Noise
 from omnibench.robot.effects.term import Term

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.extend import Extended
-from omnibench.discover.model_fit import Fit, at_runs
+from omnibench.discover.fitting.extend import Extended
+from omnibench.discover.fitting.model_fit import Fit, at_runs
+from omnibench.discover.fitting.usable_runs import in_start_frames
 from omnibench.discover.regressors.whitened import Whitened, whitened
 from omnibench.discover.result import Gap, HeldOut
-from omnibench.discover.usable_runs import in_start_frames
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions, grouped
 from omnibench.robot.kinematics import Array
 

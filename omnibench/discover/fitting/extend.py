@@ -8,7 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.model_fit import Fit, at_model, matrix_jacobian, model_with, paths_of, split_runs, with_noise
+from omnibench.discover.fitting.model_fit import (
+    Fit,
+    at_model,
+    matrix_jacobian,
+    model_with,
+    paths_of,
+    split_runs,
+    with_noise,
+)
 from omnibench.discover.regressors.paths import Paths, make_paths
 from omnibench.discover.regressors.whitened import Whitened, given
 from omnibench.discover.selection.candidate_groups import Group

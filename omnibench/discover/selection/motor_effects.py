@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.held_out import confirmation, folds_of
+from omnibench.discover.held_out.gaps import confirmation, folds_of
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Gains, gains_of
 from omnibench.discover.regressors.whitened import Whitened

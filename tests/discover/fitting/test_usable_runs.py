@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from discovery_samples import simulated
 
-from omnibench.discover.model_fit import fit_matrix
-from omnibench.discover.usable_runs import log_of, usable_runs
+from omnibench.discover.fitting.model_fit import fit_matrix
+from omnibench.discover.fitting.usable_runs import log_of, usable_runs
 from omnibench.errors import DataError
 
 
