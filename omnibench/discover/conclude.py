@@ -290,7 +290,7 @@ def _step(name: str, fit: Fit, noise: Noise, validation: Sequence[Trajectory]) -
         name,
         _chi2(noise, fit.runs, fit.residuals),
         _chi2(noise, validation, held) if held else None,
-        _eq6(fit.free_residuals),
+        _eq6(fit.nuisance_free_residuals),
         _eq6(held) if held else None,
     )
 

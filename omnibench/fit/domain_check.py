@@ -1,4 +1,4 @@
-"""Runs that drive motions which a calibration was not fitted to: there its effects are a guess."""
+"""Extrapolation: runs with motions outside a calibration's training domain, where its effects are a guess."""
 
 from __future__ import annotations
 
@@ -7,33 +7,34 @@ from collections.abc import Sequence
 from omnibench.data.dataset import Trajectory
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
-from omnibench.robot.training_domain import DrivenMotions, motions_of, not_known_to_hold
+from omnibench.robot.training_domain import TrainingDomain, extrapolation_consequence, motions_of
 
-_NAMED = 3  # commands
+_NAMED = 3  # commands that the warning names; the others are counted
 
 
-def unfitted_motions(calibration: Calibration, runs: Sequence[Trajectory]) -> str | None:
-    """What to warn of, in one line: runs that drive what the fit of the calibration's effects has not seen.
+def extrapolation_warning(calibration: Calibration, runs: Sequence[Trajectory]) -> str | None:
+    """A warning in one line, if runs drive motions that the calibration's effects were not fitted to.
 
-    None: there are none, the calibration has no effects, or it does not say which motions it was fitted to.
+    None if there are no such runs, or the calibration has no effects or does not state its training domain.
     """
     if not calibration.effects or not calibration.driven:
         return None
-    driven = DrivenMotions(calibration.robot, calibration.driven)
-    count, found = 0, dict[str, tuple[float, Array]]()  # by command: the share of a run that is new, and what
+    domain = TrainingDomain(calibration.robot, calibration.driven)
+    count = 0
+    worst = dict[str, tuple[float, Array]]()  # by command: share of the worst run that is outside, and these motions
     for run in runs:
         motions = motions_of(calibration.matrix_array, run.times, run.rates)
-        new = driven.new_in_run(motions)
-        if new.any():
+        outside = domain.outside_in_run(motions)
+        if outside.any():
             count += 1
-            command, share = run.command or run.id, float(new.mean())
-            if command not in found or share > found[command][0]:
-                found[command] = share, motions[new]
+            command, share = run.command or run.id, float(outside.mean())
+            if command not in worst or share > worst[command][0]:
+                worst[command] = share, motions[outside]
     if not count:
         return None
-    commands = sorted(found, key=lambda command: -found[command][0])
-    words = driven.in_words(found[commands[0]][1])
-    consequence = not_known_to_hold([term.name for term in calibration.effects])
+    commands = sorted(worst, key=lambda command: -worst[command][0])
+    words = domain.in_words(worst[commands[0]][1])
+    consequence = extrapolation_consequence([term.name for term in calibration.effects])
     return (
         f"{count} of {len(runs)} runs drive motions that calibration {calibration.name!r} was not fitted to "
         f"({_first(commands)}), such as {words}: {consequence}"

@@ -10,7 +10,7 @@ import numpy as np
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory
 from omnibench.errors import DataError
-from omnibench.fit.domain_check import unfitted_motions
+from omnibench.fit.domain_check import extrapolation_warning
 from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
@@ -55,14 +55,14 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
     groups: dict[str, tuple[Trajectory, ...]] = {str(name): group for name, group in present.items()}
     groups["all"] = dataset.trajectories
     model, design = calibration.model, OdometryModel.of_design(dataset.robot, calibration.integration)
-    unfitted = unfitted_motions(calibration, dataset.trajectories)
+    warning = extrapolation_warning(calibration, dataset.trajectories)
     return Evaluation(
         dataset=dataset.name,
         simulated=dataset.simulated,
         trajectories=len(dataset.trajectories),
         splits={name: split_errors(model, group) for name, group in groups.items()},
         design={name: split_errors(design, group) for name, group in groups.items()},
-        warnings=() if unfitted is None else (unfitted,),
+        warnings=() if warning is None else (warning,),
     )
 
 

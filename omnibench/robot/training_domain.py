@@ -1,4 +1,4 @@
-"""The motions that a model was fitted to, and whether others are among them: effects need not hold beyond."""
+"""Training domain: the motions that a model was fitted to. Outside it the model's effects extrapolate."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array, Robot
 
-_NEAR = 0.15  # of the largest motion: what is nearer to one that was driven is not new
-_SPACING = 0.05  # of the largest motion, between those that are kept
-_SMOOTHING = 0.25  # s
-_STANDING = 0.02  # of the largest motion: who stands drives nothing new
-_OFTEN = 0.05  # of a run's time: what is driven for less is a transition
+# Lengths of motions (m/s, turning as speed at the wheels) are shares of the largest in the domain. All are chosen.
+_NEAR = 0.15  # a motion nearer than this to one in the domain is inside
+_SPACING = 0.05  # least distance between the representatives that are kept
+_SMOOTHING = 0.25  # s, over which the twists of a run are averaged
+_STANDING = 0.02  # a smaller motion is standing still, which is inside every domain
+_OFTEN = 0.05  # share of a run's time: motions outside that take less are transitions, and do not count
 
 
 def motions_of(matrix: Array, times: Array, rates: Array) -> Array:
@@ -27,7 +28,7 @@ def motions_of(matrix: Array, times: Array, rates: Array) -> Array:
 
 
 def representatives(robot: Robot, motions: Array) -> Array:
-    """A few of many motions (k, 3), such that every one is near one of them."""
+    """A subset of motions (k, 3) such that every motion is near one of the subset."""
     at_wheels = motions * _scale(robot)
     size = _size(at_wheels)
     _, first = np.unique(np.round(at_wheels / (_SPACING * size)), axis=0, return_index=True)
@@ -38,59 +39,60 @@ def representatives(robot: Robot, motions: Array) -> Array:
     return motions[chosen]
 
 
-def new_share(robot: Robot, driven: Array, motions: Array) -> tuple[float, str]:
-    """The share of motions (k, 3) that are far from all that were driven (n, 3), and what they are, in words."""
-    known = DrivenMotions(robot, driven)
-    away = known.new_in_run(motions)
-    return (float(away.mean()), known.in_words(motions[away])) if away.any() else (0.0, "")
+def extrapolated_share(robot: Robot, fitted: Array, motions: Array) -> tuple[float, str]:
+    """The share of motions (k, 3) outside the training domain of ``fitted`` (n, 3), and what they are, in words."""
+    domain = TrainingDomain(robot, fitted)
+    outside = domain.outside_in_run(motions)
+    return (float(outside.mean()), domain.in_words(motions[outside])) if outside.any() else (0.0, "")
 
 
-class DrivenMotions:
-    """The motions (n, 3) that a model of a robot was fitted to, m/s, m/s, rad/s, and which others are far from all."""
+class TrainingDomain:
+    """The motions (n, 3) that a model was fitted to, m/s, m/s, rad/s; a motion far from all of them is outside."""
 
     def __init__(self, robot: Robot, motions: Array | Sequence[Sequence[float]]) -> None:
         self._scale = _scale(robot)
         self._known = np.asarray(motions, dtype=float) * self._scale
         self._size = _size(self._known)
 
-    def is_new(self, motion: Array) -> bool:
-        """Whether one motion (3,) is far from all: for a live node, which has no time for SciPy."""
-        own = motion * self._scale
-        if np.linalg.norm(own) < _STANDING * self._size:
+    def is_outside(self, motion: Array) -> bool:
+        """True if one motion (3,) is outside; without SciPy, whose import would delay a live node."""
+        at_wheels = motion * self._scale
+        if np.linalg.norm(at_wheels) < _STANDING * self._size:
             return False
-        return bool(np.linalg.norm(self._known - own, axis=1).min() > _NEAR * self._size)
+        return bool(np.linalg.norm(self._known - at_wheels, axis=1).min() > _NEAR * self._size)
 
-    def new_among(self, motions: Array) -> NDArray[np.bool_]:
-        """The same of many motions (k, 3): (k,)."""
+    def outside(self, motions: Array) -> NDArray[np.bool_]:
+        """Which of many motions (k, 3) are outside: (k,) of bool."""
         from scipy.spatial import KDTree
 
-        own = motions * self._scale
-        away = KDTree(self._known).query(own)[0] > _NEAR * self._size
-        new: NDArray[np.bool_] = away & (np.linalg.norm(own, axis=1) >= _STANDING * self._size)
-        return new
+        at_wheels = motions * self._scale
+        far = KDTree(self._known).query(at_wheels)[0] > _NEAR * self._size
+        outside: NDArray[np.bool_] = far & (np.linalg.norm(at_wheels, axis=1) >= _STANDING * self._size)
+        return outside
 
-    def new_in_run(self, motions: Array) -> NDArray[np.bool_]:
-        """As ``new_among`` of the motions of one run, but none where it drives new ones only in passing."""
-        away = self.new_among(motions)
-        return away if away.mean() >= _OFTEN else np.zeros_like(away)
+    def outside_in_run(self, motions: Array) -> NDArray[np.bool_]:
+        """Which motions (k, 3) of one run are outside: (k,) of bool, all False where they are mere transitions."""
+        outside = self.outside(motions)
+        return outside if outside.mean() >= _OFTEN else np.zeros_like(outside)
 
     def in_words(self, motions: Array) -> str:
-        """What kind of motion these (k, 3) are, by their medians."""
+        """The kind of motion that these (k, 3) are, by their medians, in words."""
         return _in_words(motions * self._scale, motions)
 
 
-def not_known_to_hold(effects: Sequence[str]) -> str:
-    """What follows for effects of these names beyond the motions that they were fitted to."""
+def extrapolation_consequence(effects: Sequence[str]) -> str:
+    """The consequence of extrapolation for effects of these names, in words."""
     verb = "is" if len(effects) == 1 else "are"
     return f"{', '.join(effects)} {verb} not known to hold there, and errors may be larger than stated"
 
 
 def _scale(robot: Robot) -> Array:
-    """The turning counts as what it moves at the wheels, m/s."""
+    """Factors (3,) that make m/s of a twist: turning counts as the speed that it gives the wheels."""
     return np.array([1.0, 1.0, np.mean([wheel.distance for wheel in robot.wheels])])
 
 
 def _size(at_wheels: Array) -> float:
+    """Length of the largest of some motions (k, 3), m/s."""
     return max(float(np.linalg.norm(at_wheels, axis=1).max()), 1e-9)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.errors import DataError
-from omnibench.fit.domain_check import unfitted_motions
+from omnibench.fit.domain_check import extrapolation_warning
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.pose_noise import reference_noise
@@ -46,11 +46,11 @@ def simulate_like(dataset: Dataset, calibration: Calibration, noise_seed: int | 
         licence=dataset.licence,
         simulated=True,
     )
-    unfitted = unfitted_motions(calibration, dataset.trajectories)
-    told = [] if unfitted is None else [unfitted]
+    warning = extrapolation_warning(calibration, dataset.trajectories)
+    warnings = [] if warning is None else [warning]
     if dataset.scans is not None:
-        told.append("the recording's scans are left out: they show where its robot was")
-    return replace(made, warnings=(*made.warnings, *told))
+        warnings.append("the recording's scans are left out: they show where its robot was")
+    return replace(made, warnings=(*made.warnings, *warnings))
 
 
 def _with_noise(dataset: Dataset, poses: list[Array], calibration: Calibration, seed: int) -> list[Array]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.fit.domain_check import unfitted_motions
+from omnibench.fit.domain_check import extrapolation_warning
 from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows
 from omnibench.simulate.like import simulate_like
 from omnibench.testing import synthetic_robot
@@ -39,7 +39,7 @@ def run(name: str, *twists: tuple[float, float, float], command: str | None = No
 def test_runs_commands_motions_and_effects_are_told_in_one_line() -> None:
     runs = [run("1", FORWARDS), run("2", FORWARDS, SIDEWAYS, command="corner"), run("3", SIDEWAYS, command="side")]
     other = EffectTerm(name="heading_drift", parameters={"b": 0.001})
-    assert unfitted_motions(calibration(SLIP, other), runs) == (
+    assert extrapolation_warning(calibration(SLIP, other), runs) == (
         "2 of 3 runs drive motions that calibration 'mine' was not fitted to (side, corner), such as driving straight "
         "at 0.20 m/s: centripetal_slip, heading_drift are not known to hold there, and errors may be larger than stated"
     )
@@ -47,7 +47,7 @@ def test_runs_commands_motions_and_effects_are_told_in_one_line() -> None:
 
 def test_repetitions_of_a_command_count_as_runs_and_are_named_once() -> None:
     runs = [run(str(number), ON_THE_SPOT, command="turn") for number in range(4)]
-    told = unfitted_motions(calibration(), runs)
+    told = extrapolation_warning(calibration(), runs)
     assert told is not None
     assert told.startswith(
         "4 of 4 runs drive motions that calibration 'mine' was not fitted to (turn), such as turning"
@@ -56,7 +56,7 @@ def test_repetitions_of_a_command_count_as_runs_and_are_named_once() -> None:
 
 def test_three_commands_are_named_and_the_others_counted() -> None:
     runs = [run(name, SIDEWAYS) for name in "abcde"]
-    told = unfitted_motions(calibration(), runs)
+    told = extrapolation_warning(calibration(), runs)
     assert told is not None
     assert "(a, b, c and 2 more)" in told
 
@@ -68,8 +68,8 @@ def test_three_commands_are_named_and_the_others_counted() -> None:
 )
 def test_nothing_is_told_of_what_was_driven_or_where_nothing_is_at_stake(changes: dict[str, Any]) -> None:
     runs = [run("1", FORWARDS), run("2", SIDEWAYS), run("3", ON_THE_SPOT)]
-    assert unfitted_motions(calibration(), runs) is not None
-    assert unfitted_motions(calibration(**changes), runs) is None
+    assert extrapolation_warning(calibration(), runs) is not None
+    assert extrapolation_warning(calibration(**changes), runs) is None
 
 
 def recorded(*runs: Trajectory) -> Dataset:

@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.training_domain import DrivenMotions, motions_of, new_share, not_known_to_hold, representatives
+from omnibench.robot.training_domain import (
+    TrainingDomain,
+    extrapolated_share,
+    extrapolation_consequence,
+    motions_of,
+    representatives,
+)
 
 DISTANCE = 0.195  # m, of the APR-02's wheels
 FORWARDS = np.array([0.2, 0.0, 0.0])
@@ -21,8 +27,8 @@ STANDING = np.zeros(3)
 _twists = st.integers(1, 30).flatmap(lambda count: arrays(float, (count, 3), elements=st.floats(-1, 1)))
 
 
-def known(*motions: Array) -> DrivenMotions:
-    return DrivenMotions(APR_02, motions)
+def known(*motions: Array) -> TrainingDomain:
+    return TrainingDomain(APR_02, motions)
 
 
 def at_wheels(robot: Robot, motions: Array) -> Array:
@@ -42,37 +48,37 @@ def test_a_few_representatives_are_near_every_motion(motions: Array, robot: str)
 
 @given(_twists, st.sampled_from(sorted(ROBOTS)))
 def test_what_was_driven_is_never_new(motions: Array, robot: str) -> None:
-    few = DrivenMotions(ROBOTS[robot], representatives(ROBOTS[robot], motions))
-    assert not few.new_among(motions).any()
+    few = TrainingDomain(ROBOTS[robot], representatives(ROBOTS[robot], motions))
+    assert not few.outside(motions).any()
 
 
 @given(_twists, _twists, st.sampled_from(sorted(ROBOTS)))
 def test_a_live_node_judges_one_motion_as_all_are_judged_together(driven: Array, others: Array, robot: str) -> None:
-    chosen = DrivenMotions(ROBOTS[robot], driven)
-    assert [chosen.is_new(motion) for motion in others] == chosen.new_among(others).tolist()
+    chosen = TrainingDomain(ROBOTS[robot], driven)
+    assert [chosen.is_outside(motion) for motion in others] == chosen.outside(others).tolist()
 
 
 @pytest.mark.parametrize("motion", [SIDEWAYS, ON_THE_SPOT, 1.3 * FORWARDS, -FORWARDS, 0.5 * (FORWARDS + SIDEWAYS)])
 def test_another_direction_or_speed_is_new(motion: Array) -> None:
-    assert known(FORWARDS).is_new(motion)
+    assert known(FORWARDS).is_outside(motion)
 
 
 @pytest.mark.parametrize("motion", [FORWARDS, 1.1 * FORWARDS, FORWARDS + 0.1 * SIDEWAYS, STANDING, 0.01 * SIDEWAYS])
 def test_what_is_near_is_not_new_and_to_stand_neither(motion: Array) -> None:
-    assert not known(FORWARDS).is_new(motion)
+    assert not known(FORWARDS).is_outside(motion)
 
 
 def test_turning_counts_as_what_it_moves_at_the_wheels() -> None:
     driven, more = known(FORWARDS, ON_THE_SPOT), ON_THE_SPOT * 0.2 / DISTANCE
-    assert not driven.is_new(ON_THE_SPOT + 0.1 * more)
-    assert driven.is_new(ON_THE_SPOT + 0.2 * more)
+    assert not driven.is_outside(ON_THE_SPOT + 0.1 * more)
+    assert driven.is_outside(ON_THE_SPOT + 0.2 * more)
 
 
 def test_new_motions_in_passing_do_not_make_a_run_new() -> None:
     passing = np.array([*[FORWARDS] * 97, *[SIDEWAYS] * 3])
     staying = np.array([*[FORWARDS] * 90, *[SIDEWAYS] * 10])
-    assert not known(FORWARDS).new_in_run(passing).any()
-    assert known(FORWARDS).new_in_run(staying).tolist() == [False] * 90 + [True] * 10
+    assert not known(FORWARDS).outside_in_run(passing).any()
+    assert known(FORWARDS).outside_in_run(staying).tolist() == [False] * 90 + [True] * 10
 
 
 @pytest.mark.parametrize(
@@ -85,8 +91,8 @@ def test_new_motions_in_passing_do_not_make_a_run_new() -> None:
 )
 def test_new_motions_are_told_in_words_with_their_share(motion: Array, words: str) -> None:
     run = np.array([*[FORWARDS] * 3, motion])
-    assert new_share(APR_02, FORWARDS[None], run) == (0.25, words)
-    assert new_share(APR_02, FORWARDS[None], run[:3]) == (0.0, "")
+    assert extrapolated_share(APR_02, FORWARDS[None], run) == (0.25, words)
+    assert extrapolated_share(APR_02, FORWARDS[None], run[:3]) == (0.0, "")
 
 
 def test_motions_of_a_run_are_its_twists_smoothed() -> None:
@@ -106,5 +112,5 @@ def test_a_run_shorter_than_the_smoothing_has_one_motion() -> None:
 
 
 def test_it_is_told_what_is_not_known() -> None:
-    assert not_known_to_hold(["a"]) == "a is not known to hold there, and errors may be larger than stated"
-    assert not_known_to_hold(["a", "b"]).startswith("a, b are not known to hold there")
+    assert extrapolation_consequence(["a"]) == "a is not known to hold there, and errors may be larger than stated"
+    assert extrapolation_consequence(["a", "b"]).startswith("a, b are not known to hold there")

@@ -42,7 +42,7 @@ class Fit:
     jumps: int
 
     @property
-    def free_residuals(self) -> list[Array]:
+    def nuisance_free_residuals(self) -> list[Array]:
         """Residuals as they would be without any of the nuisances' present values, to first order."""
         return [
             own + slopes @ values
@@ -59,7 +59,7 @@ class Fit:
 
         residuals (K, 3): others than the fit's own free ones.
         """
-        own = self.free_residuals if residuals is None else residuals
+        own = self.nuisance_free_residuals if residuals is None else residuals
         return whitened(own, columns, self.stamps, self.noise.noise, self.slopes, self.nuisances.deviations)
 
 
@@ -92,7 +92,7 @@ def with_noise(fit: Fit) -> Fit:
     if jumps:
         fit = _at(fit.model, runs, fit.nuisances, found, fit.jumps + jumps)
         found = estimate_noise(fit.runs, in_start_frames(fit.runs, fit.residuals), found.noise)
-    own, slopes = (in_start_frames(fit.runs, each) for each in (fit.free_residuals, fit.slopes))
+    own, slopes = (in_start_frames(fit.runs, each) for each in (fit.nuisance_free_residuals, fit.slopes))
     deviations = deviations_of(fit.runs, own, slopes, found.noise)
     values = np.where(deviations > 0, fit.nuisances.values, 0.0)
     return _at(fit.model, fit.runs, Nuisances(values, deviations), found, fit.jumps)
@@ -143,7 +143,7 @@ def _with_nuisances(fit: Fit) -> Fit:
     if not known.any():
         return fit
     values = np.zeros_like(fit.nuisances.values)
-    for row, (run, own, slopes) in enumerate(zip(fit.runs, fit.free_residuals, fit.slopes, strict=True)):
+    for row, (run, own, slopes) in enumerate(zip(fit.runs, fit.nuisance_free_residuals, fit.slopes, strict=True)):
         white = Whitener(fit.noise.noise, run.pose_times[1:])(np.concatenate([own[..., None], slopes[..., known]], -1))
         flat = white.reshape(3 * len(own), -1)
         columns = flat[:, 1:]

@@ -72,7 +72,7 @@ def held_out_residuals(extended: Extended, folds: NDArray[np.intp]) -> list[Arra
     values = _values_of_others(extended, folds)
     return [
         own - columns @ value
-        for own, columns, value in zip(extended.fit.free_residuals, extended.columns, values, strict=True)
+        for own, columns, value in zip(extended.fit.nuisance_free_residuals, extended.columns, values, strict=True)
     ]
 
 
@@ -143,7 +143,7 @@ class Floor:
 
 def floor_of(fit: Fit) -> Floor | None:
     """The floor of a fit's runs; None where no command is repeated."""
-    residuals, slopes = (in_start_frames(fit.runs, each) for each in (fit.free_residuals, fit.slopes))
+    residuals, slopes = (in_start_frames(fit.runs, each) for each in (fit.nuisance_free_residuals, fit.slopes))
     found = differences_between_repetitions(fit.runs, residuals)
     if found.source != "repetitions":
         return None

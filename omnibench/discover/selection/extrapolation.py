@@ -13,7 +13,7 @@ from omnibench.discover.result import Novelty
 from omnibench.discover.selection.competing_models import folds_of_commands
 from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.robot.kinematics import Array
-from omnibench.robot.training_domain import motions_of, new_share, representatives
+from omnibench.robot.training_domain import extrapolated_share, motions_of, representatives
 
 _QUANTILE = 2.45  # standard deviations of each coordinate: the radius that holds 95 % of positions in the plane
 
@@ -37,7 +37,7 @@ def novelties_of(
     for members in grouped([run.command or run.id for run in runs]):
         own = [runs[index] for index in members]
         motions = np.concatenate([motions_of(model.matrix, run.times, run.rates) for run in own])
-        share, words = new_share(model.robot, driven, motions)
+        share, words = extrapolated_share(model.robot, driven, motions)
         if share:
             found.append(
                 Novelty(

@@ -48,7 +48,7 @@ def look_at(
     """
     if groups is None or len(groups.columns) != sum(len(own) for own in fit.residuals):
         groups = make_groups(paths_of(fit, _COARSE), fit.runs, without)
-    residuals = fit.free_residuals
+    residuals = fit.nuisance_free_residuals
     if extended is not None:
         elements = fit.model.matrix.size
         residuals = [

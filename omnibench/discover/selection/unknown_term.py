@@ -202,7 +202,7 @@ def _gains(extended: Extended, named: int) -> Array:
     fit, elements = extended.fit, extended.fit.model.matrix.size
     residuals = [
         own + columns[..., elements:] @ extended.values
-        for own, columns in zip(fit.free_residuals, extended.columns, strict=True)
+        for own, columns in zip(fit.nuisance_free_residuals, extended.columns, strict=True)
     ]
     before = range(elements + sum(len(group.parameters) for group in extended.groups[:named]))
     data = fit.whitened(extended.columns, residuals)

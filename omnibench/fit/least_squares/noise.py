@@ -152,7 +152,7 @@ def _most_likely(groups: list[tuple[Array, Array]], near: Array | None) -> tuple
 
     prepared = [(np.diff(stamps, prepend=0.0), np.asfortranarray(_differences(values))) for stamps, values in groups]
 
-    def surprise(components: Array) -> float:
+    def negative_log_likelihood(components: Array) -> float:
         white, walk, bias = components
         total = 0.0
         for steps, differences in prepared:
@@ -166,7 +166,7 @@ def _most_likely(groups: list[tuple[Array, Array]], near: Array | None) -> tuple
         starts = np.log(0.1 + 0.6 * np.eye(3))
     tries = [
         minimize(
-            lambda logarithms: surprise(units * np.exp(logarithms)),
+            lambda logarithms: negative_log_likelihood(units * np.exp(logarithms)),
             start,
             method="L-BFGS-B",
             bounds=[_LOGARITHMS] * 3,
@@ -177,7 +177,7 @@ def _most_likely(groups: list[tuple[Array, Array]], near: Array | None) -> tuple
     best = units * np.exp(min(tries, key=lambda each: float(each.fun)).x)
     for index in np.argsort(best / units):  # on a logarithmic scale none is ever zero
         without = np.where(np.arange(3) == index, 0.0, best)
-        if count * (surprise(without) - surprise(best)) < _NO_LOSS:
+        if count * (negative_log_likelihood(without) - negative_log_likelihood(best)) < _NO_LOSS:
             best = without
     white, walk, bias = best
     return float(white), float(walk), float(bias)

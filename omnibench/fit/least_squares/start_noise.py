@@ -20,9 +20,10 @@ from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
 _NAMES = ("pose_position", "walk_position", "bias_position", "pose_heading", "walk_heading", "bias_heading")
-# Twice the gain in log-likelihood that a variance of zero exceeds by chance in 5 % of cases.
-_GAIN = 2.71
-_LARGEST = 0.3  # rad
+# Critical value (5 %) of the likelihood ratio statistic for one variance that may be zero: under the null half of it is
+# chi-square with one degree of freedom, half is 0 (Self and Liang 1987).
+_CHI_SQUARE = 2.71
+_LARGEST = 0.3  # rad, largest start heading error that is searched; chosen
 
 
 @dataclass(frozen=True)
@@ -49,17 +50,17 @@ def separate_start_noise(
         rest = np.sqrt(max(constant**2 - deviation**2, 0.0))
         return noise.model_copy(update={"bias_heading": float(rest)})
 
-    before = _surprise(groups, noise, 0.0)
+    before = _twice_negative_log_likelihood(groups, noise, 0.0)
     first = minimize_scalar(
-        lambda deviation: _surprise(groups, apart(deviation), deviation),
+        lambda deviation: _twice_negative_log_likelihood(groups, apart(deviation), deviation),
         bounds=(0.0, min(max(2 * constant, 4 * noise.pose_heading, 1e-6), _LARGEST)),
         method="bounded",
         options={"xatol": 1e-6},
     )
-    if before - float(first.fun) < _GAIN / 4:  # the others, fitted again, will not add that much
+    if before - float(first.fun) < _CHI_SQUARE / 4:  # fitting the other components again will not add that much
         return StartNoise(noise, 0.0)
     found, deviation, after = _polished(groups, apart(float(first.x)), float(first.x))
-    return StartNoise(found, deviation) if before - after > _GAIN else StartNoise(noise, 0.0)
+    return StartNoise(found, deviation) if before - after > _CHI_SQUARE else StartNoise(noise, 0.0)
 
 
 def by_stamps(differences: Sequence[Difference]) -> list[tuple[Array, Array]]:
@@ -76,8 +77,8 @@ def by_stamps(differences: Sequence[Difference]) -> list[tuple[Array, Array]]:
     ]
 
 
-def _surprise(groups: list[tuple[Array, Array]], noise: Noise, deviation: float) -> float:
-    """Minus twice the log-likelihood, less a constant."""
+def _twice_negative_log_likelihood(groups: list[tuple[Array, Array]], noise: Noise, deviation: float) -> float:
+    """Twice the negative log-likelihood of the differences, up to a constant."""
     total = 0.0
     for stamps, everything in groups:
         whitener = Whitener(noise, stamps)
@@ -104,11 +105,11 @@ def _polished(groups: list[tuple[Array, Array]], noise: Noise, deviation: float)
 
     count = sum(everything[..., 0].size for _, everything in groups)
     answer = minimize(
-        lambda logarithms: _surprise(groups, *described(logarithms)) / count,
+        lambda logarithms: _twice_negative_log_likelihood(groups, *described(logarithms)) / count,
         np.zeros(7),
         method="L-BFGS-B",
         bounds=[(-5.0, 5.0)] * 7,
         options={"eps": 1e-5, "ftol": 1e-10},
     )
     found, deviation = described(answer.x)
-    return found, deviation, _surprise(groups, found, deviation)
+    return found, deviation, _twice_negative_log_likelihood(groups, found, deviation)

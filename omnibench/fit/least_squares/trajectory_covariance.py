@@ -12,7 +12,7 @@ from omnibench.errors import DataError
 from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.fit.least_squares.trajectory_fit import Linearisation
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.fit.uncertainty.sandwich import Pulls, Sandwich, sandwich
+from omnibench.fit.uncertainty.sandwich import Sandwich, Scores, sandwich
 from omnibench.robot.kinematics import Array
 
 # Scatter counts as more than noise where chance exceeds it once in a thousand times.
@@ -42,7 +42,7 @@ class FitCovariance:
         self._scatter: Sandwich | None = None
         if known.any():
             try:
-                self._scatter = sandwich(Pulls(scores, information, trajectories, np.zeros(len(self._unit))))
+                self._scatter = sandwich(Scores(scores, information, trajectories, np.zeros(len(self._unit))))
             except DataError:
                 self._scatter = None
 

@@ -26,7 +26,7 @@ from omnibench.fit.uncertainty.physical import (
     told_parameters,
     unit_of,
 )
-from omnibench.fit.uncertainty.sandwich import Pulls, pulls_of_runs, sandwich
+from omnibench.fit.uncertainty.sandwich import Scores, sandwich, scores_of_runs
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
@@ -133,9 +133,9 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult) -> tuple[Array, 
     if result.cost is not None and result.cost < _NO_ERROR:
         raise NoCovarianceError("no covariance: no error is left to judge by")
     try:
-        pulls = _pulls(problem, objective, result.vector, free)
-        answer = sandwich(pulls)
-        _check_minimum(problem, objective, result.vector, free, pulls)
+        scores = _scores(problem, objective, result.vector, free)
+        answer = sandwich(scores)
+        _check_minimum(problem, objective, result.vector, free, scores)
     except NoCovarianceError:
         raise
     except DataError as error:
@@ -145,29 +145,29 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult) -> tuple[Array, 
     return covariance, answer.degrees_of_freedom, answer.words
 
 
-def _pulls(problem: CalibrationProblem, objective: SumOfNorms, vector: Array, free: NDArray[np.bool_]) -> Pulls:
-    """What each run pulls the free numbers by at a vector (n,)."""
+def _scores(problem: CalibrationProblem, objective: SumOfNorms, vector: Array, free: NDArray[np.bool_]) -> Scores:
+    """Score vectors of the runs in the free numbers, at a vector (n,)."""
     matrix = problem.matrix(vector)
     errors = problem.odometry.poses(matrix[None])[0] - problem.reference
     slopes = element_slopes(problem, vector)[:, free]
     jacobian = problem.odometry.jacobian(matrix).reshape(len(errors), 3, -1) @ slopes
-    return pulls_of_runs(objective, problem.odometry, errors, jacobian, problem.trajectories)
+    return scores_of_runs(objective, problem.odometry, errors, jacobian, problem.trajectories)
 
 
 def _check_minimum(
-    problem: CalibrationProblem, objective: SumOfNorms, vector: Array, free: NDArray[np.bool_], pulls: Pulls
+    problem: CalibrationProblem, objective: SumOfNorms, vector: Array, free: NDArray[np.bool_], scores: Scores
 ) -> None:
     """NoCovarianceError when a lower cost is more than a standard deviation away, as it is said to be there."""
     better, cost = vector, float(problem.values(vector[None])[0])
     for _ in range(_MOST_STEPS):
         moved = better.copy()
-        moved[free] += pulls.step
+        moved[free] += scores.step
         value = float(problem.values(moved[None])[0])
         if not value < cost * (1 - _NO_GAIN):
             break
         better, cost = moved, value
-        pulls = _pulls(problem, objective, better, free)
-    deviations = np.sqrt(np.maximum(np.diag(sandwich(pulls).covariance), 0.0))
+        scores = _scores(problem, objective, better, free)
+    deviations = np.sqrt(np.maximum(np.diag(sandwich(scores).covariance), 0.0))
     away = np.abs(better - vector)[free]
     count = float(np.max(away[deviations > 0] / deviations[deviations > 0], initial=0.0))
     if count > 1.0:

@@ -9,7 +9,7 @@ import numpy as np
 from omnibench.live.estimation.wheel_input import WheelStep
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
-from omnibench.robot.training_domain import DrivenMotions, not_known_to_hold
+from omnibench.robot.training_domain import TrainingDomain, extrapolation_consequence
 
 LOG = logging.getLogger("omnibench.live")
 _WINDOW = 0.5  # s over which a motion is averaged; it is judged no more often
@@ -24,10 +24,10 @@ class MotionWatch:
 
     def __init__(self, robot: str, calibration: Calibration) -> None:
         self._robot, self._calibration = robot, calibration
-        self._known: DrivenMotions | None = None
+        self._known: TrainingDomain | None = None
         self.seconds: float | None = None
         if calibration.effects and calibration.driven:
-            self._known, self.seconds = DrivenMotions(calibration.robot, calibration.driven), 0.0
+            self._known, self.seconds = TrainingDomain(calibration.robot, calibration.driven), 0.0
         self._matrix = calibration.matrix_array
         self._lasted = 0.0  # s of the motion that goes on
         self._turned: Array = np.zeros(self._matrix.shape[1])  # rad, in the window that goes on
@@ -50,8 +50,8 @@ class MotionWatch:
         self._turned = np.zeros(self._matrix.shape[1])
         self._elapsed = 0.0
 
-    def _judge(self, known: DrivenMotions, motion: Array) -> None:
-        if not known.is_new(motion):
+    def _judge(self, known: TrainingDomain, motion: Array) -> None:
+        if not known.is_outside(motion):
             self._lasted = 0.0
             return
         before, self._lasted = self._lasted, self._lasted + self._elapsed
@@ -62,6 +62,6 @@ class MotionWatch:
             LOG.warning(
                 "%s: drives motions that %r was not fitted to, such as %s: %s; told once, then counted in health",
                 *(self._robot, self._calibration.name, known.in_words(motion[None])),
-                not_known_to_hold([term.name for term in self._calibration.effects]),
+                extrapolation_consequence([term.name for term in self._calibration.effects]),
             )
         self.seconds += self._lasted if before <= _TRANSITION else self._elapsed
