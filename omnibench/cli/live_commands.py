@@ -80,7 +80,7 @@ def replay(
     from omnibench.config import parse_settings, validate
     from omnibench.live.network.presence import checked_robot
     from omnibench.live.replay.arrivals import ReplayConfig
-    from omnibench.live.replay.concatenated_drive import chain_recording
+    from omnibench.live.replay.concatenated_drive import concatenate_recording
     from omnibench.live.replay.played_recording import load_recording
     from omnibench.live.replay.replay_player import Player
     from omnibench.live.stopping import stop_on_signals
@@ -93,9 +93,9 @@ def replay(
     noise = None if calibration is None else read_calibration(calibration).noise
     with Steps(make_console(error=True)) as watch:
         recording = load_recording(dataset, watch=watch)
-    chain = chain_recording(recording, pause=chosen.pause, split=chosen.split)
+    drive = concatenate_recording(recording, pause=chosen.pause, split=chosen.split)
     with _client(config, connect, profile, "replay") as (session, keys), stop_on_signals() as stop:
-        player = Player(GraphNode(session, keys, "replay"), robot, chain, chosen, noise=noise)
+        player = Player(GraphNode(session, keys, "replay"), robot, drive, chosen, noise=noise)
         with ReplayBar(f"{recording.dataset.name} as {robot}") as bar:
             report = player.play(stop, bar)
     print_played(make_console(), report, recording.dataset.simulated)
@@ -180,14 +180,14 @@ def keys(
 
 
 def _run(config: LiveConfig, seconds: float | None) -> None:
-    from omnibench.live.network.access_log import log_refusals
+    from omnibench.live.network.access_log import log_refused_access
     from omnibench.live.node import LiveNode
     from omnibench.live.stopping import stop_on_signals, ticks
 
     with (
         _logging_to(make_console(error=True)) as log,
         stop_on_signals() as stop,
-        log_refusals(config.zenoh),
+        log_refused_access(config.zenoh),
         LiveNode(config) as node,
         _extras(config, node),
     ):
@@ -205,7 +205,7 @@ def _run(config: LiveConfig, seconds: float | None) -> None:
 
 def _replay_to_node(config: LiveConfig, dataset: Path | None, speed: str | None, file: Path) -> None:
     from omnibench.config import validate
-    from omnibench.live.network.access_log import log_refusals
+    from omnibench.live.network.access_log import log_refused_access
     from omnibench.live.replay.arrivals import ReplayConfig
     from omnibench.live.replay.demonstration import demonstrate
     from omnibench.live.replay.played_recording import load_recording
@@ -224,7 +224,7 @@ def _replay_to_node(config: LiveConfig, dataset: Path | None, speed: str | None,
         ReplayBar(recording.dataset.name) as bar,
         _logging_to(bar.console, logging.WARNING),
         stop_on_signals() as stop,
-        log_refusals(config.zenoh),
+        log_refused_access(config.zenoh),
     ):
         shown = demonstrate(config, recording, stop, bar, beside=lambda node: _extras(config, node))
     print_demonstration(make_console(), shown)

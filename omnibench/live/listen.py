@@ -19,8 +19,8 @@ from rich.table import Table
 from rich.text import Text
 
 from omnibench.errors import DataError
-from omnibench.live.network.presence import checked_robot, unheard
-from omnibench.live.robot_monitor import OdometryNews, RobotNews, Watch
+from omnibench.live.network.presence import checked_robot, nothing_received
+from omnibench.live.robot_monitor import OdometryStatus, RobotMonitor, RobotStatus
 from omnibench.live.stopping import ticks
 from omnibench.live.wire.topics import KeySpace
 
@@ -50,12 +50,12 @@ def listen(
     if robot is not None:
         checked_robot(robot)
     table = console.is_terminal and not as_json
-    with Watch(session, keys, robot) as watch:
+    with RobotMonitor(session, keys, robot) as monitor:
         if robot is not None:
-            _wait_for(robot, watch, stop, patience)
+            _wait_for(robot, monitor, stop, patience)
         with Live(console=console, auto_refresh=False) if table else nullcontext() as live:
             for _ in ticks(stop, _REFRESH if live else _LINE_PERIOD, seconds):
-                news = watch.news()
+                news = monitor.status()
                 if live:
                     live.update(view(news, console), refresh=True)
                     continue
@@ -63,16 +63,16 @@ def listen(
                     console.print(Text(line), soft_wrap=True)
 
 
-def _wait_for(robot: str, watch: Watch, stop: Event, patience: float) -> None:
+def _wait_for(robot: str, monitor: RobotMonitor, stop: Event, patience: float) -> None:
     deadline = time.monotonic() + patience
-    while not any(each.presence == "alive" or each.odom or each.filtered for each in watch.news()):
+    while not any(each.presence == "alive" or each.odom or each.filtered for each in monitor.status()):
         if time.monotonic() > deadline:
-            raise DataError(unheard(robot, patience, watch.alive))
+            raise DataError(nothing_received(robot, patience, monitor.alive))
         if stop.wait(0.02):
             return
 
 
-def view(news: Sequence[RobotNews], console: Console) -> RenderableType:
+def view(news: Sequence[RobotStatus], console: Console) -> RenderableType:
     """The robots as a table that fits the console: health beside the figures if there is room, else below them."""
     if not news:
         return Text(_NOBODY)
@@ -82,7 +82,7 @@ def view(news: Sequence[RobotNews], console: Console) -> RenderableType:
     return Group(figures, *(Text(f"{each.robot}: {state(each)}", style=_style(each)) for each in news))
 
 
-def _table(news: Sequence[RobotNews], health: bool) -> Table:
+def _table(news: Sequence[RobotStatus], health: bool) -> Table:
     table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, int(health), 0, 0), pad_edge=False)
     table.add_column("robot", no_wrap=True, overflow="ellipsis", max_width=None if health else _NAME_WIDTH)
     table.add_column("frame")
@@ -98,11 +98,11 @@ def _table(news: Sequence[RobotNews], health: bool) -> Table:
     return table
 
 
-def _style(news: RobotNews) -> str:
+def _style(news: RobotStatus) -> str:
     return "dim" if news.presence == "left" else ""
 
 
-def _cells(robot: str, news: OdometryNews | None, by_stamp: bool) -> list[str]:
+def _cells(robot: str, news: OdometryStatus | None, by_stamp: bool) -> list[str]:
     if news is None:
         return ["-"] * 11
     x, y, heading = news.message.pose.tolist()
@@ -129,13 +129,13 @@ def _digits(value: float, decimals: int) -> str:
     return f"{value:.{max(decimals - max(digits - 2, 0), 0)}f}"
 
 
-def _age(news: OdometryNews, by_stamp: bool) -> str:
+def _age(news: OdometryStatus, by_stamp: bool) -> str:
     """Since it came and, where the clocks agree, since its stamp; ms."""
     since_stamp = f"/{news.stamp_age * 1e3:.0f}" if by_stamp and news.stamp_age is not None else ""
     return f"{news.age * 1e3:.0f}{since_stamp}"
 
 
-def state(news: RobotNews) -> str:
+def state(news: RobotStatus) -> str:
     """How a robot is, in words."""
     parts = []
     if news.presence == "left":
@@ -158,20 +158,20 @@ def state(news: RobotNews) -> str:
     return ", ".join(parts)
 
 
-def _plain_lines(news: Sequence[RobotNews]) -> list[str]:
+def _plain_lines(news: Sequence[RobotStatus]) -> list[str]:
     return [plain(each) for each in news] or [_NOBODY]
 
 
-def plain(news: RobotNews) -> str:
+def plain(news: RobotStatus) -> str:
     """A robot as one line."""
     return "; ".join([f"{news.robot}: {state(news)}", *map(_plain_odometry, _streams(news))])
 
 
-def _streams(news: RobotNews) -> tuple[OdometryNews, ...]:
+def _streams(news: RobotStatus) -> tuple[OdometryStatus, ...]:
     return tuple(stream for stream in (news.odom, news.filtered) if stream is not None)
 
 
-def _plain_odometry(news: OdometryNews) -> str:
+def _plain_odometry(news: OdometryStatus) -> str:
     x, y, heading = news.message.pose.tolist()
     vx, vy, w = news.message.twist.tolist()
     rate = "" if news.rate is None else f", {news.rate:.1f} Hz"
@@ -183,7 +183,7 @@ def _plain_odometry(news: OdometryNews) -> str:
     )
 
 
-def document(news: RobotNews) -> Any:
+def document(news: RobotStatus) -> Any:
     """A robot as a JSON document: SI units, infinity and NaN as null."""
     content = {
         "robot": news.robot,
@@ -195,7 +195,7 @@ def document(news: RobotNews) -> Any:
     return to_jsonable_python(content, inf_nan_mode="null")
 
 
-def _odometry_record(news: OdometryNews | None) -> dict[str, Any] | None:
+def _odometry_record(news: OdometryStatus | None) -> dict[str, Any] | None:
     if news is None:
         return None
     message = news.message

@@ -15,12 +15,12 @@ from typing import Any
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError, one_line
 from omnibench.live.config import LiveConfig, RobotConfig
-from omnibench.live.control.query_server import Desk
+from omnibench.live.control.query_server import QueryServer
 from omnibench.live.estimation.health import Health
 from omnibench.live.estimation.saved_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.network.presence import alive_robots
-from omnibench.live.network.rate_limiter import Quiet
+from omnibench.live.network.rate_limiter import RateLimiter
 from omnibench.live.network.session import open_session
 from omnibench.live.robot_service import RobotService
 from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace
@@ -44,7 +44,7 @@ class LiveNode:
         self.keys = KeySpace(config.profile, config.domain)
         self._memories: dict[str, RobotMemory] = {}
         self._services: list[RobotService] = []
-        self._quiet = Quiet(math.inf)
+        self._rate_limiter = RateLimiter(math.inf)
         self._stop = threading.Event()
         load_effects(config)
         with ExitStack() as started:  # what is last started is first closed
@@ -62,8 +62,8 @@ class LiveNode:
                 service = RobotService(self.graph, self.trackers[robot.name], fusing=fusing)
                 self._services.append(service)
                 started.callback(service.close)
-            desk = Desk(self.session, self.trackers, self._info, self._memories)
-            started.callback(desk.close)
+            query_server = QueryServer(self.session, self.trackers, self._info, self._memories)
+            started.callback(query_server.close)
             self._ticking = threading.Thread(target=self._tick, name="diagnostics", daemon=True)
             self._ticking.start()
             started.callback(self._stop_ticking)
@@ -151,7 +151,7 @@ class LiveNode:
                     service.tick()
                 except Exception as error:  # of one robot; the others' go on
                     name = service.tracker.name
-                    if self._quiet.lets(f"{name} {type(error).__name__}"):
+                    if self._rate_limiter.allows(f"{name} {type(error).__name__}"):
                         LOG.error("%s: diagnostics: %s: %s", name, type(error).__name__, one_line(str(error)))
 
     def _stop_ticking(self) -> None:
@@ -183,8 +183,8 @@ _usual_turn = sys.getswitchinterval()
 def _undisturbed() -> Iterator[None]:
     """While any node of this process runs, nothing else keeps the interpreter from a sample for long.
 
-    The collector need not look at what was there at the start, and a thread that works on and on (the desk on a large
-    calibration) gives way after 0.5 ms in place of 5.
+    The collector need not look at what was there at the start, and a thread that works on and on (the query server
+    on a large calibration) gives way after 0.5 ms in place of 5.
     """
     global _running
     with _running_lock:

@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.text import Text
 
 from omnibench.errors import DataError
-from omnibench.live.network.presence import alive_robots, unheard
+from omnibench.live.network.presence import alive_robots, nothing_received
 from omnibench.live.stopping import ticks
 from omnibench.live.wire.recorder import Recorder
 from omnibench.live.wire.topics import TOPICS, KeySpace
@@ -52,14 +52,14 @@ def record(
             if not silence_told and passed >= patience:
                 silence_told = True
                 for robot in _silent(recorder, robots):
-                    status.tell(f"{unheard(robot, passed, alive_robots(session))}; recording goes on")
+                    status.tell(f"{nothing_received(robot, passed, alive_robots(session))}; recording goes on")
             status.show(status_line(recorder, passed), passed)
     if recorder.failure is not None:
         raise DataError(recorder.failure)
     seconds_recorded = time.monotonic() - began
     if not silence_told:
         for robot in _silent(recorder, robots):
-            status.tell(unheard(robot, seconds_recorded, alive_robots(session)))
+            status.tell(nothing_received(robot, seconds_recorded, alive_robots(session)))
     status.tell(status_line(recorder, seconds_recorded))
     for name in sorted(recorder.counts.keys() | recorder.undecodable.keys()):
         status.tell(f"  {name}: {recorder.counts[name]:,}{_left_out(recorder.undecodable[name])}")

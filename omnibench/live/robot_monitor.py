@@ -29,7 +29,7 @@ _COUNTERS: Final = frozenset(item.name for item in fields(Counts))
 
 
 @dataclass(frozen=True)
-class OdometryNews:
+class OdometryStatus:
     """The newest message of one topic. rate: Hz over the last 2 s. age: s since it came; stamp_age: s since its stamp,
     None where the sender's clock is another. undecodable: messages so far that were not odometry."""
 
@@ -52,7 +52,7 @@ class OdometryNews:
 
 
 @dataclass(frozen=True)
-class HealthNews:
+class HealthSummary:
     """How a robot says it is: a word, the reason, and the counters of what is not as it should be."""
 
     status: str
@@ -61,17 +61,17 @@ class HealthNews:
 
 
 @dataclass(frozen=True)
-class RobotNews:
+class RobotStatus:
     """What is heard of one robot. presence: its liveliness token; ``no token`` where no node of omnibench has it."""
 
     robot: str
     presence: Literal["alive", "left", "no token"]
-    odom: OdometryNews | None
-    filtered: OdometryNews | None
-    health: HealthNews | None
+    odom: OdometryStatus | None
+    filtered: OdometryStatus | None
+    health: HealthSummary | None
 
 
-class Watch:
+class RobotMonitor:
     """Listens for one robot, or for all when ``robot`` is None; ask for its ``news``. A context manager."""
 
     def __init__(self, session: zenoh.Session, keys: KeySpace, robot: str | None) -> None:
@@ -79,7 +79,7 @@ class Watch:
         self._robot = robot
         self._place = 0 if keys.profile == "plain" else 1  # of the robot's name in a key
         self._streams: dict[tuple[str, str], _Stream] = {}
-        self._answers: dict[str, tuple[float, HealthNews]] = {}
+        self._answers: dict[str, tuple[float, HealthSummary]] = {}
         self._lock = Lock()
         self._asked = -math.inf
         self._presence = Presence(session)
@@ -93,7 +93,7 @@ class Watch:
         """All robots whose tokens are there."""
         return self._presence.alive
 
-    def news(self) -> list[RobotNews]:
+    def status(self) -> list[RobotStatus]:
         """What is heard of each robot, by name."""
         now = time.monotonic()
         if now - self._asked >= _ASK_PERIOD:
@@ -105,11 +105,11 @@ class Watch:
         names = {name for name, _ in streams}
         names.update(name for name in (*alive, *left) if self._robot in (None, name))
         return [
-            RobotNews(
+            RobotStatus(
                 name,
                 "alive" if name in alive else "left" if name in left else "no token",
-                odom=streams[name, "odom"].news(now) if (name, "odom") in streams else None,
-                filtered=streams[name, _FUSED].news(now) if (name, _FUSED) in streams else None,
+                odom=streams[name, "odom"].status(now) if (name, "odom") in streams else None,
+                filtered=streams[name, _FUSED].status(now) if (name, _FUSED) in streams else None,
                 health=answers[name][1] if name in answers and now - answers[name][0] < _HEALTH_LASTS else None,
             )
             for name in sorted(names)
@@ -121,7 +121,7 @@ class Watch:
         for subscriber in self._subscribers:
             subscriber.undeclare()
 
-    def __enter__(self) -> Watch:
+    def __enter__(self) -> RobotMonitor:
         return self
 
     def __exit__(
@@ -151,7 +151,7 @@ class Watch:
             return
         try:
             answer = json.loads(reply.ok.payload.to_string())
-            health = HealthNews(str(answer["status"]), str(answer["message"]), _anomalies(answer["counts"]))
+            health = HealthSummary(str(answer["status"]), str(answer["message"]), _anomalies(answer["counts"]))
         except (ValueError, TypeError, KeyError, AttributeError):
             return  # of another program, or of another version
         with self._lock:
@@ -169,7 +169,7 @@ class Watch:
             return  # the robot answers questions, which says more
         worst = max(statuses, key=lambda status: status.level)
         level = _LEVELS[worst.level] if worst.level < len(_LEVELS) else str(worst.level)
-        health = HealthNews(level, worst.message, _anomalies(dict(worst.values)))
+        health = HealthSummary(level, worst.message, _anomalies(dict(worst.values)))
         with self._lock:
             self._answers[name] = time.monotonic(), health
 
@@ -195,7 +195,7 @@ class _Stream:
             self._came, self._came_by_clock = time.monotonic(), time.time()
             self._payload = payload
 
-    def news(self, now: float) -> OdometryNews | None:
+    def status(self, now: float) -> OdometryStatus | None:
         with self._lock:
             count, came, came_by_clock, payload = self._count, self._came, self._came_by_clock, self._payload
         if not self._history or self._history[-1][1] != count:
@@ -210,7 +210,7 @@ class _Stream:
             return None
         lag = came_by_clock - self._message.seconds
         age = max(now - came, 0.0)
-        return OdometryNews(
+        return OdometryStatus(
             self._message, self._rate(), age, age + lag if 0 <= lag <= _LARGEST_LAG else None, self._undecodable
         )
 

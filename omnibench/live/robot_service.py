@@ -10,7 +10,7 @@ import zenoh
 
 from omnibench.live.estimation.health import Health, diagnostic
 from omnibench.live.estimation.tracker import RobotTracker, Update
-from omnibench.live.network.rate_limiter import Quiet
+from omnibench.live.network.rate_limiter import RateLimiter
 from omnibench.live.wire.messages import Diagnostics
 from omnibench.live.wire.robot_messages import OdometryEncoder, TransformsEncoder
 from omnibench.live.wire.topics import GraphNode
@@ -27,7 +27,7 @@ class RobotService:
     def __init__(self, graph: GraphNode, tracker: RobotTracker, *, fusing: bool) -> None:
         name = tracker.name
         self.tracker = tracker
-        self._quiet = Quiet()
+        self._rate_limiter = RateLimiter()
         self._closed = False
         self._anomalies: dict[str, int] = {}
         self._status = ""
@@ -86,7 +86,7 @@ class RobotService:
 
     def _failed(self, what: str, error: Exception) -> None:
         self.tracker.count_failure()
-        if self._quiet.lets(what):
+        if self._rate_limiter.allows(what):
             LOG.error("%s: a %s message failed: %s: %s", self.tracker.name, what, type(error).__name__, error)
 
     def _log(self, health: Health) -> None:
@@ -96,7 +96,7 @@ class RobotService:
         anomalies = self.tracker.counts.anomalies()
         new = {kind: count - self._anomalies.get(kind, 0) for kind, count in anomalies.items()}
         told = ", ".join(f"{count} {kind}" for kind, count in new.items() if count)
-        if told and self._quiet.lets("anomalies"):
+        if told and self._rate_limiter.allows("anomalies"):
             self._anomalies = anomalies
             last = f"; the last: {health.last_refusal}" if health.last_refusal else ""
             LOG.warning("%s: %s%s", health.robot, told, last)

@@ -17,7 +17,7 @@ import numpy as np
 from omnibench.live.estimation.fusion import FusionSettings
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.replay.arrivals import ReplayConfig
-from omnibench.live.replay.concatenated_drive import Chain, chain_recording, chained_truth
+from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_recording, concatenated_truth
 from omnibench.live.replay.played_recording import load_recording
 from omnibench.live.replay.replay_player import events
 from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
@@ -28,12 +28,14 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 ORIGIN = 1_800_000_000_000_000_000
 
 
-def fused(chain: Chain, calibration: Calibration, delay: float, *, as_new: bool = False) -> tuple[np.ndarray, str]:
+def fused(
+    drive: ConcatenatedDrive, calibration: Calibration, delay: float, *, as_new: bool = False
+) -> tuple[np.ndarray, str]:
     """Filtered poses (n, 3) at the wheel samples, and what was counted."""
     tracker = RobotTracker("apr02", calibration, fusion=FusionSettings())
     config = ReplayConfig.model_validate({"slam": {"delay": delay, "jitter": 0.0, "period": 0.25}})
     poses, newest = [], ORIGIN
-    for event in events(chain, config, origin=ORIGIN, noise=calibration.noise):
+    for event in events(drive, config, origin=ORIGIN, noise=calibration.noise):
         message = event.message
         if isinstance(message, JointState):
             newest = message.stamp
@@ -56,18 +58,18 @@ def main() -> None:
     split = parser.parse_args().split
     recording = load_recording(CONFIGS / "apr02.yaml")
     calibration = read_calibration(CONFIGS / "apr02_calibration.yaml")
-    chain = chain_recording(recording, split=split)
-    truth = chained_truth(chain, recording)
+    drive = concatenate_recording(recording, split=split)
+    truth = concatenated_truth(drive, recording)
 
     def error(poses: np.ndarray) -> float:
-        known = chain.wheel_times > 1.0  # by then SLAM has said where the robot is
+        known = drive.wheel_times > 1.0  # by then SLAM has said where the robot is
         return float(np.sqrt(np.mean(np.sum((poses - truth)[known, :2] ** 2, axis=1))))
 
     def of(model: OdometryModel) -> float:
-        return error(model.poses([chain.log()])[0])
+        return error(model.poses([drive.log()])[0])
 
     theoretical = of(OdometryModel.of_design(calibration.robot, calibration.integration))
-    print(f"{len(chain.wheel_times)} samples of {chain.duration:.0f} s, simulated")
+    print(f"{len(drive.wheel_times)} samples of {drive.duration:.0f} s, simulated")
     print(f"odometry, design matrix       {theoretical:8.4f} m")
     print(f"odometry, calibrated          {of(calibration.model):8.4f} m")
     results = {}
@@ -76,7 +78,7 @@ def main() -> None:
         ("fused, without delay", 0.0, False),
         ("fused as if they were new", 0.2, True),
     ):
-        poses, counted = fused(chain, calibration, delay, as_new=as_new)
+        poses, counted = fused(drive, calibration, delay, as_new=as_new)
         results[label] = error(poses)
         print(f"{label:29} {results[label]:8.4f} m   ({counted})")
     late, punctual, naive = results.values()

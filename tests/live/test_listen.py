@@ -21,7 +21,7 @@ from sessions import Loopback, until
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.estimation.counts import Counts
 from omnibench.live.listen import listen, plain, state, view
-from omnibench.live.robot_monitor import HealthNews, OdometryNews, RobotNews, Watch
+from omnibench.live.robot_monitor import HealthSummary, OdometryStatus, RobotMonitor, RobotStatus
 from omnibench.live.wire.messages import Diagnostic, Diagnostics, Odometry
 from omnibench.live.wire.topics import GraphNode, KeySpace, Profile
 
@@ -55,21 +55,21 @@ def apr02(loopback: Loopback) -> Robot:
 
 
 @pytest.fixture
-def watch(loopback: Loopback) -> Iterator[Watch]:
-    with Watch(loopback.client(), KEYS, None) as opened:
+def monitor(loopback: Loopback) -> Iterator[RobotMonitor]:
+    with RobotMonitor(loopback.client(), KEYS, None) as opened:
         yield opened
 
 
-def news_of(watch: Watch, robot: str) -> RobotNews | None:
-    return next((each for each in watch.news() if each.robot == robot), None)
+def news_of(monitor: RobotMonitor, robot: str) -> RobotStatus | None:
+    return next((each for each in monitor.status() if each.robot == robot), None)
 
 
-def until_news(watch: Watch, robot: str, what: str, **expected: Any) -> RobotNews:
+def until_news(monitor: RobotMonitor, robot: str, what: str, **expected: Any) -> RobotStatus:
     """The news of a robot as soon as its fields are as expected (... : anything but None)."""
-    found: list[RobotNews] = []
+    found: list[RobotStatus] = []
 
     def arrived() -> bool:
-        news = news_of(watch, robot)
+        news = news_of(monitor, robot)
         if news is None:
             return False
         found.append(news)
@@ -94,82 +94,83 @@ def listened(loopback: Loopback, robot: str | None, *, terminal: bool = False, w
     return text.getvalue()
 
 
-def test_the_newest_odometry_of_both_topics_is_known(watch: Watch, apr02: Robot) -> None:
+def test_the_newest_odometry_of_both_topics_is_known(monitor: RobotMonitor, apr02: Robot) -> None:
     until_matched(apr02)
     for k in range(20):
         apr02.odom.put(odometry(k))
         apr02.filtered.put(odometry(k, "map"))
     until(
-        lambda: (news := news_of(watch, "apr02")) and news.odom and news.odom.message.stamp == odometry(19).stamp, "19"
+        lambda: (news := news_of(monitor, "apr02")) and news.odom and news.odom.message.stamp == odometry(19).stamp,
+        "19",
     )
-    news = until_news(watch, "apr02", "fused odometry", filtered=..., presence="alive")
+    news = until_news(monitor, "apr02", "fused odometry", filtered=..., presence="alive")
     assert news.odom is not None
     assert news.filtered is not None
     np.testing.assert_allclose(news.odom.message.pose, odometry(19).pose, atol=1e-15)
     assert news.filtered.message.frame == "map"
 
 
-def test_the_rate_is_that_of_arrival(watch: Watch, apr02: Robot) -> None:
+def test_the_rate_is_that_of_arrival(monitor: RobotMonitor, apr02: Robot) -> None:
     until_matched(apr02)
     began = time.monotonic()
     rates = []
     for k in range(50):
         apr02.odom.put(odometry(k))
         time.sleep(max(began + (k + 1) * 0.01 - time.monotonic(), 0.0))
-        news = news_of(watch, "apr02")
+        news = news_of(monitor, "apr02")
         rates.append(news.odom.rate if news and news.odom else None)
     took = time.monotonic() - began
     assert rates[-1] == pytest.approx(50 / took, rel=0.1)
 
 
-def test_the_age_by_the_stamp_is_told_where_the_clocks_agree(watch: Watch, apr02: Robot) -> None:
+def test_the_age_by_the_stamp_is_told_where_the_clocks_agree(monitor: RobotMonitor, apr02: Robot) -> None:
     until_matched(apr02)
     apr02.odom.put(replace(odometry(), stamp=time.time_ns() - 200_000_000))
-    news = until_news(watch, "apr02", "odometry", odom=...)
+    news = until_news(monitor, "apr02", "odometry", odom=...)
     assert news.odom is not None
     assert news.odom.stamp_age is not None
     assert 0.2 <= news.odom.stamp_age < 0.2 + 1.0
     assert 0.0 <= news.odom.age < news.odom.stamp_age
 
 
-def test_the_age_by_the_stamp_is_left_out_where_the_clocks_differ(watch: Watch, apr02: Robot) -> None:
+def test_the_age_by_the_stamp_is_left_out_where_the_clocks_differ(monitor: RobotMonitor, apr02: Robot) -> None:
     until_matched(apr02)
     apr02.odom.put(odometry())  # of 2023
-    news = until_news(watch, "apr02", "odometry", odom=...)
+    news = until_news(monitor, "apr02", "odometry", odom=...)
     assert news.odom is not None
     assert news.odom.stamp_age is None
 
 
-def test_a_robot_that_goes_has_left(watch: Watch, apr02: Robot) -> None:
-    until_news(watch, "apr02", "the token", presence="alive")
+def test_a_robot_that_goes_has_left(monitor: RobotMonitor, apr02: Robot) -> None:
+    until_news(monitor, "apr02", "the token", presence="alive")
     apr02.token.undeclare()
-    news = until_news(watch, "apr02", "the token to go", presence="left")
+    news = until_news(monitor, "apr02", "the token to go", presence="left")
     assert state(news).startswith("left")
 
 
-def test_a_robot_without_omnibench_is_seen_by_its_odometry(loopback: Loopback, watch: Watch) -> None:
+def test_a_robot_without_omnibench_is_seen_by_its_odometry(loopback: Loopback, monitor: RobotMonitor) -> None:
     publisher = GraphNode(loopback.router, KEYS, "bridge").publisher("other", "odom")
     until(lambda: publisher.matched, "the watcher's subscription")
     publisher.put(odometry())
-    assert until_news(watch, "other", "odometry", odom=...).presence == "no token"
+    assert until_news(monitor, "other", "odometry", odom=...).presence == "no token"
 
 
-def test_health_is_asked_for_and_tells_the_counters_that_are_not_zero(watch: Watch, apr02: Robot) -> None:
+def test_health_is_asked_for_and_tells_the_counters_that_are_not_zero(monitor: RobotMonitor, apr02: Robot) -> None:
     apr02.answer_health("degraded", "poses are refused", samples=100, late=3, pose_rejected=2)
-    news = until_news(watch, "apr02", "an answer", health=...)
-    assert news.health == HealthNews("degraded", "poses are refused", {"late": 3, "pose_rejected": 2})
+    news = until_news(monitor, "apr02", "an answer", health=...)
+    assert news.health == HealthSummary("degraded", "poses are refused", {"late": 3, "pose_rejected": 2})
     assert "degraded: poses are refused, late 3, pose_rejected 2" in state(news)
 
 
-def test_a_robot_that_does_not_answer_tells_its_health_by_diagnostics(watch: Watch, apr02: Robot) -> None:
+def test_a_robot_that_does_not_answer_tells_its_health_by_diagnostics(monitor: RobotMonitor, apr02: Robot) -> None:
     until(lambda: apr02.diagnostics.matched, "the watcher's subscription")
     values = (("rate_hz", "99.8"), ("samples", "500"), ("late", "7"))
     apr02.diagnostics.put(Diagnostics(1, (Diagnostic("odometry", 1, "late samples", "apr02", values),)))
-    news = until_news(watch, "apr02", "diagnostics", health=...)
-    assert news.health == HealthNews("warning", "late samples", {"late": 7})
+    news = until_news(monitor, "apr02", "diagnostics", health=...)
+    assert news.health == HealthSummary("warning", "late samples", {"late": 7})
 
 
-def test_an_answer_that_is_no_health_is_passed_over(loopback: Loopback, watch: Watch, apr02: Robot) -> None:
+def test_an_answer_that_is_no_health_is_passed_over(loopback: Loopback, monitor: RobotMonitor, apr02: Robot) -> None:
     asked = Event()
 
     def nonsense(query: zenoh.Query) -> None:
@@ -178,17 +179,17 @@ def test_an_answer_that_is_no_health_is_passed_over(loopback: Loopback, watch: W
         asked.set()
 
     _queryable = loopback.router.declare_queryable("omnibench/apr02/health", nonsense)
-    until(lambda: news_of(watch, "apr02") and asked.is_set(), "a question")
-    assert until_news(watch, "apr02", "the robot", presence="alive").health is None
+    until(lambda: news_of(monitor, "apr02") and asked.is_set(), "a question")
+    assert until_news(monitor, "apr02", "the robot", presence="alive").health is None
 
 
-def test_odometry_that_cannot_be_decoded_is_counted_and_the_last_stays(watch: Watch, apr02: Robot) -> None:
+def test_odometry_that_cannot_be_decoded_is_counted_and_the_last_stays(monitor: RobotMonitor, apr02: Robot) -> None:
     until_matched(apr02)
     apr02.odom.put(odometry())
-    until_news(watch, "apr02", "odometry", odom=...)
+    until_news(monitor, "apr02", "odometry", odom=...)
     apr02.odom.put_encoded(b"garbage")
-    until(lambda: (news := news_of(watch, "apr02")) and news.odom and news.odom.undecodable == 1, "the count")
-    news = news_of(watch, "apr02")
+    until(lambda: (news := news_of(monitor, "apr02")) and news.odom and news.odom.undecodable == 1, "the count")
+    news = news_of(monitor, "apr02")
     assert news is not None
     assert "undecodable odometry 1" in state(news)
 
@@ -196,21 +197,21 @@ def test_odometry_that_cannot_be_decoded_is_counted_and_the_last_stays(watch: Wa
 @pytest.mark.parametrize("profile", ["plain", "rmw", "humble"])
 def test_robots_of_every_profile_are_named_by_their_keys(loopback: Loopback, profile: Profile) -> None:
     robot = Robot(loopback.router, "apr07", profile)
-    with Watch(loopback.client(), KeySpace(profile), None) as watch:
+    with RobotMonitor(loopback.client(), KeySpace(profile), None) as monitor:
         until_matched(robot)
         robot.odom.put(odometry())
-        until_news(watch, "apr07", "odometry", odom=...)
+        until_news(monitor, "apr07", "odometry", odom=...)
 
 
 def test_only_the_robot_that_was_asked_for_is_shown(loopback: Loopback, apr02: Robot) -> None:
     other = Robot(loopback.router, "apr03")
-    with Watch(loopback.client(), KEYS, "apr02") as watch:
+    with RobotMonitor(loopback.client(), KEYS, "apr02") as monitor:
         until_matched(apr02)
         other.odom.put(odometry())
         apr02.odom.put(odometry())
-        until_news(watch, "apr02", "odometry", odom=...)
-        assert [news.robot for news in watch.news()] == ["apr02"]
-        assert watch.alive == ("apr02", "apr03")
+        until_news(monitor, "apr02", "odometry", odom=...)
+        assert [news.robot for news in monitor.status()] == ["apr02"]
+        assert monitor.alive == ("apr02", "apr03")
 
 
 def test_a_robot_that_is_not_there_is_one_line_with_the_nearest_that_is(loopback: Loopback, apr02: Robot) -> None:
@@ -243,7 +244,7 @@ def test_a_piped_listener_prints_plain_lines(loopback: Loopback, apr02: Robot) -
 
 
 def test_json_is_one_document_a_line_without_nan(loopback: Loopback, apr02: Robot) -> None:
-    with Watch(loopback.client(), KEYS, None):
+    with RobotMonitor(loopback.client(), KEYS, None):
         until_matched(apr02)
     stop = Event()
     bad = replace(odometry(), twist=np.array([math.nan, 0.0, math.inf]), stamp=time.time_ns())
@@ -282,14 +283,14 @@ def test_listening_ends_at_once_when_told_to(loopback: Loopback) -> None:
 
 def seen(
     message: Odometry | None = None, rate: float = 100.0, age: float = 0.004, stamp_age: float | None = 0.012
-) -> OdometryNews:
-    return OdometryNews(message or odometry(), rate, age, stamp_age, 0)
+) -> OdometryStatus:
+    return OdometryStatus(message or odometry(), rate, age, stamp_age, 0)
 
 
-HEALTHY = HealthNews("ok", "calibrated odometry", {})
+HEALTHY = HealthSummary("ok", "calibrated odometry", {})
 
 
-def shown(news: list[RobotNews], width: int) -> list[str]:
+def shown(news: list[RobotStatus], width: int) -> list[str]:
     text = StringIO()
     console = Console(file=text, width=width)
     console.print(view(news, console))
@@ -300,8 +301,8 @@ def shown(news: list[RobotNews], width: int) -> list[str]:
 def test_the_table_fits_the_terminal_with_every_figure_whole(width: int) -> None:
     far = replace(odometry(), pose=np.array([-123.4567, -98.7654, -3.1]), twist=np.array([-1.5, -0.25, -3.1]))
     robots = [
-        RobotNews("apr02", "alive", seen(), seen(odometry(0, "map")), HEALTHY),
-        RobotNews("apr03", "alive", seen(far, rate=1000.0), None, HealthNews("degraded", "late", {"late": 12})),
+        RobotStatus("apr02", "alive", seen(), seen(odometry(0, "map")), HEALTHY),
+        RobotStatus("apr03", "alive", seen(far, rate=1000.0), None, HealthSummary("degraded", "late", {"late": 12})),
     ]
     lines = shown(robots, width)
     text = "\n".join(lines)
@@ -314,13 +315,13 @@ def test_the_table_fits_the_terminal_with_every_figure_whole(width: int) -> None
 
 
 def test_a_silent_robot_has_no_rate_and_says_for_how_long() -> None:
-    news = RobotNews("apr02", "alive", seen(age=3.21), None, HEALTHY)
+    news = RobotStatus("apr02", "alive", seen(age=3.21), None, HEALTHY)
     assert "no news for 3.2 s" in state(news)
     assert " 100 " not in "\n".join(shown([news], 80))
 
 
 def test_the_plain_line_gives_pose_twist_sigma_rate_and_age_with_units() -> None:
-    assert plain(RobotNews("apr02", "alive", seen(), None, HEALTHY)) == (
+    assert plain(RobotStatus("apr02", "alive", seen(), None, HEALTHY)) == (
         "apr02: ok: calibrated odometry; odom x 1.250 m y -2.500 m heading 40.1 deg (1 sigma 0.025 m 2.29 deg)"
         " vx 0.310 m/s vy -0.120 m/s w 25.8 deg/s, 100.0 Hz, age 4 ms (12 ms by its stamp)"
     )

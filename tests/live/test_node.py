@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import zenoh
 from drives import SECOND, drive, slam
-from heard import Heard
 from nodes import asked, config_of, running, sent
+from received_messages import ReceivedMessages
 from sessions import until
 
 from omnibench.errors import ConfigError, DataError
@@ -23,7 +23,7 @@ from omnibench.live.wire.messages import DIAGNOSTICS, ODOMETRY, TRANSFORMS, Odom
 def test_wheel_samples_become_the_batch_odometry_on_every_topic(tmp_path: Path) -> None:
     path = drive(1.0)
     with running(config_of(tmp_path)) as (_, session):
-        heard = Heard(session, apr__odom=ODOMETRY, apr__odometry__filtered=ODOMETRY, tf=TRANSFORMS)
+        heard = ReceivedMessages(session, apr__odom=ODOMETRY, apr__odometry__filtered=ODOMETRY, tf=TRANSFORMS)
         wheels = session.declare_publisher("apr/joint_states")
         until(lambda: wheels.matching_status.matching, "the node's subscription")
         sent(wheels, path.samples())
@@ -40,7 +40,7 @@ def test_wheel_samples_become_the_batch_odometry_on_every_topic(tmp_path: Path) 
 def test_slam_poses_locate_the_robot_in_the_map(tmp_path: Path) -> None:
     path = drive(1.0)
     with running(config_of(tmp_path)) as (node, session):
-        heard = Heard(session, apr__odometry__filtered=ODOMETRY)
+        heard = ReceivedMessages(session, apr__odometry__filtered=ODOMETRY)
         wheels, poses = (session.declare_publisher(f"apr/{topic}") for topic in ("joint_states", "slam_pose"))
         until(lambda: wheels.matching_status.matching and poses.matching_status.matching, "subscriptions")
         sent(wheels, path.samples()[:80])
@@ -64,7 +64,7 @@ def test_without_fusion_slam_and_tf_are_left_alone(tmp_path: Path) -> None:
 
 def test_diagnostics_come_once_a_second_with_the_counters(tmp_path: Path) -> None:
     with running(config_of(tmp_path)) as (_, session):
-        heard = Heard(session, apr__diagnostics=DIAGNOSTICS)
+        heard = ReceivedMessages(session, apr__diagnostics=DIAGNOSTICS)
         session.put("apr/joint_states", b"garbage")
         until(lambda: len(heard["apr__diagnostics"]) >= 3, "three diagnostics")
     first, *_, last = heard["apr__diagnostics"]
@@ -79,7 +79,7 @@ def test_many_robots_in_one_node_do_not_meet(tmp_path: Path) -> None:
     names = ("apr1", "apr2", "apr3")
     paths = {name: drive(0.5, seed=number) for number, name in enumerate(names)}
     with running(config_of(tmp_path, *names)) as (node, session):
-        heard = Heard(session, **{f"{name}__odom": ODOMETRY for name in names})
+        heard = ReceivedMessages(session, **{f"{name}__odom": ODOMETRY for name in names})
         for name in names:
             publisher = session.declare_publisher(f"{name}/joint_states")
             until(lambda each=publisher: each.matching_status.matching, "a subscription")
@@ -173,7 +173,7 @@ def test_a_node_that_fails_to_start_leaves_port_and_state_to_the_next(
         raise zenoh.ZError("no more queryables")
 
     with monkeypatch.context() as patch:
-        patch.setattr("omnibench.live.node.Desk", failing)
+        patch.setattr("omnibench.live.node.QueryServer", failing)
         with pytest.raises(zenoh.ZError, match="no more queryables"):
             LiveNode(config)
     with running(config) as (_, session):
@@ -204,7 +204,7 @@ def test_a_robot_whose_diagnostics_fail_does_not_end_those_of_the_others(
             "\ud800".encode()
 
         monkeypatch.setattr(node._services[0], "tick", failing)
-        heard = Heard(session, bob__diagnostics=DIAGNOSTICS)
+        heard = ReceivedMessages(session, bob__diagnostics=DIAGNOSTICS)
         until(lambda: len(failed) >= 2 and len(heard["bob__diagnostics"]) >= 2, "diagnostics after a failure")
     assert caplog.text.count("apr: diagnostics: UnicodeEncodeError: ") == 1
 
@@ -225,7 +225,7 @@ def test_frames_of_a_single_robot_can_carry_its_name(tmp_path: Path) -> None:
     robot = {"name": "apr", "calibration": "calibration.yaml", "frames": "prefixed"}
     path = drive(0.1)
     with running(config_of(tmp_path, robots=[robot])) as (_, session):
-        heard = Heard(session, apr__odom=ODOMETRY, tf=TRANSFORMS)
+        heard = ReceivedMessages(session, apr__odom=ODOMETRY, tf=TRANSFORMS)
         wheels = session.declare_publisher("apr/joint_states")
         until(lambda: wheels.matching_status.matching, "the node's subscription")
         sent(wheels, path.samples())

@@ -20,7 +20,7 @@ from omnibench.errors import ConfigError, DataError, OmnibenchError, one_line
 from omnibench.live.control.orders import read_pose, read_sent_calibration, read_time
 from omnibench.live.estimation.saved_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.network.rate_limiter import Quiet
+from omnibench.live.network.rate_limiter import RateLimiter
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 
@@ -32,12 +32,12 @@ _MOST_WAITING: Final = 64  # requests
 _FAREWELL: Final = 6.0  # s
 
 
-class Desk:
+class QueryServer:
     """Answers queries and takes calibrations for one robot after another, in a thread of its own.
 
     What is too long, or too much at once, is refused where it comes in, so that the wheels' stream goes on. A reply has
     the congestion control of its query, whatever is said here: for a client that asked with BLOCK and does not read,
-    Zenoh waits up to 5 s and then parts with it. Until then the desk waits; the stream does not.
+    Zenoh waits up to 5 s and then parts with it. Until then the query server waits; the stream does not.
 
     info: robot -> what ``info`` answers. memories: of the robots whose calibrations outlive the node.
     """
@@ -52,10 +52,10 @@ class Desk:
         self._trackers = trackers
         self._info = info
         self._memories = memories
-        self._quiet = Quiet()
+        self._rate_limiter = RateLimiter()
         self._refused = 0
         self._work: queue.Queue[Callable[[], None] | None] = queue.Queue(_MOST_WAITING)
-        self._thread = threading.Thread(target=self._run, name="desk", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="query server", daemon=True)
         self._open: list[Any] = []
         for name in trackers:
             self._open += self._declare(session, name)
@@ -65,7 +65,7 @@ class Desk:
         """Answer what was asked and no more."""
         for each in self._open:
             each.undeclare()
-        with suppress(queue.Full):  # a client that does not read may hold the desk: not for ever, nor us
+        with suppress(queue.Full):  # a client that does not read may hold the query server: not for ever, nor us
             self._work.put(None, timeout=_FAREWELL)
         self._thread.join(_FAREWELL)
 
@@ -110,7 +110,7 @@ class Desk:
                 reason = f"{_MOST_WAITING} requests are waiting; ask again later"
         if reason is not None:
             self._refused += 1
-            if self._quiet.lets("refused"):
+            if self._rate_limiter.allows("refused"):
                 LOG.warning("requests refused so far: %d; the last: %s", self._refused, reason)
         return reason
 
@@ -123,7 +123,7 @@ class Desk:
             del work  # a query is over when nobody holds it any more
 
     def _failed(self, error: Exception) -> None:
-        if self._quiet.lets(type(error).__name__):
+        if self._rate_limiter.allows(type(error).__name__):
             LOG.error("a request failed: %s: %s", type(error).__name__, one_line(str(error)))
 
     def _answer(self, name: str, service: str, query: zenoh.Query) -> None:
@@ -189,7 +189,7 @@ class Desk:
         return answer if reason is None else answer | {"kept": False, "reason": reason}
 
     def _tell_refusal(self, tracker: RobotTracker, error: DataError) -> None:
-        if self._quiet.lets(f"calibration of {tracker.name}"):
+        if self._rate_limiter.allows(f"calibration of {tracker.name}"):
             LOG.warning("%s: calibration refused, %s runs on: %s", tracker.name, tracker.calibration.name, error)
 
     def _not_kept(self, name: str, calibration: Calibration) -> str | None:

@@ -8,7 +8,7 @@ import zenoh
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from omnibench.errors import DataError
-from omnibench.live.network.presence import alive_robots, checked_robot, unheard
+from omnibench.live.network.presence import alive_robots, checked_robot, nothing_received
 from omnibench.robot.calibration import read_calibration
 
 
@@ -44,4 +44,4 @@ def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: fl
                 raise DataError(f"robot {robot!r} refuses {file}: {_Refused.model_validate_json(said).error}")
         except ValidationError:
             raise DataError(f"robot {robot!r}: its node gives an answer that is none; is it omnibench's?") from None
-    raise DataError(unheard(robot, timeout, alive_robots(session)))
+    raise DataError(nothing_received(robot, timeout, alive_robots(session)))

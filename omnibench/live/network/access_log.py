@@ -50,29 +50,29 @@ _one_at_a_time = threading.Lock()
 
 
 @contextmanager
-def log_refusals(config: SessionConfig) -> Iterator[Refusals]:
+def log_refused_access(config: SessionConfig) -> Iterator[AccessLog]:
     """While it is open, log a warning for everybody whom this process's sessions refuse, and for what.
 
     For the main program of a node, around ``open_session``; no other session may be open. Does nothing when there is
     nobody to refuse, or when RUST_LOG is set: then Zenoh's own log comes out as it is.
     """
-    refusals = Refusals(LOG.warning)
+    access_log = AccessLog(LOG.warning)
     guarded = config.users_file is not None or (config.tls is not None and bool(config.listening))
     if "RUST_LOG" in os.environ:
         zenoh.try_init_log_from_env()
         guarded = False
     if not guarded or sys.stdout is None or not _one_at_a_time.acquire(blocking=False):
-        yield refusals
+        yield access_log
         return
     try:
-        with _descriptor_1_read_by(refusals.take):
+        with _descriptor_1_read_by(access_log.read):
             _start_log(_FILTER + (_ACCESS_FILTER if config.access is not None else ""))
-            yield refusals
+            yield access_log
     finally:
         _one_at_a_time.release()
 
 
-class Refusals:
+class AccessLog:
     """Picks refusals from the lines of Zenoh's log. count: so far, repetitions included."""
 
     def __init__(self, tell: Callable[[str], None]) -> None:
@@ -85,7 +85,7 @@ class Refusals:
         self._addresses: dict[str, str] = {}  # thread -> whom it talks to; Zenoh's id -> where it is
         self._names: dict[str, str] = {}  # Zenoh's id -> certificate or user
 
-    def take(self, line: str) -> bool:
+    def read(self, line: str) -> bool:
         """Whether the line is of Zenoh's log; a refusal in it is told."""
         found = _LINE.fullmatch(line)
         if found is None:

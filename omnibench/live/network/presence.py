@@ -28,7 +28,7 @@ def alive_robots(session: zenoh.Session, timeout: float = 1.0) -> tuple[str, ...
     return tuple(sorted({_robot(reply.ok.key_expr) for reply in replies if reply.ok is not None}))
 
 
-def unheard(robot: str, seconds: float, alive: tuple[str, ...]) -> str:
+def nothing_received(robot: str, seconds: float, alive: tuple[str, ...]) -> str:
     """One line for a robot from which nothing came in ``seconds``, with those that are there and the nearest name."""
     if robot in alive:
         return (

@@ -10,7 +10,7 @@ from typing import Final
 PATIENCE: Final = 10.0  # s between two lines of the same kind
 
 
-class Quiet:
+class RateLimiter:
     """Lets a line of each kind through, and the next one ``patience`` s later (infinity: never). Any thread may ask."""
 
     def __init__(self, patience: float = PATIENCE) -> None:
@@ -18,7 +18,7 @@ class Quiet:
         self._told: dict[str, float] = {}
         self._lock = threading.Lock()
 
-    def lets(self, kind: str) -> bool:
+    def allows(self, kind: str) -> bool:
         """Whether a line of this kind, of which there are few, is due; then it counts as told."""
         now = time.monotonic()
         with self._lock:

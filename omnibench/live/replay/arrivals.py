@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field
 
 from omnibench.config import Model
 from omnibench.data.dataset import Split
-from omnibench.live.replay.concatenated_drive import LONGEST_PAUSE, Chain
+from omnibench.live.replay.concatenated_drive import LONGEST_PAUSE, ConcatenatedDrive
 from omnibench.robot.calibration import NonNegative
 from omnibench.robot.kinematics import Array
 
@@ -82,7 +82,7 @@ class ReplayConfig(Model):
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """All messages by time of arrival: arrivals (E,) s; topics (E,) index in TOPICS_PLAYED; rows (E,) of the chain."""
+    """All messages by time of arrival: arrivals (E,) s; topics (E,) index in TOPICS_PLAYED; rows (E,) of the drive."""
 
     arrivals: Array
     topics: NDArray[np.int8]
@@ -92,12 +92,12 @@ class Schedule:
         return len(self.arrivals)
 
 
-def make_schedule(chain: Chain, config: ReplayConfig) -> Schedule:
-    """When each message of a chain arrives. The same seed gives the same, and neither topic changes the other's."""
+def make_schedule(drive: ConcatenatedDrive, config: ReplayConfig) -> Schedule:
+    """When each message of a drive arrives. The same seed gives the same, and neither topic changes the other's."""
     wheel_seed, slam_seed = np.random.SeedSequence(config.seed).spawn(2)
-    samples, sampled = _arrivals(chain.wheel_times, config.wheels, np.random.default_rng(wheel_seed))
-    kept = _thinned(chain.slam_times, config.slam.period)
-    poses, posed = _arrivals(chain.slam_times[kept], config.slam, np.random.default_rng(slam_seed))
+    samples, sampled = _arrivals(drive.wheel_times, config.wheels, np.random.default_rng(wheel_seed))
+    kept = _thinned(drive.slam_times, config.slam.period)
+    poses, posed = _arrivals(drive.slam_times[kept], config.slam, np.random.default_rng(slam_seed))
     arrivals = np.concatenate([sampled, posed])
     topics = np.repeat(np.array([WHEELS, SLAM], dtype=np.int8), [len(samples), len(poses)])
     rows = np.concatenate([samples, kept[poses]])

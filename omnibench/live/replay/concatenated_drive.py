@@ -1,7 +1,7 @@
 """All runs of a recording one after another, as one drive: each starts at the pose where the one before ended.
 
 A run goes from its first reference pose to its last; what the wheels do after that is left out. Between two runs the
-robot rests. With S_i the pose at which run i starts and p(t) its reference, the chained pose is S_i p(0)^-1 p(t).
+robot rests. With S_i the pose at which run i starts and p(t) its reference, the concatenated pose is S_i p(0)^-1 p(t).
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.planar import moved_to, relative
 
-TURN = 2 * np.pi
+FULL_TURN = 2 * np.pi
 LONGEST_PAUSE = 3600.0  # s
 _SAME_TIME = 1e-9  # s, as stamps have it
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
+class ConcatenatedDrive:
     """n wheel samples and m reference poses of R runs on one time axis in s, which begins with 0.
 
     wheel_times (n,) and angles (n, N) rad, continuous: the first are the baseline at 0. rates (n, N): mean over the
     sample that ends then, rad/s, 0 for the baseline and in rests. run (n,): index of the run; a rest belongs to the
     run before it. slam_times (m,), slam_poses (m, 3) in m, m, rad with continuous headings, slam_covariances
-    (m, 3, 3) if the data set has them, slam_run (m,). The first pose of a run is where the chain puts it and nothing
+    (m, 3, 3) if the data set has them, slam_run (m,). The first pose of a run is where the drive puts it and nothing
     that was measured, so it is not among them, but for the very first. starts (R, 3) and begins (R,) of the runs.
     """
 
@@ -45,8 +45,8 @@ class Chain:
     slam_poses: Array
     slam_covariances: Array | None
     slam_run: NDArray[np.intp]
-    starts: Array
-    begins: Array
+    start_poses: Array
+    start_times: Array
 
     @property
     def duration(self) -> float:
@@ -54,39 +54,41 @@ class Chain:
         return float(max(self.wheel_times[-1], self.slam_times[-1]))
 
     def log(self, stamps: Sequence[float] | Array | None = None, session: str | None = None) -> WheelLog:
-        """The wheel rates from the chain's start, for the batch odometry at ``stamps`` (s; default: every sample).
+        """The wheel rates from the drive's start, for the batch odometry at ``stamps`` (s; default: every sample).
 
-        The chain is one session, from its start on; session: what it is called.
+        The drive is one session, from its start on; session: what it is called.
         """
         wanted = self.wheel_times if stamps is None else np.asarray(stamps, dtype=float)
         return WheelLog(
-            self.wheel_times[1:], self.rates[1:], self.starts[0], wanted, self.angles[1:], 0.0, session or ""
+            self.wheel_times[1:], self.rates[1:], self.start_poses[0], wanted, self.angles[1:], 0.0, session or ""
         )
 
 
-def chain_runs(
-    dataset: Dataset, *, pause: float = 1.0, split: Split | None = None, anchors: Array | None = None
-) -> Chain:
+def concatenate_runs(
+    dataset: Dataset, *, pause: float = 1.0, split: Split | None = None, start_poses: Array | None = None
+) -> ConcatenatedDrive:
     """The runs of a data set (or of one split) as one drive with ``pause`` s of rest between them.
 
-    Runs go session by session, in the order of ``started_at`` where it is known, else of the data set. anchors (R, 3):
-    the poses at which they start, in place of those that follow from the reference. ConfigError: a bad pause.
-    DataError: no run, a run with a single pose, anchors of another shape or not finite.
+    Runs go session by session, in the order of ``started_at`` where it is known, else of the data set.
+    start_poses (R, 3): where the runs start, in place of what follows from the reference.
+
+    ConfigError: a pause out of range. DataError: no run, a run with a single pose, or start_poses of another shape or
+    not finite.
     """
     if not 0 <= pause <= LONGEST_PAUSE:
         raise ConfigError(f"pause: {pause:g} s between runs is not within 0 and {LONGEST_PAUSE:g} s")
     runs = _ordered(dataset, split)
     moves = np.array([relative(each.start, each.final_pose) for each in runs])
     starts = _composed(runs[0].start, moves)
-    if anchors is not None:
-        starts = _anchored(dataset, np.asarray(anchors, dtype=float), moves)
+    if start_poses is not None:
+        starts = _given_start_poses(dataset, np.asarray(start_poses, dtype=float), moves)
     rests = [_rest_samples(each, pause, dataset.sample_period) for each in runs]
     lengths = [each.times[-1] + count * dataset.sample_period for each, count in zip(runs, rests, strict=True)]
     begins = np.concatenate([[0.0], np.cumsum(lengths)[:-1]])
     rests[-1] = 0  # the drive ends with its last run
     measured = [each.pose_times > 0 for each in runs]
     measured[0] = np.ones(len(runs[0].pose_times), dtype=bool)
-    return Chain(
+    return ConcatenatedDrive(
         robot=dataset.robot,
         ids=tuple(each.id for each in runs),
         wheel_times=_wheel_times(runs, rests, begins, dataset.sample_period),
@@ -99,48 +101,50 @@ def chain_runs(
         ),
         slam_covariances=_covariances(runs, starts, measured),
         slam_run=np.repeat(np.arange(len(runs)), [np.count_nonzero(m) for m in measured]),
-        starts=starts,
-        begins=begins,
+        start_poses=starts,
+        start_times=begins,
     )
 
 
-def chain_recording(recording: Recording, *, pause: float = 1.0, split: Split | None = None) -> Chain:
-    """``chain_runs`` of a recording, on the anchors of its truth where that is known."""
-    anchors = None if recording.truth is None else true_anchors(recording, split)
-    return chain_runs(recording.dataset, pause=pause, split=split, anchors=anchors)
+def concatenate_recording(recording: Recording, *, pause: float = 1.0, split: Split | None = None) -> ConcatenatedDrive:
+    """The runs of a recording as one drive; where its truth is known, each run starts where the robot truly was."""
+    start_poses = None if recording.truth is None else true_start_poses(recording, split)
+    return concatenate_runs(recording.dataset, pause=pause, split=split, start_poses=start_poses)
 
 
-def true_anchors(recording: Recording, split: Split | None = None) -> Array:
+def true_start_poses(recording: Recording, split: Split | None = None) -> Array:
     """Start poses (R, 3) with which a simulated robot truly goes on where it was. DataError without a truth.
 
-    The reference poses of a chain then err about the truth and do not drift away from it.
+    The reference poses of a drive then err about the truth and do not drift away from it.
     """
     truth, runs = _TruthOfRuns(recording), _ordered(recording.dataset, split)
     moves = [relative(each.start, truth.poses(each, each.times[-1:])[0]) for each in runs]
     return _composed(runs[0].start, np.array(moves))
 
 
-def chained_truth(chain: Chain, recording: Recording) -> Array:
-    """True poses (n, 3) of a simulated robot at the chain's wheel times, each run from its start in the chain.
+def concatenated_truth(drive: ConcatenatedDrive, recording: Recording) -> Array:
+    """True poses (n, 3) of a simulated robot at the drive's wheel times, each run from its start in the drive.
 
-    Continuous on true anchors; else it leaps from run to run by what the reference was wrong. DataError without a
-    truth.
+    Continuous if the drive has true start poses; else it jumps between runs by the error of the reference. DataError
+    without a truth.
     """
     truth = _TruthOfRuns(recording)
     known = {each.id: each for each in recording.dataset.trajectories}
-    bounds = np.searchsorted(chain.run, np.arange(1, len(chain.ids)))
+    bounds = np.searchsorted(drive.run, np.arange(1, len(drive.ids)))
     poses = []
-    for index, times in enumerate(np.split(chain.wheel_times, bounds)):
-        if chain.ids[index] not in known:
-            raise DataError(f"run {chain.ids[index]} is not in data set {recording.dataset.name}; chain that one")
-        run = _trimmed(known[chain.ids[index]])
-        driven = truth.poses(run, np.append(0.0, times - chain.begins[index]))
-        poses.append(moved_to(chain.starts[index], driven)[1:])
+    for index, times in enumerate(np.split(drive.wheel_times, bounds)):
+        if drive.ids[index] not in known:
+            raise DataError(
+                f"run {drive.ids[index]} is not in data set {recording.dataset.name}; take the drive's own recording"
+            )
+        run = _trimmed(known[drive.ids[index]])
+        driven = truth.poses(run, np.append(0.0, times - drive.start_times[index]))
+        poses.append(moved_to(drive.start_poses[index], driven)[1:])
     return np.concatenate(poses)
 
 
 def _ordered(dataset: Dataset, split: Split | None) -> list[Trajectory]:
-    """The runs in the order in which they are chained, each up to its last reference pose."""
+    """The runs in the order in which they are concatenated, each up to its last reference pose."""
     chosen = dataset.trajectories if split is None else dataset.split(split)
     if not chosen:
         raise DataError(f"data set {dataset.name}: no run in its split {split!r}; choose the other, or none")
@@ -153,7 +157,9 @@ def _ordered(dataset: Dataset, split: Split | None) -> list[Trajectory]:
     ordered = [each for runs in sessions.values() for each in runs]
     for each in ordered:
         if len(each.pose_times) < 2:
-            raise DataError(f"data set {dataset.name}: run {each.id} has a single reference pose; it cannot be chained")
+            raise DataError(
+                f"data set {dataset.name}: run {each.id} has a single reference pose; it cannot be concatenated"
+            )
     return [_trimmed(each) for each in ordered]
 
 
@@ -237,13 +243,15 @@ def _composed(first: Array, moves: Array) -> Array:
     return np.column_stack([path.real, path.imag, headings])
 
 
-def _anchored(dataset: Dataset, anchors: Array, moves: Array) -> Array:
-    """The anchors with whole turns added to their headings, so that those of the chain go on without any."""
-    if anchors.shape != moves.shape or not np.isfinite(anchors).all():
-        raise DataError(f"data set {dataset.name}: anchors have shape {anchors.shape}, expected {moves.shape}, finite")
-    leaps = np.diff(anchors[:, 2]) - moves[:-1, 2]
-    turns = np.concatenate([[0.0], np.cumsum(np.round(leaps / TURN))])
-    return np.column_stack([anchors[:, :2], anchors[:, 2] - TURN * turns])
+def _given_start_poses(dataset: Dataset, start_poses: Array, moves: Array) -> Array:
+    """The given start poses, checked, with multiples of 2 pi added so that headings are continuous from run to run."""
+    if start_poses.shape != moves.shape or not np.isfinite(start_poses).all():
+        raise DataError(
+            f"data set {dataset.name}: start poses have shape {start_poses.shape}, expected {moves.shape}, finite"
+        )
+    leaps = np.diff(start_poses[:, 2]) - moves[:-1, 2]
+    turns = np.concatenate([[0.0], np.cumsum(np.round(leaps / FULL_TURN))])
+    return np.column_stack([start_poses[:, :2], start_poses[:, 2] - FULL_TURN * turns])
 
 
 class _TruthOfRuns:

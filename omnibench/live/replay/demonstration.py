@@ -1,4 +1,4 @@
-"""The whole chain on one machine with no robot: a recording is played to a node and what comes out is judged."""
+"""the whole live system on one machine with no robot: a recording is played to a node and what comes out is judged."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from omnibench.live.config import LiveConfig, client_session, robot_called
 from omnibench.live.estimation.health import Health
 from omnibench.live.network.session import open_session
 from omnibench.live.node import LiveNode, load_effects
-from omnibench.live.replay.concatenated_drive import Chain, chain_recording, chained_truth
+from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_recording, concatenated_truth
 from omnibench.live.replay.played_recording import Recording
 from omnibench.live.replay.replay_player import Player, PlayReport, Progress
 from omnibench.live.wire.messages import Odometry
@@ -105,7 +105,7 @@ def demonstrate(
     robot = robot_called(config, config.replay.robot)
     load_effects(config)
     _check_wheels(recording, read_calibration(robot.calibration), robot.name)
-    chain = chain_recording(recording, pause=config.replay.pause, split=config.replay.split)
+    drive = concatenate_recording(recording, pause=config.replay.pause, split=config.replay.split)
     with LiveNode(config, remember=False) as node, beside(node) if beside else nullcontext():
         tracker = node.trackers[robot.name]
         guarded = config.zenoh.users_file is not None and config.zenoh.user is None
@@ -118,7 +118,7 @@ def demonstrate(
             player = Player(
                 GraphNode(session, node.keys, "replay"),
                 robot.name,
-                chain,
+                drive,
                 config.replay,
                 names=robot.wheels.joints,
                 noise=tracker.calibration.noise,
@@ -137,7 +137,7 @@ def demonstrate(
         finally:
             if not guarded:
                 session.close()
-        return _judged(chain, recording, tracker.calibration, report, odometry, fused, health)
+        return _judged(drive, recording, tracker.calibration, report, odometry, fused, health)
 
 
 def _check_wheels(recording: Recording, calibration: Calibration, robot: str) -> None:
@@ -164,7 +164,7 @@ def _wait_for_the_last(
 
 
 def _judged(
-    chain: Chain,
+    drive: ConcatenatedDrive,
     recording: Recording,
     calibration: Calibration,
     report: PlayReport,
@@ -172,19 +172,19 @@ def _judged(
     fused: _Collector | None,
     health: Health,
 ) -> Demonstration:
-    times = chain.wheel_times
-    batch = calibration.model.poses([chain.log(session=calibration.session)])[0]
-    design = OdometryModel.of_design(calibration.robot, calibration.integration).poses([chain.log()])[0]
+    times = drive.wheel_times
+    batch = calibration.model.poses([drive.log(session=calibration.session)])[0]
+    design = OdometryModel.of_design(calibration.robot, calibration.integration).poses([drive.log()])[0]
     origin = odometry.stamps[0] if odometry.stamps else 0
     rows = _rows(odometry.stamps, origin, times)
     # odom begins at its own origin, the recording anywhere
-    published = moved_to(chain.starts[0], odometry.poses) if odometry.stamps else odometry.poses
+    published = moved_to(drive.start_poses[0], odometry.poses) if odometry.stamps else odometry.poses
     if recording.truth is not None:
-        against, reference = "the simulated truth", chained_truth(chain, recording)
+        against, reference = "the simulated truth", concatenated_truth(drive, recording)
         chosen = rows
     else:
-        against, reference = "the reference poses of the recording", _interpolated(chain)
-        chosen = rows[(times[rows] >= chain.slam_times[0]) & (times[rows] <= chain.slam_times[-1])]
+        against, reference = "the reference poses of the recording", _interpolated(drive)
+        chosen = rows[(times[rows] >= drive.slam_times[0]) & (times[rows] <= drive.slam_times[-1])]
     return Demonstration(
         robot=health.robot,
         calibration=calibration.name,
@@ -193,7 +193,7 @@ def _judged(
         against=against,
         theoretical=_deviation(design[chosen], reference[chosen]),
         calibrated=_deviation(batch[chosen], reference[chosen]),
-        fused=None if fused is None else _fused_deviation(fused, origin, chain, reference, chosen),
+        fused=None if fused is None else _fused_deviation(fused, origin, drive, reference, chosen),
         batch_difference=_difference(published, batch[rows]),
         lost=health.counts["samples"] - len(odometry.stamps),
         health=health,
@@ -206,15 +206,17 @@ def _rows(stamps: list[int], origin: int, times: Array) -> Array:
     return np.clip(np.searchsorted(times, seconds - 1e-6), 0, len(times) - 1)
 
 
-def _fused_deviation(fused: _Collector, origin: int, chain: Chain, reference: Array, chosen: Array) -> Deviation:
+def _fused_deviation(
+    fused: _Collector, origin: int, drive: ConcatenatedDrive, reference: Array, chosen: Array
+) -> Deviation:
     """From where SLAM has first been heard on: before that nobody knows where the robot is in the map."""
-    rows = _rows(fused.stamps, origin, chain.wheel_times)
-    known = np.isin(rows, chosen) & (chain.wheel_times[rows] > chain.slam_times[0] + 1.0)
+    rows = _rows(fused.stamps, origin, drive.wheel_times)
+    known = np.isin(rows, chosen) & (drive.wheel_times[rows] > drive.slam_times[0] + 1.0)
     return _deviation(fused.poses[known], reference[rows[known]])
 
 
-def _interpolated(chain: Chain) -> Array:
-    columns = [np.interp(chain.wheel_times, chain.slam_times, chain.slam_poses[:, axis]) for axis in range(3)]
+def _interpolated(drive: ConcatenatedDrive) -> Array:
+    columns = [np.interp(drive.wheel_times, drive.slam_times, drive.slam_poses[:, axis]) for axis in range(3)]
     return np.column_stack(columns)
 
 

@@ -23,7 +23,7 @@ from omnibench.live.replay.arrivals import (
     WheelChannel,
     make_schedule,
 )
-from omnibench.live.replay.concatenated_drive import Chain
+from omnibench.live.replay.concatenated_drive import ConcatenatedDrive
 from omnibench.live.wire.messages import JointState, PoseEstimate
 from omnibench.live.wire.topics import GraphNode
 from omnibench.robot.calibration import Noise
@@ -57,33 +57,35 @@ class Event:
 
 
 def events(
-    chain: Chain,
+    drive: ConcatenatedDrive,
     config: ReplayConfig,
     *,
     origin: int | None = None,
     noise: Noise | None = None,
     names: Sequence[str] | None = None,
 ) -> Iterator[Event]:
-    """Every message of a chain, by time of arrival.
+    """Every message of a drive, by time of arrival.
 
-    origin: stamp of the chain's start, ns (default: the config's, or now). noise: of the reference, for poses whose
+    origin: stamp of the drive's start, ns (default: the config's, or now). noise: of the reference, for poses whose
     covariance neither the data set nor the config tells. names (N,) of the joints; default: the robot's wheels.
     """
-    return _Messages(chain, config, noise, names).stamped_from(origin)
+    return _Messages(drive, config, noise, names).stamped_from(origin)
 
 
 class _Messages:
-    """All messages of a chain but for their stamps, made ready so that playing them can start at once."""
+    """All messages of a drive but for their stamps, made ready so that playing them can start at once."""
 
-    def __init__(self, chain: Chain, config: ReplayConfig, noise: Noise | None, names: Sequence[str] | None) -> None:
-        self._chain = chain
+    def __init__(
+        self, drive: ConcatenatedDrive, config: ReplayConfig, noise: Noise | None, names: Sequence[str] | None
+    ) -> None:
+        self._drive = drive
         self._origin = config.stamp_origin
-        self._joints = _joint_names(chain, names)
-        self._schedule = make_schedule(chain, config)
-        self._sampled, self._posed = (_nanoseconds(times) for times in (chain.wheel_times, chain.slam_times))
-        self._covariances = _pose_covariances(chain, config.slam, noise)
-        self._angles = None if config.wheels.use == "velocities" else chain.angles
-        self._rates = None if config.wheels.use == "positions" else chain.rates
+        self._joints = _joint_names(drive, names)
+        self._schedule = make_schedule(drive, config)
+        self._sampled, self._posed = (_nanoseconds(times) for times in (drive.wheel_times, drive.slam_times))
+        self._covariances = _pose_covariances(drive, config.slam, noise)
+        self._angles = None if config.wheels.use == "velocities" else drive.angles
+        self._rates = None if config.wheels.use == "positions" else drive.rates
 
     def __len__(self) -> int:
         return len(self._schedule)
@@ -102,7 +104,7 @@ class _Messages:
         return JointState(start + int(self._sampled[row]), self._joints, positions, velocities)
 
     def _pose(self, start: int, row: int) -> PoseEstimate:
-        return PoseEstimate(start + int(self._posed[row]), MAP, self._chain.slam_poses[row], self._covariances[row])
+        return PoseEstimate(start + int(self._posed[row]), MAP, self._drive.slam_poses[row], self._covariances[row])
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +139,7 @@ class PlayReport:
 
 
 class Player:
-    """Plays a chain as one robot. Its publishers go with the session of ``graph``.
+    """Plays a drive as one robot. Its publishers go with the session of ``graph``.
 
     A subscriber that does not keep up holds it up, so that nothing of the recording is lost at any speed. names, noise:
     as for ``events``. ConfigError: a robot's name that cannot be, or not a name for each wheel.
@@ -147,14 +149,14 @@ class Player:
         self,
         graph: GraphNode,
         robot: str,
-        chain: Chain,
+        drive: ConcatenatedDrive,
         config: ReplayConfig,
         names: Sequence[str] | None = None,
         noise: Noise | None = None,
     ) -> None:
         self._robot = checked_robot(robot)
         self._config = config
-        self._messages = _Messages(chain, config, noise, names)
+        self._messages = _Messages(drive, config, noise, names)
         self._publishers = {topic: graph.publisher(robot, topic, lossless=True) for topic in TOPICS_PLAYED}
 
     def play(self, stop: threading.Event | None = None, watch: Callable[[Progress], None] | None = None) -> PlayReport:
@@ -213,13 +215,13 @@ def _nanoseconds(times: Array) -> NDArray[np.int64]:
     return np.round(times * 1e9).astype(np.int64)
 
 
-def _pose_covariances(chain: Chain, slam: SlamChannel, noise: Noise | None) -> Array:
+def _pose_covariances(drive: ConcatenatedDrive, slam: SlamChannel, noise: Noise | None) -> Array:
     """Covariances (m, 3, 3) of the SLAM poses about where the robot was."""
-    if chain.slam_covariances is not None:
-        return chain.slam_covariances
-    count = len(chain.slam_times)
+    if drive.slam_covariances is not None:
+        return drive.slam_covariances
+    count = len(drive.slam_times)
     if slam.covariance is None and noise is not None:
-        seconds = chain.slam_times - chain.begins[chain.slam_run]  # that the walk has had since the run's start
+        seconds = drive.slam_times - drive.start_times[drive.slam_run]  # that the walk has had since the run's start
         position = np.sqrt(noise.pose_position**2 + noise.bias_position**2 + noise.walk_position**2 * seconds)
         heading = np.sqrt(noise.pose_heading**2 + noise.bias_heading**2 + noise.walk_heading**2 * seconds)
     else:
@@ -230,8 +232,8 @@ def _pose_covariances(chain: Chain, slam: SlamChannel, noise: Noise | None) -> A
     return covariances
 
 
-def _joint_names(chain: Chain, names: Sequence[str] | None) -> tuple[str, ...]:
-    joints, wheels = tuple(chain.robot.wheel_names if names is None else names), chain.robot.wheel_names
+def _joint_names(drive: ConcatenatedDrive, names: Sequence[str] | None) -> tuple[str, ...]:
+    joints, wheels = tuple(drive.robot.wheel_names if names is None else names), drive.robot.wheel_names
     if len(joints) != len(wheels) or len(set(joints)) != len(joints):
         raise ConfigError(f"joints {', '.join(joints) or '(none)'}: give each of the wheels {', '.join(wheels)} a name")
     return joints

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import zenoh
 
 from omnibench.errors import ConfigError
-from omnibench.live.wire.topic_listener import Arrival, Tap
+from omnibench.live.wire.topic_listener import Arrival, TopicListener
 from omnibench.live.wire.topics import TOPICS, KeySpace
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class FoxgloveServer:
             ) from None
         self.address = f"ws://{host}:{self._server.port}"
         self._channels: dict[str, Channel] = {}
-        self._taps: list[Tap] = []
+        self._listeners: list[TopicListener] = []
 
     def forward(
         self, session: zenoh.Session, keys: KeySpace, robots: Sequence[str], topics: Sequence[str] = tuple(TOPICS)
@@ -54,12 +54,12 @@ class FoxgloveServer:
         """Offer the robots' topics from now on; each message goes out as it came. ConfigError: no such topic."""
         import foxglove
 
-        tap = Tap(session, keys, robots, topics, self._arrived)
-        for name, topic in tap.topics.items():
+        listener = TopicListener(session, keys, robots, topics, self._arrived)
+        for name, topic in listener.topics.items():
             kind = TOPICS[topic]
             schema = foxglove.Schema(name=kind.name, encoding="ros2msg", data=kind.definition.encode())
             self._channels[name] = foxglove.Channel(name, schema=schema, message_encoding="cdr", context=self._context)
-        self._taps.append(tap)
+        self._listeners.append(listener)
 
     def subscribed(self, name: str) -> bool:
         """Whether a client wants the topic, as /apr02/odom, now."""
@@ -67,8 +67,8 @@ class FoxgloveServer:
 
     def close(self) -> None:
         """Stop serving."""
-        for tap in self._taps:
-            tap.close()
+        for listener in self._listeners:
+            listener.close()
         self._server.stop()
 
     def __enter__(self) -> FoxgloveServer:

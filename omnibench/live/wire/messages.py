@@ -21,7 +21,7 @@ from omnibench.robot.kinematics import Array
 
 STORE: Final = get_typestore(Stores.ROS2_JAZZY)
 
-FLAT = np.array([0, 1, 5, 6, 7, 11, 30, 31, 35])  # the plane's nine places in the 36
+PLANAR_INDICES = np.array([0, 1, 5, 6, 7, 11, 30, 31, 35])  # the plane's nine places in the 36
 _ELSEWHERE = np.zeros(36)
 _ELSEWHERE[[14, 21, 28]] = 1e-9
 _SECOND = 1_000_000_000
@@ -182,7 +182,7 @@ def _heading(quaternion: Any) -> float:
 
 def _covariance_36(covariance: Array) -> Array:
     full = _ELSEWHERE.copy()
-    full[FLAT] = np.ravel(covariance)
+    full[PLANAR_INDICES] = np.ravel(covariance)
     return full
 
 
@@ -191,7 +191,7 @@ def _plane_pose(pose: Any) -> Array:
 
 
 def _plane_covariance(covariance: Array) -> Array:
-    return np.asarray(covariance[FLAT], dtype=float).reshape(3, 3)
+    return np.asarray(covariance[PLANAR_INDICES], dtype=float).reshape(3, 3)
 
 
 def _ros_pose(pose: Array) -> Any:

@@ -18,7 +18,7 @@ import zenoh
 from omnibench.errors import DataError
 from omnibench.live.wire.mcap_file import McapFile
 from omnibench.live.wire.messages import MessageError, MessageType
-from omnibench.live.wire.topic_listener import Arrival, Tap
+from omnibench.live.wire.topic_listener import Arrival, TopicListener
 from omnibench.live.wire.topics import TOPICS, KeySpace
 
 _FLUSH_PERIOD: Final = 1.0  # s; so much is lost when the process is killed
@@ -61,7 +61,7 @@ class Recorder:
         self._waiting: SimpleQueue[Arrival] = SimpleQueue()
         self._stopping = Event()
         self._file: McapFile | None = None
-        self._tap: Tap | None = None
+        self._listener: TopicListener | None = None
         self._thread = Thread(target=self._run, name="omnibench-recorder", daemon=True)
 
     @property
@@ -77,20 +77,20 @@ class Recorder:
     def start(self) -> None:
         """Begin."""
         session, keys, robots, topics = self._source
-        tap = Tap(session, keys, robots, topics, self._arrived)
+        listener = TopicListener(session, keys, robots, topics, self._arrived)
         try:
             self._file = McapFile(self.path)
         except DataError:
-            tap.close()
+            listener.close()
             raise
-        self._tap = tap
+        self._listener = listener
         self._thread.start()
 
     def stop(self) -> None:
         """Write what has come, and complete the file. Stopping twice does no harm."""
-        if self._tap is None:
+        if self._listener is None:
             return
-        self._tap.close()
+        self._listener.close()
         self._stopping.set()
         self._thread.join()
 

@@ -11,15 +11,23 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from omnibench.live.wire.messages import FLAT, JOINT_STATE, ODOMETRY, TRANSFORMS, JointState, Odometry, Transform
+from omnibench.live.wire.messages import (
+    JOINT_STATE,
+    ODOMETRY,
+    PLANAR_INDICES,
+    TRANSFORMS,
+    JointState,
+    Odometry,
+    Transform,
+)
 from omnibench.robot.kinematics import Array
 
 _SECOND = 1_000_000_000
 _STAMP_AT = 4  # bytes: after the CDR header
 _NUMBERS = 7 + 36 + 6 + 36  # at the end of an Odometry: pose, its covariance, twist, its covariance
 _TWIST = 7 + 36
-_POSE_COVARIANCE = 7 + FLAT
-_TWIST_COVARIANCE = _TWIST + 6 + FLAT
+_POSE_COVARIANCE = 7 + PLANAR_INDICES
+_TWIST_COVARIANCE = _TWIST + 6 + PLANAR_INDICES
 
 
 class OdometryEncoder:

@@ -31,7 +31,7 @@ class Arrival:
     payload: bytes
 
 
-class Tap:
+class TopicListener:
     """Hands every message of the robots' topics to ``consume``, one at a time, in Zenoh's thread: it must be quick.
 
     Raises ConfigError for a topic that is not there or a robot's name that cannot be.

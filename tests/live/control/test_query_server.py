@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import zenoh
 from drives import ORIGIN, SECOND, calibration, drive
-from heard import Heard
 from nodes import as_text, asked, config_of, running, sent
+from received_messages import ReceivedMessages
 from sessions import Loopback, until
 
-from omnibench.live.control.query_server import Desk
+from omnibench.live.control.query_server import QueryServer
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.wire.messages import ODOMETRY
 
@@ -125,24 +125,24 @@ def test_a_failure_of_its_own_is_answered_in_one_line_and_logged(
     def failing(_: RobotTracker) -> dict[str, Any]:
         raise RuntimeError("a bug\nof two lines")
 
-    desk = Desk(loopback.client(), {"apr": RobotTracker("apr", calibration())}, failing, {})
+    query_server = QueryServer(loopback.client(), {"apr": RobotTracker("apr", calibration())}, failing, {})
     session = loopback.client()
-    until(lambda: list(session.get("omnibench/apr/health", timeout=1.0)), "the desk")
+    until(lambda: list(session.get("omnibench/apr/health", timeout=1.0)), "the query server")
     answer = asked(session, "omnibench/apr/info")
     again = asked(session, "omnibench/apr/health")
-    desk.close()
+    query_server.close()
     assert answer["error"] == "omnibench/apr/info: RuntimeError: a bug of two lines"
     assert again["status"] == "waiting"
     assert "a request failed: RuntimeError: a bug of two lines" in caplog.text
 
 
-def test_more_requests_than_the_desk_holds_are_refused_and_the_stream_goes_on(tmp_path: Path) -> None:
+def test_more_requests_than_the_server_holds_are_refused_and_the_stream_goes_on(tmp_path: Path) -> None:
     path = drive(1.0)
     with running(config_of(tmp_path, "apr", "bob")) as (node, session):
-        heard = Heard(session, bob__odom=ODOMETRY)
+        heard = ReceivedMessages(session, bob__odom=ODOMETRY)
         wheels = session.declare_publisher("bob/joint_states")
         until(lambda: wheels.matching_status.matching, "the node's subscription")
-        with node.trackers["apr"]._lock:  # the desk is held up by the first
+        with node.trackers["apr"]._lock:  # the query server is held up by the first
             waiting = [session.get("omnibench/apr/health", timeout=20.0) for _ in range(100)]
             sent(wheels, path.samples())
             until(lambda: len(heard["bob__odom"]) == 101, "the odometry")
@@ -156,7 +156,7 @@ def test_more_requests_than_the_desk_holds_are_refused_and_the_stream_goes_on(tm
 def test_a_calibration_that_is_put_runs_from_the_next_sample_on_and_odom_does_not_jump(tmp_path: Path) -> None:
     path, other = drive(1.0), calibration(scale=1.2)
     with running(config_of(tmp_path)) as (node, session):
-        heard = Heard(session, apr__odom=ODOMETRY)
+        heard = ReceivedMessages(session, apr__odom=ODOMETRY)
         wheels = session.declare_publisher("apr/joint_states")
         until(lambda: wheels.matching_status.matching, "the node's subscription")
         sent(wheels, path.samples()[:51])

@@ -27,7 +27,7 @@ from omnibench.live.estimation.tracker import RobotTracker, Update
 from omnibench.live.estimation.wheel_input import WheelStep
 from omnibench.live.node import LiveNode
 from omnibench.live.replay.arrivals import ReplayConfig
-from omnibench.live.replay.concatenated_drive import chain_recording, chain_runs, chained_truth
+from omnibench.live.replay.concatenated_drive import concatenate_recording, concatenate_runs, concatenated_truth
 from omnibench.live.replay.replay_player import events
 from omnibench.live.wire.messages import JOINT_STATE
 from omnibench.robot.calibration import Calibration, EffectTerm, covariance_rows, matrix_rows, write_calibration
@@ -92,15 +92,15 @@ class TestAgreesWithTheBatch:
     def test_a_replayed_recording_gives_the_batch_odometry(self, integration: str) -> None:
         using = with_effects(*every_effect(), plain=calibration(integration=integration))  # type: ignore[arg-type]
         dataset = random_dataset(3)
-        chain = chain_runs(dataset)
+        drive = concatenate_runs(dataset)
         robot = RobotTracker("apr", using.model_copy(update={"robot": dataset.robot}))
         updates = [
             update
-            for event in events(chain, ReplayConfig(), origin=ORIGIN)
+            for event in events(drive, ReplayConfig(), origin=ORIGIN)
             if event.topic == "joint_states"
             for update in robot.take_wheels(JOINT_STATE.encode(event.message), event.arrival)  # type: ignore[arg-type]
         ]
-        log = replace(chain.log(session="evening"), start=np.zeros(3))
+        log = replace(drive.log(session="evening"), start=np.zeros(3))
         np.testing.assert_allclose(odometry(updates), using.model.poses([log])[0], atol=1e-9)
 
     def test_a_sender_of_rates_alone_has_its_wheel_angles_counted_from_0(self) -> None:
@@ -247,12 +247,12 @@ class TestAngles:
         (term("wheel_eccentricity", **ECCENTRIC), term("thermal_radius_drift", k=1e-4)),
     ],
 )
-def test_the_truth_of_a_chain_has_the_effects_that_were_hidden(hidden: tuple[EffectTerm, ...]) -> None:
+def test_the_truth_of_a_drive_has_the_effects_that_were_hidden(hidden: tuple[EffectTerm, ...]) -> None:
     recording = simulated_recording(effects=hidden)
-    chain = chain_recording(recording)
-    truth = chained_truth(chain, recording)
-    at = np.searchsorted(chain.wheel_times, chain.slam_times - 1e-6)
-    np.testing.assert_allclose(chain.slam_poses, truth[at], atol=1e-9)
+    drive = concatenate_recording(recording)
+    truth = concatenated_truth(drive, recording)
+    at = np.searchsorted(drive.wheel_times, drive.slam_times - 1e-6)
+    np.testing.assert_allclose(drive.slam_poses, truth[at], atol=1e-9)
 
 
 def test_a_replay_with_effects_to_a_real_node_shows_the_batch_odometry(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from sessions import free_port, until
 
 from omnibench.errors import ConfigError
 from omnibench.live.network.access import rights_of
-from omnibench.live.network.access_log import Refusals
+from omnibench.live.network.access_log import AccessLog
 from omnibench.live.network.keys import make_keys
 from omnibench.live.network.session import open_session, zenoh_config
 from omnibench.live.network.session_config import Access, SessionConfig, Tls, User
@@ -394,20 +394,22 @@ def alive(session: zenoh.Session, key: str) -> list[str]:
 class TestLog:
     def test_lines_that_are_not_zenohs_are_left_alone(self) -> None:
         told: list[str] = []
-        refusals = Refusals(told.append)
-        assert not refusals.take("a table of the program, with words as unauthorized to Put in it")
+        access_log = AccessLog(told.append)
+        assert not access_log.read("a table of the program, with words as unauthorized to Put in it")
         assert not told
 
     def test_what_is_only_looked_up_is_not_told(self) -> None:
         told: list[str] = []
-        refusals = Refusals(told.append)
+        access_log = AccessLog(told.append)
         head = "2026-11-21T08:51:04.100951Z TRACE  rx-1 ThreadId(10) zenoh::net::routing::interceptor"
         subject = "Interface(lo)+CertCommonName(apr02)+Transport(Tls)+3f"
-        assert refusals.take(f"{head}::access_control: 3f on {subject} is unauthorized to Put (ingress) on apr03/odom")
+        assert access_log.read(
+            f"{head}::access_control: 3f on {subject} is unauthorized to Put (ingress) on apr03/odom"
+        )
         assert not told
-        assert refusals.take(f"{head}: Msg intercepted!")
+        assert access_log.read(f"{head}: Msg intercepted!")
         assert told == ["refused: certificate 'apr02' at an unknown address: may not write apr03/odom"]
-        assert refusals.count == 1
+        assert access_log.count == 1
 
     def test_the_programs_own_output_comes_out_as_it_was_written(self, keys: Path, tmp_path: Path) -> None:
         config = tmp_path / "router.yaml"
@@ -430,12 +432,12 @@ class TestLog:
 _PROGRAM = """
 import os, subprocess, sys
 from pathlib import Path
-from omnibench.live.network.access_log import log_refusals
+from omnibench.live.network.access_log import log_refused_access
 from omnibench.live.network.session import open_session
 from omnibench.live.network.session_config import read_session_config
 config = read_session_config(Path(sys.argv[1]))
 print("before")
-with log_refusals(config), open_session(config, "router"):
+with log_refused_access(config), open_session(config, "router"):
     print("printed")
     subprocess.run(["echo", "of a child"], check=True)
 print("unended", end="")

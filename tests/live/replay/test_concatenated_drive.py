@@ -16,7 +16,13 @@ from recordings import MODEL, PERIOD, ROBOT, homogeneous, random_dataset, random
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.importer import import_dataset
 from omnibench.errors import ConfigError, DataError
-from omnibench.live.replay.concatenated_drive import Chain, chain_recording, chain_runs, chained_truth, true_anchors
+from omnibench.live.replay.concatenated_drive import (
+    ConcatenatedDrive,
+    concatenate_recording,
+    concatenate_runs,
+    concatenated_truth,
+    true_start_poses,
+)
 from omnibench.live.replay.played_recording import Recording
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
@@ -30,12 +36,12 @@ pauses = st.sampled_from([0.0, 0.1, 1.0])
 
 def composed_by_hand(runs: tuple[Trajectory, ...]) -> list[Array]:
     """Matrices (K, 3, 3) of the reference poses of each run, the runs one after another."""
-    at, chained = homogeneous(runs[0].start), []
+    at, concatenated = homogeneous(runs[0].start), []
     for run in runs:
         since_start = np.linalg.inv(homogeneous(run.start)) @ np.array([homogeneous(pose) for pose in run.poses])
-        chained.append(at @ since_start)
-        at = chained[-1][-1]
-    return chained
+        concatenated.append(at @ since_start)
+        at = concatenated[-1][-1]
+    return concatenated
 
 
 def motions(poses: Array) -> Array:
@@ -47,24 +53,24 @@ class TestPoses:
     @given(seeds, st.integers(1, 5), pauses)
     def test_reference_poses_are_those_composed_by_hand(self, seed: int, count: int, pause: float) -> None:
         dataset = random_dataset(seed, count)
-        chain = chain_runs(dataset, pause=pause)
+        drive = concatenate_runs(dataset, pause=pause)
         by_hand = composed_by_hand(dataset.trajectories)
         np.testing.assert_allclose(
-            [homogeneous(pose) for pose in chain.starts], [each[0] for each in by_hand], atol=1e-9
+            [homogeneous(pose) for pose in drive.start_poses], [each[0] for each in by_hand], atol=1e-9
         )
         measured = [by_hand[0], *(each[1:] for each in by_hand[1:])]
-        found = [homogeneous(pose) for pose in chain.slam_poses]
+        found = [homogeneous(pose) for pose in drive.slam_poses]
         np.testing.assert_allclose(found, np.concatenate(measured), atol=1e-9)
 
     @given(seeds)
     def test_their_times_are_those_of_the_runs_after_the_runs_begin(self, seed: int) -> None:
         dataset = random_dataset(seed)
-        chain = chain_runs(dataset)
+        drive = concatenate_runs(dataset)
         first, *others = dataset.trajectories
-        expected = [chain.begins[0] + first.pose_times]
-        expected += [begin + run.pose_times[1:] for begin, run in zip(chain.begins[1:], others, strict=True)]
-        np.testing.assert_allclose(chain.slam_times, np.concatenate(expected), atol=1e-12)
-        assert (np.diff(chain.slam_times) > 0).all()
+        expected = [drive.start_times[0] + first.pose_times]
+        expected += [begin + run.pose_times[1:] for begin, run in zip(drive.start_times[1:], others, strict=True)]
+        np.testing.assert_allclose(drive.slam_times, np.concatenate(expected), atol=1e-12)
+        assert (np.diff(drive.slam_times) > 0).all()
 
     @given(seeds)
     def test_headings_turn_on_without_a_leap(self, seed: int) -> None:
@@ -75,9 +81,9 @@ class TestPoses:
         wrapped = (poses[:, 2] + np.pi) % (2 * np.pi) - np.pi
         spun = replace(runs[0], rates=rates, poses=np.column_stack([poses[:, :2], wrapped]))
         dataset = make_dataset("spun", ROBOT, PERIOD, [spun, *runs[1:]])
-        chain = chain_runs(dataset)
+        drive = concatenate_runs(dataset)
         turned = np.concatenate([np.diff(run.poses[:, 2]) for run in dataset.trajectories])
-        np.testing.assert_allclose(np.diff(chain.slam_poses[:, 2]), turned, atol=1e-9)
+        np.testing.assert_allclose(np.diff(drive.slam_poses[:, 2]), turned, atol=1e-9)
 
     def test_covariances_turn_with_their_runs(self) -> None:
         rng = np.random.default_rng(1)
@@ -87,34 +93,38 @@ class TestPoses:
             replace(run, pose_covariances=half @ np.swapaxes(half, 1, 2))
             for run, half in zip(runs, halves, strict=True)
         ]
-        chain = chain_runs(make_dataset("covariances", ROBOT, PERIOD, runs))
-        assert chain.slam_covariances is not None
+        drive = concatenate_runs(make_dataset("covariances", ROBOT, PERIOD, runs))
+        assert drive.slam_covariances is not None
         last = runs[2]
-        turn = homogeneous(np.array([0.0, 0.0, chain.starts[2, 2] - last.poses[0, 2]]))
+        turn = homogeneous(np.array([0.0, 0.0, drive.start_poses[2, 2] - last.poses[0, 2]]))
         assert last.pose_covariances is not None
         expected = turn @ last.pose_covariances[1:] @ turn.T
-        np.testing.assert_allclose(chain.slam_covariances[chain.slam_run == 2], expected, atol=1e-12)
+        np.testing.assert_allclose(drive.slam_covariances[drive.slam_run == 2], expected, atol=1e-12)
 
     def test_covariances_that_one_run_lacks_are_those_of_none(self) -> None:
         first, second = random_dataset(1, 2).trajectories
         first = replace(first, pose_covariances=np.tile(np.eye(3), (len(first.poses), 1, 1)))
-        assert chain_runs(make_dataset("mixed", ROBOT, PERIOD, [first, second])).slam_covariances is None
+        assert concatenate_runs(make_dataset("mixed", ROBOT, PERIOD, [first, second])).slam_covariances is None
 
     @given(seeds)
-    def test_anchors_say_where_runs_start(self, seed: int) -> None:
+    def test_start_poses_can_be_given(self, seed: int) -> None:
         dataset = random_dataset(seed)
-        anchors = np.random.default_rng(seed).normal(0.0, 3.0, (3, 3))
-        chain = chain_runs(dataset, anchors=anchors)
+        start_poses = np.random.default_rng(seed).normal(0.0, 3.0, (3, 3))
+        drive = concatenate_runs(dataset, start_poses=start_poses)
         for index, run in enumerate(dataset.trajectories):
-            np.testing.assert_allclose(homogeneous(chain.starts[index]), homogeneous(anchors[index]), atol=1e-9)
-            poses = np.vstack([chain.starts[index], chain.slam_poses[chain.slam_run == index][-len(run.poses) + 1 :]])
+            np.testing.assert_allclose(
+                homogeneous(drive.start_poses[index]), homogeneous(start_poses[index]), atol=1e-9
+            )
+            poses = np.vstack(
+                [drive.start_poses[index], drive.slam_poses[drive.slam_run == index][-len(run.poses) + 1 :]]
+            )
             np.testing.assert_allclose(motions(poses), motions(run.poses), atol=1e-9)
 
-    def test_wrapped_headings_of_anchors_are_put_right(self) -> None:
+    def test_wrapped_headings_of_start_poses_are_unwrapped(self) -> None:
         dataset = random_dataset(3, 5)
-        anchors = chain_runs(dataset).starts
-        wrapped = anchors + 2 * np.pi * np.array([0, 3, -2, 0, 1])[:, None] * [0, 0, 1]
-        np.testing.assert_allclose(chain_runs(dataset, anchors=wrapped).starts, anchors, atol=1e-12)
+        start_poses = concatenate_runs(dataset).start_poses
+        wrapped = start_poses + 2 * np.pi * np.array([0, 3, -2, 0, 1])[:, None] * [0, 0, 1]
+        np.testing.assert_allclose(concatenate_runs(dataset, start_poses=wrapped).start_poses, start_poses, atol=1e-12)
 
 
 class TestWheels:
@@ -125,9 +135,9 @@ class TestWheels:
         for run in random_dataset(seed).trajectories:
             driven = np.cumsum(run.rates * np.diff(run.times, prepend=0.0)[:, None], axis=0)
             runs.append(replace(run, angles=driven + rng.normal(0.0, 100.0, 3)))
-        chain = chain_runs(make_dataset("counters", ROBOT, PERIOD, runs), pause=pause)
-        durations = np.diff(chain.wheel_times)[:, None]
-        np.testing.assert_allclose(np.diff(chain.angles, axis=0), chain.rates[1:] * durations, atol=1e-10)
+        drive = concatenate_runs(make_dataset("counters", ROBOT, PERIOD, runs), pause=pause)
+        durations = np.diff(drive.wheel_times)[:, None]
+        np.testing.assert_allclose(np.diff(drive.angles, axis=0), drive.rates[1:] * durations, atol=1e-10)
 
     def test_recorded_angles_are_kept_where_they_differ_from_the_rates(self) -> None:
         tick = 0.01
@@ -135,46 +145,46 @@ class TestWheels:
         for run in random_dataset(2, 2).trajectories:
             driven = np.cumsum(run.rates * np.diff(run.times, prepend=0.0)[:, None], axis=0)
             runs.append(replace(run, angles=5.0 + tick * np.round(driven / tick)))
-        chain = chain_runs(make_dataset("ticks", ROBOT, PERIOD, runs), pause=0.0)
+        drive = concatenate_runs(make_dataset("ticks", ROBOT, PERIOD, runs), pause=0.0)
         for index, run in enumerate(runs):
             assert run.angles is not None
-            found = chain.angles[chain.run == index][-len(run.times) :]
+            found = drive.angles[drive.run == index][-len(run.times) :]
             np.testing.assert_allclose(np.diff(found, axis=0), np.diff(run.angles, axis=0), atol=1e-12)
 
     def test_angles_are_integrated_rates_where_none_are_recorded(self) -> None:
         dataset = random_dataset(4)
-        chain = chain_runs(dataset)
-        np.testing.assert_array_equal(chain.angles[0], np.zeros(3))
+        drive = concatenate_runs(dataset)
+        np.testing.assert_array_equal(drive.angles[0], np.zeros(3))
         driven = [run.rates.T @ np.diff(run.times, prepend=0.0) for run in dataset.trajectories]
-        np.testing.assert_allclose(chain.angles[-1], np.sum(driven, axis=0), atol=1e-10)
+        np.testing.assert_allclose(drive.angles[-1], np.sum(driven, axis=0), atol=1e-10)
 
     @given(seeds, st.integers(1, 5), pauses)
-    def test_odometry_of_the_chain_is_that_of_the_runs_composed(self, seed: int, count: int, pause: float) -> None:
+    def test_odometry_of_the_drive_is_that_of_the_runs_composed(self, seed: int, count: int, pause: float) -> None:
         dataset = random_dataset(seed, count)
-        chain = chain_runs(dataset, pause=pause)
-        at = homogeneous(chain.starts[0])
+        drive = concatenate_runs(dataset, pause=pause)
+        at = homogeneous(drive.start_poses[0])
         for run, odometry in zip(
             dataset.trajectories, MODEL.poses([t.final_log for t in dataset.trajectories]), strict=True
         ):
             at = at @ np.linalg.inv(homogeneous(run.start)) @ homogeneous(odometry[0])
-        (poses,) = MODEL.poses([chain.log()])
+        (poses,) = MODEL.poses([drive.log()])
         np.testing.assert_allclose(homogeneous(poses[-1]), at, atol=1e-9)
-        np.testing.assert_array_equal(poses[0], chain.starts[0])
+        np.testing.assert_array_equal(poses[0], drive.start_poses[0])
 
     def test_the_robot_rests_between_runs_at_the_sample_period(self) -> None:
-        chain = chain_runs(random_dataset(5, 2), pause=0.5)
-        between = (chain.wheel_times > 0.8 + 1e-9) & (chain.wheel_times <= chain.begins[1] + 1e-9)
+        drive = concatenate_runs(random_dataset(5, 2), pause=0.5)
+        between = (drive.wheel_times > 0.8 + 1e-9) & (drive.wheel_times <= drive.start_times[1] + 1e-9)
         assert np.count_nonzero(between) == 25
-        assert chain.begins[1] == pytest.approx(0.8 + 0.5)
-        assert (chain.rates[between] == 0).all()
-        assert (np.ptp(chain.angles[between], axis=0) == 0).all()
-        assert (chain.run[between] == 0).all()
-        np.testing.assert_allclose(np.diff(chain.wheel_times), PERIOD, atol=1e-9)
+        assert drive.start_times[1] == pytest.approx(0.8 + 0.5)
+        assert (drive.rates[between] == 0).all()
+        assert (np.ptp(drive.angles[between], axis=0) == 0).all()
+        assert (drive.run[between] == 0).all()
+        np.testing.assert_allclose(np.diff(drive.wheel_times), PERIOD, atol=1e-9)
 
     def test_the_drive_ends_with_its_last_run(self) -> None:
-        chain = chain_runs(random_dataset(6, 2))
-        assert chain.duration == pytest.approx(0.8 + 1.0 + 0.8)
-        assert chain.rates[-1].any()
+        drive = concatenate_runs(random_dataset(6, 2))
+        assert drive.duration == pytest.approx(0.8 + 1.0 + 0.8)
+        assert drive.rates[-1].any()
 
     @given(seeds, st.integers(1, 24).map(lambda eighths: eighths / 8) | st.just(1 + 1e-5))
     def test_what_wheels_do_after_the_last_reference_pose_is_left_out(self, seed: int, late: float) -> None:
@@ -185,37 +195,37 @@ class TestWheels:
         driven = [np.cumsum(run.rates * PERIOD, axis=0) for run in runs]
         runs = [replace(run, angles=angles) for run, angles in zip(runs, driven, strict=True)]
         dataset = make_dataset("tail", ROBOT, PERIOD, runs)
-        chain = chain_runs(dataset, pause=0.0)
-        assert chain.begins[1] == pytest.approx(runs[0].pose_times[-1])
-        at = homogeneous(chain.starts[0])
+        drive = concatenate_runs(dataset, pause=0.0)
+        assert drive.start_times[1] == pytest.approx(runs[0].pose_times[-1])
+        at = homogeneous(drive.start_poses[0])
         for run, odometry in zip(runs, MODEL.poses([run.final_log for run in runs]), strict=True):
             at = at @ np.linalg.inv(homogeneous(run.start)) @ homogeneous(odometry[0])
-        (poses,) = MODEL.poses([chain.log()])
+        (poses,) = MODEL.poses([drive.log()])
         np.testing.assert_allclose(homogeneous(poses[-1]), at, atol=1e-9)
-        durations = np.diff(chain.wheel_times)[:, None]
-        np.testing.assert_allclose(np.diff(chain.angles, axis=0), chain.rates[1:] * durations, atol=1e-10)
+        durations = np.diff(drive.wheel_times)[:, None]
+        np.testing.assert_allclose(np.diff(drive.angles, axis=0), drive.rates[1:] * durations, atol=1e-10)
 
     def test_wheels_rest_until_a_last_reference_pose_that_is_later(self) -> None:
         rng = np.random.default_rng(7)
         run = random_run("late", rng)
         late = replace(run, pose_times=np.append(run.pose_times[:-1], 0.85))
-        chain = chain_runs(make_dataset("late", ROBOT, PERIOD, [late, random_run("next", rng)]), pause=0.0)
-        assert chain.begins[1] == pytest.approx(0.86)
-        assert (np.diff(chain.slam_times) > 0).all()
+        drive = concatenate_runs(make_dataset("late", ROBOT, PERIOD, [late, random_run("next", rng)]), pause=0.0)
+        assert drive.start_times[1] == pytest.approx(0.86)
+        assert (np.diff(drive.slam_times) > 0).all()
 
     def test_two_hundred_thousand_samples_take_less_than_a_second(self) -> None:
         rng = np.random.default_rng(8)
         dataset = make_dataset("long", ROBOT, PERIOD, [random_run(f"{n}", rng, samples=500) for n in range(400)])
         begin = time.perf_counter()
-        chain = chain_runs(dataset, pause=0.1)
+        drive = concatenate_runs(dataset, pause=0.1)
         assert time.perf_counter() - begin < 1.0
-        assert len(chain.wheel_times) > 200_000
+        assert len(drive.wheel_times) > 200_000
 
 
 class TestOrder:
     @staticmethod
     def ids(*runs: Trajectory, split: str | None = None) -> tuple[str, ...]:
-        return chain_runs(make_dataset("order", ROBOT, PERIOD, runs), split=split).ids
+        return concatenate_runs(make_dataset("order", ROBOT, PERIOD, runs), split=split).ids
 
     @staticmethod
     def run(name: str, **known: object) -> Trajectory:
@@ -239,90 +249,92 @@ class TestOrder:
 class TestTruth:
     def test_without_noise_the_reference_is_the_truth(self) -> None:
         recording = simulated_recording()
-        chain = chain_runs(recording.dataset)
-        truth = chained_truth(chain, recording)
-        at = np.searchsorted(chain.wheel_times, chain.slam_times - 1e-6)
-        np.testing.assert_allclose(chain.slam_poses, truth[at], atol=1e-9)
+        drive = concatenate_runs(recording.dataset)
+        truth = concatenated_truth(drive, recording)
+        at = np.searchsorted(drive.wheel_times, drive.slam_times - 1e-6)
+        np.testing.assert_allclose(drive.slam_poses, truth[at], atol=1e-9)
 
-    def test_without_noise_the_anchors_of_the_truth_are_those_of_the_reference(self) -> None:
+    def test_without_noise_the_true_start_poses_are_those_of_the_reference(self) -> None:
         recording = simulated_recording()
-        np.testing.assert_allclose(true_anchors(recording), chain_runs(recording.dataset).starts, atol=1e-9)
+        np.testing.assert_allclose(
+            true_start_poses(recording), concatenate_runs(recording.dataset).start_poses, atol=1e-9
+        )
 
-    def test_on_its_anchors_the_truth_goes_on_without_a_leap(self) -> None:
+    def test_with_true_start_poses_the_truth_goes_on_without_a_jump(self) -> None:
         recording = simulated_recording(EncoderNoise(bias_position=0.1, bias_heading=0.1, encoder=0.1))
-        chain = chain_recording(recording)
-        steps = np.diff(chained_truth(chain, recording), axis=0)
+        drive = concatenate_recording(recording)
+        steps = np.diff(concatenated_truth(drive, recording), axis=0)
         assert np.hypot(steps[:, 0], steps[:, 1]).max() < 1.1 * 0.3 * 0.01
-        assert (steps[chain.rates[1:].any(axis=1) == 0] == 0).all()
+        assert (steps[drive.rates[1:].any(axis=1) == 0] == 0).all()
 
-    def test_on_its_anchors_the_truth_is_what_the_robots_own_matrix_drives(self) -> None:
+    def test_with_true_start_poses_the_truth_is_what_the_robots_own_matrix_drives(self) -> None:
         recording = simulated_recording(EncoderNoise(bias_position=0.1, bias_heading=0.1))
-        chain = chain_recording(recording)  # without noise of the encoders their rates are the targets
+        drive = concatenate_recording(recording)  # without noise of the encoders their rates are the targets
         assert recording.truth is not None
         model = OdometryModel(ROBOT, np.array(recording.truth.matrix), recording.truth.integration)
-        (poses,) = model.poses([chain.log()])
-        np.testing.assert_allclose(chained_truth(chain, recording), poses, atol=1e-9)
+        (poses,) = model.poses([drive.log()])
+        np.testing.assert_allclose(concatenated_truth(drive, recording), poses, atol=1e-9)
 
-    def test_on_its_anchors_the_reference_errs_as_the_noise_says_and_does_not_drift(self) -> None:
+    def test_with_true_start_poses_the_reference_errs_as_the_noise_says_and_does_not_drift(self) -> None:
         noise = EncoderNoise(pose_position=0.02, pose_heading=0.01, bias_position=0.03)
         recording = simulated_recording(noise, repetitions=60)
-        chain = chain_recording(recording)
-        truth = chained_truth(chain, recording)
-        error = (chain.slam_poses - truth[np.searchsorted(chain.wheel_times, chain.slam_times - 1e-6)])[1:]
+        drive = concatenate_recording(recording)
+        truth = concatenated_truth(drive, recording)
+        error = (drive.slam_poses - truth[np.searchsorted(drive.wheel_times, drive.slam_times - 1e-6)])[1:]
         assert np.sqrt((error[:, :2] ** 2).mean()) == pytest.approx(np.hypot(0.02, 0.03), rel=0.1)
         assert np.sqrt((error[:, 2] ** 2).mean()) == pytest.approx(0.01, rel=0.1)
         third = len(error) // 3
         assert np.abs(error[-third:, :2]).mean() < 1.3 * np.abs(error[:third, :2]).mean()
 
-    def test_without_anchors_each_run_of_the_truth_starts_where_the_chain_puts_it(self) -> None:
+    def test_without_true_start_poses_each_run_of_the_truth_starts_where_the_drive_puts_it(self) -> None:
         recording = simulated_recording(EncoderNoise(bias_position=0.1, bias_heading=0.1))
-        chain = chain_runs(recording.dataset, pause=0.0)
-        truth = chained_truth(chain, recording)
+        drive = concatenate_runs(recording.dataset, pause=0.0)
+        truth = concatenated_truth(drive, recording)
         assert recording.truth is not None
         model = OdometryModel(ROBOT, np.array(recording.truth.matrix), recording.truth.integration)
         for index, run in enumerate(recording.dataset.trajectories):
             assert run.targets is not None
-            log = WheelLog(run.times, run.targets, chain.starts[index], run.times)
-            found = truth[chain.run == index][-len(run.times) :]
+            log = WheelLog(run.times, run.targets, drive.start_poses[index], run.times)
+            found = truth[drive.run == index][-len(run.times) :]
             np.testing.assert_allclose(found, model.poses([log])[0], atol=1e-9)
 
     def test_a_split_has_its_own_truth(self) -> None:
         recording = simulated_recording()
         first, *others = recording.dataset.trajectories
         mixed = make_dataset("mixed", ROBOT, 0.01, [replace(first, split="validation"), *others])
-        chain = chain_recording(Recording(mixed, recording.truth), split="train")
-        assert len(chain.starts) == len(others)
-        assert len(chained_truth(chain, Recording(mixed, recording.truth))) == len(chain.wheel_times)
+        drive = concatenate_recording(Recording(mixed, recording.truth), split="train")
+        assert len(drive.start_poses) == len(others)
+        assert len(concatenated_truth(drive, Recording(mixed, recording.truth))) == len(drive.wheel_times)
 
     def test_a_recording_whose_truth_is_not_known_says_so(self) -> None:
         recording = Recording(random_dataset(1))
         with pytest.raises(DataError, match="data set random: its truth is not known; simulate it from"):
-            true_anchors(recording)
+            true_start_poses(recording)
         with pytest.raises(DataError, match="its truth is not known"):
-            chained_truth(chain_recording(recording), recording)
+            concatenated_truth(concatenate_recording(recording), recording)
 
 
 class TestMistakes:
     def test_a_split_without_runs_is_named(self) -> None:
         with pytest.raises(DataError, match="data set random: no run in its split 'validation'"):
-            chain_runs(random_dataset(1), split="validation")
+            concatenate_runs(random_dataset(1), split="validation")
 
     def test_a_run_with_a_single_pose_is_named(self) -> None:
         run = random_run("lonely", np.random.default_rng(1))
         lonely = replace(run, pose_times=run.pose_times[:1], poses=run.poses[:1])
         dataset = Dataset("one pose", ROBOT, PERIOD, (lonely,))
         with pytest.raises(DataError, match="data set one pose: run lonely has a single reference pose"):
-            chain_runs(dataset)
+            concatenate_runs(dataset)
 
-    @pytest.mark.parametrize("anchors", [np.zeros((2, 3)), np.zeros(3), np.full((3, 3), np.nan)])
-    def test_anchors_that_cannot_be_are_refused(self, anchors: Array) -> None:
-        with pytest.raises(DataError, match=r"anchors have shape .*, expected \(3, 3\), finite"):
-            chain_runs(random_dataset(1), anchors=anchors)
+    @pytest.mark.parametrize("start_poses", [np.zeros((2, 3)), np.zeros(3), np.full((3, 3), np.nan)])
+    def test_start_poses_of_another_shape_are_refused(self, start_poses: Array) -> None:
+        with pytest.raises(DataError, match=r"start poses have shape .*, expected \(3, 3\), finite"):
+            concatenate_runs(random_dataset(1), start_poses=start_poses)
 
     @pytest.mark.parametrize("pause", [-1.0, np.nan, np.inf, 1e9])
     def test_a_pause_that_cannot_be_is_refused(self, pause: float) -> None:
         with pytest.raises(ConfigError, match=r"pause: .* s between runs is not within 0 and 3600 s"):
-            chain_runs(random_dataset(1), pause=pause)
+            concatenate_runs(random_dataset(1), pause=pause)
 
 
 @pytest.fixture(scope="module")
@@ -331,24 +343,24 @@ def omni3() -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def chain(omni3: Dataset) -> Chain:
-    return chain_runs(omni3)
+def drive(omni3: Dataset) -> ConcatenatedDrive:
+    return concatenate_runs(omni3)
 
 
 @pytest.mark.skipif(not OMNI3.is_dir(), reason=f"the OptiOdom recordings are not at {OMNI3}")
 class TestRealRecordings:
-    def test_all_runs_are_chained_session_by_session(self, omni3: Dataset, chain: Chain) -> None:
+    def test_all_runs_are_concatenated_session_by_session(self, omni3: Dataset, drive: ConcatenatedDrive) -> None:
         sessions = {run.id: run.session for run in omni3.trajectories}
-        order = [sessions[each] for each in chain.ids]
+        order = [sessions[each] for each in drive.ids]
         assert len(order) == 67
         assert sum(before != after for before, after in pairwise(order)) == len(set(order)) - 1
 
-    def test_wheel_angles_and_rates_tell_the_same_motion(self, chain: Chain) -> None:
-        driven = chain.rates[1:] * np.diff(chain.wheel_times)[:, None]
-        np.testing.assert_allclose(np.diff(chain.angles, axis=0), driven, atol=1e-9)
-        assert (np.diff(chain.wheel_times) > 0).all()
+    def test_wheel_angles_and_rates_tell_the_same_motion(self, drive: ConcatenatedDrive) -> None:
+        driven = drive.rates[1:] * np.diff(drive.wheel_times)[:, None]
+        np.testing.assert_allclose(np.diff(drive.angles, axis=0), driven, atol=1e-9)
+        assert (np.diff(drive.wheel_times) > 0).all()
 
-    def test_reference_poses_are_those_composed_by_hand(self, omni3: Dataset, chain: Chain) -> None:
+    def test_reference_poses_are_those_composed_by_hand(self, omni3: Dataset, drive: ConcatenatedDrive) -> None:
         known = {run.id: run for run in omni3.trajectories}
-        by_hand = composed_by_hand(tuple(known[each] for each in chain.ids))
-        np.testing.assert_allclose(homogeneous(chain.slam_poses[-1]), by_hand[-1][-1], atol=1e-8)
+        by_hand = composed_by_hand(tuple(known[each] for each in drive.ids))
+        np.testing.assert_allclose(homogeneous(drive.slam_poses[-1]), by_hand[-1][-1], atol=1e-8)

@@ -21,7 +21,7 @@ from sessions import Loopback, until
 
 from omnibench.config import parse_yaml, to_yaml, validate
 from omnibench.errors import ConfigError
-from omnibench.live.replay.concatenated_drive import Chain, chain_runs
+from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_runs
 from omnibench.live.replay.replay_player import Event, Player, PlayReport, Progress, ReplayConfig, events
 from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 from omnibench.live.wire.topics import GraphNode, KeySpace, Profile
@@ -29,7 +29,7 @@ from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
 ORIGIN = 1_700_000_000_000_000_000
-CHAIN = chain_runs(random_dataset(1))  # 2.4 s of motion and 2 s of rest, a pose every 0.1 s
+DRIVE = concatenate_runs(random_dataset(1))  # 2.4 s of motion and 2 s of rest, a pose every 0.1 s
 TOPICS = ("joint_states", "slam_pose")
 
 
@@ -37,8 +37,8 @@ def config(**changes: Any) -> ReplayConfig:
     return validate(ReplayConfig, {"stamp_origin": ORIGIN} | changes, "test")
 
 
-def played(chain: Chain = CHAIN, *, noise: Noise | None = None, **changes: Any) -> list[Event]:
-    return list(events(chain, config(**changes), noise=noise))
+def played(drive: ConcatenatedDrive = DRIVE, *, noise: Noise | None = None, **changes: Any) -> list[Event]:
+    return list(events(drive, config(**changes), noise=noise))
 
 
 def of(found: list[Event], topic: str) -> list[Event]:
@@ -91,20 +91,20 @@ class TestEvents:
             assert (np.diff([each.message.stamp for each in messages]) > 0).all()
             np.testing.assert_allclose(arrivals(messages) - taken(messages), delay, atol=1e-8)
 
-    def test_every_sample_and_pose_of_the_chain_is_there(self) -> None:
+    def test_every_sample_and_pose_of_the_drive_is_there(self) -> None:
         found = played(slam={"period": 0})
         samples, poses = of(found, "joint_states"), of(found, "slam_pose")
         poses.sort(key=lambda each: each.message.stamp)
-        np.testing.assert_allclose(taken(samples), CHAIN.wheel_times, atol=1e-9)
-        np.testing.assert_array_equal([each.message.positions for each in samples], CHAIN.angles)
-        np.testing.assert_array_equal([each.message.velocities for each in samples], CHAIN.rates)
-        np.testing.assert_allclose(taken(poses), CHAIN.slam_times, atol=1e-9)
-        np.testing.assert_array_equal([each.message.pose for each in poses], CHAIN.slam_poses)
+        np.testing.assert_allclose(taken(samples), DRIVE.wheel_times, atol=1e-9)
+        np.testing.assert_array_equal([each.message.positions for each in samples], DRIVE.angles)
+        np.testing.assert_array_equal([each.message.velocities for each in samples], DRIVE.rates)
+        np.testing.assert_allclose(taken(poses), DRIVE.slam_times, atol=1e-9)
+        np.testing.assert_array_equal([each.message.pose for each in poses], DRIVE.slam_poses)
         assert {each.message.frame for each in poses} == {"map"}
 
     def test_jitter_is_half_normal(self) -> None:
         times = 0.01 * np.arange(20_000.0)
-        long = replace(CHAIN, wheel_times=times, angles=np.zeros((20_000, 3)), rates=np.zeros((20_000, 3)))
+        long = replace(DRIVE, wheel_times=times, angles=np.zeros((20_000, 3)), rates=np.zeros((20_000, 3)))
         samples = of(played(long, wheels={"delay": 1.0, "jitter": 0.05}), "joint_states")
         late = arrivals(samples) - taken(samples) - 1.0
         assert late.min() > -1e-9
@@ -114,18 +114,18 @@ class TestEvents:
     def test_jitter_of_more_than_the_period_brings_wheel_samples_out_of_order(self) -> None:
         stamps = np.array([each.message.stamp for each in of(played(wheels={"jitter": 0.05}), "joint_states")])
         assert np.count_nonzero(np.diff(stamps) < 0) > 10
-        assert len(np.unique(stamps)) == len(CHAIN.wheel_times)
+        assert len(np.unique(stamps)) == len(DRIVE.wheel_times)
 
     def test_the_share_to_drop_is_dropped(self) -> None:
         samples = of(played(wheels={"drop": 0.3}), "joint_states")
-        assert len(samples) == pytest.approx(0.7 * len(CHAIN.wheel_times), rel=0.2)
+        assert len(samples) == pytest.approx(0.7 * len(DRIVE.wheel_times), rel=0.2)
         assert of(played(slam={"drop": 1}), "slam_pose") == []
 
     def test_the_share_to_duplicate_comes_twice_with_the_same_content(self) -> None:
         samples = of(played(wheels={"duplicate": 0.3, "jitter": 0.05}), "joint_states")
         counts = Counter(each.message.stamp for each in samples)
         assert set(counts.values()) == {1, 2}
-        assert sum(count == 2 for count in counts.values()) == pytest.approx(0.3 * len(CHAIN.wheel_times), rel=0.25)
+        assert sum(count == 2 for count in counts.values()) == pytest.approx(0.3 * len(DRIVE.wheel_times), rel=0.25)
         stamp = next(stamp for stamp, count in counts.items() if count == 2)
         first, second = (each for each in samples if each.message.stamp == stamp)
         assert same(first.message, second.message)
@@ -152,7 +152,7 @@ class TestEvents:
         assert times[0] == 0
         assert (np.diff(times) >= period - 1e-6).all()
         for before, after in pairwise(times):  # the next one is the first that was far enough
-            assert after == pytest.approx(CHAIN.slam_times[CHAIN.slam_times >= before + period - 1e-6][0])
+            assert after == pytest.approx(DRIVE.slam_times[DRIVE.slam_times >= before + period - 1e-6][0])
 
     @pytest.mark.parametrize(("use", "held"), [("positions", (1, 0)), ("velocities", (0, 1)), ("both", (1, 1))])
     def test_wheel_messages_hold_what_is_asked_for(self, use: str, held: tuple[int, int]) -> None:
@@ -160,32 +160,32 @@ class TestEvents:
         assert {(m.positions is not None, m.velocities is not None) for m in messages} == {held}
 
     def test_joints_are_the_robots_wheels_or_as_named(self) -> None:
-        assert next(events(CHAIN, config())).message.names == ("a", "b", "c")
-        named = next(events(CHAIN, config(), names=("left", "right", "rear")))
+        assert next(events(DRIVE, config())).message.names == ("a", "b", "c")
+        named = next(events(DRIVE, config(), names=("left", "right", "rear")))
         assert named.message.names == ("left", "right", "rear")
 
     @pytest.mark.parametrize("names", [("left", "right"), ("left", "left", "rear"), ()])
     def test_names_that_are_not_one_for_each_wheel_are_refused(self, names: tuple[str, ...]) -> None:
         with pytest.raises(ConfigError, match="give each of the wheels a, b, c a name"):
-            events(CHAIN, config(), names=names)
+            events(DRIVE, config(), names=names)
 
     def test_stamps_begin_with_the_time_of_the_replay_unless_told(self) -> None:
         before = time.time_ns()
-        first = next(events(CHAIN, ReplayConfig()))
+        first = next(events(DRIVE, ReplayConfig()))
         assert before <= first.message.stamp <= time.time_ns()
-        assert next(events(CHAIN, config(), origin=5)).message.stamp == 5
+        assert next(events(DRIVE, config(), origin=5)).message.stamp == 5
 
 
 class TestCovariances:
     @staticmethod
-    def covariances(chain: Chain = CHAIN, noise: Noise | None = None, **slam: Any) -> Array:
-        found = of(played(chain, noise=noise, slam={"period": 0, "jitter": 0} | slam), "slam_pose")
+    def covariances(drive: ConcatenatedDrive = DRIVE, noise: Noise | None = None, **slam: Any) -> Array:
+        found = of(played(drive, noise=noise, slam={"period": 0, "jitter": 0} | slam), "slam_pose")
         return np.array([each.message.covariance for each in found])
 
     def test_those_of_the_data_set_come_first(self) -> None:
-        recorded = np.random.default_rng(1).normal(size=(len(CHAIN.slam_times), 3, 3))
+        recorded = np.random.default_rng(1).normal(size=(len(DRIVE.slam_times), 3, 3))
         found = self.covariances(
-            replace(CHAIN, slam_covariances=recorded), Noise(pose_position=1), covariance={"position": 1, "heading": 1}
+            replace(DRIVE, slam_covariances=recorded), Noise(pose_position=1), covariance={"position": 1, "heading": 1}
         )
         np.testing.assert_array_equal(found, recorded)
 
@@ -203,7 +203,7 @@ class TestCovariances:
             walk_heading=0.1,
         )
         found = self.covariances(noise=noise)
-        since = CHAIN.slam_times - CHAIN.begins[CHAIN.slam_run]
+        since = DRIVE.slam_times - DRIVE.start_times[DRIVE.slam_run]
         assert since.max() == pytest.approx(0.8)
         np.testing.assert_allclose(found[:, 0, 0], 0.0025 + 0.0004 * since)
         np.testing.assert_allclose(found[:, 1, 1], found[:, 0, 0])
@@ -273,8 +273,8 @@ class Listener:
         return take
 
 
-def player(loopback: Loopback, chain: Chain = CHAIN, profile: Profile = "plain", **changes: Any) -> Player:
-    return Player(GraphNode(loopback.client(), KeySpace(profile), "replay"), "apr02", chain, config(**changes))
+def player(loopback: Loopback, drive: ConcatenatedDrive = DRIVE, profile: Profile = "plain", **changes: Any) -> Player:
+    return Player(GraphNode(loopback.client(), KeySpace(profile), "replay"), "apr02", drive, config(**changes))
 
 
 class TestPlayer:
@@ -305,8 +305,8 @@ class TestPlayer:
 
     def test_twenty_times_the_speed_takes_a_twentieth_of_the_time(self, loopback: Loopback) -> None:
         node = Listener(loopback)
-        chain = chain_runs(random_dataset(2, 5), pause=3.0)
-        report = player(loopback, chain, speed=20).play()
+        drive = concatenate_runs(random_dataset(2, 5), pause=3.0)
+        report = player(loopback, drive, speed=20).play()
         until(lambda: node.count == report.total, "all messages")
         assert report.wall_seconds == pytest.approx(report.data_seconds / 20, rel=0.1)
 
@@ -326,8 +326,8 @@ class TestPlayer:
 
     def test_nothing_is_lost_at_the_highest_speed_on_a_subscriber_that_stalls(self, loopback: Loopback) -> None:
         node = Listener(loopback, stall=1.5)  # in which the buffers on the way fill up, with some 25,000 messages
-        chain = chain_runs(random_dataset(3, 10, samples=5000), pause=0.1)
-        report = player(loopback, chain, speed="max").play()
+        drive = concatenate_runs(random_dataset(3, 10, samples=5000), pause=0.1)
+        report = player(loopback, drive, speed="max").play()
         assert report.complete
         assert report.total > 50_000
         until(lambda: node.count == report.total, "all messages", 30)
@@ -337,8 +337,8 @@ class TestPlayer:
     def test_nothing_is_lost_when_the_session_closes_right_after(self, loopback: Loopback) -> None:
         node = Listener(loopback, work=2e-5)
         session = loopback.client()
-        chain = chain_runs(random_dataset(4, 5, samples=1000))
-        report = Player(GraphNode(session, KeySpace(), "replay"), "apr02", chain, config(speed="max")).play()
+        drive = concatenate_runs(random_dataset(4, 5, samples=1000))
+        report = Player(GraphNode(session, KeySpace(), "replay"), "apr02", drive, config(speed="max")).play()
         session.close()
         until(lambda: node.count == report.total, "all messages", 30)
 
@@ -373,7 +373,7 @@ class TestPlayer:
 
     def test_a_robot_that_cannot_be_part_of_a_key_is_refused(self, loopback: Loopback) -> None:
         with pytest.raises(ConfigError, match="robot 'a/\\*': a robot's name is one word"):
-            Player(GraphNode(loopback.client(), KeySpace(), "replay"), "a/*", CHAIN, config())
+            Player(GraphNode(loopback.client(), KeySpace(), "replay"), "a/*", DRIVE, config())
 
 
 class TestStopping:

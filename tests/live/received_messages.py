@@ -7,7 +7,7 @@ from typing import Any
 import zenoh
 
 
-class Heard:
+class ReceivedMessages:
     """Everything that comes on some keys, decoded."""
 
     def __init__(self, session: zenoh.Session, **kinds: Any) -> None:
