@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from omnibench.live.estimation.fusion import FusionSettings
 from omnibench.live.estimation.tracker import RobotTracker
+from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.replay.arrivals import ReplayConfig
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_recording, concatenated_truth
 from omnibench.live.replay.played_recording import load_recording

@@ -15,14 +15,14 @@ from omnibench.config import Model
 from omnibench.errors import DataError, OmnibenchError
 from omnibench.live.estimation.counts import Counts
 from omnibench.live.estimation.extrapolation_monitor import MotionWatch
-from omnibench.live.estimation.fusion import Fusion, FusionSettings, Outcome
 from omnibench.live.estimation.health import FusionHealth, Health, Status, SwapRecord
 from omnibench.live.estimation.live_odometry import UNKNOWN_NOISE, LiveOdometry, Motion
 from omnibench.live.estimation.published_stamps import PublishedStamps
-from omnibench.live.estimation.reference_correction import ReferenceCorrection
 from omnibench.live.estimation.saved_state import RobotMemory, SavedState
-from omnibench.live.estimation.timeline import Entry, Fix, Timeline
 from omnibench.live.estimation.wheel_input import WheelInput, WheelSettings, WheelStep
+from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings, Outcome
+from omnibench.live.fusion.reference_correction import ReferenceCorrection
+from omnibench.live.fusion.timeline import Entry, Fix, Timeline
 from omnibench.live.wire.messages import POSE_ESTIMATE, MessageError, Odometry, Transform
 from omnibench.live.wire.robot_messages import JointStateDecoder
 from omnibench.robot.calibration import Calibration

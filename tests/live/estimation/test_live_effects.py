@@ -21,10 +21,10 @@ from recordings import random_dataset, simulated_recording
 from sessions import free_port
 
 from omnibench.config import to_yaml
-from omnibench.live.estimation.fusion import FusionSettings
 from omnibench.live.estimation.live_odometry import LiveOdometry
 from omnibench.live.estimation.tracker import RobotTracker, Update
 from omnibench.live.estimation.wheel_input import WheelStep
+from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.node import LiveNode
 from omnibench.live.replay.arrivals import ReplayConfig
 from omnibench.live.replay.concatenated_drive import concatenate_recording, concatenate_runs, concatenated_truth

@@ -13,9 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from omnibench.errors import ConfigError, DataError
-from omnibench.live.estimation.fusion import FusionSettings
 from omnibench.live.estimation.saved_state import RobotMemory
 from omnibench.live.estimation.tracker import Frames, RobotTracker, Update
+from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY, JointState
 from omnibench.robot.calibration import EffectTerm, matrix_rows
 from omnibench.robot.odometry import Integration, advance

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from drives import EXACT, ORIGIN, PERIOD, calibration, drive, slam
 
-from omnibench.live.estimation.fusion import FusionSettings
 from omnibench.live.estimation.tracker import RobotTracker, Update
+from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.robot.calibration import Calibration, EffectTerm
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import compose, moved_to

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.live.estimation.counts import Counts
-from omnibench.live.estimation.fusion import Fusion, FusionSettings
-from omnibench.live.estimation.timeline import Entry, Fix, Timeline
+from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings
+from omnibench.live.fusion.timeline import Entry, Fix, Timeline
 from omnibench.robot.odometry import advance
 
 R = np.diag([1e-4, 1e-4, 1e-4])

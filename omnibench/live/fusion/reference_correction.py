@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from omnibench.live.estimation.timeline import Fix
+from omnibench.live.fusion.timeline import Fix
 from omnibench.robot.effects.effect import ReferenceEffect, Values
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel

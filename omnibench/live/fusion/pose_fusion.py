@@ -14,10 +14,10 @@ from scipy.stats import chi2
 from omnibench.config import Model
 from omnibench.live.estimation.counts import Counts
 from omnibench.live.estimation.live_odometry import Motion
-from omnibench.live.estimation.pose_filter import PoseFilter
-from omnibench.live.estimation.reference_correction import turned
-from omnibench.live.estimation.rejections import Rejections
-from omnibench.live.estimation.timeline import Entry, Fix, Timeline
+from omnibench.live.fusion.pose_filter import PoseFilter
+from omnibench.live.fusion.reference_correction import turned
+from omnibench.live.fusion.rejections import Rejections
+from omnibench.live.fusion.timeline import Entry, Fix, Timeline
 from omnibench.robot.kinematics import Array
 
 _SECOND = 1e9  # ns

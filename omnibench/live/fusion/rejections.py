@@ -6,8 +6,8 @@ from collections import deque
 
 import numpy as np
 
-from omnibench.live.estimation.pose_filter import innovation_of
-from omnibench.live.estimation.timeline import Fix
+from omnibench.live.fusion.pose_filter import innovation_of
+from omnibench.live.fusion.timeline import Fix
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import compose, relative
 

@@ -1,0 +1,1 @@
+"""Fusion: SLAM poses and odometry brought together, each at its own time."""
