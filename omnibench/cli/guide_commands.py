@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from omnibench.errors import ConfigError
+
 guide_app = typer.Typer()
 
 _READING_WIDTH = 100  # columns: longer lines are hard to follow
+_NAME_WIDTH = 15  # columns, of the longest topic
 
 
 @guide_app.command()
@@ -25,18 +31,51 @@ def guide(
         _show(find_topic(topic).text)
 
 
+@guide_app.command()
+def example(
+    name: Annotated[str | None, typer.Argument(help="One of the list that is shown without it.")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder to write to.")] = None,
+) -> None:
+    """Write a config, with what it needs, or a small recording to begin with; or list the examples."""
+    from omnibench.cli.examples import find_example, write_example
+
+    if name is None:
+        return _list_examples()
+    chosen = find_example(name)
+    if output is None:
+        raise ConfigError(f"say where the example goes: omnibench example {name} -o DIR")
+    for path in write_example(chosen, output):
+        typer.echo(f"written: {path}")
+    if chosen.note:
+        typer.echo(f"note: {chosen.note}")
+    typer.echo("to go on, type:")
+    if output.resolve() != Path.cwd():
+        typer.echo(f"  cd {shlex.quote(str(output))}")
+    for command in chosen.commands:
+        typer.echo(f"  {command}")
+    return None
+
+
 def _list_topics() -> None:
     from omnibench.cli.handbook_topics import topics
 
     listed = topics()
-    width = max(len(topic.name) for topic in listed)
-    group = ""
-    for topic in listed:
-        if topic.group != group:
-            group = topic.group
-            typer.echo(f"\n{group}")
-        typer.echo(f"  {topic.name:{width}}  {topic.summary}")
-    typer.echo("\nread one: omnibench guide getting-started")
+    for group in dict.fromkeys(topic.group for topic in listed):
+        typer.echo(f"{group}:")
+        _print_names({topic.name: topic.summary for topic in listed if topic.group == group})
+    typer.echo("to read one, type: omnibench guide getting-started")
+
+
+def _list_examples() -> None:
+    from omnibench.cli.examples import EXAMPLES
+
+    _print_names({each.name: each.summary for each in EXAMPLES})
+    typer.echo("to write one, type: omnibench example small -o demo")
+
+
+def _print_names(summaries: Mapping[str, str]) -> None:
+    for name, summary in summaries.items():
+        typer.echo(f"  {name:{_NAME_WIDTH}}  {summary}")
 
 
 def _show(markdown: str) -> None:

@@ -1,0 +1,95 @@
+"""``omnibench example``: configs and plug-ins to begin with, wherever omnibench is installed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from commands import CONFIGS, Command, assert_refused
+from typed_commands import parse
+
+from omnibench.cli import examples
+from omnibench.cli.examples import EXAMPLES, Example, find_example, write_example
+from omnibench.compare.plan import read_compare_config
+from omnibench.errors import ConfigError
+
+TYPED = [(example, command) for example in EXAMPLES for command in example.commands]
+
+
+def test_every_example_is_listed_with_one_line(command: Command) -> None:
+    lines = command("example").stdout.splitlines()
+    assert [line.split()[0] for line in lines[:-1]] == [example.name for example in EXAMPLES]
+    assert all(len(line) <= 80 for line in lines)
+
+
+def test_every_config_of_the_repository_is_in_an_example() -> None:
+    shown = {file for example in EXAMPLES for file in example.files}
+    assert {f"configs/{file.name}" for file in CONFIGS.glob("*.yaml")} <= shown
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.name)
+def test_an_example_brings_every_file_that_its_configs_name(example: Example, tmp_path: Path) -> None:
+    written = write_example(example, tmp_path)
+    for config in (tmp_path / "configs").glob("*.yaml"):
+        content = yaml.safe_load(config.read_text(encoding="utf-8"))
+        if "calibrators" in content and config.name == Path(example.files[0]).name:
+            assert all(folder.is_dir() for folder in read_compare_config(config).plugins)
+        for robot in content.get("robots", ()):
+            assert (config.parent / robot["calibration"]).is_file()
+        if "replay" in content:
+            assert (config.parent / content["replay"]["dataset"]).is_file()
+    assert written
+
+
+@pytest.mark.parametrize(("example", "command"), TYPED, ids=lambda value: getattr(value, "name", value))
+def test_what_an_example_says_to_type_next_can_be_typed(example: Example, command: str, tmp_path: Path) -> None:
+    if not command.startswith("omnibench"):
+        return
+    parse(command)
+    write_example(example, tmp_path)
+    for word in command.split():
+        if word.startswith(("configs/", "plugins/")) and "." in word:
+            assert (tmp_path / word).is_file()
+
+
+def test_an_example_says_what_to_type_next(command: Command) -> None:
+    printed = command("example", "apr02", "-o", "demo").stdout.splitlines()
+    assert printed[-2:] == ["  cd demo", "  omnibench compare configs/apr02.yaml"]
+    assert "written: demo/plugins/cmaes.py" in printed
+
+
+def test_two_examples_share_a_folder(command: Command) -> None:
+    assert command("example", "apr02", "-o", ".").returncode == 0
+    assert command("example", "live", "-o", ".").stdout.startswith("written: configs/live.yaml\n")
+
+
+def test_a_file_that_differs_is_not_overwritten(command: Command) -> None:
+    Path("configs").mkdir()
+    Path("configs/apr02.yaml").write_text("name: mine\n", encoding="utf-8")
+    assert_refused(command("example", "apr02", "-o", "."), "configs/apr02.yaml is there already")
+    assert Path("configs/apr02.yaml").read_text(encoding="utf-8") == "name: mine\n"
+    assert not Path("plugins").exists()
+
+
+@pytest.mark.parametrize("name", ["apr02", "recording"])
+def test_an_example_that_is_there_is_not_written_again(command: Command, name: str) -> None:
+    assert command("example", name, "-o", "demo").returncode == 0
+    assert_refused(command("example", name, "-o", "demo"), "is there already", "choose another folder")
+
+
+def test_a_wrong_name_is_answered_with_the_nearest(command: Command) -> None:
+    assert_refused(command("example", "apr2", "-o", "demo"), "unknown example 'apr2'; did you mean 'apr02'?")
+
+
+def test_an_example_without_a_folder_is_refused(command: Command) -> None:
+    assert_refused(command("example", "apr02"), "omnibench example apr02 -o DIR")
+
+
+def test_an_installed_package_has_its_own_copies(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "example_files" / "configs").mkdir(parents=True)
+    (tmp_path / "example_files" / "configs" / "small.yaml").write_text("name: bundled\n", encoding="utf-8")
+    monkeypatch.setattr(examples, "__file__", str(tmp_path / "examples.py"))
+    assert write_example(find_example("small"), tmp_path / "demo") == [tmp_path / "demo" / "configs" / "small.yaml"]
+    with pytest.raises(ConfigError, match="all of the example 'small' is there already"):
+        write_example(find_example("small"), tmp_path / "demo")
