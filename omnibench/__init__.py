@@ -7,7 +7,6 @@ if TYPE_CHECKING:
     from omnibench.compare.plan import read_compare_config
     from omnibench.compare.run import run_comparison
     from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-    from omnibench.data.importer import import_dataset
     from omnibench.data.storage import load_dataset, save_dataset
     from omnibench.design.design import design_experiment
     from omnibench.discover.discover import discover_effects
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
     from omnibench.robot.export.formats import export_calibration
     from omnibench.simulate.simulate import simulate_dataset
+    from omnibench.slam.import_dataset import import_dataset
 
 __all__ = [
     "Calibration",
@@ -51,8 +51,8 @@ _HOMES = {
     "compare.plan": ("read_compare_config",),
     "compare.run": ("run_comparison",),
     "data.dataset": ("Dataset", "Trajectory", "make_dataset"),
-    "data.importer": ("import_dataset",),
     "simulate.simulate": ("simulate_dataset",),
+    "slam.import_dataset": ("import_dataset",),
     "data.storage": ("load_dataset", "save_dataset"),
     "discover.discover": ("discover_effects",),
     "errors": ("OmnibenchError",),

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from bag_samples import DRIVE, EPOCH, ROBOT, TRUTH, Drive, Sent, header
+from bag_samples import DRIVE, EPOCH, ROBOT, SLAM, TRUTH, Drive, Sent, header, part
 
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
@@ -18,6 +18,7 @@ RAYS, ANGLE_MIN, INCREMENT = 361, -0.75 * math.pi, 1.5 * math.pi / 360
 RANGE_MIN, RANGE_MAX = 0.1, 30.0
 MOUNT = (0.12, -0.03, 0.2)  # m, m, rad
 SCAN_PERIOD = 200_000_000  # ns
+SECONDS = 12.4  # two runs
 FIRST = 60_000_000  # ns, until the first scan
 
 
@@ -111,3 +112,8 @@ def tf_static(*transforms: dict[str, Any]) -> Sent:
 
 
 MOUNTED = tf_static(transform("base_link", "laser", *MOUNT))
+
+
+def without_poses(extra: Sequence[Sent] = (MOUNTED,), seconds: float = SECONDS) -> list[Sent]:
+    """The first seconds of the drive with scans, and without reference poses."""
+    return [each for each in [*part(seconds), *scans(seconds), *extra] if each.topic != SLAM]

@@ -423,8 +423,8 @@ def import_(
     plugins: Plugins = None,
 ) -> None:
     """Turn recordings into a data set."""
-    from omnibench.data.importer import import_dataset
     from omnibench.data.storage import save_dataset
+    from omnibench.slam.import_dataset import import_dataset
 
     load_given_plugins(plugins)
     importers.entry(importer, "import")

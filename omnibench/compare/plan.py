@@ -17,7 +17,6 @@ from pydantic import BaseModel
 from omnibench.compare.config import CalibratorEntry, CompareConfig, DatasetSource
 from omnibench.config import read_model, validate
 from omnibench.data.dataset import Dataset
-from omnibench.data.importer import import_dataset
 from omnibench.data.storage import load_dataset
 from omnibench.data.watch import Watch, unwatched
 from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
@@ -26,6 +25,7 @@ from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import make_parameterisation, training_split
 from omnibench.registry import PluginFailure, calibrators, costs, load_plugins
 from omnibench.simulate.simulate import simulate_dataset
+from omnibench.slam.import_dataset import import_dataset
 
 
 @dataclass(frozen=True)

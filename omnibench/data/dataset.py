@@ -79,7 +79,8 @@ class Trajectory:
 class Dataset:
     """Recordings of one robot. Make it with :func:`make_dataset`, which unwraps headings and looks for wrong units.
 
-    scans: of its laser scanner, if it has one and they were recorded.
+    scans: those of its laser scanner, if it has one and they were recorded. referenced: the poses are reference poses;
+    False: they are placeholders until ``slam_dataset`` makes poses from the scans, and the data set cannot be saved.
     """
 
     name: str
@@ -92,6 +93,7 @@ class Dataset:
     simulated: bool = False
     warnings: tuple[str, ...] = field(default=())
     scans: Scans | None = None
+    referenced: bool = True
 
     def split(self, name: Split) -> tuple[Trajectory, ...]:
         """The trajectories of one split; may be empty."""

@@ -1,19 +1,22 @@
-"""What an importer is: something that turns other people's recordings into a data set."""
+"""The contract of importers, which turn other people's recordings into data sets."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
 from omnibench.data.dataset import Dataset
-from omnibench.errors import DataError
 from omnibench.registry import Options, importers
 
 
 class Importer(ABC):
-    """Reads one kind of recording. Made with validated options."""
+    """Reader of one kind of recording, made with validated options.
+
+    An importer that also reads recordings with scans and without reference poses returns them with ``referenced=False``
+    and placeholders for poses (zeros, say). ``import_dataset`` then makes the poses by SLAM; an option ``slam`` (a
+    mapping) of the importer holds the options for it.
+    """
 
     Options: ClassVar[type[Options]] = Options
     name: ClassVar[str]
@@ -30,12 +33,3 @@ class Importer(ABC):
 
 
 importers.contract = Importer
-
-
-def import_dataset(name: str, source: Path | str, options: Mapping[str, Any] | None = None) -> Dataset:
-    """Read ``source`` with the importer called ``name``. UnknownNameError, ConfigError or DataError in one line."""
-    importer: Importer = importers.create(name, options)
-    source = Path(source)
-    if not source.exists():
-        raise DataError(f"{source}: no such file or folder")
-    return importer.read(source)

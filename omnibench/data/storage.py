@@ -86,8 +86,16 @@ def load_dataset(path: Path | str) -> Dataset:
 
 
 def save_dataset(dataset: Dataset, path: Path | str, table_format: TableFormat = "parquet") -> None:
-    """Write a data set folder. DataError when the disk refuses, or when the folder holds something else."""
+    """Write a data set folder.
+
+    DataError when the poses are placeholders, the folder holds something else, or the disk refuses.
+    """
     folder = Path(path)
+    if not dataset.referenced:
+        raise DataError(
+            f"data set {dataset.name}: it has no reference poses; make them from its scans with slam_dataset, as "
+            "omnibench.import_dataset does"
+        )
     check_dataset_folder(folder)
     tables = {
         "trajectories": pl.DataFrame(

@@ -16,11 +16,11 @@ import yaml
 
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.importer import import_dataset
 from omnibench.registry import load_plugin_file
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
+from omnibench.slam.import_dataset import import_dataset
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDINGS = ROOT.parent / "shared" / "data"

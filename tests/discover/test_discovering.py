@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from discovery_samples import COUPLING, simulated
 
-from omnibench.data.importer import import_dataset
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.result import Discovery
 from omnibench.errors import UnknownNameError
 from omnibench.fit.evaluate import evaluate
 from omnibench.robot.calibration import read_calibration, write_calibration
 from omnibench.simulate.source import read_simulation
+from omnibench.slam.import_dataset import import_dataset
 
 OMNI3 = Path(__file__).parents[2].parent / "shared" / "data" / "optiodom" / "omni3"
 

@@ -10,8 +10,8 @@ import pytest
 from fit_samples import noisy_trajectories
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.importer import import_dataset
 from omnibench.fit.inspect import Inspection, inspect_dataset
+from omnibench.slam.import_dataset import import_dataset
 from omnibench.testing.synthetic import synthetic_robot
 
 RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "data" / "optiodom" / "omni3"

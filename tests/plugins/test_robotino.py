@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.importer import import_dataset
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.registry import importers, load_plugin_file
 from omnibench.robot.kinematics import wheel_equations
 from omnibench.robot.odometry import OdometryBatch
+from omnibench.slam.import_dataset import import_dataset
 
 ROOT = Path(__file__).resolve().parents[2]
 PLUGIN = ROOT / "plugins" / "robotino.py"

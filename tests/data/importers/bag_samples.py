@@ -19,10 +19,10 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.importer import import_dataset
 from omnibench.robot.kinematics import Array, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
+from omnibench.slam.import_dataset import import_dataset
 from omnibench.testing.synthetic import synthetic_robot, true_robot
 
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)

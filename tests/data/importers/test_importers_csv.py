@@ -12,12 +12,12 @@ import pytest
 import yaml
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.importer import import_dataset
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
+from omnibench.slam.import_dataset import import_dataset
 
 ROBOT: dict[str, Any] = {
     "name": "square",

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.importer import import_dataset
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
+from omnibench.slam.import_dataset import import_dataset
 
 OMNI3 = Path(__file__).resolve().parents[4] / "shared" / "data" / "optiodom" / "omni3"
 needs_recordings = pytest.mark.skipif(not OMNI3.is_dir(), reason=f"the OptiOdom recordings are not at {OMNI3}")

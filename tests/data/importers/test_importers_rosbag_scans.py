@@ -1,4 +1,4 @@
-"""Scans in ROS recordings: they come into the data set with their scanner, and poses are made from them if need be."""
+"""Scans in ROS recordings: they come into the data set with their scanner."""
 
 from __future__ import annotations
 
@@ -20,15 +20,9 @@ from bag_samples import (
     edited,
     header,
     messages,
-    odometry_error,
     part,
-    pose,
     read,
-    text,
     write_mcap,
-    write_mcap_ros2,
-    write_rosbag1,
-    write_rosbag2,
 )
 from scan_samples import (
     ANGLE_MIN,
@@ -40,28 +34,25 @@ from scan_samples import (
     RAYS,
     SCAN,
     SCANS,
+    SECONDS,
     scans,
     seen,
     tf_static,
     transform,
     true_places,
+    without_poses,
 )
 
 from omnibench.data.dataset import Dataset
 from omnibench.data.scans import Scanner
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError
+from omnibench.registry import importers
 from omnibench.testing import ImporterConformance
-
-SECONDS = 12.4  # two runs
 
 
 def with_scans(extra: Sequence[Sent] = (MOUNTED,), **options: Any) -> list[Sent]:
     return [*part(SECONDS), *scans(SECONDS, **options), *extra]
-
-
-def without_poses(extra: Sequence[Sent] = (MOUNTED,), seconds: float = SECONDS) -> list[Sent]:
-    return [each for each in [*part(seconds), *scans(seconds), *extra] if each.topic != SLAM]
 
 
 def scanner_of(data: Dataset) -> Scanner:
@@ -328,42 +319,20 @@ def test_a_bag_that_is_gone_when_its_scans_are_wanted_is_told(tmp_path: Path) ->
         data.scans.of("003")
 
 
-@pytest.mark.parametrize("write", [write_mcap, write_mcap_ros2, write_rosbag1, write_rosbag2])
-def test_without_poses_they_are_made_from_the_scans(
-    tmp_path: Path, write: Callable[[Path, Sequence[Sent]], Path]
-) -> None:
-    data = read(write(tmp_path / "drive", without_poses()))
-    assert "reference poses were made from the scans by SLAM, because no topic holds any" in data.warnings[0]
-    assert len(data.trajectories) == 2
+def test_without_poses_the_data_set_has_placeholders_and_cannot_be_saved(tmp_path: Path) -> None:
+    importer = importers.create("rosbag", {"robot": ROBOT.model_dump()})
+    data = importer.read(write_mcap(tmp_path / "drive", without_poses()))
+    assert not data.referenced
+    assert data.warnings == ()
     for run in data.trajectories:
         np.testing.assert_array_equal(run.poses[0], 0.0)
-        assert run.pose_covariances is not None
-    assert odometry_error(data) < 0.005  # m and rad; the true odometry agrees with SLAM
+        assert run.pose_covariances is None
+    with pytest.raises(DataError, match=r"data set rosbag: it has no reference poses; .*omnibench\.import_dataset"):
+        save_dataset(data, tmp_path / "data")
 
 
-def test_odometry_is_no_reference_where_scans_can_make_one(tmp_path: Path) -> None:
-    odometry = [
-        Sent(
-            "/robot/odom",
-            "nav_msgs/msg/Odometry",
-            {"header": header(int(stamp)), "pose": {"pose": pose(place)}},
-            int(stamp),
-        )
-        for stamp, place in zip(DRIVE.pose_stamps, DRIVE.poses * 1.1, strict=True)
-        if stamp < EPOCH + SECONDS * 1e9
-    ]
-    data = read(write_mcap(tmp_path / "drive", without_poses([MOUNTED, *odometry])))
-    assert "made from the scans by SLAM" in data.warnings[0]
-    assert odometry_error(data) < 0.005
-
-
-def test_runs_are_cut_by_a_topic_without_poses_too(tmp_path: Path) -> None:
-    words = [text(f"go{number}", EPOCH + int(begin * 1e9)) for number, begin in enumerate(DRIVE.begins[:2])]
-    data = read(
-        write_mcap(tmp_path / "drive", without_poses([MOUNTED, *words])), cut="topic", cut_topic="/robot/command"
-    )
-    assert [run.id for run in data.trajectories] == ["001-go0", "002-go1"]
-    assert odometry_error(data) < 0.005
+def test_with_poses_the_data_set_says_so(tmp_path: Path) -> None:
+    assert read(write_mcap(tmp_path / "drive", with_scans())).referenced
 
 
 def test_without_poses_and_scans_the_bag_is_refused(tmp_path: Path) -> None:

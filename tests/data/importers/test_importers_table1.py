@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.importer import import_dataset
 from omnibench.data.importers.table1 import APR_02
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import wheel_equations
 from omnibench.robot.model import OdometryModel
+from omnibench.slam.import_dataset import import_dataset
 
 RPM = 2 * math.pi / 60
 PERIOD, SAMPLES = 0.01, 100

@@ -12,7 +12,6 @@ from fit_samples import make_problem
 from motions import FLOWER, RING, SPEED, TURNS, Twist, driven
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.importer import import_dataset
 from omnibench.errors import DataError
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.calibrators.closed_form import linear_start
@@ -21,6 +20,7 @@ from omnibench.fit.span import driven_span
 from omnibench.fit.uncertainty.identifiability import Identifiability, identifiability
 from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
 from omnibench.registry import load_plugin_file
+from omnibench.slam.import_dataset import import_dataset
 from omnibench.testing.synthetic import synthetic_robot
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from recordings import MODEL, PERIOD, ROBOT, homogeneous, random_dataset, random_run, simulated_recording
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.importer import import_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.replay.concatenated_drive import (
     ConcatenatedDrive,
@@ -28,6 +27,7 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 from omnibench.simulate.config import EncoderNoise
+from omnibench.slam.import_dataset import import_dataset
 
 OMNI3 = Path(__file__).resolve().parents[4] / "shared" / "data" / "optiodom" / "omni3"
 seeds = st.integers(0, 2**32 - 1)

@@ -31,8 +31,8 @@ class Rosbag(Importer):
 
     scans: of a sensor_msgs/LaserScan (``scan_topic``; ``scans: false`` leaves them out) go into the data set, where the
     scanner is mounted is told by /tf_static or ``scanner_mount: {x, y, yaw}`` (m, rad). A bag with scans and without
-    reference poses (odometry is none) gets them from its scans by SLAM, as ``slam`` says; each run then begins at
-    (0, 0, 0).
+    reference poses (odometry does not count as one) gets them from its scans by SLAM, with the options in ``slam``;
+    each run then begins at (0, 0, 0).
 
     times: the stamps of the headers, of all topics by one clock; when a message was recorded does not matter.
     Messages recorded late are sorted; those without a stamp, with a stamp that was there or with values that are not
@@ -59,22 +59,27 @@ class Rosbag(Importer):
         warnings: list[str] = []
         runs: list[Trajectory] = []
         scans: dict[str, RunScans] = {}
-        bare: list[Path] = []
+        unreferenced: list[Path] = []
         for name, path in bags.items():
             recording = read_recording(path, name, self.options, warnings)
             if not recording.referenced:
-                bare.append(path)
-            found, left_out = cut_into_runs(recording, self.options, alone=len(bags) == 1)
+                unreferenced.append(path)
+            recorded_runs, left_out = cut_into_runs(recording, self.options, alone=len(bags) == 1)
             warnings += left_out
-            for run in found:
+            for run in recorded_runs:
                 named = replace(run.trajectory, id=f"{name}/{run.trajectory.id}") if len(bags) > 1 else run.trajectory
                 runs.append(named)
                 if run.scans is not None:
                     scans[named.id] = run.scans
         if not runs:
             raise DataError(f"{warnings[-1]}; nothing is left")
-        if bare:
-            runs = self._placed(runs, bare, len(bags))
+        if 0 < len(unreferenced) < len(bags):
+            raise DataError(
+                f"{unreferenced[0]}: no topic holds reference poses, as it does in other bags; import the bags without "
+                "reference poses apart"
+            )
+        if unreferenced:
+            runs = self._with_placeholders(runs)
         if any(run.angles is None for run in runs):
             runs = [replace(run, angles=None) for run in runs]
         if any(run.pose_covariances is None for run in runs):
@@ -90,27 +95,15 @@ class Rosbag(Importer):
             licence=self.options.licence,
             scans=gather_scans({run.id: scans[run.id] for run in chosen if run.id in scans}),
         )
-        if bare:
-            dataset = self._mapped(dataset)
-            made = "reference poses were made from the scans by SLAM, because no topic holds any"
-            warnings += [f"{path}: {made}" for path in bare]
+        if unreferenced:  # the data set is checked once more when it has its poses
+            return replace(dataset, referenced=False, warnings=tuple(warnings))
         return replace(dataset, warnings=(*warnings, *dataset.warnings))
 
-    def _placed(self, runs: Sequence[Trajectory], bare: Sequence[Path], bags: int) -> list[Trajectory]:
-        """Runs of bags without reference poses, at the design odometry's poses until SLAM has found better ones."""
-        if len(bare) < bags:
-            raise DataError(
-                f"{bare[0]}: no topic holds reference poses, as it does in other bags; import those without apart"
-            )
+    def _with_placeholders(self, runs: Sequence[Trajectory]) -> list[Trajectory]:
+        """The runs with the design model's odometry, from (0, 0, 0) on, in the place of reference poses."""
         design = OdometryModel.of_design(self.options.robot, "arc")
         poses = design.poses([run.log(run.pose_times) for run in runs])
         return [replace(run, poses=pose) for run, pose in zip(runs, poses, strict=True)]
-
-    def _mapped(self, dataset: Dataset) -> Dataset:
-        # Imported here, because small_gicp takes a moment.
-        from omnibench.slam.slam_dataset import slam_dataset
-
-        return slam_dataset(dataset, self.options.slam)
 
     def _split(self, runs: Sequence[Trajectory]) -> list[Trajectory]:
         splits: Sequence[Split | None]

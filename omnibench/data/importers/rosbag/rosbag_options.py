@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -11,7 +11,6 @@ from omnibench.data.importers.rosbag.message_streams import Use
 from omnibench.data.scans import Mount
 from omnibench.data.splits import Names
 from omnibench.registry import Options
-from omnibench.slam.slam_options import SlamOptions
 
 
 class RosbagOptions(Options):
@@ -36,7 +35,9 @@ class RosbagOptions(Options):
     scanner_mount: Mount | None = Field(
         None, description="x, y, yaw of the scanner on the robot; default: what /tf_static says, else the middle"
     )
-    slam: SlamOptions = Field(SlamOptions(), description="how bags without reference poses get them from their scans")
+    slam: dict[str, Any] = Field(
+        {}, description="options of omnibench slam, for bags whose reference poses are made from their scans"
+    )
     joints: Names = Field((), description="in the robot's wheel order; default: those called like the wheels")
     joint_signs: tuple[Literal[1, -1], ...] = Field((), description="-1 for joints that count the other way round")
     wheel_wrap: float | None = Field(

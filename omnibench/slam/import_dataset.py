@@ -1,0 +1,38 @@
+"""Import of recordings as a data set, with reference poses from the laser scans of recordings that hold none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from omnibench.config import validate
+from omnibench.data.dataset import Dataset
+from omnibench.data.importer import Importer
+from omnibench.errors import DataError
+from omnibench.registry import importers
+from omnibench.slam.slam_options import SlamOptions
+
+
+def import_dataset(name: str, source: Path | str, options: Mapping[str, Any] | None = None) -> Dataset:
+    """Read ``source`` with the importer called ``name``; recordings without reference poses get them by SLAM.
+
+    options: the importer's, with those of SLAM under ``slam`` where the importer reads scans. UnknownNameError,
+    ConfigError or DataError in one line.
+    """
+    importer: Importer = importers.create(name, options)
+    slam = validate(SlamOptions, getattr(importer.options, "slam", {}), f"importer {name!r}: slam")
+    source = Path(source)
+    if not source.exists():
+        raise DataError(f"{source}: no such file or folder")
+    recorded = importer.read(source)
+    return recorded if recorded.referenced else _with_reference_poses(recorded, slam, source)
+
+
+def _with_reference_poses(recorded: Dataset, options: SlamOptions, source: Path) -> Dataset:
+    from omnibench.slam.slam_dataset import slam_dataset  # small_gicp and numba, which other recordings do without
+
+    dataset = slam_dataset(recorded, options)
+    made = f"{source}: reference poses were made from the scans by SLAM, because the recording holds none"
+    return replace(dataset, warnings=(*recorded.warnings, made, *dataset.warnings))
