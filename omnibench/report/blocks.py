@@ -1,4 +1,4 @@
-"""What a report is made of. Texts are plain: the template escapes them."""
+"""The blocks that a report is built from. Their texts are plain text: the template escapes them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Callout:
 
 @dataclass(frozen=True)
 class Fact:
-    """A name and a value, with a smaller remark."""
+    """A named value with a remark in smaller type."""
 
     name: str
     value: str
@@ -50,7 +50,7 @@ class Fact:
 
 @dataclass(frozen=True)
 class Facts:
-    """Facts as a list, or as ``tiles`` where they are the message."""
+    """Facts as a list, or as large ``tiles`` where the figures are the message."""
 
     kind: ClassVar[str] = "facts"
     items: tuple[Fact, ...]
@@ -59,7 +59,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Column:
-    """Head of a table's column; numeric columns are set flush right."""
+    """The head of a table column; numeric columns are aligned right."""
 
     title: str
     unit: str = ""
@@ -68,7 +68,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Cell:
-    """A value with what stands below it in small print; ``colour`` draws a swatch before it."""
+    """A table cell: a value, a ``note`` below it in small print, and a swatch of ``colour`` before it."""
 
     text: str
     note: str = ""
@@ -77,7 +77,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """A table's row. ``group`` rows have one cell, which spans the table."""
+    """A table row. A ``group`` row has one cell that spans the table."""
 
     cells: tuple[Cell, ...]
     role: Literal["plain", "best", "failed", "muted", "group"] = "plain"
@@ -106,7 +106,7 @@ class LegendItem:
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """A plot under its own title. ``description`` says in words what is drawn, for readers who cannot see it."""
+    """A plot under its own title. ``description``: the picture in words, for readers who cannot see it."""
 
     title: str
     plot: go.Figure
@@ -127,7 +127,7 @@ class FigureGrid:
 
 @dataclass(frozen=True)
 class Code:
-    """Text that is set as it stands and can be copied."""
+    """Preformatted text that can be copied."""
 
     kind: ClassVar[str] = "code"
     text: str
@@ -136,7 +136,7 @@ class Code:
 
 @dataclass(frozen=True, eq=False)
 class Details:
-    """Blocks that are folded away."""
+    """Blocks that are folded away until the reader opens them."""
 
     kind: ClassVar[str] = "details"
     title: str
@@ -146,7 +146,7 @@ class Details:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """Blocks of which one option's are shown; a menu called ``label`` chooses. Without JavaScript all are."""
+    """Alternatives, one shown at a time: a menu called ``label`` chooses. Without JavaScript all are shown."""
 
     kind: ClassVar[str] = "choice"
     label: str
@@ -155,9 +155,10 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class Player:
-    """Runs of a robot to be gone through step by step. ``runs``: by name, JSON as player.js reads it.
+    """A player that shows runs of a robot step by step.
 
-    ``description`` says in words what is drawn, for readers who cannot see it.
+    runs: for each name the JSON document that player.js reads. description: the picture in words, for readers who
+    cannot see it.
     """
 
     kind: ClassVar[str] = "player"

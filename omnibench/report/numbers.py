@@ -1,4 +1,4 @@
-"""Numbers as a person reads them."""
+"""Numbers formatted for readers: decimals, significant digits, per cent, durations, lists and plurals."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def fixed(value: float | None, decimals: int, signed: bool = False) -> str:
-    """``value`` with so many decimals, a true minus sign and, if ``signed``, a plus."""
+    """``value`` with ``decimals`` decimals, a typographic minus sign and, if ``signed``, a plus sign."""
     if value is None or math.isnan(value):
         return NOTHING
     if math.isinf(value):
@@ -21,7 +21,7 @@ def fixed(value: float | None, decimals: int, signed: bool = False) -> str:
 
 
 def significant(value: float | None, digits: int = 3, signed: bool = False) -> str:
-    """``value`` to so many significant digits; powers of ten where zeros would have to be counted."""
+    """``value`` to ``digits`` significant digits, with a power of ten below 10⁻⁴ and from 10⁶ on."""
     if value is None or not math.isfinite(value) or value == 0:
         return fixed(value, 0, signed) if value is None or value else "0"
     exponent = math.floor(math.log10(float(f"{abs(value):.{digits - 1}e}")))
@@ -32,25 +32,25 @@ def significant(value: float | None, digits: int = 3, signed: bool = False) -> s
 
 
 def decimals_for(value: float | None, digits: int = 3) -> int:
-    """Decimals that show ``value`` to so many significant digits, for a column that shares them; at most 9."""
+    """The decimals (at most 9) that show ``value`` to ``digits`` significant digits, for a column that shares them."""
     if value is None or not math.isfinite(value) or value == 0:
         return digits
     return min(9, max(0, digits - 1 - math.floor(math.log10(abs(value)))))
 
 
 def percent(share: float | None, decimals: int = 1, signed: bool = False) -> str:
-    """A share as per cent."""
+    """A share between 0 and 1 as per cent."""
     text = fixed(None if share is None else 100 * share, decimals, signed)
     return text if text == NOTHING else f"{text} %"
 
 
 def count(value: float | None) -> str:
-    """A number of things, in groups of three digits."""
+    """A whole number, in groups of three digits."""
     return fixed(value, 0)
 
 
 def seconds(value: float | None) -> str:
-    """A duration, to about three digits."""
+    """A duration given in s, as ms or s to about three digits."""
     if value is None or not math.isfinite(value):
         return NOTHING
     if value < 1e-3:
@@ -61,23 +61,23 @@ def seconds(value: float | None) -> str:
 
 
 def power_of_ten(exponent: int) -> str:
-    """``10⁻³``; small whole powers as they are."""
+    """A power of ten as a reader writes it: ``10⁻³``, but ``0.01`` to ``1,000`` in full."""
     plain = {-2: "0.01", -1: "0.1", 0: "1", 1: "10", 2: "100", 3: "1,000"}
     return plain.get(exponent, f"10{str(exponent).translate(_SUPERSCRIPT)}")
 
 
 def span(low: float, high: float, decimals: int, signed: bool = False) -> str:
-    """An interval's two ends."""
+    """An interval: ``low to high``."""
     return f"{fixed(low, decimals, signed)} to {fixed(high, decimals, signed)}"
 
 
 def listing(names: list[str], limit: int = 8) -> str:
-    """Names as ``a, b and c``; beyond ``limit`` their number."""
+    """Names as ``a, b and c``; those beyond ``limit`` are counted."""
     shown = names[:limit] + ([f"{len(names) - limit} more"] if len(names) > limit else [])
     return " and ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)
 
 
 def plural(number: int, noun: str) -> str:
-    """``1 run``, ``2 runs``."""
-    irregular = {"entry": "entries", "trajectory": "trajectories", "repetition": "repetitions"}
+    """A number with its noun: ``1 run``, ``2 runs``."""
+    irregular = {"entry": "entries", "trajectory": "trajectories"}
     return f"{count(number)} {noun if number == 1 else irregular.get(noun, noun + 's')}"

@@ -1,4 +1,4 @@
-"""A document as one HTML file that needs nothing else: no network, no fonts, no second file."""
+"""Rendering a document as one self-contained HTML file: no network, no fonts, no second file."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _PLOT_OPTIONS = {
 
 
 def write_document(document: Document, path: Path) -> None:
-    """Write a report, whole or not at all. DataError when the disk refuses."""
+    """Write a report as one HTML file, complete or not at all. DataError: the disk refuses it."""
     write_text(path, render(document))
 
 
 def render(document: Document) -> str:
-    """The report's HTML."""
+    """The HTML of a report."""
     template = _environment().get_template("report.html.j2")
     return template.render(document=document, plot_options=_json(_PLOT_OPTIONS))
 

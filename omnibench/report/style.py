@@ -1,4 +1,4 @@
-"""How plots look: quiet axes, colours that colour-blind readers can tell apart, units on every axis."""
+"""The style of all plots: quiet axes, units on every axis, colours that colour-blind readers can tell apart."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ QUIET = "#66727f"
 GRID = "#e6e9ed"
 AXIS = "#9aa5b1"
 
-# As in the paper's figures: the reference is red, the theoretical matrix green.
+# The colours of the paper's figures: red for the reference, green for the theoretical matrix.
 REFERENCE = "#c8102e"
 THEORETICAL = "#00875f"
 
-# After Okabe and Ito and after Tol, without the red and the green above.
+# Palettes of Okabe and Ito and of Tol for colour-blind readers, without the red and the green above.
 PALETTE = (
     "#0072b2",
     "#e69f00",
@@ -53,11 +53,11 @@ SYMBOLS = (
 
 
 def colours(wanted: Mapping[str, str | None]) -> dict[str, tuple[str, Dash]]:
-    """A colour and a dash for each key: the wanted colour while it is free, then the palette's next."""
+    """A colour and a dash for each key: its wanted colour while that is free, else the next of the palette."""
     styles: dict[str, tuple[str, Dash]] = {}
     taken: set[tuple[str, Dash]] = set()
     reserved = {colour for colour in wanted.values() if colour}
-    # Colours that nobody has asked for come first, so that every key can have what it wants.
+    # Colours that no key wants come first, so that wanted ones stay free for their keys.
     order = sorted(PALETTE, key=lambda colour: colour in reserved)
     pool = [(colour, dash) for dash in DASHES for colour in order]
     for key, colour in wanted.items():
@@ -73,12 +73,12 @@ def colours(wanted: Mapping[str, str | None]) -> dict[str, tuple[str, Dash]]:
 
 
 def text(words: str) -> str:
-    """Words for a plot, which reads some HTML: as they stand."""
+    """Words escaped for a plot, since Plotly interprets some HTML."""
     return html.escape(words, quote=False)
 
 
 def plot(*traces: go.Scatter, **layout: Any) -> go.Figure:
-    """A figure of these traces in the house style, without a legend of its own."""
+    """A figure of these traces in the common style, without a legend of its own."""
     figure = go.Figure(data=list(traces))
     figure.update_layout(
         template=_TEMPLATE,
@@ -117,7 +117,7 @@ def logarithmic(figure: go.Figure, axis: Literal["x", "y"], low: float, high: fl
 
 
 def equal_aspect(figure: go.Figure) -> None:
-    """A metre is as long upwards as sideways."""
+    """Give x and y the same scale."""
     figure.update_yaxes(scaleanchor="x", scaleratio=1)
 
 

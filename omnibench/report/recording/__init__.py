@@ -1,1 +1,1 @@
-"""Pictures of a recording: the room with scans and paths, wheels against their targets, a run step by step."""
+"""The report on a recording: room, scans and paths, wheel rates against targets, a run step by step."""

@@ -1,4 +1,4 @@
-"""What was recorded: Table 1 of the paper, with rates and numbers of this recording."""
+"""The contents of a recording as a table after Table 1 of the paper: quantities, numbers, intervals."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from omnibench.robot.kinematics import Array
 
 
 def contents_table(dataset: Dataset) -> Table:
-    """Each link of the chain from command to SLAM: whether it was recorded, how often, how many."""
+    """A table of the quantities from motion command to SLAM pose: recorded or not, how many, at what interval."""
     runs = dataset.trajectories
     samples = [run.times for run in runs]
     number = sum(map(len, samples))
     rows = [
         _commands(runs),
-        _wheels("Target wheel rates", "(ωMa, ωMb, ωMc)", runs, "targets", "what the controllers were told"),
+        _wheels("Target wheel rates", "(ωMa, ωMb, ωMc)", runs, "targets", "what the motor controllers were told"),
         _row("Measured wheel rates", "(ωa, ωb, ωc)", number, "samples", _every(samples, first=0.0), _steps(runs)),
         _wheels("Wheel angles", "beyond Table 1", runs, "angles", "absolute, continuous within a session"),
         _row("Odometry", "(x, y, θ)", number, "poses", _every(samples, first=0.0), "computed from the wheel rates"),
@@ -36,8 +36,8 @@ def contents_table(dataset: Dataset) -> Table:
             Column("Remarks", numeric=False),
         ),
         rows=tuple(rows),
-        note="After Table 1 of the paper; small print: its symbols. Every: the median interval, and the middle 98 % of "
-        "the intervals where they vary.",
+        note="After Table 1 of the paper, whose symbols stand in small print. Every: the median interval; where they "
+        "vary, in brackets the range that holds 98 % of them.",
     )
 
 
@@ -52,12 +52,12 @@ def _commands(runs: Sequence[Trajectory]) -> Row:
 
 
 def _wheels(name: str, symbol: str, runs: Sequence[Trajectory], field: str, remark: str) -> Row:
-    found = [run for run in runs if getattr(run, field) is not None]
-    if not found:
+    recorded = [run for run in runs if getattr(run, field) is not None]
+    if not recorded:
         return _missing(name, symbol)
-    times = [run.times for run in found]
-    if len(found) < len(runs):
-        remark += f"; of {count(len(found))} of {count(len(runs))} runs"
+    times = [run.times for run in recorded]
+    if len(recorded) < len(runs):
+        remark += f"; in {count(len(recorded))} of {count(len(runs))} runs"
     return _row(name, symbol, sum(map(len, times)), "samples", _every(times, first=0.0), remark)
 
 
@@ -75,7 +75,7 @@ def _scans(dataset: Dataset) -> Row:
     name = f"{scanner.name}: " if scanner.name else ""
     remark = f"{name}{count(scanner.rays)} ranges over {significant(float(turn), 3)}°, to {scanner.range_max:g} m"
     if len(times) < len(dataset.trajectories):
-        remark += f"; of {count(len(times))} of {count(len(dataset.trajectories))} runs"
+        remark += f"; in {count(len(times))} of {count(len(dataset.trajectories))} runs"
     return _row("LIDAR scans", "LIDAR", sum(map(len, times)), "scans", _every(times), remark)
 
 
@@ -90,9 +90,9 @@ def _reference(runs: Sequence[Trajectory]) -> Row:
 
 
 def _every(times: Iterable[Array], first: float | None = None) -> str:
-    """The interval between stamps; ``first``: what the first of each run counts from."""
-    stamps = times if first is None else [np.append(first, each) for each in times]
-    gaps = 1e3 * np.concatenate([np.diff(each) for each in stamps])
+    """The interval between stamps in words. first: the time from which the first interval of a run counts, s."""
+    stamps = times if first is None else [np.append(first, run) for run in times]
+    gaps = 1e3 * np.concatenate([np.diff(run) for run in stamps])
     if not len(gaps):
         return NOTHING
     low, middle, high = np.quantile(gaps, [0.01, 0.5, 0.99])

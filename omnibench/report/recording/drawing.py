@@ -1,4 +1,4 @@
-"""What the pictures of a recording share: colours, lines, and coordinates with the digits that a screen can show."""
+"""Traces that the figures of a recording share: colours, paths, points, and coordinates rounded for the screen."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COVARIANCE_ITEM = LegendItem("covariance", "covariance", COVARIANCE)
 
 
 def path_line(item: LegendItem, poses: Array, width: float, **changes: Any) -> go.Scatter:
-    """A path over the ground, poses (K, 2 or 3) in m."""
+    """A trace of a path over the ground; poses (K, 2 or 3), m."""
     style: dict[str, Any] = {
         "x": short(poses[:, 0]),
         "y": short(poses[:, 1]),
@@ -36,7 +36,7 @@ def path_line(item: LegendItem, poses: Array, width: float, **changes: Any) -> g
 
 
 def scatter(item: LegendItem, points: Array, size: float, **changes: Any) -> go.Scatter:
-    """Points (n, 2) in m."""
+    """A trace of points (n, 2), m."""
     style: dict[str, Any] = {
         "x": short(points[:, 0], 3),
         "y": short(points[:, 1], 3),
@@ -49,7 +49,7 @@ def scatter(item: LegendItem, points: Array, size: float, **changes: Any) -> go.
 
 
 def joined(paths: Sequence[Array]) -> Array:
-    """Paths (K, n) as one, with a row of NaN between them, where a line breaks."""
+    """Paths (K, n) joined into one array, with a row of NaN between them, at which a plotted line breaks."""
     if not paths:
         return np.empty((0, 2))
     gap = np.full((1, paths[0].shape[1]), np.nan)
@@ -57,5 +57,5 @@ def joined(paths: Sequence[Array]) -> Array:
 
 
 def short(values: Array, decimals: int = 4) -> list[float | None]:
-    """Numbers with so many decimals; NaN breaks a line."""
+    """Values rounded to ``decimals`` decimals; NaN becomes None, at which a plotted line breaks."""
     return [None if value != value else value for value in np.round(values, decimals).tolist()]

@@ -1,4 +1,4 @@
-"""A run step by step, as templates/player.js reads it: poses, wheel rates and scans, with few digits."""
+"""The document that templates/player.js plays: poses, wheel rates and scans of a run, rounded."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from omnibench.report.style import INK
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 
-_FRAMES = 240
-_MEAN_OVER = 0.1  # s, before each frame
-_SCANS = 60  # of a run
-_RAYS = 270  # of a scan
-_MARGIN = 0.4  # m about what is drawn
+_FRAMES = 240  # of a run (chosen: steps of the slider that can be told apart)
+_MEAN_OVER = 0.1  # s; wheel rates are means over this time before each frame
+_SCANS = 60  # scans drawn of a run (chosen: keeps the file small)
+_RAYS = 270  # rays drawn of a scan (chosen: keeps the file small)
+_MARGIN = 0.4  # m around everything that is drawn
 _SEEN = LegendItem("scan", "this moment's scan", "#d97706")
 
 
@@ -41,9 +41,9 @@ def player(
     truth: Mapping[str, TruePath],
     outlines: Mapping[str, Sequence[Array]],
 ) -> Player:
-    """Runs, by the name that the menu has for them, to be gone through with a slider.
+    """A player for these runs, chosen by the menu's names and moved through with a slider.
 
-    outlines: of the floor plan by run, in the frame of its reference.
+    outlines: for each run the walls of the floor plan in the frame of its reference poses, each (n, 2), m.
     """
     shown = ["the robot"]
     shown += ["its last scan, and what it saw before"] if dataset.scans is not None else []
@@ -88,22 +88,24 @@ def _run(
 
 
 def _scans(dataset: Dataset, run: Trajectory) -> list[dict[str, Any]]:
-    """Some scans of a run: their stamps, where the scanner was, points as x, y, x, y, ..., m."""
+    """Some scans of a run: stamp, scanner position, and points as x, y, x, y, ..., m."""
     if dataset.scans is None or run.id not in dataset.scans.trajectories:
         return []
     scanner, scans = dataset.scans.scanner, dataset.scans.of(run.id)
     stride = -(-scanner.rays // _RAYS)
-    found = []
+    documents = []
     for scan in evenly(len(scans.times), _SCANS):
         stamp = scans.times[scan]
-        place = scanner_poses(poses_at(run, stamp), scanner)
+        origin = scanner_poses(poses_at(run, stamp), scanner)
         points = scan_points(run, scanner, scans, int(scan), stride)
-        found.append({"t": round(float(stamp), 4), "from": _rounded(place[:2]), "points": _rounded(points.ravel())})
-    return found
+        documents.append(
+            {"t": round(float(stamp), 4), "from": _rounded(origin[:2]), "points": _rounded(points.ravel())}
+        )
+    return documents
 
 
 def _means(run: Trajectory, values: Array, times: Array) -> Array:
-    """Means (n, N) over the time before each of ``times``, of rates (F, N) that hold over their samples."""
+    """Mean rates (n, N) over the 0.1 s before each of ``times`` (n,), s; values (F, N): the rate of each sample."""
     ends = np.append(0.0, run.times)
     durations = np.diff(ends)[:, None]
     angles = np.vstack([np.zeros(values.shape[1]), np.cumsum(values * durations, axis=0)])
@@ -115,18 +117,18 @@ def _means(run: Trajectory, values: Array, times: Array) -> Array:
 
 
 def _limit(rates: Array) -> float:
-    """The rate at which a bar is full, rad/s."""
+    """The rate that fills a bar, rad/s."""
     return round(1.05 * max(float(np.abs(rates).max()), 1e-3), 3)
 
 
 def _window(points: Array) -> list[float]:
-    """Left, bottom, right and top of what is drawn, but for the few farthest points."""
+    """Left, bottom, right and top of the picture, m; the farthest 0.5 % of the points on each side are cut off."""
     low, high = np.quantile(points, 0.005, axis=0) - _MARGIN, np.quantile(points, 0.995, axis=0) + _MARGIN
     return _rounded(np.concatenate([low, high]))
 
 
 def _wheels(robot: Robot) -> list[dict[str, Any]]:
-    """Wheels as they stand; those of a mecanum robot are not where their axle's direction points."""
+    """The robot's wheels; mecanum wheels are not drawn, because a wheel's angle does not say where it sits."""
     return [wheel.model_dump() | {"drawn": wheel.roller_angle == 0} for wheel in robot.wheels]
 
 

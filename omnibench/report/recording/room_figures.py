@@ -1,4 +1,4 @@
-"""The room as scans, reference, odometry and truth have it: all runs at once, and one run with its covariances."""
+"""Plans of the room with scans, reference poses, odometry and true paths: of all runs, and of one run."""
 
 from __future__ import annotations
 
@@ -29,19 +29,20 @@ from omnibench.report.style import INK, equal_aspect, plot
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 
-_POINTS = 3500  # of the scans, in one picture
-_SCANS = 120  # of a run, in one picture
-_RUNS = 400  # in the picture of all
-_PATH = 300  # poses of a drawn path
+# How much one figure draws (chosen: more cannot be told apart on a screen).
+_POINTS = 3500  # scan points
+_SCANS = 120  # scans of a run
+_RUNS = 400  # runs
+_PATH = 300  # poses of a path
 _ELLIPSES = 6
-_QUANTILE = math.sqrt(5.991)  # 95 % of two normal coordinates
-_SHOWN_AS = 0.07  # the largest ellipse's half axis, as a share of the picture
+_QUANTILE = math.sqrt(5.991)  # 95 % quantile of chi-square with 2 degrees of freedom, as a radius
+_SHOWN_AS = 0.07  # half axis of the largest ellipse, as a share of the picture's size (chosen)
 
 
 def all_runs(dataset: Dataset, shown: Trajectory, outlines: Sequence[Array]) -> FigureGrid:
-    """The reference paths of all runs from one start, in the room as one of them (``shown``) has seen it.
+    """The reference paths of all runs, moved to one start, and the room that the scans of the run ``shown`` saw.
 
-    outlines: of the floor plan as seen from that start, each (n, 2) and closed; empty where it is not known.
+    outlines: the walls of the floor plan as seen from that start, closed (n, 2) each, m; empty where not known.
     """
     runs = [dataset.trajectories[index] for index in evenly(len(dataset.trajectories), _RUNS)]
     flower = joined([_from_start(run, _thin(run.poses)) for run in runs])
@@ -57,7 +58,7 @@ def all_runs(dataset: Dataset, shown: Trajectory, outlines: Sequence[Array]) -> 
         return FigureGrid((close,), tuple(items), 1, words)
     points = _from_start(shown, thinned(run_points(dataset, shown), _POINTS))
     room = Figure(
-        f"The same in the room that {shown.id} saw",
+        f"The runs in the room that {shown.id} saw",
         _map([*_plan(outlines), scatter(SCANS_ITEM, points, 2.5, opacity=0.6), *paths]),
         "Reference paths of all runs with the points that the scans of one have seen, x and y in metres",
         500,
@@ -68,9 +69,9 @@ def all_runs(dataset: Dataset, shown: Trajectory, outlines: Sequence[Array]) -> 
 def one_run(
     dataset: Dataset, trajectory: Trajectory, odometry: OdometryModel, truth: TruePath | None, outlines: Sequence[Array]
 ) -> FigureGrid:
-    """A run in its room, and close up with the covariances of some reference poses.
+    """One run in its room, and close up with covariance ellipses of some reference poses.
 
-    outlines: of the floor plan in the frame of the run's reference, each (n, 2) and closed.
+    outlines: the walls of the floor plan in the frame of the run's reference poses, closed (n, 2) each, m.
     """
     end = trajectory.pose_times[-1]
     (driven,) = odometry.poses([trajectory.log(np.linspace(0.0, end, _PATH))])
@@ -101,14 +102,14 @@ def one_run(
         Figure("Close up", _map([*lines, *poses]), "The run's paths close up, with covariance ellipses", 460)
     )
     items += _room_items(dataset, outlines)
-    said = "Scan points are placed at the reference poses, each ray where the robot was when it was measured." * (
+    caption = "Scan points are placed at the reference poses, each ray where the robot was when it was measured." * (
         len(figures) > 1
     )
-    return FigureGrid(tuple(figures), tuple(items), 2 if len(figures) > 1 else 1, f"{said} {words}".strip())
+    return FigureGrid(tuple(figures), tuple(items), 2 if len(figures) > 1 else 1, f"{caption} {words}".strip())
 
 
 def run_points(dataset: Dataset, trajectory: Trajectory) -> Array:
-    """What the scans of a run saw (n, 2), m, in the frame of its reference; not more than a picture needs."""
+    """Scan points (n, 2) of a run, m, in the frame of its reference poses, from at most 120 scans."""
     if dataset.scans is None:
         return np.empty((0, 2))
     scanner, scans = dataset.scans.scanner, dataset.scans.of(trajectory.id)
@@ -117,14 +118,14 @@ def run_points(dataset: Dataset, trajectory: Trajectory) -> Array:
 
 
 def in_frame_of(start: Array, points: Array) -> Array:
-    """Points (n, 2 or more) given as seen from a start pose (3,), in the frame of that pose (n, 2)."""
+    """Points (n, 2): points (n, 2 or more) given relative to a start pose (3,), in the frame of that pose."""
     cosine, sine = math.cos(start[2]), math.sin(start[2])
     seen: Array = points[:, :2] @ np.array([[cosine, sine], [-sine, cosine]]) + start[:2]
     return seen
 
 
 def _ellipses(trajectory: Trajectory, driven: Array) -> tuple[list[go.Scatter], str]:
-    """95 % ellipses of a few positions, scaled so that they can be seen, and the words for it."""
+    """95 % ellipses of a few positions, enlarged until they can be seen, and the sentence that says so."""
     covariances = trajectory.pose_covariances
     if covariances is None:
         return [], ""
@@ -151,7 +152,7 @@ def _ellipses(trajectory: Trajectory, driven: Array) -> tuple[list[go.Scatter], 
 
 
 def _round_below(factor: float) -> float:
-    """1, 2 or 5 times a power of ten, not above ``factor`` and not below 1."""
+    """``factor`` rounded down to 1, 2 or 5 times a power of ten, at least 1."""
     if factor <= 1:
         return 1.0
     power = 10.0 ** math.floor(math.log10(factor))
@@ -159,7 +160,7 @@ def _round_below(factor: float) -> float:
 
 
 def _from_start(trajectory: Trajectory, points: Array) -> Array:
-    """Points (n, 2 or more) as seen from the run's start pose (n, 2)."""
+    """Points (n, 2): points (n, 2 or more) relative to the start pose of the run."""
     x, y, heading = trajectory.start
     cosine, sine = math.cos(heading), math.sin(heading)
     seen: Array = (points[:, :2] - (x, y)) @ np.array([[cosine, -sine], [sine, cosine]])
@@ -200,7 +201,7 @@ def _map(traces: Sequence[go.Scatter]) -> go.Figure:
 
 
 def _framed(columns: Sequence[Any]) -> list[float]:
-    """From the least to the greatest with a margin, so that no line runs along the frame or out of it."""
+    """The range of an axis: least to greatest value with a margin, so that no line runs along the frame."""
     values = np.concatenate([np.asarray(column, dtype=float) for column in columns])
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     margin = max(0.05 * (high - low), 0.05)  # m

@@ -1,4 +1,4 @@
-"""Which runs of a recording are shown, and what they are called."""
+"""The choice of runs that a report shows, and their names."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.report.numbers import fixed
 from omnibench.robot.model import OdometryModel
 
-_SHOWN = 4
-_STRAIGHT = 1e-3  # rad/s
+_SHOWN = 4  # runs, where kinds of motion are not known
+_STRAIGHT = 1e-3  # rad/s; a slower turn counts as straight
 
 
 def describe(trajectory: Trajectory) -> str:
-    """A trajectory's command as the paper writes it, else its name."""
+    """A trajectory's motion command as the paper writes it; without one, its name."""
     if trajectory.alpha is None or trajectory.omega is None:
         command = "" if trajectory.command is None else f"{trajectory.command}, "
         return f"{command}{trajectory.id}"
@@ -26,28 +26,28 @@ def describe(trajectory: Trajectory) -> str:
 
 
 def representative_runs(dataset: Dataset) -> dict[str, Trajectory]:
-    """A few runs that differ, by a name that says how: straight, turning left and right, on the spot.
+    """One run of each kind of motion (straight, turning left, turning right, on the spot), by a name that says which.
 
-    Of each kind the run at whose end the odometry of the design values is wrong by the median. Runs with scans where
-    the data set has any. Where commands are not known, or are of one kind: a spread over the recording.
+    The run chosen of a kind has the median final position error of the design odometry. Where the data set has
+    scans, only runs with scans are chosen. Where commands are unknown or of one kind: runs spread over the recording.
     """
     runs: Sequence[Trajectory] = dataset.trajectories
     if dataset.scans is not None:
         scanned = set(dataset.scans.trajectories)
         runs = [run for run in runs if run.id in scanned]
-    found = {
+    by_kind = {
         f"{kind}: {describe(run)}": run
         for kind, like in _kinds(runs).items()
         for run in [_of_median_error(like, OdometryModel.of_design(dataset.robot, "arc"))]
     }
-    if len(found) > 1:
-        return found
+    if len(by_kind) > 1:
+        return by_kind
     picks = np.unique(np.linspace(0, len(runs) - 1, min(_SHOWN, len(runs))).round().astype(int))
     return {describe(runs[index]): runs[index] for index in picks}
 
 
 def _kinds(runs: Sequence[Trajectory]) -> dict[str, list[Trajectory]]:
-    """The runs of each kind of motion that was commanded; of turns those at the highest rate."""
+    """The runs of each kind of commanded motion; of turning ones only those at the highest rate."""
     kinds: dict[str, list[Trajectory]] = {"straight": [], "turning left": [], "turning right": [], "on the spot": []}
     for run in runs:
         if run.omega is None or run.alpha is None:

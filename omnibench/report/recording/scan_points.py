@@ -1,4 +1,4 @@
-"""Where the scans of a run saw something: points in the frame of its reference poses."""
+"""Scan points of a run in the frame of its reference poses."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from omnibench.data.dataset import Trajectory
 from omnibench.data.scans import Scanner, TrajectoryScans
 from omnibench.robot.kinematics import Array
 
-_GOES_ON = 0.1  # s, longer than a scan takes
+_GOES_ON = 0.1  # s of motion after the last pose: longer than a scan takes
 
 
 def poses_at(trajectory: Trajectory, times: Array) -> Array:
-    """Reference poses (..., 3) at times (...), s, on straight lines between those recorded.
+    """Reference poses (..., 3) interpolated linearly at times (...), s.
 
-    Before the first the robot rests; after the last it goes on for a scan's time as it came.
+    Before the first pose the robot rests; after the last one it keeps its velocity for 0.1 s.
     """
     stamps, poses = trajectory.pose_times, trajectory.poses
     if len(stamps) > 1:
@@ -34,23 +34,23 @@ def scanner_poses(poses: Array, scanner: Scanner) -> Array:
 
 
 def scan_points(trajectory: Trajectory, scanner: Scanner, scans: TrajectoryScans, scan: int, stride: int = 1) -> Array:
-    """Points (n, 2), m, of one scan; every ray from where the reference has the robot when that ray is measured."""
+    """Points (n, 2) of one scan, m; each ray starts at the reference pose of the time at which it was measured."""
     ranges = scans.ranges[scan, ::stride].astype(float)
     seen = scanner.valid(scans.ranges[scan, ::stride])
     poses = scanner_poses(poses_at(trajectory, scans.times[scan] + scanner.delays[::stride][seen]), scanner)
     directions = poses[:, 2] + scanner.angles[::stride][seen]
-    found: Array = poses[:, :2] + ranges[seen, None] * np.column_stack([np.cos(directions), np.sin(directions)])
-    return found
+    points: Array = poses[:, :2] + ranges[seen, None] * np.column_stack([np.cos(directions), np.sin(directions)])
+    return points
 
 
 def evenly(count: int, limit: int) -> Array:
-    """Up to ``limit`` of ``count`` indices, the first and the last among them."""
+    """At most ``limit`` of the indices 0 to ``count`` - 1, evenly spaced, the first and the last among them."""
     picks: Array = np.unique(np.linspace(0, count - 1, min(limit, count)).round().astype(int))
     return picks
 
 
 def thinned(points: Array, limit: int, cell: float = 0.01) -> Array:
-    """One point for every square of a grid that sees one; the grid (``cell`` m) is widened until ``limit`` do."""
+    """At most ``limit`` of the points (n, 2): one for each occupied cell of a grid (``cell`` m), widened as needed."""
     while True:
         _, first = np.unique(np.round(points / cell).astype(np.int64), axis=0, return_index=True)
         if len(first) <= limit:

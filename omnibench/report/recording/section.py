@@ -1,4 +1,4 @@
-"""The report on a recording, and the section that other reports take from it."""
+"""The report on a recording, and the section on it that other reports include."""
 
 from __future__ import annotations
 
@@ -54,13 +54,13 @@ def write_recording_report(
     accuracy: SlamAccuracy | None = None,
     notes: Sequence[str] = (),
 ) -> None:
-    """Write one HTML file on a recording, which opens offline: what was recorded, its room, its wheels, a run to play.
+    """Write the report on a recording as one HTML file: its contents, the room, the wheels, a run step by step.
 
-    Of simulated data also: truth: true poses by run, against which the reference poses are judged. plan: the room.
-    starts: true start pose (3,) of each run in that room, m, m, rad; else runs are drawn from the plan's own start.
-    accuracy: of the reference poses; by default from the truth. notes: what a reader must know first.
+    For simulated data: truth: true path of each run, which the reference poses are compared with. plan: the room.
+    starts: true start pose (3,) of each run in that room, m, m, rad (default: the plan's start). accuracy: errors of
+    the reference poses (default: computed from the truth). notes: remarks at the top of the report.
 
-    DataError in one line: the scans are broken, the truth is of other runs, or the disk refuses.
+    DataError in one line: broken scans, a truth of other runs, or a disk that refuses the file.
     """
     write_document(recording_document(dataset, truth, plan, starts, accuracy, notes), file)
 
@@ -77,7 +77,9 @@ def recording_document(
     known = truth or {}
     for run in dataset.trajectories if known else ():
         if run.id not in known:
-            raise DataError(f"data set {dataset.name}: run {run.id} is not in the truth; is that of others?")
+            raise DataError(
+                f"data set {dataset.name}: run {run.id} is not in the truth; name the truth of this data set"
+            )
     sections = [Section("recorded", "What was recorded", (*_about(dataset, notes), contents_table(dataset)))]
     if known and accuracy is None:
         accuracy = slam_accuracy(dataset, known)
@@ -95,14 +97,14 @@ def recording_document(
 
 
 def has_recording(dataset: Dataset) -> bool:
-    """Whether there is more to show of a data set than wheel rates and poses: scans, or targets of the wheels."""
+    """True if a data set holds more than wheel rates and poses: scans, or targets of the wheels."""
     return dataset.scans is not None or any(run.targets is not None for run in dataset.trajectories)
 
 
 def recording_section(dataset: Dataset, prefix: str = "") -> Section:
-    """A recording's section in the report of something else; ``prefix`` of the keys of its parts.
+    """The section on a recording for another report; ``prefix`` is put before the keys of its parts.
 
-    DataError in one line: the scans on disk are broken.
+    DataError in one line: broken scans.
     """
     parts = _pictures(dataset, f"{prefix}recording-", {}, None, {})
     return Section(f"{prefix}recording", "Recording", (contents_table(dataset),), tuple(parts))
@@ -131,7 +133,7 @@ def _pictures(
     plan: RoomPlan | None,
     starts: Mapping[str, Array],
 ) -> list[Section]:
-    """The room, the wheels, and runs to be gone through."""
+    """The sections on the room, the wheels and the step-by-step player."""
     runs = representative_runs(dataset)
     odometry = OdometryModel.of_design(dataset.robot, "arc")
     from_start = {run.id: _outlines(plan, starts.get(run.id)) for run in runs.values()}
@@ -144,7 +146,8 @@ def _pictures(
     exactness: tuple[str, ...] = ()
     if plan is not None and not _all_known(runs, starts):
         exactness = (
-            f"The floor plan ({plan.name}) is drawn from the robot's mark; a run that begins beside it is off by that.",
+            f"The floor plan ({plan.name}) is drawn from the robot's mark; for a run that began beside the mark it is "
+            "shifted by that distance.",
         )
     return [
         Section(
@@ -162,7 +165,7 @@ def _all_known(runs: Mapping[str, Trajectory], starts: Mapping[str, Array]) -> b
 
 
 def _outlines(plan: RoomPlan | None, start: Array | None) -> list[Array]:
-    """The walls of a floor plan as seen from a start pose in it (its own, if that is not known): closed (n, 2) each."""
+    """The walls of a floor plan relative to a start pose (3,) in it (default: its own), closed (n, 2) each, m."""
     if plan is None:
         return []
     x, y, heading = plan.start if start is None else start

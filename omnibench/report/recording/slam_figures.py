@@ -1,4 +1,4 @@
-"""Reference poses of simulated runs against the truth: errors over time and way, at the ends, and their covariances."""
+"""Figures of the errors of reference poses against the truth: over time and distance, at the end, and their NEES."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from omnibench.report.style import INK, PALETTE, QUIET, plot
 from omnibench.robot.kinematics import Array
 from omnibench.slam.accuracy import RunErrors, run_errors
 
-_RUNS = 150  # drawn one by one
-_BINS = 16  # of time or way
-_LEAST = 5  # poses in a bin that has a mean
+_RUNS = 150  # runs drawn as thin lines (chosen)
+_BINS = 16  # bins of time or distance (chosen)
+_LEAST = 5  # poses; a bin with fewer shows no mean (chosen)
 
 _RUN = LegendItem("run", "a run", "#c3c9d0")
 _MEAN = LegendItem("mean", "mean", PALETTE[0])
@@ -27,31 +27,31 @@ _HIGH = LegendItem("high", "95th percentile", PALETTE[2], "dash")
 
 
 def error_figures(dataset: Dataset, truth: Mapping[str, TruePath]) -> tuple[Block, ...]:
-    """Errors of the reference poses of every run, whose true paths are all known."""
+    """Figures of the errors of the reference poses; the true path of every run must be known."""
     errors = [run_errors(run, truth[run.id]) for run in dataset.trajectories]
     figures = [
         _curves(errors, lambda e: e.times, lambda e: 1e3 * e.position, "t (s)", "position error (mm)"),
         _curves(errors, lambda e: e.times, lambda e: np.degrees(e.heading), "t (s)", "heading error (°)"),
-        _curves(errors, lambda e: e.driven, lambda e: 1e3 * e.position, "way (m)", "position error (mm)"),
-        _curves(errors, lambda e: e.driven, lambda e: np.degrees(e.heading), "way (m)", "heading error (°)"),
+        _curves(errors, lambda e: e.driven, lambda e: 1e3 * e.position, "distance (m)", "position error (mm)"),
+        _curves(errors, lambda e: e.driven, lambda e: np.degrees(e.heading), "distance (m)", "heading error (°)"),
         _histogram([1e3 * e.position[-1] for e in errors], "mm", "Final position errors"),
         _histogram([float(np.degrees(e.heading[-1])) for e in errors], "°", "Final heading errors"),
     ]
-    drawn = f", of which {count(_RUNS)} are drawn one by one" if len(errors) > _RUNS else ""
+    drawn = f", of which {count(_RUNS)} are drawn as thin lines" if len(errors) > _RUNS else ""
     caption = (
-        f"Of {plural(len(errors), 'run')}{drawn}; mean and percentile are of bins of time or way. Errors are "
-        "magnitudes, at the stamps of the reference poses, the start left out."
+        f"{plural(len(errors), 'run')}{drawn}; mean and percentile in bins of time or distance. Errors are "
+        "magnitudes at the stamps of the reference poses, without the start."
     )
     curves = FigureGrid(tuple(figures), (_RUN, _MEAN, _HIGH), 2, caption)
     return (curves, *_nees_figures(errors))
 
 
 def _nees_figures(errors: Sequence[RunErrors]) -> tuple[Block, ...]:
-    """Whether errors are as large as the covariances say."""
-    known = [each.of(np.isfinite(each.nees)) for each in errors if each.nees is not None]
-    if not sum(len(each.times) for each in known):
+    """The normalised estimation error squared (NEES): its distribution and its course over time."""
+    known = [run.of(np.isfinite(run.nees)) for run in errors if run.nees is not None]
+    if not sum(len(run.times) for run in known):
         return ()
-    values = np.concatenate([_squares(each) for each in known])
+    values = np.concatenate([_squares(run) for run in known])
     limit = max(12.0, 1.2 * float(np.quantile(values, 0.98)))
     edges = np.linspace(0.0, limit, 40)
     heights, _ = np.histogram(values, edges)
@@ -70,13 +70,13 @@ def _nees_figures(errors: Sequence[RunErrors]) -> tuple[Block, ...]:
     distribution = Figure(
         f"NEES of all poses: mean {significant(float(values.mean()), 3)}",
         plot(bars, expected, xaxis_title_text="NEES", yaxis_title_text="density"),
-        "Histogram of the normalised squared errors with the density that honest covariances give",
+        "Histogram of the normalised squared errors with the density that right covariances give",
         340,
     )
     time = _curves(known, lambda e: e.times, _squares, "t (s)", "NEES", level=3.0)
     caption = (
-        "NEES: the squared error, weighted by the inverse covariance; 3 on average (line) where covariances are "
-        f"honest, larger where they promise too much. {_beyond(values, limit)}"
+        "NEES: the squared error weighted by the inverse covariance. Its mean is 3 (line) where covariances are right, "
+        f"and larger where they are too small. {_beyond(values, limit)}"
     )
     return (FigureGrid((distribution, time), (_RUN, _MEAN, _HIGH), 2, caption.strip()),)
 
@@ -87,7 +87,7 @@ def _beyond(values: Array, limit: float) -> str:
 
 
 def _squares(errors: RunErrors) -> Array:
-    assert errors.nees is not None  # only such are drawn
+    assert errors.nees is not None  # runs without covariances are left out before
     return errors.nees
 
 
@@ -99,22 +99,23 @@ def _curves(
     y_title: str,
     level: float | None = None,
 ) -> Figure:
-    """Thin lines of runs, with mean and 95th percentile of bins."""
+    """The errors of runs as thin lines, with mean and 95th percentile in bins."""
     drawn = [errors[index] for index in evenly(len(errors), _RUNS)]
-    lines = joined([np.column_stack([along(each), value(each)]) for each in drawn])
-    x, y = (np.concatenate([of(each) for each in errors]) for of in (along, value))
+    lines = joined([np.column_stack([along(run), value(run)]) for run in drawn])
+    x, y = (np.concatenate([quantity(run) for run in errors]) for quantity in (along, value))
     edges = np.linspace(0.0, float(x.max()) * (1 + 1e-9) or 1.0, _BINS + 1)
-    places = np.digitize(x, edges) - 1
-    bins = [index for index in range(_BINS) if (places == index).sum() >= _LEAST]
-    middles = np.array([float(x[places == index].mean()) for index in bins])
+    bin_of = np.digitize(x, edges) - 1
+    bins = [index for index in range(_BINS) if (bin_of == index).sum() >= _LEAST]
+    middles = np.array([float(x[bin_of == index].mean()) for index in bins])
     traces = [_trace(_RUN, lines[:, 0], lines[:, 1], 0.8, 0.6)]
-    for item, of in ((_MEAN, np.mean), (_HIGH, lambda v: np.quantile(v, 0.95))):
-        traces.append(_trace(item, middles, np.array([float(of(y[places == index])) for index in bins]), 2.4, 1.0))
+    for item, statistic in ((_MEAN, np.mean), (_HIGH, lambda v: np.quantile(v, 0.95))):
+        level_of = np.array([float(statistic(y[bin_of == index])) for index in bins])
+        traces.append(_trace(item, middles, level_of, 2.4, 1.0))
     figure = plot(*traces, xaxis_title_text=x_title, yaxis_title_text=y_title)
     figure.update_yaxes(rangemode="tozero")
     if level is not None:
         figure.add_hline(level, line={"color": QUIET, "width": 1})
-    name, by = y_title.split(" (")[0], "time" if x_title.startswith("t ") else "way driven"
+    name, by = y_title.split(" (")[0], "time" if x_title.startswith("t ") else "distance driven"
     title = f"{name[:1].upper()}{name[1:]} over {by}"
     return Figure(title, figure, f"{title} of every run, with its mean and 95th percentile", 340)
 
@@ -143,6 +144,6 @@ def _histogram(values: Sequence[float], unit: str, title: str) -> Figure:
     )
     mean, high = float(np.mean(values)), float(np.quantile(values, 0.95))
     gap = "" if unit == "°" else " "
-    told = f"{title}: mean {significant(mean, 2)}{gap}{unit}, 95 % below {significant(high, 2)}{gap}{unit}"
+    headline = f"{title}: mean {significant(mean, 2)}{gap}{unit}, 95 % below {significant(high, 2)}{gap}{unit}"
     figure = plot(bars, xaxis_title_text=f"error ({unit})", yaxis_title_text="runs", bargap=0)
-    return Figure(told, figure, f"Histogram of {title.lower()} in {unit}", 320)
+    return Figure(headline, figure, f"Histogram of {title.lower()} in {unit}", 320)

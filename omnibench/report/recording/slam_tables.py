@@ -1,4 +1,4 @@
-"""How good reference poses are, in figures: of their ends and of all, drift, bias and covariance."""
+"""Tables of the errors of reference poses against the truth: final and overall errors, drift, bias, NEES."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from omnibench.slam.accuracy import ErrorSummary, SlamAccuracy
 
 
 def accuracy_blocks(accuracy: SlamAccuracy) -> tuple[Block, ...]:
-    """The errors of reference poses against the truth as tiles and as tables."""
+    """The errors of reference poses against the truth, as tiles and as tables."""
     return (_tiles(accuracy), _errors(accuracy), _biases(accuracy))
 
 
@@ -22,8 +22,8 @@ def _tiles(accuracy: SlamAccuracy) -> Facts:
         (
             Fact("Final position error, mean", f"{position} mm", f"95 % below {_mm(final.position_p95_m)} mm"),
             Fact("Final heading error, mean", f"{heading}°", f"95 % below {_degrees(final.heading_p95_rad)}°"),
-            Fact("Drift", f"{drift} mm a metre", f"heading {turn}° a metre"),
-            Fact("NEES, mean of all poses", _nees(accuracy.every), "3 where covariances are honest"),
+            Fact("Drift", f"{drift} mm per metre", f"heading {turn}° per metre"),
+            Fact("NEES, mean of all poses", _nees(accuracy.every), "3 where covariances are right"),
         ),
         "tiles",
     )
@@ -47,8 +47,8 @@ def _errors(accuracy: SlamAccuracy) -> Table:
             Column("NEES, mean"),
         ),
         rows=tuple(rows),
-        note=f"{plural(accuracy.runs, 'run')}, {significant(accuracy.distance_m, 4)} m in all. Drift: by how much the "
-        "error grows with the way, from its squares; 0 where it does not grow.",
+        note=f"{plural(accuracy.runs, 'run')}, {significant(accuracy.distance_m, 4)} m in all. Drift: the "
+        "growth k of the error over the distance s, from error² = noise² + (k s)²; 0 where it does not grow.",
     )
 
 
@@ -67,7 +67,7 @@ def _biases(accuracy: SlamAccuracy) -> Table:
             Column("heading", "°"),
         ),
         rows=tuple(rows),
-        note="What is left of the errors when they are averaged with their signs: a reference without bias has none.",
+        note="The signed mean of the errors: 0 for a reference without bias.",
     )
 
 

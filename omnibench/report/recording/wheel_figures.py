@@ -1,4 +1,4 @@
-"""Wheel rates of a run: what was measured, its mean over 100 ms, the target, and how far they are apart."""
+"""Figures of the wheel rates of a run: measured, their mean over 100 ms, targets, and the difference."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from omnibench.report.recording.drawing import short
 from omnibench.report.style import INK, PALETTE, plot
 from omnibench.robot.kinematics import Array, Robot
 
-_MEAN_OVER = 0.1  # s
-_DRAWN = 2000  # samples, at most
-_ROW = 150  # px
-_GAP = 0.05  # between rows, as a share of the plot
+_MEAN_OVER = 0.1  # s; also in the legends
+_DRAWN = 2000  # samples drawn at most (chosen: finer than a screen shows)
+_ROW = 150  # px, height of a wheel's row
+_GAP = 0.05  # space between rows, as a share of the plot
 
 _MEASURED = LegendItem("measured", "measured", "#a9c9e8")
 _MEAN = LegendItem("mean", "measured, mean over 100 ms", PALETTE[0])
@@ -28,7 +28,7 @@ _ERROR = LegendItem("error", "measured − target, mean over 100 ms", PALETTE[2]
 
 @dataclass(frozen=True, eq=False)
 class _Series:
-    """Values (n, N) that hold from one of ``edges`` (n + 1,), s, to the next."""
+    """Piecewise constant values (n, N) between ``edges`` (n + 1,), s."""
 
     edges: Array
     values: Array
@@ -40,7 +40,7 @@ class _Series:
 
 
 def wheel_rates(trajectory: Trajectory, robot: Robot) -> FigureGrid:
-    """One row a wheel: measured rates and targets over time; beside it their difference, where there are targets."""
+    """Measured rates and targets over time, a row for each wheel; with targets also the difference."""
     measured = _blocks(trajectory.times, trajectory.rates, max(1, -(-len(trajectory.times) // _DRAWN)))
     period = float(np.median(np.diff(trajectory.times, prepend=0.0)))
     size = max(1, round(_MEAN_OVER / period), -(-len(trajectory.times) // _DRAWN))
@@ -53,7 +53,7 @@ def wheel_rates(trajectory: Trajectory, robot: Robot) -> FigureGrid:
     step = rate_step(trajectory)
     if step is not None:
         words.append(
-            f"The encoder's steps are {significant(step, 3)} rad/s, one tick a sample; a mean over 100 ms is finer."
+            f"The encoder resolves {significant(step, 3)} rad/s, one tick per sample; a mean over 100 ms is finer."
         )
     titles = [f"{name} (rad/s)" for name in robot.wheel_names]
     end = float(trajectory.times[-1])
@@ -79,7 +79,7 @@ def wheel_rates(trajectory: Trajectory, robot: Robot) -> FigureGrid:
 
 
 def rate_step(trajectory: Trajectory) -> float | None:
-    """The step (rad/s) in which measured wheel rates come, if an encoder's ticks can be seen in them."""
+    """The quantisation step of the measured wheel rates, rad/s; None if they show no encoder ticks."""
     values = np.unique(np.round(trajectory.rates, 7))
     if not 2 <= len(values) <= trajectory.rates.size / 4:
         return None
@@ -98,7 +98,7 @@ def _error_in_words(trajectory: Trajectory) -> str:
 
 
 def _blocks(times: Array, values: Array, size: int) -> _Series:
-    """Means over ``size`` samples each, weighted by how long these last; the last block may be shorter."""
+    """Means over blocks of ``size`` samples, weighted by their durations; the last block may be shorter."""
     starts = np.arange(0, len(times), size)
     durations = np.diff(times, prepend=0.0)[:, None]
     weights = np.add.reduceat(durations, starts)
@@ -130,7 +130,7 @@ def _trace(item: LegendItem, times: Array, values: Array, width: float, shape: s
 def _stacked(
     rows: Sequence[Sequence[go.Scatter]], titles: Sequence[str], end: float, with_zero: bool = False
 ) -> go.Figure:
-    """Plots one above the other with one axis of time, to ``end`` s."""
+    """Plots in rows above each other with a common time axis from 0 to ``end`` s."""
     height = (1 + _GAP) / len(rows) - _GAP
     layout: dict[str, object] = {}
     traces = []
