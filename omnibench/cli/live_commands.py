@@ -113,7 +113,7 @@ def listen(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document a line, once a second.")] = False,
 ) -> None:
     """Show a robot's odometry live: pose, rate, age, health."""
-    from omnibench.live.listen import listen as show
+    from omnibench.cli.terminal.robot_table import listen as show
     from omnibench.live.stopping import stop_on_signals
 
     with _client(config, connect, profile, "listen") as (session, keys), stop_on_signals() as stop:
@@ -150,8 +150,8 @@ def record(
     topics: Annotated[list[str] | None, typer.Option("--topic", help="Only this; may be repeated.")] = None,
 ) -> None:
     """Record live topics into MCAP, which Foxglove and rosbags open."""
+    from omnibench.cli.terminal.recording_status import record as write
     from omnibench.live.config import read_live_config
-    from omnibench.live.record import record as write
     from omnibench.live.stopping import stop_on_signals
     from omnibench.live.wire.topics import TOPICS
 

@@ -23,8 +23,8 @@ from rosbags.highlevel import AnyReader
 from samples import PERIOD, STAMP, sample
 from sessions import Loopback, until
 
+from omnibench.cli.terminal.recording_status import record
 from omnibench.errors import ConfigError, DataError, UnknownNameError
-from omnibench.live.record import record
 from omnibench.live.wire.recorder import Recorder
 from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace, Publisher
 
@@ -271,7 +271,7 @@ RECORDING_PROCESS = """
 import sys
 from pathlib import Path
 from rich.console import Console
-from omnibench.live.record import record
+from omnibench.cli.terminal.recording_status import record
 from omnibench.live.stopping import stop_on_signals
 from omnibench.live.wire.topics import KeySpace
 from sessions import raw_session

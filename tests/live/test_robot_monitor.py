@@ -18,9 +18,9 @@ from rich.console import Console
 from samples import odometry
 from sessions import Loopback, until
 
+from omnibench.cli.terminal.robot_table import listen, plain, state, view
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.estimation.counts import Counts
-from omnibench.live.listen import listen, plain, state, view
 from omnibench.live.robot_monitor import HealthSummary, OdometryStatus, RobotMonitor, RobotStatus
 from omnibench.live.wire.messages import Diagnostic, Diagnostics, Odometry
 from omnibench.live.wire.topics import GraphNode, KeySpace, Profile
