@@ -1,4 +1,4 @@
-"""What is heard of robots: the newest odometry, how often it comes, how old it is, and how the robot says it is."""
+"""Listening to robots: newest odometry, its rate and age, presence and health of each, from their messages."""
 
 from __future__ import annotations
 
@@ -6,99 +6,62 @@ import json
 import math
 import time
 from collections import deque
-from dataclasses import dataclass, fields
-from threading import Lock
+from dataclasses import fields
+from threading import Event, Lock
 from types import TracebackType
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import zenoh
 from zenoh.handlers import Callback
 
+from omnibench.errors import DataError
 from omnibench.live.estimation.counts import Counts
-from omnibench.live.network.presence import Presence
+from omnibench.live.network.presence import Presence, checked_robot, nothing_received
+from omnibench.live.robot_status import HealthSummary, OdometryStatus, RobotStatus
 from omnibench.live.wire.messages import DIAGNOSTICS, ODOMETRY, MessageError, Odometry
 from omnibench.live.wire.topics import KeySpace
 
 _FUSED: Final = "odometry/filtered"
-_RATE_WINDOW: Final = 2.0  # s
-_ASK_PERIOD: Final = 1.0  # s, between questions for the health
-_HEALTH_LASTS: Final = 3.5  # s
-_LARGEST_LAG: Final = 10.0  # s; beyond it, or before the stamp, sender and receiver have different clocks
-_LEVELS: Final = ("ok", "warning", "error", "stale")  # of ROS 2's diagnostics
+_RATE_WINDOW: Final = 2.0  # s of messages that the rate is the mean of; chosen
+_QUERY_PERIOD: Final = 1.0  # s between queries for the health; chosen
+_HEALTH_LIFETIME: Final = 3.5  # s after which an answer no longer counts: three queries without a reply
+_LARGEST_LAG: Final = 10.0  # s from stamp to arrival; beyond it, or below 0, the two clocks differ
+_LEVELS: Final = ("ok", "warning", "error", "stale")  # names of DiagnosticStatus's levels 0 to 3
 _COUNTERS: Final = frozenset(item.name for item in fields(Counts))
 
 
-@dataclass(frozen=True)
-class OdometryStatus:
-    """The newest message of one topic. rate: Hz over the last 2 s. age: s since it came; stamp_age: s since its stamp,
-    None where the sender's clock is another. undecodable: messages so far that were not odometry."""
-
-    message: Odometry
-    rate: float | None
-    age: float
-    stamp_age: float | None
-    undecodable: int
-
-    @property
-    def position_sigma(self) -> float:
-        """Standard deviation of the position along an axis, m: the root of the mean of x's and y's variances."""
-        covariance = self.message.pose_covariance
-        return math.sqrt(max(float(covariance[0, 0] + covariance[1, 1]) / 2, 0.0))
-
-    @property
-    def heading_sigma(self) -> float:
-        """Standard deviation of the heading, rad."""
-        return math.sqrt(max(float(self.message.pose_covariance[2, 2]), 0.0))
-
-
-@dataclass(frozen=True)
-class HealthSummary:
-    """How a robot says it is: a word, the reason, and the counters of what is not as it should be."""
-
-    status: str
-    message: str
-    counts: dict[str, int]
-
-
-@dataclass(frozen=True)
-class RobotStatus:
-    """What is heard of one robot. presence: its liveliness token; ``no token`` where no node of omnibench has it."""
-
-    robot: str
-    presence: Literal["alive", "left", "no token"]
-    odom: OdometryStatus | None
-    filtered: OdometryStatus | None
-    health: HealthSummary | None
-
-
 class RobotMonitor:
-    """Listens for one robot, or for all when ``robot`` is None; ask for its ``news``. A context manager."""
+    """Listens to one robot, or to all if ``robot`` is None; a context manager.
+
+    ConfigError: no robot can have this name.
+    """
 
     def __init__(self, session: zenoh.Session, keys: KeySpace, robot: str | None) -> None:
         self._session = session
-        self._robot = robot
-        self._place = 0 if keys.profile == "plain" else 1  # of the robot's name in a key
+        self._robot = None if robot is None else checked_robot(robot)
+        self._name_part = 0 if keys.profile == "plain" else 1  # which part of a key is the robot's name
         self._streams: dict[tuple[str, str], _Stream] = {}
         self._answers: dict[str, tuple[float, HealthSummary]] = {}
         self._lock = Lock()
-        self._asked = -math.inf
+        self._queried_at = -math.inf
         self._presence = Presence(session)
-        who = robot or "*"
-        self._subscribers = [self._subscribe(keys.expression(who, topic), topic) for topic in ("odom", _FUSED)]
-        heard: Any = Callback(self._diagnosed, indirect=False)
-        self._subscribers.append(session.declare_subscriber(keys.expression(who, "diagnostics"), heard))
+        names = robot or "*"
+        self._subscribers = [self._subscribe(keys.expression(names, topic), topic) for topic in ("odom", _FUSED)]
+        take_diagnostics: Any = Callback(self._take_diagnostics, indirect=False)
+        expression = keys.expression(names, "diagnostics")
+        self._subscribers.append(session.declare_subscriber(expression, take_diagnostics))
 
     @property
     def alive(self) -> tuple[str, ...]:
-        """All robots whose tokens are there."""
+        """The names of all robots whose liveliness token is declared."""
         return self._presence.alive
 
-    def status(self) -> list[RobotStatus]:
-        """What is heard of each robot, by name."""
+    def statuses(self) -> list[RobotStatus]:
+        """The present state of each robot, sorted by name."""
         now = time.monotonic()
-        if now - self._asked >= _ASK_PERIOD:
-            self._asked = now
-            self._ask()
+        if now - self._queried_at >= _QUERY_PERIOD:
+            self._queried_at = now
+            self._query_health()
         alive, left = self._presence.alive, self._presence.left
         with self._lock:
             streams, answers = dict(self._streams), dict(self._answers)
@@ -110,10 +73,19 @@ class RobotMonitor:
                 "alive" if name in alive else "left" if name in left else "no token",
                 odom=streams[name, "odom"].status(now) if (name, "odom") in streams else None,
                 filtered=streams[name, _FUSED].status(now) if (name, _FUSED) in streams else None,
-                health=answers[name][1] if name in answers and now - answers[name][0] < _HEALTH_LASTS else None,
+                health=answers[name][1] if name in answers and now - answers[name][0] < _HEALTH_LIFETIME else None,
             )
             for name in sorted(names)
         ]
+
+    def wait_until_present(self, stop: Event, patience: float) -> None:
+        """Wait until the robot is alive or sends odometry, or ``stop`` is set; DataError after ``patience`` s."""
+        deadline = time.monotonic() + patience
+        while not any(status.presence == "alive" or status.odom or status.filtered for status in self.statuses()):
+            if time.monotonic() > deadline:
+                raise DataError(nothing_received(self._robot or "*", patience, self.alive))
+            if stop.wait(0.02):
+                return
 
     def close(self) -> None:
         """Stop listening."""
@@ -130,34 +102,34 @@ class RobotMonitor:
         self.close()
 
     def _subscribe(self, expression: str, topic: str) -> zenoh.Subscriber[None]:
-        def arrived(sample: zenoh.Sample) -> None:
+        def take_odometry(sample: zenoh.Sample) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
                 key = self._name(sample), topic
                 with self._lock:
                     stream = self._streams.setdefault(key, _Stream())
-                stream.arrived(sample.payload.to_bytes())
+                stream.take(sample.payload.to_bytes())
 
-        direct: Any = Callback(arrived, indirect=False)
+        direct: Any = Callback(take_odometry, indirect=False)
         return self._session.declare_subscriber(expression, direct)
 
-    def _ask(self) -> None:
-        replied: Any = Callback(self._answered, indirect=False)
+    def _query_health(self) -> None:
+        take_answer: Any = Callback(self._take_answer, indirect=False)
         self._session.get(
-            f"omnibench/{self._robot or '*'}/health", replied, target=zenoh.QueryTarget.ALL, timeout=_ASK_PERIOD
+            f"omnibench/{self._robot or '*'}/health", take_answer, target=zenoh.QueryTarget.ALL, timeout=_QUERY_PERIOD
         )
 
-    def _answered(self, reply: zenoh.Reply) -> None:
+    def _take_answer(self, reply: zenoh.Reply) -> None:
         if reply.ok is None:
             return
         try:
             answer = json.loads(reply.ok.payload.to_string())
             health = HealthSummary(str(answer["status"]), str(answer["message"]), _anomalies(answer["counts"]))
         except (ValueError, TypeError, KeyError, AttributeError):
-            return  # of another program, or of another version
+            return  # the answer of another program or another version
         with self._lock:
             self._answers[str(reply.ok.key_expr).split("/")[1]] = time.monotonic(), health
 
-    def _diagnosed(self, sample: zenoh.Sample) -> None:
+    def _take_diagnostics(self, sample: zenoh.Sample) -> None:
         name = self._name(sample)
         with self._lock:
             answer = self._answers.get(name)
@@ -165,8 +137,8 @@ class RobotMonitor:
             statuses = DIAGNOSTICS.decode(sample.payload.to_bytes()).statuses
         except MessageError:
             return
-        if not statuses or (answer is not None and time.monotonic() - answer[0] < _ASK_PERIOD * 1.5):
-            return  # the robot answers questions, which says more
+        if not statuses or (answer is not None and time.monotonic() - answer[0] < _QUERY_PERIOD * 1.5):
+            return  # the robot answers queries, which hold more than diagnostics
         worst = max(statuses, key=lambda status: status.level)
         level = _LEVELS[worst.level] if worst.level < len(_LEVELS) else str(worst.level)
         health = HealthSummary(level, worst.message, _anomalies(dict(worst.values)))
@@ -174,32 +146,33 @@ class RobotMonitor:
             self._answers[name] = time.monotonic(), health
 
     def _name(self, sample: zenoh.Sample) -> str:
-        return str(sample.key_expr).split("/")[self._place]
+        return str(sample.key_expr).split("/")[self._name_part]
 
 
 class _Stream:
-    """The odometry of one robot's topic."""
+    """The odometry messages of one robot's topic. ``take`` runs in Zenoh's thread, ``status`` in the reader's."""
 
     def __init__(self) -> None:
         self._lock = Lock()
         self._count = 0
         self._undecodable = 0
-        self._came, self._came_by_clock = 0.0, 0.0
+        self._arrived_at, self._arrived_at_by_clock = 0.0, 0.0
         self._payload = b""
         self._message: Odometry | None = None
-        self._history: deque[tuple[float, int]] = deque()  # when the last message of so many came
+        self._history: deque[tuple[float, int]] = deque()  # (time of arrival, messages until then) at each reading
 
-    def arrived(self, payload: bytes) -> None:
+    def take(self, payload: bytes) -> None:
         with self._lock:
             self._count += 1
-            self._came, self._came_by_clock = time.monotonic(), time.time()
+            self._arrived_at, self._arrived_at_by_clock = time.monotonic(), time.time()
             self._payload = payload
 
     def status(self, now: float) -> OdometryStatus | None:
         with self._lock:
-            count, came, came_by_clock, payload = self._count, self._came, self._came_by_clock, self._payload
+            count, payload = self._count, self._payload
+            arrived_at, arrived_at_by_clock = self._arrived_at, self._arrived_at_by_clock
         if not self._history or self._history[-1][1] != count:
-            self._history.append((came, count))
+            self._history.append((arrived_at, count))
             try:
                 self._message = ODOMETRY.decode(payload)
             except MessageError:
@@ -208,17 +181,16 @@ class _Stream:
             self._history.popleft()
         if self._message is None:
             return None
-        lag = came_by_clock - self._message.seconds
-        age = max(now - came, 0.0)
-        return OdometryStatus(
-            self._message, self._rate(), age, age + lag if 0 <= lag <= _LARGEST_LAG else None, self._undecodable
-        )
+        lag = arrived_at_by_clock - self._message.seconds
+        age = max(now - arrived_at, 0.0)
+        stamp_age = age + lag if 0 <= lag <= _LARGEST_LAG else None
+        return OdometryStatus(self._message, self._rate(), age, stamp_age, self._undecodable)
 
     def _rate(self) -> float | None:
-        (first, before), (last, count) = self._history[0], self._history[-1]
-        return (count - before) / (last - first) if last > first else None
+        (first, count_before), (last, count) = self._history[0], self._history[-1]
+        return (count - count_before) / (last - first) if last > first else None
 
 
 def _anomalies(counts: dict[str, Any]) -> dict[str, int]:
-    """Those of a node's counters that tell of something that is not as it should be."""
+    """The counters of anomalies that are not 0, from all of a node's counters."""
     return Counts(**{name: int(value) for name, value in counts.items() if name in _COUNTERS}).anomalies()

@@ -1,4 +1,4 @@
-"""``omnibench record``: a recorder with a status line, until told to stop."""
+"""``omnibench record``: a recorder with a status line, until it is stopped."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from omnibench.live.network.presence import alive_robots, nothing_received
 from omnibench.live.stopping import ticks
 from omnibench.live.wire.recorder import Recorder
 from omnibench.live.wire.topics import TOPICS, KeySpace
+from omnibench.report.numbers import plural
 
-_PERIOD: Final = 0.25  # s, of the line on a terminal
-_PIPED_PERIOD: Final = 10.0  # s, of the lines when piped
+_PERIOD: Final = 0.25  # s between two updates of the line on a terminal; chosen
+_PIPED_PERIOD: Final = 10.0  # s between two lines when the output is piped
 
 
 def record(
@@ -37,46 +38,46 @@ def record(
 ) -> Recorder:
     """Record the robots' topics into the MCAP file ``path`` until ``stop`` is set or ``seconds`` have passed.
 
-    A robot from which nothing has come after ``patience`` s is told. Returns the recorder with its counts; the file is
-    complete then, and after KeyboardInterrupt too. ConfigError: a name that cannot be. DataError: the file exists
-    already or cannot be made, or the disk refused while recording.
+    A line names each robot from which nothing has come after ``patience`` s. Returns the recorder with its counts;
+    the file is complete then, and after KeyboardInterrupt too. ConfigError: a robot's name or topic is not valid.
+    DataError: the file exists already or cannot be made, or writing failed while recording.
     """
     recorder = Recorder(session, keys, robots, path, topics, on_failure=lambda _: None)
-    status = _Status(console)
+    status = _StatusLine(console)
     began = time.monotonic()
     with recorder, status:
-        silence_told = False
+        silence_reported = False
         for passed in ticks(stop, _PERIOD, seconds):
             if recorder.failure is not None:
                 raise DataError(recorder.failure)
-            if not silence_told and passed >= patience:
-                silence_told = True
-                for robot in _silent(recorder, robots):
-                    status.tell(f"{nothing_received(robot, passed, alive_robots(session))}; recording goes on")
-            status.show(status_line(recorder, passed), passed)
+            if not silence_reported and passed >= patience:
+                silence_reported = True
+                for robot in recorder.silent_robots:
+                    status.keep(f"{nothing_received(robot, passed, alive_robots(session))}; recording goes on")
+            status.update(status_line(recorder, passed), passed)
     if recorder.failure is not None:
         raise DataError(recorder.failure)
     seconds_recorded = time.monotonic() - began
-    if not silence_told:
-        for robot in _silent(recorder, robots):
-            status.tell(nothing_received(robot, seconds_recorded, alive_robots(session)))
-    status.tell(status_line(recorder, seconds_recorded))
+    if not silence_reported:
+        for robot in recorder.silent_robots:
+            status.keep(nothing_received(robot, seconds_recorded, alive_robots(session)))
+    status.keep(status_line(recorder, seconds_recorded))
     for name in sorted(recorder.counts.keys() | recorder.undecodable.keys()):
-        status.tell(f"  {name}: {recorder.counts[name]:,}{_left_out(recorder.undecodable[name])}")
+        status.keep(f"  {name}: {recorder.counts[name]:,}{_left_out(recorder.undecodable[name])}")
     return recorder
 
 
 def status_line(recorder: Recorder, seconds: float) -> str:
-    """What was recorded in ``seconds``, in one line."""
-    lost = f", {recorder.lost:,} lost to a slow disk" if recorder.lost else ""
+    """One line with what was recorded in ``seconds``."""
+    lost = f", {recorder.lost:,} lost because the disk was too slow" if recorder.lost else ""
     return (
-        f"{recorder.path}: {seconds:.1f} s, {recorder.messages:,} messages, {recorder.bytes / 1e6:.2f} MB"
+        f"{recorder.path}: {seconds:.1f} s, {plural(recorder.messages, 'message')}, {recorder.bytes / 1e6:.2f} MB"
         f"{_left_out(recorder.undecodable.total())}{lost}"
     )
 
 
-class _Status:
-    """A line that is kept up to date on a terminal; when piped, one now and then."""
+class _StatusLine:
+    """A line that is kept up to date on a terminal; when piped, a new line every ten seconds."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -91,23 +92,18 @@ class _Status:
         if self._live:
             self._live.stop()
 
-    def tell(self, line: str) -> None:
+    def keep(self, line: str) -> None:
         """Print a line that stays."""
         self._console.print(Text(line), soft_wrap=True)
 
-    def show(self, line: str, passed: float) -> None:
-        """The state after ``passed`` s."""
+    def update(self, line: str, passed: float) -> None:
+        """Show the state after ``passed`` s."""
         if self._live:
             self._live.update(Text(line), refresh=True)
         elif passed >= self._next:
             self._next = passed + _PIPED_PERIOD
-            self.tell(line)
+            self.keep(line)
 
 
 def _left_out(undecodable: int) -> str:
     return f", {undecodable:,} left out that could not be decoded" if undecodable else ""
-
-
-def _silent(recorder: Recorder, robots: Sequence[str]) -> list[str]:
-    heard = recorder.counts.keys() | recorder.undecodable.keys()
-    return [robot for robot in robots if not any(name.startswith(f"/{robot}/") for name in heard)]

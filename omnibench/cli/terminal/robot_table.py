@@ -1,35 +1,32 @@
-"""``omnibench listen``: robots' odometry as a live table, as plain lines, or as JSON."""
+"""``omnibench listen``: robots' odometry as a table that refreshes itself, as plain lines, or as JSON."""
 
 from __future__ import annotations
 
 import json
 import math
-import time
 from collections.abc import Sequence
 from contextlib import nullcontext
 from threading import Event
-from typing import Any, Final
+from typing import Final
 
 import zenoh
-from pydantic_core import to_jsonable_python
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from omnibench.errors import DataError
-from omnibench.live.network.presence import checked_robot, nothing_received
-from omnibench.live.robot_monitor import OdometryStatus, RobotMonitor, RobotStatus
+from omnibench.live.robot_monitor import RobotMonitor
+from omnibench.live.robot_status import OdometryStatus, RobotStatus, json_document
 from omnibench.live.stopping import ticks
 from omnibench.live.wire.topics import KeySpace
 
-_REFRESH: Final = 0.2  # s, of the table
-_LINE_PERIOD: Final = 1.0  # s, of lines
-_SILENCE: Final = 1.0  # s without a message, then it is said
-_HEALTH_WIDTH: Final = 48  # columns that health, and more room between the figures, need beside these
-_NAME_WIDTH: Final = 10
-_NOBODY: Final = "no robot is heard yet"
+_REFRESH: Final = 0.2  # s between two drawings of the table; chosen
+_LINE_PERIOD: Final = 1.0  # s between two lines of a robot
+_SILENCE: Final = 1.0  # s without a message from which on the silence is shown
+_HEALTH_WIDTH: Final = 48  # columns that the health and wider gaps between the figures need beside the figures
+_NAME_WIDTH: Final = 10  # columns of a robot's name in the narrow table
+_NO_ROBOT: Final = "no robot seen yet"
 
 
 def listen(
@@ -42,47 +39,72 @@ def listen(
     as_json: bool = False,
     patience: float = 3.0,
 ) -> None:
-    """Show what is heard of ``robot`` (None: of all) until ``stop`` is set or ``seconds`` have passed.
+    """Show the state of ``robot`` (None: of all robots) until ``stop`` is set or ``seconds`` have passed.
 
-    A table on a terminal, else a line a second for each robot; ``as_json``: that line is a JSON document.
-    DataError: nothing is heard of ``robot`` within ``patience`` s. ConfigError: no robot can have this name.
+    A table on a terminal, else a line a second for each robot; with ``as_json`` the line is a JSON document.
+    DataError: nothing was received from ``robot`` within ``patience`` s. ConfigError: no robot can have this name.
     """
-    if robot is not None:
-        checked_robot(robot)
-    table = console.is_terminal and not as_json
+    draws_table = console.is_terminal and not as_json
     with RobotMonitor(session, keys, robot) as monitor:
         if robot is not None:
-            _wait_for(robot, monitor, stop, patience)
-        with Live(console=console, auto_refresh=False) if table else nullcontext() as live:
+            monitor.wait_until_present(stop, patience)
+        with Live(console=console, auto_refresh=False) if draws_table else nullcontext() as live:
             for _ in ticks(stop, _REFRESH if live else _LINE_PERIOD, seconds):
-                news = monitor.status()
+                statuses = monitor.statuses()
                 if live:
-                    live.update(view(news, console), refresh=True)
+                    live.update(view(statuses, console), refresh=True)
                     continue
-                for line in [json.dumps(document(each)) for each in news] if as_json else _plain_lines(news):
+                for line in _json_lines(statuses) if as_json else _plain_lines(statuses):
                     console.print(Text(line), soft_wrap=True)
 
 
-def _wait_for(robot: str, monitor: RobotMonitor, stop: Event, patience: float) -> None:
-    deadline = time.monotonic() + patience
-    while not any(each.presence == "alive" or each.odom or each.filtered for each in monitor.status()):
-        if time.monotonic() > deadline:
-            raise DataError(nothing_received(robot, patience, monitor.alive))
-        if stop.wait(0.02):
-            return
-
-
-def view(news: Sequence[RobotStatus], console: Console) -> RenderableType:
+def view(statuses: Sequence[RobotStatus], console: Console) -> RenderableType:
     """The robots as a table that fits the console: health beside the figures if there is room, else below them."""
-    if not news:
-        return Text(_NOBODY)
-    figures = _table(news, health=False)
+    if not statuses:
+        return Text(_NO_ROBOT)
+    figures = _table(statuses, health=False)
     if console.measure(figures).maximum + _HEALTH_WIDTH <= console.width:
-        return _table(news, health=True)
-    return Group(figures, *(Text(f"{each.robot}: {state(each)}", style=_style(each)) for each in news))
+        return _table(statuses, health=True)
+    return Group(figures, *(Text(f"{status.robot}: {describe(status)}", style=_style(status)) for status in statuses))
 
 
-def _table(news: Sequence[RobotStatus], health: bool) -> Table:
+def describe(status: RobotStatus) -> str:
+    """A robot's presence and health in words."""
+    parts = []
+    if status.presence == "left":
+        parts.append("left")
+    streams = _streams(status)
+    silence = min((stream.age for stream in streams), default=None)
+    if silence is None:
+        parts.append("no odometry yet")
+    elif silence >= _SILENCE:
+        parts.append(f"no message for {silence:.1f} s")
+    elif status.health is None and status.presence != "left":
+        parts.append("health unknown")
+    if status.health is not None and status.presence != "left":
+        message = status.health.message
+        parts.append(status.health.status + (f": {message}" if message not in ("", status.health.status) else ""))
+        parts.extend(f"{name} {count}" for name, count in status.health.counts.items())
+    undecodable = sum(stream.undecodable for stream in streams)
+    if undecodable:
+        parts.append(f"undecodable odometry {undecodable}")
+    return ", ".join(parts)
+
+
+def plain_line(status: RobotStatus) -> str:
+    """A robot's state as one line of text."""
+    return "; ".join([f"{status.robot}: {describe(status)}", *map(_plain_odometry, _streams(status))])
+
+
+def _plain_lines(statuses: Sequence[RobotStatus]) -> list[str]:
+    return [plain_line(status) for status in statuses] or [_NO_ROBOT]
+
+
+def _json_lines(statuses: Sequence[RobotStatus]) -> list[str]:
+    return [json.dumps(json_document(status)) for status in statuses]
+
+
+def _table(statuses: Sequence[RobotStatus], health: bool) -> Table:
     table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, int(health), 0, 0), pad_edge=False)
     table.add_column("robot", no_wrap=True, overflow="ellipsis", max_width=None if health else _NAME_WIDTH)
     table.add_column("frame")
@@ -90,36 +112,36 @@ def _table(news: Sequence[RobotStatus], health: bool) -> Table:
         table.add_column(heading, justify="right", no_wrap=True)
     if health:
         table.add_column("health")
-    for each in news:
-        for row, stream in enumerate(_streams(each) or (None,)):
-            words = [state(each) if row == 0 else ""] if health else []
-            name = each.robot if row == 0 else ""
-            table.add_row(name, *_cells(each.robot, stream, by_stamp=health), *words, style=_style(each))
+    for status in statuses:
+        for row, stream in enumerate(_streams(status) or (None,)):
+            words = [describe(status) if row == 0 else ""] if health else []
+            name = status.robot if row == 0 else ""
+            table.add_row(name, *_cells(status.robot, stream, by_stamp=health), *words, style=_style(status))
     return table
 
 
-def _style(news: RobotStatus) -> str:
-    return "dim" if news.presence == "left" else ""
+def _style(status: RobotStatus) -> str:
+    return "dim" if status.presence == "left" else ""
 
 
-def _cells(robot: str, news: OdometryStatus | None, by_stamp: bool) -> list[str]:
-    if news is None:
+def _cells(robot: str, stream: OdometryStatus | None, by_stamp: bool) -> list[str]:
+    if stream is None:
         return ["-"] * 11
-    x, y, heading = news.message.pose.tolist()
-    vx, vy, w = news.message.twist.tolist()
-    silent = news.age >= _SILENCE
+    x, y, heading = stream.message.pose.tolist()
+    vx, vy, w = stream.message.twist.tolist()
+    silent = stream.age >= _SILENCE
     return [
-        news.message.frame.removeprefix(f"{robot}/"),  # frames of one robot among several carry its name
+        stream.message.frame.removeprefix(f"{robot}/"),  # in a node of several robots frames carry the robot's name
         _digits(x, 3),
         _digits(y, 3),
         f"{math.degrees(heading):.1f}",
-        _digits(news.position_sigma, 3),
-        _digits(math.degrees(news.heading_sigma), 2),
+        _digits(stream.position_sigma, 3),
+        _digits(math.degrees(stream.heading_sigma), 2),
         f"{vx:.2f}",
         f"{vy:.2f}",
         _digits(math.degrees(w), 1),
-        "-" if silent or news.rate is None else f"{news.rate:.0f}",
-        "-" if silent else _age(news, by_stamp),
+        "-" if silent or stream.rate is None else f"{stream.rate:.0f}",
+        "-" if silent else _age(stream, by_stamp),
     ]
 
 
@@ -129,86 +151,23 @@ def _digits(value: float, decimals: int) -> str:
     return f"{value:.{max(decimals - max(digits - 2, 0), 0)}f}"
 
 
-def _age(news: OdometryStatus, by_stamp: bool) -> str:
-    """Since it came and, where the clocks agree, since its stamp; ms."""
-    since_stamp = f"/{news.stamp_age * 1e3:.0f}" if by_stamp and news.stamp_age is not None else ""
-    return f"{news.age * 1e3:.0f}{since_stamp}"
+def _age(stream: OdometryStatus, by_stamp: bool) -> str:
+    """Time since the message arrived and, where the clocks agree, since its stamp; ms."""
+    since_stamp = f"/{stream.stamp_age * 1e3:.0f}" if by_stamp and stream.stamp_age is not None else ""
+    return f"{stream.age * 1e3:.0f}{since_stamp}"
 
 
-def state(news: RobotStatus) -> str:
-    """How a robot is, in words."""
-    parts = []
-    if news.presence == "left":
-        parts.append("left")
-    streams = _streams(news)
-    silence = min((stream.age for stream in streams), default=None)
-    if silence is None:
-        parts.append("no odometry yet")
-    elif silence >= _SILENCE:
-        parts.append(f"no news for {silence:.1f} s")
-    elif news.health is None and news.presence != "left":
-        parts.append("it does not tell its health")
-    if news.health is not None and news.presence != "left":
-        message = news.health.message
-        parts.append(news.health.status + (f": {message}" if message not in ("", news.health.status) else ""))
-        parts.extend(f"{name} {count}" for name, count in news.health.counts.items())
-    undecodable = sum(stream.undecodable for stream in streams)
-    if undecodable:
-        parts.append(f"undecodable odometry {undecodable}")
-    return ", ".join(parts)
+def _streams(status: RobotStatus) -> tuple[OdometryStatus, ...]:
+    return tuple(stream for stream in (status.odom, status.filtered) if stream is not None)
 
 
-def _plain_lines(news: Sequence[RobotStatus]) -> list[str]:
-    return [plain(each) for each in news] or [_NOBODY]
-
-
-def plain(news: RobotStatus) -> str:
-    """A robot as one line."""
-    return "; ".join([f"{news.robot}: {state(news)}", *map(_plain_odometry, _streams(news))])
-
-
-def _streams(news: RobotStatus) -> tuple[OdometryStatus, ...]:
-    return tuple(stream for stream in (news.odom, news.filtered) if stream is not None)
-
-
-def _plain_odometry(news: OdometryStatus) -> str:
-    x, y, heading = news.message.pose.tolist()
-    vx, vy, w = news.message.twist.tolist()
-    rate = "" if news.rate is None else f", {news.rate:.1f} Hz"
-    by_stamp = "" if news.stamp_age is None else f" ({news.stamp_age * 1e3:.0f} ms by its stamp)"
+def _plain_odometry(stream: OdometryStatus) -> str:
+    x, y, heading = stream.message.pose.tolist()
+    vx, vy, w = stream.message.twist.tolist()
+    rate = "" if stream.rate is None else f", {stream.rate:.1f} Hz"
+    by_stamp = "" if stream.stamp_age is None else f" ({stream.stamp_age * 1e3:.0f} ms by its stamp)"
     return (
-        f"{news.message.frame} x {x:.3f} m y {y:.3f} m heading {math.degrees(heading):.1f} deg"
-        f" (1 sigma {news.position_sigma:.3f} m {math.degrees(news.heading_sigma):.2f} deg)"
-        f" vx {vx:.3f} m/s vy {vy:.3f} m/s w {math.degrees(w):.1f} deg/s{rate}, age {news.age * 1e3:.0f} ms{by_stamp}"
+        f"{stream.message.frame} x {x:.3f} m y {y:.3f} m heading {math.degrees(heading):.1f} deg"
+        f" (1 sigma {stream.position_sigma:.3f} m {math.degrees(stream.heading_sigma):.2f} deg)"
+        f" vx {vx:.3f} m/s vy {vy:.3f} m/s w {math.degrees(w):.1f} deg/s{rate}, age {stream.age * 1e3:.0f} ms{by_stamp}"
     )
-
-
-def document(news: RobotStatus) -> Any:
-    """A robot as a JSON document: SI units, infinity and NaN as null."""
-    content = {
-        "robot": news.robot,
-        "presence": news.presence,
-        "odom": _odometry_record(news.odom),
-        "filtered": _odometry_record(news.filtered),
-        "health": news.health,
-    }
-    return to_jsonable_python(content, inf_nan_mode="null")
-
-
-def _odometry_record(news: OdometryStatus | None) -> dict[str, Any] | None:
-    if news is None:
-        return None
-    message = news.message
-    return {
-        "stamp": message.seconds,
-        "frame": message.frame,
-        "pose": message.pose.tolist(),
-        "pose_covariance": message.pose_covariance.tolist(),
-        "position_sigma_m": news.position_sigma,
-        "heading_sigma_rad": news.heading_sigma,
-        "twist": message.twist.tolist(),
-        "rate_hz": news.rate,
-        "age_s": news.age,
-        "stamp_age_s": news.stamp_age,
-        "undecodable": news.undecodable,
-    }

@@ -1,4 +1,4 @@
-"""Who is there: each robot that a node carries has a liveliness token, ``omnibench/<robot>/alive``."""
+"""Which robots are present: each robot that a node runs has a liveliness token, ``omnibench/<robot>/alive``."""
 
 from __future__ import annotations
 
@@ -16,59 +16,59 @@ _NAME = re.compile(r"[^\s/*$?#@]+")
 
 
 def checked_robot(name: str) -> str:
-    """A robot's name that can be one part of a key. ConfigError when it cannot."""
+    """The name, if it can be a robot's, that is one part of a key. ConfigError otherwise."""
     if not _NAME.fullmatch(name):
         raise ConfigError(f"robot {name!r}: a robot's name is one word without / * $ ? # or @, as apr02")
     return name
 
 
 def alive_robots(session: zenoh.Session, timeout: float = 1.0) -> tuple[str, ...]:
-    """The robots whose tokens are there now, by name. timeout: s."""
+    """The names of the robots whose tokens are declared now, sorted. timeout: s."""
     replies = session.liveliness().get(_ALIVE, timeout=timeout)
     return tuple(sorted({_robot(reply.ok.key_expr) for reply in replies if reply.ok is not None}))
 
 
 def nothing_received(robot: str, seconds: float, alive: tuple[str, ...]) -> str:
-    """One line for a robot from which nothing came in ``seconds``, with those that are there and the nearest name."""
+    """One line for a robot from which nothing came in ``seconds``: those that are alive, and the nearest name."""
     if robot in alive:
         return (
-            f"robot {robot!r} is alive, but nothing was heard of it in {seconds:.0f} s; perhaps no wheel samples come, "
-            f"or its profile is another: omnibench/{robot}/info tells"
+            f"robot {robot!r} is alive, but nothing was received from it in {seconds:.0f} s; either it gets no wheel "
+            f"samples or it has another profile: query omnibench/{robot}/info"
         )
     others = f"alive: {', '.join(alive)}" if alive else "no robot is alive; is its node running, and connected to here?"
-    return f"robot {robot!r}: nothing was heard of it in {seconds:.1f} s; {nearest(robot, alive)}{others}"
+    return f"robot {robot!r}: nothing was received from it in {seconds:.1f} s; {nearest(robot, alive)}{others}"
 
 
 class Presence:
-    """The robots that are there and those that have left, as their tokens come and go. ``close`` when done."""
+    """Tracks which robots are alive and which have left, by their liveliness tokens. ``close`` when done."""
 
     def __init__(self, session: zenoh.Session) -> None:
-        self._there: dict[str, bool] = {}
+        self._is_alive: dict[str, bool] = {}
         self._lock = Lock()
         direct: Any = Callback(self._changed, indirect=False)
         self._subscriber = session.liveliness().declare_subscriber(_ALIVE, direct, history=True)
 
     @property
     def alive(self) -> tuple[str, ...]:
-        """The robots whose tokens are there, by name."""
-        return self._names(True)
+        """The names of the robots whose tokens are declared, sorted."""
+        return self._names(alive=True)
 
     @property
     def left(self) -> tuple[str, ...]:
-        """The robots whose tokens were there and are not, by name."""
-        return self._names(False)
+        """The names of the robots whose tokens were declared and are not any more, sorted."""
+        return self._names(alive=False)
 
     def close(self) -> None:
-        """Stop looking."""
+        """Stop tracking."""
         self._subscriber.undeclare()
 
     def _changed(self, sample: zenoh.Sample) -> None:
         with self._lock:
-            self._there[_robot(sample.key_expr)] = sample.kind == zenoh.SampleKind.PUT
+            self._is_alive[_robot(sample.key_expr)] = sample.kind == zenoh.SampleKind.PUT
 
-    def _names(self, there: bool) -> tuple[str, ...]:
+    def _names(self, alive: bool) -> tuple[str, ...]:
         with self._lock:
-            return tuple(sorted(name for name, is_there in self._there.items() if is_there is there))
+            return tuple(sorted(name for name, is_alive in self._is_alive.items() if is_alive is alive))
 
 
 def _robot(key: zenoh.KeyExpr) -> str:

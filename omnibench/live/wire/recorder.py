@@ -1,4 +1,4 @@
-"""Live topics into an MCAP file that Foxglove, rosbags and mcap-ros2-support open."""
+"""Recording of live topics into an MCAP file that Foxglove, rosbags and mcap-ros2-support open."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from omnibench.live.wire.messages import MessageError, MessageType
 from omnibench.live.wire.topic_listener import Arrival, TopicListener
 from omnibench.live.wire.topics import TOPICS, KeySpace
 
-_FLUSH_PERIOD: Final = 1.0  # s; so much is lost when the process is killed
-_LOOK_PERIOD: Final = 0.02  # s; looking for each message as it comes would cost four times as much
-_WITHOUT_PAUSE: Final = 16  # messages, 0.2 ms
-_MOST_WAITING: Final = 200_000  # messages, some 150 MB, behind a disk that has stopped for a while
+_FLUSH_PERIOD: Final = 1.0  # s between two flushes; at most so much is lost when the process is killed
+_POLL_PERIOD: Final = 0.02  # s between two looks at the queue; waking up for each message costs four times as much
+_BATCH: Final = 16  # messages, about 0.2 ms, written before the thread lets others run
+_LONGEST_QUEUE: Final = 200_000  # messages, about 150 MB, that wait while the disk does not write
 
 _log = logging.getLogger(__name__)
 
 
 class Recorder:
-    """Records the robots' topics from ``start`` to ``stop`` (or as a context manager); each payload as it came.
+    """Records the robots' topics from ``start`` to ``stop`` (or as a context manager); payloads are not changed.
 
-    Log times are those of arrival, publish times those in the messages' headers. A disk that refuses ends the
-    recording, and nothing else: ``failure`` and ``on_failure`` (by default the log) get one line, and what was recorded
-    stays readable.
+    Log times are times of arrival, publish times the stamps in the messages' headers. If writing fails, only the
+    recording ends: ``failure`` and ``on_failure`` (by default the log) get one line, and what was recorded stays
+    readable.
 
-    counts: messages written, by ROS topic. undecodable: payloads that are not of their topic's type, left out, by ROS
-    topic. lost: messages that came while the disk stood still for too long.
+    counts: messages written, by ROS topic. undecodable: payloads that are not of their topic's type and were left out,
+    by ROS topic. lost: messages dropped because the queue was full while the disk did not write.
 
-    ConfigError: a robot's name or a topic that cannot be. DataError: ``path`` exists already or cannot be written.
+    ConfigError: a robot's name or a topic is not valid. DataError: ``path`` exists already or cannot be written.
     """
 
     def __init__(
@@ -57,7 +57,8 @@ class Recorder:
         self.undecodable: Counter[str] = Counter()
         self.lost = 0
         self.failure: str | None = None
-        self._source = session, keys, tuple(robots), tuple(topics)
+        self._session, self._keys = session, keys
+        self._robots, self._topics = tuple(robots), tuple(topics)
         self._waiting: SimpleQueue[Arrival] = SimpleQueue()
         self._stopping = Event()
         self._file: McapFile | None = None
@@ -70,14 +71,19 @@ class Recorder:
         return self.counts.total()
 
     @property
+    def silent_robots(self) -> list[str]:
+        """The robots from which nothing has arrived yet."""
+        names = self.counts.keys() | self.undecodable.keys()
+        return [robot for robot in self._robots if not any(name.startswith(f"/{robot}/") for name in names)]
+
+    @property
     def bytes(self) -> int:
         """The file's size so far."""
         return self._file.size if self._file else 0
 
     def start(self) -> None:
-        """Begin."""
-        session, keys, robots, topics = self._source
-        listener = TopicListener(session, keys, robots, topics, self._arrived)
+        """Begin to record."""
+        listener = TopicListener(self._session, self._keys, self._robots, self._topics, self._take)
         try:
             self._file = McapFile(self.path)
         except DataError:
@@ -87,7 +93,7 @@ class Recorder:
         self._thread.start()
 
     def stop(self) -> None:
-        """Write what has come, and complete the file. Stopping twice does no harm."""
+        """Write what has arrived, and complete the file. Stopping twice does no harm."""
         if self._listener is None:
             return
         self._listener.close()
@@ -103,10 +109,10 @@ class Recorder:
     ) -> None:
         self.stop()
 
-    def _arrived(self, arrival: Arrival) -> None:
+    def _take(self, arrival: Arrival) -> None:
         if self.failure is not None:
             return
-        if self._waiting.qsize() < _MOST_WAITING:
+        if self._waiting.qsize() < _LONGEST_QUEUE:
             self._waiting.put(arrival)
         else:
             self.lost += 1
@@ -119,7 +125,7 @@ class Recorder:
         except OSError as error:
             reason = error.strerror or str(error)
             self.failure = (
-                f"{self.path}: cannot be written: {reason}; the recording ends here, what it holds can be read"
+                f"{self.path}: cannot be written: {reason}; the recording ends here, and what it holds can be read"
             )
             self._file.close()
             self._on_failure(self.failure)
@@ -129,7 +135,7 @@ class Recorder:
         flush_at = time.monotonic() + _FLUSH_PERIOD
         stopping = False
         while not stopping:
-            stopping = self._stopping.wait(_LOOK_PERIOD)
+            stopping = self._stopping.wait(_POLL_PERIOD)
             self._add_all(file)
             if time.monotonic() >= flush_at:
                 file.flush()
@@ -142,8 +148,8 @@ class Recorder:
             except Empty:
                 return
             self._add(file, arrival)
-            if count % _WITHOUT_PAUSE == 0:
-                time.sleep(0)  # the other threads of a node are in a hurry
+            if count % _BATCH == 0:
+                time.sleep(0)  # lets the node's other threads run
 
     def _add(self, file: McapFile, arrival: Arrival) -> None:
         kind = TOPICS[arrival.topic]
@@ -163,14 +169,14 @@ class Recorder:
 
 
 def free_path(path: Path) -> Path:
-    """``path``, or the same with the time in its name where that is there: a node that starts again records on."""
+    """``path`` or, if it exists, a path with the time added to its name, so that a restarted node records too."""
     if not path.exists():
         return path
     return path.with_name(f"{path.stem}-{time.strftime('%Y%m%d-%H%M%S')}{path.suffix}")
 
 
 def _stamp(kind: MessageType[Any], payload: bytes) -> int | None:
-    """The stamp in a payload's header, ns; None where it has none. MessageError: not of this type."""
+    """The stamp in a payload's header, ns; None if it has none. MessageError: the payload is not of this type."""
     content = kind.parse(payload)
     if kind is TOPICS["tf"]:
         if not content.transforms:

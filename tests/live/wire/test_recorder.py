@@ -3,52 +3,23 @@
 from __future__ import annotations
 
 import os
-import re
-import resource
-import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from io import StringIO
+from collections.abc import Iterator
 from pathlib import Path
-from threading import Event, Thread
 from typing import Any
 
 import pytest
 from mcap.reader import make_reader
-from rich.console import Console
-from rosbags.highlevel import AnyReader
+from mcap_recordings import disk_with_room_for, messages_of, publishers, wait_for_subscribers
 from samples import PERIOD, STAMP, sample
 from sessions import Loopback, until
 
-from omnibench.cli.terminal.recording_status import record
 from omnibench.errors import ConfigError, DataError, UnknownNameError
 from omnibench.live.wire.recorder import Recorder
-from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace, Publisher
+from omnibench.live.wire.topics import TOPICS, KeySpace, Publisher
 
 KEYS = KeySpace()
 ROBOT_TOPICS = tuple(topic for topic in TOPICS if topic != "tf")
-
-
-def publishers(loopback: Loopback, robot: str = "apr02") -> dict[str, Publisher[Any]]:
-    node = GraphNode(loopback.router, KEYS, "node")
-    return {topic: node.publisher(robot, topic) for topic in TOPICS}
-
-
-def matched(*each: Publisher[Any]) -> None:
-    """Wait until somebody subscribes to each."""
-    until(lambda: all(publisher.matched for publisher in each), "the recorder's subscriptions")
-
-
-def messages_of(path: Path) -> dict[str, list[bytes]]:
-    """The payloads in a file, as rosbags reads them, by ROS topic."""
-    found: dict[str, list[bytes]] = {}
-    with AnyReader([path]) as reader:
-        for connection, _, payload in reader.messages():
-            found.setdefault(connection.topic, []).append(bytes(payload))
-    return found
 
 
 @pytest.fixture
@@ -59,7 +30,7 @@ def recorder(loopback: Loopback, tmp_path: Path) -> Iterator[Recorder]:
 
 def test_a_recording_holds_every_payload_of_every_topic_as_it_was_sent(loopback: Loopback, recorder: Recorder) -> None:
     each = publishers(loopback)
-    matched(*each.values())
+    wait_for_subscribers(*each.values())
     sent: dict[str, list[bytes]] = {}
     for topic, publisher in each.items():
         name = "/tf" if topic == "tf" else f"/apr02/{topic}"
@@ -75,7 +46,7 @@ def test_a_recording_holds_every_payload_of_every_topic_as_it_was_sent(loopback:
 
 def test_times_in_a_recording_are_those_of_header_and_arrival(loopback: Loopback, recorder: Recorder) -> None:
     odom = publishers(loopback)["odom"]
-    matched(odom)
+    wait_for_subscribers(odom)
     before = time.time_ns()
     odom.put(sample("odom", 7))
     odom.put(sample("odom", 8))
@@ -89,7 +60,7 @@ def test_times_in_a_recording_are_those_of_header_and_arrival(loopback: Loopback
 
 def test_payloads_that_cannot_be_decoded_are_counted_and_left_out(loopback: Loopback, recorder: Recorder) -> None:
     odom = publishers(loopback)["odom"]
-    matched(odom)
+    wait_for_subscribers(odom)
     whole = TOPICS["odom"].encode(sample("odom"))
     for broken in (
         b"",
@@ -110,7 +81,7 @@ def test_several_robots_and_tf_once_are_in_one_file(loopback: Loopback, tmp_path
     first, second = publishers(loopback, "apr02"), publishers(loopback, "apr03")
     with Recorder(loopback.client(), KEYS, ["apr02", "apr03"], tmp_path / "fleet.mcap") as recorder:
         for each in (first, second):
-            matched(each["odom"], each["tf"])
+            wait_for_subscribers(each["odom"], each["tf"])
             each["odom"].put(sample("odom"))
             each["tf"].put(sample("tf"))
         until(lambda: recorder.messages >= 4, "all messages")
@@ -121,7 +92,7 @@ def test_several_robots_and_tf_once_are_in_one_file(loopback: Loopback, tmp_path
 def test_only_the_topics_that_were_asked_for_are_recorded(loopback: Loopback, tmp_path: Path) -> None:
     each = publishers(loopback)
     with Recorder(loopback.client(), KEYS, ["apr02"], tmp_path / "some.mcap", ["joint_states", "odom"]) as recorder:
-        matched(each["odom"], each["joint_states"])
+        wait_for_subscribers(each["odom"], each["joint_states"])
         for topic in reversed(TOPICS):
             each[topic].put(sample(topic))
         until(lambda: recorder.messages >= 2, "the two messages")
@@ -159,20 +130,9 @@ def test_a_name_that_no_robot_can_have_is_refused(loopback: Loopback, tmp_path: 
         Recorder(loopback.client(), KEYS, ["**"], tmp_path / "run.mcap").start()
 
 
-@contextmanager
-def disk_with_room_for(size: int) -> Iterator[None]:
-    """Files of this process cannot grow beyond ``size`` bytes: writing more fails, as on a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 def fill(recorder: Recorder, publisher: Publisher[Any]) -> None:
     """Publish what does not compress until the disk is full."""
-    matched(publisher)
+    wait_for_subscribers(publisher)
     publisher.put(sample("joint_states"))
     kind, k = TOPICS["joint_states"], 0
 
@@ -206,130 +166,11 @@ def test_a_full_disk_ends_the_recording_with_one_line_and_a_file_that_can_be_rea
     joints.put(sample("joint_states"))  # who publishes does not notice
 
 
-def test_the_command_ends_with_one_line_when_the_disk_is_full(loopback: Loopback, tmp_path: Path) -> None:
-    joints = publishers(loopback)["joint_states"]
-    with pytest.raises(DataError, match="cannot be written"):
-        run_record(loopback, tmp_path / "run.mcap", 10.0, lambda: joints.put(sample("joint_states")), room=300)
-    assert messages_of(tmp_path / "run.mcap") == {}
-
-
-def run_record(
-    loopback: Loopback, path: Path, seconds: float, feed: Callable[[], None], robot: str = "apr02", room: int = 10**9
-) -> str:
-    """What ``record`` prints when it is piped, with ``feed`` called meanwhile and a disk that has so much room."""
-    stop, text, session = Event(), StringIO(), loopback.client()
-
-    def keep_feeding() -> None:
-        while not stop.wait(0.01):
-            feed()
-
-    feeder = Thread(target=keep_feeding)
-    feeder.start()
-    try:
-        with disk_with_room_for(room):
-            console = Console(file=text, width=160)
-            record(session, KEYS, [robot], path, console, Event(), seconds=seconds, patience=0.2)
-    finally:
-        stop.set()
-        feeder.join()
-    return text.getvalue()
-
-
-def test_the_command_says_what_it_recorded(loopback: Loopback, tmp_path: Path) -> None:
-    odom = publishers(loopback)["odom"]
-    said = run_record(loopback, tmp_path / "run.mcap", 0.5, lambda: odom.put(sample("odom")))
-    count = len(messages_of(tmp_path / "run.mcap")["/apr02/odom"])
-    assert re.search(rf"run\.mcap: \d\.\d s, {count} messages, 0\.\d\d MB\n", said)
-    assert f"/apr02/odom: {count}" in said
-
-
-def test_the_command_ends_at_once_when_it_was_told_to_before(loopback: Loopback, tmp_path: Path) -> None:
-    stop = Event()
-    stop.set()
-    recorder = record(loopback.client(), KEYS, ["apr02"], tmp_path / "run.mcap", Console(file=StringIO()), stop)
-    assert recorder.messages == 0
-
-
 def test_a_recorder_whose_session_has_closed_completes_its_file(loopback: Loopback, tmp_path: Path) -> None:
     session, odom = loopback.client(), publishers(loopback)["odom"]
     with Recorder(session, KEYS, ["apr02"], tmp_path / "run.mcap") as recorder:
-        matched(odom)
+        wait_for_subscribers(odom)
         odom.put(sample("odom"))
         until(lambda: recorder.messages, "the message")
         session.close()
     assert len(messages_of(tmp_path / "run.mcap")["/apr02/odom"]) == 1
-
-
-def test_the_command_says_when_nothing_comes_from_a_robot_and_who_is_there(loopback: Loopback, tmp_path: Path) -> None:
-    _token = loopback.router.liveliness().declare_token("omnibench/apr02/alive")
-    said = run_record(loopback, tmp_path / "run.mcap", 0.5, lambda: None, "apr20")
-    assert "robot 'apr20': nothing was heard of it in" in said
-    assert "did you mean 'apr02'? alive: apr02; recording goes on" in said
-
-
-RECORDING_PROCESS = """
-import sys
-from pathlib import Path
-from rich.console import Console
-from omnibench.cli.terminal.recording_status import record
-from omnibench.live.stopping import stop_on_signals
-from omnibench.live.wire.topics import KeySpace
-from sessions import raw_session
-
-session = raw_session("client", connect=[sys.argv[1]])
-with stop_on_signals() as stop:
-    record(session, KeySpace(), ["apr02"], Path(sys.argv[2]), Console(), stop)
-"""
-
-
-@contextmanager
-def recording_process(loopback: Loopback, path: Path) -> Iterator[subprocess.Popen[str]]:
-    """Another process that records to ``path``, from which messages come already."""
-    joints = publishers(loopback)["joint_states"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", RECORDING_PROCESS, loopback.address, str(path)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
-    )
-
-    def some_are_written() -> bool:
-        joints.put(sample("joint_states"))
-        assert process.poll() is None, process.communicate()[1]
-        return path.exists() and path.stat().st_size > 1000
-
-    try:
-        until(some_are_written, "the other process to have written something", seconds=30)
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_recording_that_is_told_to_stop_is_complete(
-    loopback: Loopback, tmp_path: Path, number: signal.Signals
-) -> None:
-    path = tmp_path / "run.mcap"
-    with recording_process(loopback, path) as process:
-        process.send_signal(number)
-        output, errors = process.communicate(timeout=20)
-    assert process.returncode == 0, errors
-    assert errors == ""
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    assert summary.statistics is not None
-    assert f"{summary.statistics.message_count:,} messages" in output
-
-
-def test_a_killed_recorder_leaves_a_file_that_rosbags_and_mcap_read(loopback: Loopback, tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    with recording_process(loopback, path) as process:
-        process.kill()
-        process.communicate()
-    recorded = messages_of(path)["/apr02/joint_states"]
-    assert len(recorded) > 10
-    with path.open("rb") as file:
-        assert [message.data for _, _, message in make_reader(file).iter_messages()] == recorded

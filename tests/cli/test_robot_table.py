@@ -1,0 +1,167 @@
+"""``omnibench listen``: the table, plain lines and JSON, from real sessions."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import replace
+from io import StringIO
+from threading import Event, Thread
+from typing import Any
+
+import numpy as np
+import pytest
+from announced_robot import AnnouncedRobot
+from rich.console import Console
+from samples import odometry
+from sessions import Loopback
+
+from omnibench.cli.terminal.robot_table import describe, listen, plain_line, view
+from omnibench.errors import ConfigError, DataError
+from omnibench.live.robot_monitor import RobotMonitor
+from omnibench.live.robot_status import HealthSummary, OdometryStatus, RobotStatus
+from omnibench.live.wire.messages import Odometry
+from omnibench.live.wire.topics import KeySpace
+
+KEYS = KeySpace()
+
+
+@pytest.fixture
+def apr02(loopback: Loopback) -> AnnouncedRobot:
+    return AnnouncedRobot(loopback.router, "apr02")
+
+
+def listened(loopback: Loopback, robot: str | None, *, terminal: bool = False, width: int = 100, **options: Any) -> str:
+    """The output of ``listen`` after one reading."""
+    text = StringIO()
+    console = Console(file=text, width=width, force_terminal=terminal, color_system=None)
+    listen(robot, loopback.client(), KEYS, console, Event(), **{"seconds": 0.05, "patience": 0.5, **options})
+    return text.getvalue()
+
+
+def test_a_robot_that_is_not_there_is_one_line_with_the_nearest_that_is(
+    loopback: Loopback, apr02: AnnouncedRobot
+) -> None:
+    assert apr02.token
+    with pytest.raises(
+        DataError, match=r"'apr2': nothing was received from it in 0\.5 s; did you mean 'apr02'\? alive: apr02"
+    ):
+        listened(loopback, "apr2")
+
+
+def test_when_nobody_is_there_the_line_says_so(loopback: Loopback) -> None:
+    with pytest.raises(DataError, match="no robot is alive; is its node running"):
+        listened(loopback, "apr02")
+
+
+def test_a_name_that_no_robot_can_have_is_refused(loopback: Loopback) -> None:
+    with pytest.raises(ConfigError, match="a robot's name is one word"):
+        listened(loopback, "apr02/odom")
+
+
+def test_listening_to_all_goes_on_while_nobody_is_there(loopback: Loopback) -> None:
+    assert listened(loopback, None) == "no robot seen yet\n"
+
+
+def test_a_piped_listener_prints_plain_lines(loopback: Loopback, apr02: AnnouncedRobot) -> None:
+    apr02.answer_health("ok", "calibrated")
+    lines = listened(loopback, "apr02", seconds=1.2).splitlines()
+    assert len(lines) == 2
+    assert lines[1].startswith("apr02: no odometry yet, ok: calibrated")
+
+
+def test_json_is_one_document_a_line_without_nan(loopback: Loopback, apr02: AnnouncedRobot) -> None:
+    with RobotMonitor(loopback.client(), KEYS, None):
+        apr02.wait_for_subscribers()
+    stop = Event()
+    bad = replace(odometry(), twist=np.array([math.nan, 0.0, math.inf]), stamp=time.time_ns())
+
+    class Feeder(StringIO):
+        """Publishes a message whenever a line is printed."""
+
+        def write(self, text: str) -> int:
+            if '"odom": {' in text:
+                stop.set()
+            apr02.odom.put(bad)
+            return super().write(text)
+
+    text = Feeder()
+    listen("apr02", loopback.client(), KEYS, Console(file=text, width=80), stop, seconds=10.0, as_json=True)
+    document = json.loads(text.getvalue().splitlines()[-1], parse_constant=pytest.fail)  # NaN, Infinity
+    assert document["robot"] == "apr02"
+    assert document["odom"]["pose"] == pytest.approx(odometry().pose.tolist())
+    assert document["odom"]["twist"] == [None, 0.0, None]
+
+
+def test_a_terminal_gets_a_table(loopback: Loopback, apr02: AnnouncedRobot) -> None:
+    text = listened(loopback, apr02.name, terminal=True)
+    assert "deg/s" in text
+    assert "no odometry yet" in text
+
+
+def test_listening_ends_at_once_when_told_to(loopback: Loopback) -> None:
+    stop = Event()
+    listener = Thread(target=listen, args=(None, loopback.client(), KEYS, Console(file=StringIO()), stop))
+    listener.start()
+    stop.set()
+    listener.join(5)
+    assert not listener.is_alive()
+
+
+def seen(
+    message: Odometry | None = None, rate: float = 100.0, age: float = 0.004, stamp_age: float | None = 0.012
+) -> OdometryStatus:
+    return OdometryStatus(message or odometry(), rate, age, stamp_age, 0)
+
+
+HEALTHY = HealthSummary("ok", "calibrated odometry", {})
+
+
+def shown(status: list[RobotStatus], width: int) -> list[str]:
+    text = StringIO()
+    console = Console(file=text, width=width)
+    console.print(view(status, console))
+    return text.getvalue().splitlines()
+
+
+@pytest.mark.parametrize("width", [80, 120, 160])
+def test_the_table_fits_the_terminal_with_every_figure_whole(width: int) -> None:
+    far = replace(odometry(), pose=np.array([-123.4567, -98.7654, -3.1]), twist=np.array([-1.5, -0.25, -3.1]))
+    robots = [
+        RobotStatus("apr02", "alive", seen(), seen(odometry(0, "map")), HEALTHY),
+        RobotStatus("apr03", "alive", seen(far, rate=1000.0), None, HealthSummary("degraded", "late", {"late": 12})),
+    ]
+    lines = shown(robots, width)
+    text = "\n".join(lines)
+    assert max(map(len, lines)) <= width
+    assert "…" not in text
+    for figure in ("1.250", "-2.500", "40.1", "0.025", "2.29", "0.31", "-0.12", "25.8", "-123.46", "-177.6", "1000"):
+        assert figure in text
+    assert "ok: calibrated odometry" in text
+    assert "degraded: late, late 12" in " ".join(text.split())
+
+
+def test_a_silent_robot_has_no_rate_and_says_for_how_long() -> None:
+    status = RobotStatus("apr02", "alive", seen(age=3.21), None, HEALTHY)
+    assert "no message for 3.2 s" in describe(status)
+    assert " 100 " not in "\n".join(shown([status], 80))
+
+
+def test_a_robot_that_has_left_says_so_first() -> None:
+    assert describe(RobotStatus("apr02", "left", seen(age=0.1), None, HEALTHY)).startswith("left")
+
+
+def test_health_counters_and_undecodable_messages_stand_in_the_description() -> None:
+    degraded = HealthSummary("degraded", "poses are refused", {"late": 3, "pose_rejected": 2})
+    stream = replace(seen(), undecodable=1)
+    assert describe(RobotStatus("apr02", "alive", stream, None, degraded)) == (
+        "degraded: poses are refused, late 3, pose_rejected 2, undecodable odometry 1"
+    )
+
+
+def test_the_plain_line_gives_pose_twist_sigma_rate_and_age_with_units() -> None:
+    assert plain_line(RobotStatus("apr02", "alive", seen(), None, HEALTHY)) == (
+        "apr02: ok: calibrated odometry; odom x 1.250 m y -2.500 m heading 40.1 deg (1 sigma 0.025 m 2.29 deg)"
+        " vx 0.310 m/s vy -0.120 m/s w 25.8 deg/s, 100.0 Hz, age 4 ms (12 ms by its stamp)"
+    )
