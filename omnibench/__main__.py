@@ -10,8 +10,8 @@ from contextlib import suppress
 from types import FrameType
 from typing import Any, NoReturn
 
-# Files whose imports go on while nothing is under way yet.
-_COMMANDS = ("__main__.py", "app.py", "guide_commands.py", "live_commands.py")
+_PACKAGE = os.path.dirname(__file__)
+_COMMANDS = os.path.join(_PACKAGE, "cli")
 
 
 def main() -> None:
@@ -36,12 +36,13 @@ def _interrupted(number: int, frame: FrameType | None) -> None:
 
 
 def _imports_of_a_command(frame: FrameType | None) -> bool:
+    """True while ``main`` or a function of the commands' folder imports something: no work is under way yet."""
     importing = False
     while frame is not None:
-        name = frame.f_code.co_filename
-        importing = importing or name.startswith("<frozen importlib")
-        if frame.f_code.co_name != "<module>" and name.startswith(os.path.dirname(__file__) + os.sep):
-            return importing and os.path.basename(name) in _COMMANDS
+        file = frame.f_code.co_filename
+        importing = importing or file.startswith("<frozen importlib")
+        if frame.f_code.co_name != "<module>" and file.startswith(_PACKAGE + os.sep):
+            return importing and (file == __file__ or os.path.dirname(file) == _COMMANDS)
         frame = frame.f_back
     return False
 

@@ -1,7 +1,5 @@
 """The commands for whoever begins: the handbook, and examples to run."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 from collections.abc import Mapping

@@ -1,23 +1,18 @@
 """The commands of the live runtime: parse, call, print."""
 
-from __future__ import annotations
-
-import logging
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.console import Console
 
 from omnibench.cli.options import Plugins, load_given_plugins, plugin_folders
-from omnibench.cli.terminal.calibration_tables import Steps, make_console
-from omnibench.cli.terminal.live_tables import LogLines, ReplayBar, print_demonstration, print_played
+from omnibench.cli.terminal.console import make_console
 from omnibench.errors import ConfigError
 
 if TYPE_CHECKING:
-    from omnibench.live.config import ClientConfig, LiveConfig
+    from omnibench.live.config import LiveConfig
     from omnibench.live.node import LiveNode
 
 live_app = typer.Typer()
@@ -77,6 +72,8 @@ def replay(
     plugins: Plugins = None,
 ) -> None:
     """Play a recording onto Zenoh, as the robot and its SLAM would."""
+    from omnibench.cli.terminal.live_tables import print_played
+    from omnibench.cli.terminal.progress import ReplayBar, Steps
     from omnibench.config import parse_settings, validate
     from omnibench.live.network.presence import checked_robot
     from omnibench.live.replay.arrivals import ReplayConfig
@@ -179,13 +176,14 @@ def keys(
         typer.echo(f"written: {file}")
 
 
-def _run(config: LiveConfig, seconds: float | None) -> None:
+def _run(config: "LiveConfig", seconds: float | None) -> None:
+    from omnibench.cli.terminal.live_tables import node_log
     from omnibench.live.network.access_log import log_refused_access
     from omnibench.live.node import LiveNode
     from omnibench.live.stopping import stop_on_signals, ticks
 
     with (
-        _logging_to(make_console(error=True)) as log,
+        node_log(make_console(error=True)) as log,
         stop_on_signals() as stop,
         log_refused_access(config.zenoh),
         LiveNode(config) as node,
@@ -203,7 +201,9 @@ def _run(config: LiveConfig, seconds: float | None) -> None:
             pass
 
 
-def _replay_to_node(config: LiveConfig, dataset: Path | None, speed: str | None, file: Path) -> None:
+def _replay_to_node(config: "LiveConfig", dataset: Path | None, speed: str | None, file: Path) -> None:
+    from omnibench.cli.terminal.live_tables import node_log, print_demonstration
+    from omnibench.cli.terminal.progress import ReplayBar, Steps
     from omnibench.config import validate
     from omnibench.live.network.access_log import log_refused_access
     from omnibench.live.replay.arrivals import ReplayConfig
@@ -222,7 +222,7 @@ def _replay_to_node(config: LiveConfig, dataset: Path | None, speed: str | None,
         recording = load_recording(source, watch=watch)
     with (
         ReplayBar(recording.dataset.name) as bar,
-        _logging_to(bar.console, logging.WARNING),
+        node_log(bar.console, warnings_only=True),
         stop_on_signals() as stop,
         log_refused_access(config.zenoh),
     ):
@@ -233,8 +233,10 @@ def _replay_to_node(config: LiveConfig, dataset: Path | None, speed: str | None,
 
 
 @contextmanager
-def _extras(config: LiveConfig, node: LiveNode) -> Iterator[None]:
+def _extras(config: "LiveConfig", node: "LiveNode") -> Iterator[None]:
     """The recorder and the Foxglove server that a node's config asks for."""
+    import logging
+
     from omnibench.live.wire.foxglove import PORT, FoxgloveServer
     from omnibench.live.wire.recorder import Recorder, free_path
 
@@ -280,16 +282,3 @@ def _speed(text: str) -> float | str:
         return float(text)
     except ValueError:
         return text
-
-
-@contextmanager
-def _logging_to(console: Console, level: int = logging.INFO) -> Iterator[logging.Logger]:
-    """What the node has to say goes to ``console``."""
-    log = logging.getLogger("omnibench.live")
-    lines = LogLines(console)
-    log.setLevel(level)
-    log.addHandler(lines)
-    try:
-        yield log
-    finally:
-        log.removeHandler(lines)

@@ -1,4 +1,4 @@
-"""The option ``--plugins`` of the commands that need calibrators, effects, costs or importers of one's own."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
@@ -6,12 +6,24 @@ import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from omnibench.registry import PluginFailure, load_plugins
+if TYPE_CHECKING:
+    from omnibench.registry import PluginFailure
 
+
+def output_option(text: str) -> Any:
+    """``-o`` and ``--output``, which mean the same on every command that writes something."""
+    return typer.Option("-o", "--output", help=text)
+
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+Settings = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="An option, value in YAML; may be repeated.")
+]
+TableFormat = Annotated[Literal["parquet", "csv"], typer.Option("--format", help="Format of the tables.")]
 Plugins = Annotated[
     list[Path] | None,
     typer.Option("--plugins", help="Folder of plug-ins; may be repeated. Default: ./plugins, if it is there."),
@@ -27,6 +39,8 @@ def plugin_folders(given: Sequence[Path] | None) -> list[Path]:
 
 def load_given_plugins(given: Sequence[Path] | None) -> list[PluginFailure]:
     """Load their plug-ins; one that cannot be imported is a warning on standard error. PluginError: no such folder."""
+    from omnibench.registry import load_plugins
+
     with redirect_stdout(sys.stderr):  # what a plug-in prints is not our output
         failures = load_plugins(plugin_folders(given))
     for failure in failures:

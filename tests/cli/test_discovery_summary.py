@@ -10,7 +10,8 @@ import pytest
 from discovery_samples import incomplete, named, nameless, nothing
 from rich.console import Console
 
-from omnibench.cli.terminal.discovery_summary import Stages, print_discovery
+from omnibench.cli.terminal.discovery_summary import print_discovery
+from omnibench.cli.terminal.progress import Stages
 from omnibench.discover.result import Discovery
 
 

@@ -1,120 +1,21 @@
-"""What the command line prints besides tables of a comparison."""
+"""What ``calibrate``, ``evaluate`` and ``certify`` print: a matrix, its errors on a data set, a proven bound."""
 
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator, Sequence
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from omnibench.fit.calibrate import CalibrationRun
-from omnibench.fit.certify import CertifiedCalibration, Proof
+from omnibench.fit.certify import CertifiedCalibration
 from omnibench.fit.evaluate import Evaluation
-from omnibench.fit.inspect import Inspection, ScansContent
 from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals
-from omnibench.fit.uncertainty.identifiability import ROWS, Identifiability
 from omnibench.fit.uncertainty.physical import ParameterEstimate
-from omnibench.registry import REGISTRIES, Entry, PluginFailure
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
-
-_PIPED_WIDTH = 160
-
-
-def make_console(error: bool = False) -> Console:
-    """A console that shows texts as they are, and does not squeeze tables into 80 columns when it is piped."""
-    stream = sys.stderr if error else sys.stdout
-    width = None if stream.isatty() else _PIPED_WIDTH
-    return Console(file=stream, width=width, markup=False, emoji=False, highlight=False)
-
-
-class EvaluationsBar:
-    """A bar of evaluations for one calibrator, on a terminal."""
-
-    def __init__(self, title: str, evaluations: int) -> None:
-        console = make_console(error=True)
-        self._progress = Progress(
-            TextColumn(title),
-            BarColumn(),
-            TextColumn("{task.fields[note]}"),
-            TimeElapsedColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-        self._task = self._progress.add_task("", total=evaluations, note="")
-
-    def __enter__(self) -> EvaluationsBar:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def __call__(self, evaluations: int, best: float) -> None:
-        self._progress.update(self._task, completed=evaluations, note=f"{evaluations} evaluations, best {best:.6f}")
-
-
-class Steps:
-    """What is under way and how far it is: a bar for each stage on a terminal, a line for each where it is piped."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._progress = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-        self._tasks: dict[str, TaskID] = {}
-
-    def __enter__(self) -> Steps:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def __call__(self, what: str, done: int, total: int) -> None:
-        if what not in self._tasks:
-            self._progress.start()  # only now is there something to show
-            self._tasks[what] = self._progress.add_task(what, total=total)
-            if not self._console.is_terminal:
-                self._console.print(f"{what}: {total}", soft_wrap=True)
-        self._progress.update(self._tasks[what], completed=done)
-
-
-class ProofLine:
-    """How far a proof has come, on a terminal."""
-
-    def __init__(self) -> None:
-        console = make_console(error=True)
-        self._progress = Progress(
-            TextColumn("proving"),
-            TextColumn("{task.fields[note]}"),
-            TimeElapsedColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-        self._task = self._progress.add_task("", total=None, note="")
-
-    def __enter__(self) -> ProofLine:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def __call__(self, proof: Proof) -> None:
-        note = f"{proof.boxes} parts of the box, bound {proof.lower_bound:.6f}, best {proof.best_cost:.6f}"
-        self._progress.update(self._task, note=note)
 
 
 def print_certificate(console: Console, certified: CertifiedCalibration) -> None:
@@ -222,96 +123,6 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
                 f"{math.degrees(errors.heading_max_rad):.2f} deg",
             )
     console.print(table)
-
-
-def print_inspection(console: Console, found: Inspection) -> None:
-    """A data set in a table and its findings in words."""
-    kind = "simulated data" if found.simulated else "recorded data"
-    described = f"; {found.description}" if found.description else ""
-    console.print(f"{found.dataset}: {kind}{described}", soft_wrap=True)
-    for label, text in (("source", found.source), ("licence", found.licence)):
-        if text:
-            console.print(f"{label}: {text}", soft_wrap=True)
-    shortest, longest = (1000 * period for period in found.sample_period_range_s)
-    console.print(
-        f"robot {found.robot}, wheels {', '.join(found.wheels)}; {found.wheel_samples} wheel samples every "
-        f"{1000 * found.sample_period_s:g} ms ({shortest:.3g} to {longest:.3g} ms), {found.reference_poses} reference "
-        f"poses every {1000 * found.pose_period_s:.3g} ms",
-        soft_wrap=True,
-    )
-    if found.scans is not None:
-        _print_scans(console, found.scans)
-    table = Table()
-    for heading in ("split", "runs", "commands", "repetitions", "sessions", "duration", "distance", "turned"):
-        table.add_column(heading, justify="left" if heading == "split" else "right")
-    for name, split in found.splits.items():
-        repetitions = f"{split.repetitions_min}"
-        if split.repetitions_max != split.repetitions_min:
-            repetitions += f" to {split.repetitions_max}"
-        table.add_row(
-            name,
-            str(split.trajectories),
-            str(split.commands),
-            repetitions,
-            str(split.sessions),
-            f"{split.duration_s:.0f} s",
-            f"{split.distance_m:.1f} m",
-            f"{math.degrees(split.turned_rad):.0f} deg",
-        )
-    console.print(table)
-    shares = ", ".join(f"{share:.2g}" for share in found.driven_shares)
-    console.print(f"directions of wheel rates driven: {found.driven_directions} of {len(found.wheels)} ({shares})")
-    _print_identifiability(console, found.identifiability)
-    for finding in found.findings:
-        console.print(f"- {finding}", soft_wrap=True)
-
-
-def _print_scans(console: Console, scans: ScansContent) -> None:
-    every = "" if scans.scan_period_s is None else f" every {1000 * scans.scan_period_s:.3g} ms"
-    console.print(
-        f"{scans.scans} scans{every} in {scans.trajectories} runs; {scans.rays} rays over "
-        f"{math.degrees(scans.field_of_view_rad):.0f} deg up to {scans.range_max_m:g} m, of which "
-        f"{scans.seen_share:.0%} measured something",
-        soft_wrap=True,
-    )
-
-
-def _print_identifiability(console: Console, told: Identifiability) -> None:
-    table = Table(title="what a calibration can tell, +- % of the row's largest element", title_justify="left")
-    for heading in ("wheel rates along", "which is", "driven", *(f"row {row}" for row in ROWS)):
-        table.add_column(heading, justify="left" if heading in ("wheel rates along", "which is") else "right")
-    for each in told.directions:
-        deviations = ["open"] * len(ROWS)
-        if each.state == "driven" and each.deviations is not None:
-            deviations = [f"{100 * value:.2g} %" for value in each.deviations]
-        table.add_row(each.direction, each.motion or "slip of the wheels", f"{100 * each.share:.3g} %", *deviations)
-    console.print(table)
-    console.print(f"noise: {told.noise_source}", soft_wrap=True)
-
-
-def print_registries(console: Console) -> None:
-    """Everything that a config can name."""
-    for registry in REGISTRIES:
-        entries = registry.entries()
-        table = Table(title=f"{registry.kind}s", title_justify="left", title_style="bold", expand=False)
-        for heading in ("name", "what", "from"):
-            table.add_column(heading, overflow="fold")
-        for entry in entries:
-            table.add_row(entry.name, entry.summary, entry.origin)
-        console.print(table if entries else f"{registry.kind}s: none yet")
-
-
-def registry_document(failures: list[PluginFailure]) -> dict[str, object]:
-    """Everything that a config can name, with options, as one JSON document."""
-
-    def row(entry: Entry[object]) -> dict[str, object]:
-        options = entry.options.model_json_schema().get("properties", {})
-        return {"name": entry.name, "summary": entry.summary, "from": entry.origin, "options": options}
-
-    document: dict[str, object] = {
-        f"{registry.kind}s": [row(entry) for entry in registry.entries()] for registry in REGISTRIES
-    }
-    return document | {"failures": [{"from": failure.origin, "error": failure.error} for failure in failures]}
 
 
 def _deviation(value: float, design: float) -> str:

@@ -1,4 +1,4 @@
-"""A comparison on a terminal: progress while it runs, the paper's Tables 2 and 3 when it has."""
+"""A comparison's results on a terminal: the paper's Tables 2 and 3, final errors, and how each matrix was found."""
 
 from __future__ import annotations
 
@@ -7,111 +7,10 @@ from collections.abc import Iterable, Sequence
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from omnibench.cli.terminal.calibration_tables import Steps
-from omnibench.compare.plan import PlannedRun
 from omnibench.compare.result import ComparisonResult, EntryStatistics, Interval
 from omnibench.data.dataset import SPLITS, Split
-from omnibench.fit.calibrator import RunResult
-
-
-class Bars:
-    """A bar for the whole comparison and one for every run that is under way."""
-
-    def __init__(self, console: Console) -> None:
-        self._progress = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[note]}"),
-            TimeElapsedColumn(),
-            console=console,
-        )
-        self._all = self._progress.add_task("runs", total=None, note="")
-        self._tasks: dict[str, TaskID] = {}
-        self._preparation = Steps(console)
-
-    def __enter__(self) -> Bars:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._preparation.__exit__()
-        self._progress.stop()
-
-    def prepared(self, what: str, done: int, total: int) -> None:
-        """A bar for each stage in which data sets are made."""
-        self._preparation(what, done, total)
-
-    def planned(self, runs: int) -> None:
-        """How many runs there will be; only now is there something to show."""
-        self._preparation.__exit__()
-        self._progress.update(self._all, total=runs)
-        self._progress.start()
-
-    def began(self, run: PlannedRun) -> None:
-        """A bar of evaluations for the run."""
-        total = run.config.budget.evaluations
-        self._tasks[run_title(run)] = self._progress.add_task(run_title(run), total=total, note="")
-
-    def moved(self, run: PlannedRun, evaluations: int, best: float) -> None:
-        """Evaluations so far and the best cost."""
-        self._progress.update(self._tasks[run_title(run)], completed=evaluations, note=f"best {best:.6f}")
-
-    def ended(self, run: PlannedRun, result: RunResult, reused: bool) -> None:
-        """The bar gives way to a line."""
-        task = self._tasks.pop(run_title(run), None)
-        if task is not None:
-            self._progress.remove_task(task)
-        self._progress.console.print(run_line(run, result, reused))
-        self._progress.advance(self._all)
-
-
-class Lines:
-    """Plain lines, for pipes and logs."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._preparation = Steps(console)
-        self._runs = 0
-        self._ended = 0
-
-    def __enter__(self) -> Lines:
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def prepared(self, what: str, done: int, total: int) -> None:
-        """A line for each stage in which data sets are made."""
-        self._preparation(what, done, total)
-
-    def planned(self, runs: int) -> None:
-        """How many runs there will be."""
-        self._runs = runs
-
-    def began(self, run: PlannedRun) -> None: ...
-
-    def moved(self, run: PlannedRun, evaluations: int, best: float) -> None: ...
-
-    def ended(self, run: PlannedRun, result: RunResult, reused: bool) -> None:
-        """One line for every run."""
-        self._ended += 1
-        line = f"[{self._ended}/{self._runs}] {run_line(run, result, reused)}"
-        self._console.print(line, soft_wrap=True)
-
-
-def run_title(run: PlannedRun) -> str:
-    """Data set, entry and seed of a run."""
-    return f"{run.dataset_name} {run.label} seed {run.seed}"
-
-
-def run_line(run: PlannedRun, result: RunResult, reused: bool) -> str:
-    """How a run ended, in one line."""
-    cost = "no answer" if result.cost is None else f"cost {result.cost:.6f}"
-    kept = ", kept from an earlier run" if reused else ""
-    figures = f"{cost}, {result.evaluations} evaluations, {result.seconds:.1f} s{kept}"
-    return f"{run_title(run)}: {result.outcome}, {figures} ({result.reason})"
 
 
 def print_result(console: Console, result: ComparisonResult) -> None:

@@ -1,4 +1,4 @@
-"""A discovery on a terminal: what is under way, and then the answer in a screenful of 80 columns."""
+"""A discovery on a terminal: the answer in a screenful of 80 columns."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from omnibench.discover.document import experiment_file
@@ -34,36 +33,6 @@ _HIDDEN = 4  # effects of which the terminal says how large they could be
 _PLACES = 4
 _PARAMETERS = 9  # of each effect
 _LINES = 3  # of notes, and of warnings
-
-
-class Stages:
-    """What is under way: a line that changes on a terminal, a line for each stage where it is piped."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._progress = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}", markup=False),
-            TimeElapsedColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-        self._task = self._progress.add_task("reading", total=None)
-
-    def __enter__(self) -> Stages:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def stage(self, text: str) -> None:
-        """What is done from now on."""
-        if self._console.is_terminal:
-            self._progress.update(self._task, description=text)
-        else:
-            self._console.print(text, soft_wrap=True)
 
 
 def print_discovery(console: Console, discovery: Discovery, folder: Path) -> None:

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from omnibench.cli.terminal.calibration_tables import make_console
-
 if TYPE_CHECKING:
-    from omnibench.live.estimation.health import Health
     from omnibench.live.replay.demonstration import Demonstration, Deviation
     from omnibench.live.replay.replay_player import PlayReport
-    from omnibench.live.replay.replay_player import Progress as Played
 
 
 class LogLines(logging.Handler):
@@ -34,41 +31,17 @@ class LogLines(logging.Handler):
             self.handleError(record)
 
 
-class ReplayBar:
-    """How far a replay is, on a terminal; a line every ten seconds when piped."""
-
-    _PERIOD = 10.0  # s
-
-    def __init__(self, title: str) -> None:
-        self.console = make_console(error=True)
-        self._progress = Progress(
-            TextColumn(title),
-            BarColumn(),
-            TextColumn("{task.fields[note]}"),
-            TimeElapsedColumn(),
-            console=self.console,
-            transient=True,
-            disable=not self.console.is_terminal,
-        )
-        self._task = self._progress.add_task("", total=None, note="")
-        self._title = title
-        self._told = 0.0
-
-    def __enter__(self) -> ReplayBar:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def __call__(self, played: Played, health: Health | None = None) -> None:
-        note = f"{played.data_seconds:.0f} s of the drive"
-        if health is not None:
-            note += f", {health.rate_hz:.0f} samples/s, {health.counts['poses']} poses fused"
-        self._progress.update(self._task, total=played.total, completed=played.done, note=note)
-        if not self.console.is_terminal and played.wall_seconds - self._told >= self._PERIOD:
-            self._told = played.wall_seconds
-            self.console.print(f"{self._title}: {played.done} of {played.total} messages, {note}")
+@contextmanager
+def node_log(console: Console, warnings_only: bool = False) -> Iterator[logging.Logger]:
+    """The node's log, whose lines go to ``console`` as long as the context lasts."""
+    log = logging.getLogger("omnibench.live")
+    lines = LogLines(console)
+    log.setLevel(logging.WARNING if warnings_only else logging.INFO)
+    log.addHandler(lines)
+    try:
+        yield log
+    finally:
+        log.removeHandler(lines)
 
 
 def print_played(console: Console, report: PlayReport, simulated: bool) -> None:

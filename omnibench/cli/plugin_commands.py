@@ -1,0 +1,85 @@
+"""``list``, ``schema`` and ``plugin``: what configs can name, and how to add to it."""
+
+from collections import Counter
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from omnibench.cli.options import Json, Plugins, load_given_plugins
+from omnibench.cli.terminal.console import make_console, print_json
+from omnibench.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+plugin_app = typer.Typer()
+_plugin = typer.Typer(help="Write a plug-in, or check one.", no_args_is_help=True, rich_markup_mode=None)
+plugin_app.add_typer(_plugin, name="plugin")
+
+# Where the config of each command is: module and class.
+_CONFIGS = {
+    "compare": ("omnibench.compare.config", "CompareConfig"),
+    "design": ("omnibench.design.config", "DesignConfig"),
+    "live": ("omnibench.live.config", "LiveConfig"),
+    "simulate": ("omnibench.simulate.source", "SimulationConfig"),
+}
+
+
+@plugin_app.command("list")
+def list_(plugins: Plugins = None, as_json: Json = False) -> None:
+    """Calibrators, effects, costs and importers, and where each comes from."""
+    from omnibench.cli.terminal.registry_tables import print_registries, registry_document
+
+    failures = load_given_plugins(plugins)
+    if as_json:
+        return print_json(registry_document(failures))
+    return print_registries(make_console())
+
+
+@plugin_app.command()
+def schema(
+    kind: Annotated[
+        Literal["compare", "design", "live", "simulate"], typer.Argument(help="Configs of which command.")
+    ] = "compare",
+) -> None:
+    """JSON schema of the configs, for editors."""
+    module, name = _CONFIGS[kind]
+    config: type[BaseModel] = getattr(import_module(module), name)
+    print_json(config.model_json_schema(by_alias=True))
+
+
+@_plugin.command("new")
+def plugin_new(
+    name: Annotated[str, typer.Argument(help="Its name in configs.")],
+    kind: Annotated[str | None, typer.Option(help="calibrator (the default), importer, cost or effect.")] = None,
+    effect: Annotated[bool, typer.Option("--effect", help="The same as --kind effect.")] = False,
+    folder: Annotated[Path, typer.Option(help="Where it goes.")] = Path("plugins"),
+) -> None:
+    """Write a working plug-in and its test."""
+    from omnibench.testing.plugin_files import new_plugin
+
+    if effect and kind not in (None, "effect"):
+        raise ConfigError(f"--effect and --kind {kind} contradict each other; leave one out")
+    for file in new_plugin(name, "effect" if effect else kind or "calibrator", folder):
+        typer.echo(f"written: {file}")
+    typer.echo(f"check it: omnibench plugin check {folder / name}.py")
+
+
+@_plugin.command("check")
+def plugin_check(
+    file: Annotated[Path, typer.Argument(help="A plug-in file.")],
+    sample: Annotated[Path | None, typer.Option(help="Recordings for an importer to read.")] = None,
+) -> None:
+    """Run the conformance tests on a plug-in; exit code 1 when one fails."""
+    from omnibench.testing.plugin_files import check_plugin
+
+    report = check_plugin(file, sample)
+    for result in report.results:
+        message = f": {result.message}" if result.message else ""
+        typer.echo(f"{result.outcome:7} {result.kind} {result.name}: {result.case}{message}")
+    counts = Counter(str(result.outcome) for result in report.results)
+    typer.echo(", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
+    if report.failures:
+        raise typer.Exit(1)
