@@ -9,8 +9,8 @@ import numpy as np
 
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory
+from omnibench.data.domain_check import extrapolation_warning
 from omnibench.errors import DataError
-from omnibench.fit.domain_check import extrapolation_warning
 from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from omnibench.data.dataset import Dataset, make_dataset
+from omnibench.data.domain_check import extrapolation_warning
 from omnibench.errors import DataError
-from omnibench.fit.domain_check import extrapolation_warning
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.pose_noise import reference_noise

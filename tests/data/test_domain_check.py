@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.fit.domain_check import extrapolation_warning
+from omnibench.data.domain_check import extrapolation_warning
 from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows
 from omnibench.simulate.like import simulate_like
 from omnibench.testing import synthetic_robot
