@@ -1,0 +1,122 @@
+"""The handbook and the README: every topic is found, and whatever they say to type exists."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from commands import ROOT, Command, assert_refused
+from pydantic import TypeAdapter
+from typed_commands import commands_in, parse
+
+import omnibench
+from omnibench.cli.handbook_topics import HANDBOOK, topics
+from omnibench.compare.config import CompareConfig
+from omnibench.data.importers.robot_option import RobotOption
+
+PAGES = [ROOT / "README.md", *sorted(HANDBOOK.rglob("*.md"))]
+BY_NAME = {topic.name: topic for topic in topics()}
+TYPED = sorted({command for page in PAGES for command in commands_in(page.read_text(encoding="utf-8"))})
+
+_LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
+_IN_THE_CLONE = re.compile(r"\b((?:tests/benchmarks|configs)/[\w./-]+\.(?:py|yaml))")
+_PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
+
+
+def relative(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def blocks(page: Path) -> list[str]:
+    """The indented blocks of a page."""
+    found = re.findall(r"(?:^    .*\n(?:\n(?=    ))?)+", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return [block.replace("\n    ", "\n")[4:] for block in found]
+
+
+def test_the_list_of_topics_fits_a_terminal(command: Command) -> None:
+    lines = command("guide").stdout.splitlines()
+    assert all(len(line) <= 80 for line in lines)
+    assert {line.split()[0] for line in lines if line.startswith("  ")} == set(BY_NAME)
+
+
+def test_every_page_of_the_handbook_is_listed_once() -> None:
+    listed = [topic.file for topic in topics()]
+    assert sorted(listed) == [page for page in PAGES[1:] if page.name != "README.md"]
+    assert all(topic.name == topic.file.stem for topic in topics())
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_a_topic_is_plain_markdown_where_it_is_piped(command: Command, name: str) -> None:
+    printed = command("guide", name)
+    assert printed.returncode == 0
+    assert printed.stdout.startswith("# ")
+    assert ".md" not in printed.stdout  # links to topics are commands there
+
+
+def test_a_topic_is_set_for_reading_on_a_terminal(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    printed = command("guide", "data").stdout
+    assert "# Data" not in printed
+    assert "omnibench guide plugins" in printed
+    assert all(len(line) <= 80 for line in re.sub(r"\x1b[^m]*m", "", printed).splitlines())
+
+
+def test_an_unknown_topic_is_answered_with_the_nearest(command: Command) -> None:
+    assert_refused(command("guide", "calibrator"), "unknown topic 'calibrator'; did you mean 'calibrators'?")
+
+
+@pytest.mark.parametrize("typed", TYPED)
+def test_a_command_that_is_shown_can_be_typed(typed: str) -> None:
+    parse(typed)
+
+
+def test_a_command_that_does_not_exist_would_be_noticed() -> None:
+    for typed in ("omnibench compar x", "omnibench compare x --out y", "omnibench calibrate", "omnibench plugin neu x"):
+        with pytest.raises(Exception, match=r"No such|Missing"):
+            parse(typed)
+    assert commands_in("    omnibench a  # b\n`omnibench c && d`\n    cd x && omnibench d\n") == [
+        "omnibench a  # b",
+        "omnibench d",
+        "omnibench c",
+    ]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_every_link_and_every_file_that_is_named_exists(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for link in _LINK.findall(text):
+        assert (page.parent / link).exists(), link
+    for file in _IN_THE_CLONE.findall(text):
+        assert (ROOT / file).is_file(), file
+
+
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_python_that_is_shown_uses_public_names(page: Path) -> None:
+    for program in _PYTHON.findall(page.read_text(encoding="utf-8")):
+        compile(program, str(page), "exec")
+        assert set(re.findall(r"omnibench\.(\w+)\(", program)) <= set(omnibench.__all__)
+
+
+def test_the_handbook_tells_of_every_public_name() -> None:
+    text = BY_NAME["python"].text
+    assert [name for name in omnibench.__all__ if f"`{name}`" not in text] == []
+
+
+def test_the_config_and_the_robot_that_are_shown_are_right() -> None:
+    (config,) = (block for block in blocks(BY_NAME["compare"].file) if block.startswith("name:"))
+    CompareConfig.model_validate(yaml.safe_load(config))
+    (robot,) = (block for block in blocks(BY_NAME["getting-started"].file) if block.startswith("name:"))
+    load = TypeAdapter(RobotOption)
+    assert load.validate_python(yaml.safe_load(robot)).wheel_names == ("a", "b", "c")
+
+
+def test_the_readme_is_short_and_holds_the_test_command_that_ci_looks_for() -> None:
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 120
+    assert [line for line in lines if re.match(r"^    pip install .*\[test\]", line)] == [
+        '    pip install -e ".[test]" && pytest -n 2'
+    ]
