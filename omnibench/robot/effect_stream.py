@@ -1,4 +1,4 @@
-"""Odometry with effects, one wheel sample at a time: the same corrections as in batch, of samples that come singly."""
+"""Odometry with effects, one wheel sample at a time; the corrections are those of the batch."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryStream, advance
 from omnibench.robot.signals import SignalStream
 
-_NO_STRETCH = 1e-6  # of an arc that comes back to where it began: no motion in the robot's frame moves it
+# Chord by length of an arc. Below it the arc ends where it began, and no motion in the robot's frame displaces its end.
+_NO_STRETCH = 1e-6
 
 
 class EffectStream(OdometryStream):
     """A stream whose samples are corrected by effects of stage wheel, clock, body and world.
 
-    Effects that need poses get those by the uncorrected path, as in a batch, from the start or from the pose that was
-    last set from outside.
+    Effects that need poses get those of the uncorrected path, as in a batch. The path begins at the start, and again
+    wherever ``pose`` is set from outside.
     """
 
     def __init__(
@@ -32,8 +33,21 @@ class EffectStream(OdometryStream):
         self._left_at: Array | None = None
 
     def step(self, rates: Array, duration: float, wheel_angles: Array | None = None) -> Array:
-        if duration <= 0:
-            return self.drive(np.asarray(rates) * duration, duration, wheel_angles)
+        rates = np.asarray(rates)
+        if duration > 0:
+            return self._take(rates, duration, wheel_angles)
+        return self._take_at_once(rates * duration, wheel_angles)
+
+    def drive(self, angles: Array, duration: float | None = None, wheel_angles: Array | None = None) -> Array:
+        if duration is None:
+            raise ValueError("a model with effects needs the duration of every sample")
+        angles = np.asarray(angles)
+        if duration > 0:
+            return self._take(angles / duration, duration, wheel_angles)
+        return self._take_at_once(angles, wheel_angles)
+
+    def _take(self, rates: Array, duration: float, wheel_angles: Array | None) -> Array:
+        """Advance by one sample of mean wheel rates (N,) rad/s over a duration > 0 s, with all effects."""
         self._follow()
         signals = self._signals.next(np.asarray(rates, dtype=float), duration, wheel_angles, self.frame_heading)
         twists, drift = corrected_twists(self._terms, signals, self.matrix)
@@ -46,13 +60,10 @@ class EffectStream(OdometryStream):
         self.moved, self._left_at = moved, self.pose
         return self.pose
 
-    def drive(self, angles: Array, duration: float | None = None, wheel_angles: Array | None = None) -> Array:
-        if duration is None:
-            raise ValueError("a model with effects needs the duration of every sample")
-        if duration > 0:
-            return self.step(np.asarray(angles) / duration, duration, wheel_angles)
+    def _take_at_once(self, angles: Array, wheel_angles: Array | None) -> Array:
+        """Advance by wheel angles (N,) rad that take no time: without rates no effect acts, and the matrix stands."""
         self._follow()
-        self._signals.turn(angles, wheel_angles)  # no time, no rate: the matrix alone
+        self._signals.turn(angles, wheel_angles)
         self._signals.move(self.matrix @ angles)
         self._left_at = super().drive(angles)
         return self.pose
@@ -63,15 +74,15 @@ class EffectStream(OdometryStream):
             self._signals.pose = self.pose
 
     def _in_frame(self, drift: Array) -> complex:
-        """A way (2,) in the reference's frame as x + iy in the stream's, m."""
+        """A displacement (2,) in the reference's frame, m, as x + iy in the stream's frame."""
         turn = complex(math.cos(self.frame_heading), -math.sin(self.frame_heading))
         return complex(drift[0], drift[1]) * turn
 
-    def _in_body(self, way: complex, heading: float, turned: float) -> Array:
-        """The motion (3,) in the robot's frame that adds a way to a sample which begins at a heading and turns."""
+    def _in_body(self, displacement: complex, heading: float, turned: float) -> Array:
+        """Motion (3,) in the robot's frame that displaces the end of a sample which begins at ``heading`` and turns."""
         half = turned / 2 if self.integration == "arc" else 0.0
         stretch = math.sin(half) / half if half else 1.0
         if abs(stretch) < _NO_STRETCH:
             return np.zeros(3)
-        own = way * complex(math.cos(heading + half), -math.sin(heading + half)) / stretch
-        return np.array([own.real, own.imag, 0.0])
+        in_body = displacement * complex(math.cos(heading + half), -math.sin(heading + half)) / stretch
+        return np.array([in_body.real, in_body.imag, 0.0])
