@@ -1,4 +1,4 @@
-"""A robot that drives motions which its calibration was not fitted to: there the calibration's effects are a guess."""
+"""Extrapolation monitor: how long a robot has driven outside the training domain of its calibration's effects."""
 
 from __future__ import annotations
 
@@ -12,46 +12,46 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.training_domain import TrainingDomain, extrapolation_consequence
 
 LOG = logging.getLogger("omnibench.live")
-_WINDOW = 0.5  # s over which a motion is averaged; it is judged no more often
-_TRANSITION = 1.0  # s; what lasts no longer is on the way from one motion to another
+_WINDOW = 0.5  # s, over which a twist is averaged before it is judged; chosen
+_TRANSITION = 1.0  # s; a motion that lasts no longer is a transition and does not count; chosen
 
 
-class MotionWatch:
-    """Counts how long a robot has driven such motions with one calibration, and warns in the log the first time.
+class ExtrapolationMonitor:
+    """Counts the time that a robot drives outside its calibration's training domain; warns in the log the first time.
 
-    seconds: so far; None where the calibration has no effects, or does not say what it was fitted to.
+    seconds: that time so far; None where the calibration has no effects, or does not say what it was fitted to.
     """
 
     def __init__(self, robot: str, calibration: Calibration) -> None:
         self._robot, self._calibration = robot, calibration
-        self._known: TrainingDomain | None = None
+        self._domain: TrainingDomain | None = None
         self.seconds: float | None = None
         if calibration.effects and calibration.driven:
-            self._known, self.seconds = TrainingDomain(calibration.robot, calibration.driven), 0.0
+            self._domain, self.seconds = TrainingDomain(calibration.robot, calibration.driven), 0.0
         self._matrix = calibration.matrix_array
-        self._lasted = 0.0  # s of the motion that goes on
-        self._turned: Array = np.zeros(self._matrix.shape[1])  # rad, in the window that goes on
-        self._elapsed = 0.0  # s of it
+        self._lasted = 0.0  # s that the robot has now been outside the domain without a break
+        self._turned: Array = np.zeros(self._matrix.shape[1])  # rad, of the wheels in the present window
+        self._elapsed = 0.0  # s since the present window began
 
     def take(self, step: WheelStep) -> None:
         """Take a wheel step."""
-        if self._known is None:
+        if self._domain is None:
             return
-        if step.blind:  # who knows what it did
+        if step.blind:  # its motion is not known
             self._begin()
             return
         self._turned = self._turned + step.angles
         self._elapsed += step.duration
         if self._elapsed >= _WINDOW:
-            self._judge(self._known, self._matrix @ self._turned / self._elapsed)
+            self._judge(self._domain, self._matrix @ self._turned / self._elapsed)
             self._begin()
 
     def _begin(self) -> None:
         self._turned = np.zeros(self._matrix.shape[1])
         self._elapsed = 0.0
 
-    def _judge(self, known: TrainingDomain, motion: Array) -> None:
-        if not known.is_outside(motion):
+    def _judge(self, domain: TrainingDomain, motion: Array) -> None:
+        if not domain.is_outside(motion):
             self._lasted = 0.0
             return
         before, self._lasted = self._lasted, self._lasted + self._elapsed
@@ -61,7 +61,7 @@ class MotionWatch:
         if not self.seconds:
             LOG.warning(
                 "%s: drives motions that %r was not fitted to, such as %s: %s; told once, then counted in health",
-                *(self._robot, self._calibration.name, known.in_words(motion[None])),
+                *(self._robot, self._calibration.name, domain.in_words(motion[None])),
                 extrapolation_consequence([term.name for term in self._calibration.effects]),
             )
         self.seconds += self._lasted if before <= _TRANSITION else self._elapsed

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from omnibench.config import Model
 from omnibench.errors import DataError, OmnibenchError
 from omnibench.live.estimation.counts import Counts
-from omnibench.live.estimation.extrapolation_monitor import MotionWatch
+from omnibench.live.estimation.extrapolation_monitor import ExtrapolationMonitor
 from omnibench.live.estimation.health import FusionHealth, Health, Status, SwapRecord
 from omnibench.live.estimation.live_odometry import UNKNOWN_NOISE, LiveOdometry, Motion
 from omnibench.live.estimation.published_stamps import PublishedStamps
@@ -22,7 +22,7 @@ from omnibench.live.estimation.saved_state import RobotMemory, SavedState
 from omnibench.live.estimation.wheel_input import WheelInput, WheelSettings, WheelStep
 from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings, Outcome
 from omnibench.live.fusion.reference_correction import ReferenceCorrection
-from omnibench.live.fusion.timeline import Entry, Fix, Timeline
+from omnibench.live.fusion.timeline import Entry, PoseMeasurement, Timeline
 from omnibench.live.wire.messages import POSE_ESTIMATE, MessageError, Odometry, Transform
 from omnibench.live.wire.robot_messages import JointStateDecoder
 from omnibench.robot.calibration import Calibration
@@ -106,7 +106,7 @@ class RobotTracker:
         self._fusion = Fusion(fusion, self._timeline, self.counts) if fusion else None
         self._reference = ReferenceCorrection(calibration.model)
         self._wants_angles = _wheel_angle_effects(calibration)
-        self._watch = MotionWatch(name, calibration)
+        self._watch = ExtrapolationMonitor(name, calibration)
         self._stamps = PublishedStamps()
         self._decode = JointStateDecoder().decode
         self._arrival: float | None = None  # of the last wheel sample
@@ -115,6 +115,11 @@ class RobotTracker:
         self._saved = -np.inf
         self._counted = (time.monotonic(), 0)
         self._rate = 0.0
+
+    @property
+    def fusing(self) -> bool:
+        """True if SLAM poses are fused."""
+        return self._fusion is not None
 
     def take_wheels(self, payload: bytes, arrival: float) -> list[Update]:
         """Take a sensor_msgs/JointState; what is to be published. arrival: s, monotonic."""
@@ -142,7 +147,7 @@ class RobotTracker:
             if self._fusion is None:
                 return None
             try:
-                return self._fusion.correct(self._reference.corrected(self._fix(payload, arrival)))
+                return self._fusion.correct(self._reference.corrected(self._measurement(payload, arrival)))
             except MessageError as error:
                 self._last_refusal = str(error)
                 return None
@@ -160,7 +165,7 @@ class RobotTracker:
                 raise DataError(str(error)) from None
             self._odometry, self._reference, self.calibration = odometry, reference, calibration
             self._wants_angles = _wheel_angle_effects(calibration)
-            self._watch = MotionWatch(self.name, calibration)
+            self._watch = ExtrapolationMonitor(self.name, calibration)
             self.counts.swaps += 1
             self._last_swap = SwapRecord(accepted=True, name=calibration.name, reason="runs", at=time.time())
             self._save()
@@ -303,7 +308,7 @@ class RobotTracker:
         to_odom = Transform(stamp, frames.map, frames.odom, correction(fused, pose))
         return Update(odometry, filtered, (to_odom, to_base))
 
-    def _fix(self, payload: bytes, arrival: float) -> Fix:
+    def _measurement(self, payload: bytes, arrival: float) -> PoseMeasurement:
         try:
             message = POSE_ESTIMATE.decode(payload)
         except MessageError:
@@ -325,7 +330,7 @@ class RobotTracker:
         except MessageError:
             self.counts.pose_invalid += 1
             raise
-        return Fix(message.stamp, message.pose, covariance, arrival)
+        return PoseMeasurement(message.stamp, message.pose, covariance, arrival)
 
     def _usual_covariance(self) -> Array:
         """Of a pose that comes without: white noise and bias of the reference, as the calibration knows them."""

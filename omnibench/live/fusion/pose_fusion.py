@@ -17,7 +17,7 @@ from omnibench.live.estimation.live_odometry import Motion
 from omnibench.live.fusion.pose_filter import PoseFilter
 from omnibench.live.fusion.reference_correction import turned
 from omnibench.live.fusion.rejections import Rejections
-from omnibench.live.fusion.timeline import Entry, Fix, Timeline
+from omnibench.live.fusion.timeline import Entry, PoseMeasurement, Timeline
 from omnibench.robot.kinematics import Array
 
 _SECOND = 1e9  # ns
@@ -55,7 +55,7 @@ class Fusion:
         self._filter = PoseFilter(np.zeros(3), _NOWHERE)
         self._limit = float(chi2.ppf(settings.gate, 3))
         self._rejections = Rejections(settings.reacquire_after, self._limit)
-        self._waiting: deque[Fix] = deque()
+        self._waiting: deque[PoseMeasurement] = deque()
         self._since = _EVER  # what was measured before has no meaning: the pose was set
         self.located = False
         self.outcome: Outcome | None = None
@@ -88,18 +88,18 @@ class Fusion:
 
     def take_waiting(self) -> None:
         """Fuse poses that came before the wheel samples of their time, once these are there."""
-        if self._waiting and min(fix.latest for fix in self._waiting) <= self._timeline.newest:
+        if self._waiting and min(measurement.latest for measurement in self._waiting) <= self._timeline.newest:
             waiting, self._waiting = self._waiting, deque()
-            for fix in waiting:
-                self.correct(fix)
+            for measurement in waiting:
+                self.correct(measurement)
 
-    def correct(self, fix: Fix) -> Outcome:
+    def correct(self, measurement: PoseMeasurement) -> Outcome:
         """Fuse a pose at its own time, or say why not; every outcome is counted."""
-        self.outcome = self._refused(fix) or self._judged(self._at_one_time(fix))
+        self.outcome = self._refused(measurement) or self._judged(self._at_one_time(measurement))
         if self.outcome in ("fused", "located", "reacquired"):
             self._counts.poses += 1
             self._rejections.clear()
-            self.fused_at = fix.arrival
+            self.fused_at = measurement.arrival
         return self.outcome
 
     def set_pose(self, pose: Array, covariance: Array) -> None:
@@ -134,67 +134,67 @@ class Fusion:
         self._filter.set(entries[-1].pose, entries[-1].covariance)
         return found
 
-    def _refused(self, fix: Fix) -> Outcome | None:
+    def _refused(self, measurement: PoseMeasurement) -> Outcome | None:
         """Why a pose cannot be fused now, whatever it says."""
         timeline = self._timeline
-        if not timeline.entries or fix.latest > timeline.newest:
-            ahead = (fix.latest - timeline.newest) / _SECOND if timeline.entries else 0.0
+        if not timeline.entries or measurement.latest > timeline.newest:
+            ahead = (measurement.latest - timeline.newest) / _SECOND if timeline.entries else 0.0
             if ahead > self.settings.ahead or len(self._waiting) >= _WAITING:
                 self._counts.pose_ahead += 1
                 return "ahead"
-            self._waiting.append(fix)
+            self._waiting.append(measurement)
             return "waiting"
-        if fix.earliest < timeline.oldest or fix.stamp < self._since:
+        if measurement.earliest < timeline.oldest or measurement.stamp < self._since:
             self._counts.pose_too_late += 1
             return "too late"
-        known = timeline.entries[timeline.index(fix.stamp)].fixes
-        if any(each.stamp == fix.stamp for each in known) or self._rejections.known(fix.stamp):
+        known = timeline.entries[timeline.index(measurement.stamp)].measurements
+        if any(each.stamp == measurement.stamp for each in known) or self._rejections.known(measurement.stamp):
             self._counts.pose_duplicates += 1
             return "duplicate"
         return None
 
-    def _at_one_time(self, fix: Fix) -> Fix:
+    def _at_one_time(self, measurement: PoseMeasurement) -> PoseMeasurement:
         """A pose whose heading is of another time, with the odometry's turn until its own."""
-        if fix.heading_stamp is None:
-            return fix
-        before, after = (self._timeline.odometry_at(each) for each in (fix.heading_stamp, fix.stamp))
+        if measurement.heading_stamp is None:
+            return measurement
+        before, after = (self._timeline.odometry_at(each) for each in (measurement.heading_stamp, measurement.stamp))
         assert before is not None
         assert after is not None
-        return turned(fix, before, after)
+        return turned(measurement, before, after)
 
-    def _judged(self, fix: Fix) -> Outcome:
+    def _judged(self, measurement: PoseMeasurement) -> Outcome:
         """What becomes of a pose whose time is known to the timeline."""
-        index = self._timeline.index(fix.stamp)
-        self._to(index, fix.stamp)
+        index = self._timeline.index(measurement.stamp)
+        self._to(index, measurement.stamp)
         if not self.located:
-            self._replace(index, fix)
+            self._replace(index, measurement)
             self.located = True
             return "located"
-        if self._filter.distance(fix.pose, fix.covariance) <= self._limit:
-            self._insert(index, fix)
+        if self._filter.distance(measurement.pose, measurement.covariance) <= self._limit:
+            self._insert(index, measurement)
             return "fused"
-        odometry = self._timeline.odometry_at(fix.stamp)
+        odometry = self._timeline.odometry_at(measurement.stamp)
         assert odometry is not None
-        if self._rejections.add(fix, odometry):
-            self._replace(index, fix)
+        if self._rejections.add(measurement, odometry):
+            self._replace(index, measurement)
             self._counts.reacquired += 1
             return "reacquired"
         self._counts.pose_rejected += 1
         self._filter.set(self._timeline.entries[-1].pose, self._timeline.entries[-1].covariance)
         return "rejected"
 
-    def _replace(self, index: int, fix: Fix) -> None:
+    def _replace(self, index: int, measurement: PoseMeasurement) -> None:
         """Believe a pose alone: what other poses said of the time around it and after is forgotten."""
         for entry in self._timeline.entries[index:]:
-            entry.fixes = ()
-        self._insert(index, replace(fix, absolute=True))
+            entry.measurements = ()
+        self._insert(index, replace(measurement, absolute=True))
 
-    def _insert(self, index: int, fix: Fix) -> None:
+    def _insert(self, index: int, measurement: PoseMeasurement) -> None:
         """Put a pose where it belongs and take what came after it again."""
         entry = self._timeline.entries[index]
-        entry.fixes = tuple(sorted((*entry.fixes, fix), key=lambda each: each.stamp))
+        entry.measurements = tuple(sorted((*entry.measurements, measurement), key=lambda each: each.stamp))
         if index == 0:  # nothing is known of the motion up to the oldest entry: it is corrected as it stands
-            self._apply(fix)
+            self._apply(measurement)
             entry.pose, entry.covariance = self._filter.pose, self._filter.covariance
         self._replay(max(index, 1))
 
@@ -209,7 +209,7 @@ class Fusion:
         self._filter.set(entries[first - 1].pose, entries[first - 1].covariance)
         for index in range(first, len(entries)):
             entry = entries[index]
-            if entry.fixes:
+            if entry.measurements:
                 self._to(index, entry.stamp)
             else:
                 self._filter.predict(entry.motion)
@@ -222,18 +222,18 @@ class Fusion:
         if index == 0:
             return
         done = 0.0
-        for fix in entry.fixes:
-            if fix.stamp > stamp:
+        for measurement in entry.measurements:
+            if measurement.stamp > stamp:
                 break
-            done = self._drive(entry, done, self._timeline.share(index, fix.stamp))
-            self._apply(fix)
+            done = self._drive(entry, done, self._timeline.share(index, measurement.stamp))
+            self._apply(measurement)
         self._drive(entry, done, self._timeline.share(index, stamp))
 
-    def _apply(self, fix: Fix) -> None:
-        if fix.absolute:
-            self._filter.set(fix.pose, fix.covariance)
+    def _apply(self, measurement: PoseMeasurement) -> None:
+        if measurement.absolute:
+            self._filter.set(measurement.pose, measurement.covariance)
         else:
-            self._filter.correct(fix.pose, fix.covariance)
+            self._filter.correct(measurement.pose, measurement.covariance)
 
     def _drive(self, entry: Entry, done: float, to: float) -> float:
         if to > done:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from omnibench.live.fusion.timeline import Fix
+from omnibench.live.fusion.timeline import PoseMeasurement
 from omnibench.robot.effects.effect import ReferenceEffect, Values
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
@@ -20,7 +20,7 @@ class ReferenceCorrection:
     A run starts with the first pose that comes: effects that act from a run's start pose on begin there.
     """
 
-    def __init__(self, model: OdometryModel, start: Fix | None = None) -> None:
+    def __init__(self, model: OdometryModel, start: PoseMeasurement | None = None) -> None:
         self._terms: list[tuple[ReferenceEffect, Values]] = [
             (term.effect, term.values) for term in model.reference_terms if isinstance(term.effect, ReferenceEffect)
         ]
@@ -34,30 +34,30 @@ class ReferenceCorrection:
         """The next pose is the first of another run."""
         self._start = None
 
-    def corrected(self, fix: Fix) -> Fix:
+    def corrected(self, measurement: PoseMeasurement) -> PoseMeasurement:
         """The pose as it truly was, at the time at which its position was taken; its heading may be of another time."""
         if self._start is None:
-            self._start = fix
+            self._start = measurement
         if not self._terms:
-            return fix
-        stamps = np.array([(fix.stamp - self._start.stamp) / _SECOND])
+            return measurement
+        stamps = np.array([(measurement.stamp - self._start.stamp) / _SECOND])
         delays = [effect.delays(stamps, values) for effect, values in self._terms]
         of_position, of_heading = (sum(float(each[kind][0]) for each in delays) for kind in range(2))
-        poses = fix.pose[None]
+        poses = measurement.pose[None]
         for effect, values in reversed(self._terms):
             poses = effect.corrected(poses, self._start.pose, values)
         return replace(
-            fix,
-            stamp=fix.stamp - round(_SECOND * of_position),
-            heading_stamp=fix.stamp - round(_SECOND * of_heading),
+            measurement,
+            stamp=measurement.stamp - round(_SECOND * of_position),
+            heading_stamp=measurement.stamp - round(_SECOND * of_heading),
             pose=np.array(poses[0]),
         )
 
 
-def turned(fix: Fix, before: Array, after: Array) -> Fix:
+def turned(measurement: PoseMeasurement, before: Array, after: Array) -> PoseMeasurement:
     """A pose whose heading was taken at another time, with its heading at its own.
 
     before, after: odometry's poses (3,) at the time of the heading and at that of the position.
     """
-    pose: Array = fix.pose + np.array([0.0, 0.0, after[2] - before[2]])
-    return replace(fix, pose=pose, heading_stamp=None)
+    pose: Array = measurement.pose + np.array([0.0, 0.0, after[2] - before[2]])
+    return replace(measurement, pose=pose, heading_stamp=None)

@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 
 from omnibench.live.fusion.pose_filter import innovation_of
-from omnibench.live.fusion.timeline import Fix
+from omnibench.live.fusion.timeline import PoseMeasurement
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import compose, relative
 
@@ -23,7 +23,7 @@ class Rejections:
     def __init__(self, enough: int, limit: float) -> None:
         self._enough = enough
         self._limit = limit
-        self._poses: deque[tuple[Fix, Array]] = deque(maxlen=enough)
+        self._poses: deque[tuple[PoseMeasurement, Array]] = deque(maxlen=enough)
         self.in_a_row = 0
 
     def clear(self) -> None:
@@ -33,17 +33,19 @@ class Rejections:
 
     def known(self, stamp: int) -> bool:
         """Whether a pose of this time was rejected already."""
-        return any(fix.stamp == stamp for fix, _ in self._poses)
+        return any(measurement.stamp == stamp for measurement, _ in self._poses)
 
-    def add(self, fix: Fix, odometry: Array) -> bool:
+    def add(self, measurement: PoseMeasurement, odometry: Array) -> bool:
         """Another one; whether the last ones agree on where the robot is. odometry (3,): pose in odom at its time."""
         self.in_a_row += 1
-        self._poses.append((fix, odometry))
-        return len(self._poses) == self._enough and all(self._agrees(*each, fix, odometry) for each in self._poses)
+        self._poses.append((measurement, odometry))
+        return len(self._poses) == self._enough and all(
+            self._agrees(*each, measurement, odometry) for each in self._poses
+        )
 
-    def _agrees(self, earlier: Fix, seen: Array, fix: Fix, odometry: Array) -> bool:
+    def _agrees(self, earlier: PoseMeasurement, seen: Array, measurement: PoseMeasurement, odometry: Array) -> bool:
         """Whether the earlier pose, carried along by odometry, is the later one."""
         carried = compose(earlier.pose, relative(seen, odometry))
-        innovation = innovation_of(fix.pose, carried)
-        spread = fix.covariance + earlier.covariance + _DRIFT
+        innovation = innovation_of(measurement.pose, carried)
+        spread = measurement.covariance + earlier.covariance + _DRIFT
         return float(innovation @ np.linalg.solve(spread, innovation)) <= self._limit

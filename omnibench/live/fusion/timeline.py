@@ -16,7 +16,7 @@ _MOST_A_SECOND = 2000  # samples; a sender with nonsense for stamps shall not fi
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fix:
+class PoseMeasurement:
     """A pose in the map at its own time.
 
     arrival: s, monotonic. absolute: it replaces what the filter believes, instead of correcting it. heading_stamp: when
@@ -45,7 +45,7 @@ class Fix:
 class Entry:
     """What is known at one wheel sample: the motion up to it, odometry's pose after it, and the filter's.
 
-    fixes: poses in the map whose time lies within the motion, by time.
+    measurements: poses in the map whose time lies within the motion, by time.
     """
 
     stamp: int
@@ -53,7 +53,7 @@ class Entry:
     odometry: Array
     pose: Array
     covariance: Array
-    fixes: tuple[Fix, ...] = ()
+    measurements: tuple[PoseMeasurement, ...] = ()
 
 
 class Timeline:
@@ -88,7 +88,7 @@ class Timeline:
     def restart(self, stamp: int) -> None:
         """Keep the newest entry alone, at another time: the clock jumped, or all before has no meaning any more."""
         newest = self.entries[-1]
-        newest.stamp, newest.fixes = stamp, ()
+        newest.stamp, newest.measurements = stamp, ()
         self.entries, self._stamps = [newest], [stamp]
 
     def index(self, stamp: int) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from drives import ORIGIN, PERIOD, SECOND, calibration
 
-from omnibench.live.estimation.extrapolation_monitor import MotionWatch
+from omnibench.live.estimation.extrapolation_monitor import ExtrapolationMonitor
 from omnibench.live.estimation.health import diagnostic
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.estimation.wheel_input import WheelStep
@@ -34,8 +34,8 @@ def steps(twist: Twist, seconds: float, blind: float = 0.0) -> list[WheelStep]:
     return [WheelStep(0, PERIOD, PERIOD * rates, rates, blind) for _ in range(round(seconds / PERIOD))]
 
 
-def watched(*driven: list[WheelStep], by: Calibration | None = None) -> MotionWatch:
-    watch = MotionWatch("apr", by or fitted())
+def watched(*driven: list[WheelStep], by: Calibration | None = None) -> ExtrapolationMonitor:
+    watch = ExtrapolationMonitor("apr", by or fitted())
     for each in driven:
         for step in each:
             watch.take(step)

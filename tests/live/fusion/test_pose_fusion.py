@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from omnibench.live.estimation.counts import Counts
 from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings
-from omnibench.live.fusion.timeline import Entry, Fix, Timeline
+from omnibench.live.fusion.timeline import Entry, PoseMeasurement, Timeline
 from omnibench.robot.odometry import advance
 
 R = np.diag([1e-4, 1e-4, 1e-4])
@@ -45,7 +45,7 @@ class Robot:
         return advance(self.truth[whole], (time / 0.01 - whole) * np.array([0.005, 0.0, 0.005]), "arc")
 
     def see(self, time: float, error: tuple[float, float, float] = (0, 0, 0), covariance: np.ndarray = R) -> str:
-        return self.fusion.correct(Fix(stamp(time), self.at(time) + error, covariance))
+        return self.fusion.correct(PoseMeasurement(stamp(time), self.at(time) + error, covariance))
 
 
 def stamp(time: float) -> int:
@@ -75,7 +75,7 @@ def test_poses_may_come_late_and_in_any_order_and_the_result_is_the_same(data: s
 def test_the_first_pose_says_where_the_robot_is() -> None:
     robot = Robot().drive(50)
     offset = np.array([3.0, -2.0, 0.0])
-    assert robot.fusion.correct(Fix(stamp(0.3), robot.at(0.3) + offset, R)) == "located"
+    assert robot.fusion.correct(PoseMeasurement(stamp(0.3), robot.at(0.3) + offset, R)) == "located"
     np.testing.assert_allclose(robot.fusion.pose, robot.truth[-1] + offset, atol=1e-12)
 
 
@@ -98,7 +98,7 @@ def test_poses_within_the_history_are_never_too_late() -> None:
 def test_a_pose_that_comes_before_its_wheel_sample_waits_for_it() -> None:
     robot = Robot().drive(10)
     robot.see(0.05)
-    ahead = Fix(stamp(0.15), np.array([0.0749, 0.0028, 0.075]), R)
+    ahead = PoseMeasurement(stamp(0.15), np.array([0.0749, 0.0028, 0.075]), R)
     assert robot.fusion.correct(ahead) == "waiting"
     before = robot.counts.poses
     robot.drive(4)
@@ -109,7 +109,7 @@ def test_a_pose_that_comes_before_its_wheel_sample_waits_for_it() -> None:
 
 def test_a_pose_of_the_far_future_is_refused() -> None:
     robot = Robot(ahead=1.0).drive(10)
-    assert robot.fusion.correct(Fix(stamp(5.0), np.zeros(3), R)) == "ahead"
+    assert robot.fusion.correct(PoseMeasurement(stamp(5.0), np.zeros(3), R)) == "ahead"
     assert robot.counts.pose_ahead == 1
 
 
