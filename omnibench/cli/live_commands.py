@@ -1,7 +1,7 @@
 """The commands of the live runtime: parse, call, print."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,7 +13,6 @@ from omnibench.errors import ConfigError
 
 if TYPE_CHECKING:
     from omnibench.live.config import LiveConfig
-    from omnibench.live.node import LiveNode
 
 live_app = typer.Typer()
 _LISTENING = 0.2  # s
@@ -187,7 +186,6 @@ def _run(config: "LiveConfig", seconds: float | None) -> None:
         stop_on_signals() as stop,
         log_refused_access(config.zenoh),
         LiveNode(config) as node,
-        _extras(config, node),
     ):
         for robot in config.robots:
             fused = "fused with SLAM" if config.fusion_of(robot) else "without fusion"
@@ -226,33 +224,10 @@ def _replay_to_node(config: "LiveConfig", dataset: Path | None, speed: str | Non
         stop_on_signals() as stop,
         log_refused_access(config.zenoh),
     ):
-        shown = demonstrate(config, recording, stop, bar, beside=lambda node: _extras(config, node))
+        shown = demonstrate(config, recording, stop, bar)
     print_demonstration(make_console(), shown)
     if not shown.report.complete:
         raise typer.Exit(130)
-
-
-@contextmanager
-def _extras(config: "LiveConfig", node: "LiveNode") -> Iterator[None]:
-    """The recorder and the Foxglove server that a node's config asks for."""
-    import logging
-
-    from omnibench.live.wire.foxglove import PORT, FoxgloveServer
-    from omnibench.live.wire.recorder import Recorder, free_path
-
-    names = [robot.name for robot in config.robots]
-    log = logging.getLogger("omnibench.live")
-    with ExitStack() as stack:
-        if config.foxglove is not False:
-            port = PORT if config.foxglove is True else config.foxglove
-            server = stack.enter_context(FoxgloveServer(port=port))
-            server.forward(node.session, node.keys, names)
-            log.warning("Foxglove: open ws://127.0.0.1:%d", port)
-        if config.record is not None:
-            path = free_path(config.record)
-            stack.enter_context(Recorder(node.session, node.keys, names, path, on_failure=log.error))
-            log.warning("recording to %s", path)
-        yield
 
 
 @contextmanager

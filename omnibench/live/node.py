@@ -1,77 +1,65 @@
-"""The node: robots' trackers behind one Zenoh session."""
+"""The node: every step from a config to robots whose samples become odometry on a Zenoh session."""
 
 from __future__ import annotations
 
-import gc
 import logging
-import math
-import sys
-import threading
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from typing import Any
+from collections.abc import Collection, Sequence
+from contextlib import ExitStack
+from functools import partial
 
-from omnibench.environment import package_versions
-from omnibench.errors import ConfigError, one_line
-from omnibench.live.config import LiveConfig, RobotConfig
+from omnibench.errors import ConfigError
+from omnibench.live.config import LiveConfig
 from omnibench.live.control.query_server import QueryServer
+from omnibench.live.control.robot_info import robot_info
+from omnibench.live.diagnostics_timer import DiagnosticsTimer
 from omnibench.live.estimation.health import Health
 from omnibench.live.estimation.saved_state import RobotMemory
-from omnibench.live.estimation.tracker import RobotTracker
+from omnibench.live.low_latency import low_latency
 from omnibench.live.network.presence import alive_robots
-from omnibench.live.network.rate_limiter import RateLimiter
 from omnibench.live.network.session import open_session
 from omnibench.live.robot_service import RobotService
-from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace
+from omnibench.live.robot_setup import make_tracker
+from omnibench.live.wire.foxglove import PORT, FoxgloveServer
+from omnibench.live.wire.recorder import Recorder, free_path
+from omnibench.live.wire.topics import GraphNode, KeySpace
 from omnibench.registry import load_plugins
-from omnibench.robot.calibration import Calibration, read_calibration
 
 LOG = logging.getLogger("omnibench.live")
-_TICK = 1.0  # s
-_TURN = 0.0005  # s that a thread has the interpreter while others wait
-_LOOKING = 0.5  # s, for other robots on the network
+_PRESENCE_TIMEOUT = 0.5  # s to wait for the tokens of robots of other nodes
 
 
 class LiveNode:
-    """Runs from its making until ``close``. ConfigError or DataError when it cannot start; then nothing stays open.
+    """Runs from its construction until ``close``; does all that its config says, ``record`` and ``foxglove`` included.
 
-    remember: use the config's ``state``, if it has one; a replay starts afresh.
+    remember: use the config's ``state``, if it has one; a replay starts afresh. ConfigError or DataError: it cannot
+    start; what was started before the error is closed again.
     """
 
     def __init__(self, config: LiveConfig, *, remember: bool = True) -> None:
         self.config = config
         self.keys = KeySpace(config.profile, config.domain)
-        self._memories: dict[str, RobotMemory] = {}
-        self._services: list[RobotService] = []
-        self._rate_limiter = RateLimiter(math.inf)
-        self._stop = threading.Event()
         load_effects(config)
-        with ExitStack() as started:  # what is last started is first closed
-            if remember and config.state is not None:
-                for robot in config.robots:
-                    self._memories[robot.name] = memory = RobotMemory(config.state, robot.name)
-                    started.callback(memory.close)
-            self.trackers = {robot.name: self._tracker(robot) for robot in config.robots}
+        with ExitStack() as started:  # what is started last is closed first
+            memories = self._open_memories(started) if remember else {}
+            self.trackers = {
+                robot.name: make_tracker(config, robot, memories.get(robot.name)) for robot in config.robots
+            }
             self.session = open_session(config.zenoh, f"node {config.name}")
             started.callback(self.session.close)
-            self._look_around()
-            self.graph = GraphNode(self.session, self.keys, config.name)
-            for robot in config.robots:
-                fusing = config.fusion_of(robot) is not None
-                service = RobotService(self.graph, self.trackers[robot.name], fusing=fusing)
-                self._services.append(service)
-                started.callback(service.close)
-            query_server = QueryServer(self.session, self.trackers, self._info, self._memories)
-            started.callback(query_server.close)
-            self._ticking = threading.Thread(target=self._tick, name="diagnostics", daemon=True)
-            self._ticking.start()
-            started.callback(self._stop_ticking)
-            started.enter_context(_undisturbed())
+            self._check_other_nodes()
+            self._serve_foxglove(started)
+            self._record(started)
+            self._services = self._start_services(started)
+            queries = QueryServer(self.session, self.trackers, partial(robot_info, config, self.keys), memories)
+            started.callback(queries.close)
+            diagnostics = DiagnosticsTimer(self._services)
+            started.callback(diagnostics.close)
+            started.enter_context(low_latency())
             self._started = started.pop_all()
 
     def close(self) -> None:
-        """Take no more orders, then no more messages; write states down; leave."""
+        """Take no more requests, then no more messages; write the robots' states; complete the recording; leave."""
         self._started.close()
 
     def __enter__(self) -> LiveNode:
@@ -81,122 +69,76 @@ class LiveNode:
         self.close()
 
     def health(self, robot: str) -> Health:
-        """How a robot's stream is, now."""
+        """A robot's health now."""
         return self.trackers[robot].health(time.monotonic())
 
-    def _tracker(self, robot: RobotConfig) -> RobotTracker:
-        memory = self._memories.get(robot.name)
-        calibration = self._calibration(robot, memory)
-        _check_joints(robot, calibration)
-        tracker = RobotTracker(
-            robot.name,
-            calibration,
-            wheels=robot.wheels,
-            fusion=self.config.fusion_of(robot),
-            frames=self.config.frames_of(robot),
-            stale_after=self.config.stale_after,
-            memory=memory,
+    def _open_memories(self, started: ExitStack) -> dict[str, RobotMemory]:
+        """The robots' saved states, locked for this node; none if the config has no ``state``."""
+        memories: dict[str, RobotMemory] = {}
+        if self.config.state is not None:
+            for robot in self.config.robots:
+                memories[robot.name] = memory = RobotMemory(self.config.state, robot.name)
+                started.callback(memory.close)
+        return memories
+
+    def _check_other_nodes(self) -> None:
+        """Refuse a robot that another node runs, and warn of tf frames that another node may publish too."""
+        others = alive_robots(self.session, _PRESENCE_TIMEOUT)
+        _refuse_taken_robots(self.trackers, others)
+        _warn_of_shared_frames(self.config.on_common_frames(), others)
+
+    def _serve_foxglove(self, started: ExitStack) -> None:
+        """Serve the robots' topics to Foxglove, if the config asks for it."""
+        if self.config.foxglove is False:
+            return
+        server = started.enter_context(
+            FoxgloveServer(port=PORT if self.config.foxglove is True else self.config.foxglove)
         )
-        saved = memory.load() if memory is not None else None
-        if saved is not None:
-            tracker.resume(saved, time.monotonic(), time.time())
-            x, y, _ = saved.pose
-            LOG.info("%s: goes on at x %.3f m, y %.3f m of odom", robot.name, x, y)
-        return tracker
+        server.forward(self.session, self.keys, list(self.trackers))
+        LOG.warning("Foxglove: open %s", server.address)
 
-    def _calibration(self, robot: RobotConfig, memory: RobotMemory | None) -> Calibration:
-        if memory is None:
-            return read_calibration(robot.calibration)
-        return memory.calibration(robot.calibration)
+    def _record(self, started: ExitStack) -> None:
+        """Record the robots' topics, if the config asks for it; in a new file where the config's is there already."""
+        if self.config.record is None:
+            return
+        path = free_path(self.config.record)
+        started.enter_context(Recorder(self.session, self.keys, list(self.trackers), path, on_failure=LOG.error))
+        LOG.warning("recording to %s", path)
 
-    def _info(self, tracker: RobotTracker) -> Mapping[str, Any]:
-        robot = next(each for each in self.config.robots if each.name == tracker.name)
-        return {
-            "robot": tracker.name,
-            "node": self.config.name,
-            "wheels": tracker.calibration.robot.wheel_names,
-            "calibration": tracker.calibration.name,
-            "integration": tracker.calibration.integration,
-            "profile": self.config.profile,
-            "domain": self.config.domain,
-            "topics": {topic: self.keys.key(tracker.name, topic) for topic in TOPICS},
-            "frames": self.config.frames_of(robot),
-            "fusion": self.config.fusion_of(robot),
-            "versions": package_versions(),
-        }
-
-    def _look_around(self) -> None:
-        """Who else is there. Two nodes for one robot would publish every stamp twice: ConfigError.
-
-        tf is everybody's, and two robots on frames of the same names tear one another's apart: a warning.
-        """
-        others = set(alive_robots(self.session, _LOOKING))
-        for name in self.trackers:
-            if name in others:
-                raise ConfigError(
-                    f"robot {name!r} is run by another node already; stop that, or give this one's another name"
-                )
-        common = self.config.on_common_frames()
-        if others and common:
-            LOG.warning(
-                "robot %s publishes tf between map, odom and base_link, and so may %s on the same network; "
-                "`frames: prefixed` makes them %s/odom and %s/base_link",
-                *(common[0], ", ".join(sorted(others)), common[0], common[0]),
-            )
-
-    def _tick(self) -> None:
-        while not self._stop.wait(_TICK):
-            for service in self._services:
-                try:
-                    service.tick()
-                except Exception as error:  # of one robot; the others' go on
-                    name = service.tracker.name
-                    if self._rate_limiter.allows(f"{name} {type(error).__name__}"):
-                        LOG.error("%s: diagnostics: %s: %s", name, type(error).__name__, one_line(str(error)))
-
-    def _stop_ticking(self) -> None:
-        self._stop.set()
-        self._ticking.join()
+    def _start_services(self, started: ExitStack) -> list[RobotService]:
+        """Subscribe to every robot's wheels and poses, and publish what its tracker makes of them."""
+        graph = GraphNode(self.session, self.keys, self.config.name)
+        services = []
+        for tracker in self.trackers.values():
+            services.append(service := RobotService(graph, tracker))
+            started.callback(service.close)
+        return services
 
 
 def load_effects(config: LiveConfig) -> None:
-    """Load the plug-ins whose effects calibrations may name; one that cannot be imported is told in the log."""
+    """Load the plug-ins whose effects calibrations may name; one that cannot be imported is a warning in the log."""
     for failure in load_plugins(config.plugins):
         LOG.warning("plug-in %s cannot be imported: %s", failure.origin, failure.error)
 
 
-def _check_joints(robot: RobotConfig, calibration: Calibration) -> None:
-    joints, wheels = robot.wheels.joints, calibration.robot.wheel_names
-    if joints is not None and (len(joints) != len(wheels) or len(set(joints)) < len(joints)):
-        raise ConfigError(
-            f"robot {robot.name!r}: wheels.joints: {', '.join(joints) or 'none'}; name one joint, and a different one, "
-            f"for each of the wheels {', '.join(wheels)}"
-        )
+def _refuse_taken_robots(robots: Collection[str], others: Collection[str]) -> None:
+    """Two nodes for one robot would publish every stamp twice: ConfigError."""
+    for name in robots:
+        if name in others:
+            raise ConfigError(
+                f"robot {name!r} is run by another node already; stop that, or give this one's another name"
+            )
 
 
-_running = 0  # nodes of this process
-_running_lock = threading.Lock()
-_usual_turn = sys.getswitchinterval()
+def _warn_of_shared_frames(robots: Sequence[str], others: Sequence[str]) -> None:
+    """All robots share the topic tf: two on frames of the same names overwrite each other's transforms.
 
-
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """While any node of this process runs, nothing else keeps the interpreter from a sample for long.
-
-    The collector need not look at what was there at the start, and a thread that works on and on (the query server
-    on a large calibration) gives way after 0.5 ms in place of 5.
+    robots: this node's, on the default frames. others: robots of other nodes.
     """
-    global _running
-    with _running_lock:
-        _running += 1
-        gc.collect()
-        gc.freeze()
-        sys.setswitchinterval(_TURN)
-    try:
-        yield
-    finally:
-        with _running_lock:
-            _running -= 1
-            if not _running:
-                gc.unfreeze()
-                sys.setswitchinterval(_usual_turn)
+    if robots and others:
+        name = robots[0]
+        LOG.warning(
+            "robot %s publishes tf between map, odom and base_link, and so may %s on the same network; "
+            "`frames: prefixed` makes them %s/odom and %s/base_link",
+            *(name, ", ".join(others), name, name),
+        )

@@ -24,7 +24,7 @@ class RobotService:
     Messages are taken in Zenoh's own threads, as they come; one that fails is counted, told and forgotten.
     """
 
-    def __init__(self, graph: GraphNode, tracker: RobotTracker, *, fusing: bool) -> None:
+    def __init__(self, graph: GraphNode, tracker: RobotTracker) -> None:
         name = tracker.name
         self.tracker = tracker
         self._rate_limiter = RateLimiter()
@@ -37,16 +37,16 @@ class RobotService:
         self._encode_odometry = OdometryEncoder(frames.odom, frames.base).encode
         self._encode_filtered = OdometryEncoder(frames.map, frames.base).encode
         self._encode_transforms = TransformsEncoder(((frames.map, frames.odom), (frames.odom, frames.base))).encode
-        self._filtered = graph.publisher(name, "odometry/filtered") if fusing else None
-        self._transforms = graph.publisher(name, "tf") if fusing else None
+        self._filtered = graph.publisher(name, "odometry/filtered") if tracker.fusing else None
+        self._transforms = graph.publisher(name, "tf") if tracker.fusing else None
         self._diagnostics = graph.publisher(name, "diagnostics")
         self._inputs = [graph.subscribe(name, "joint_states", self._take_wheels)]
-        if fusing:
+        if tracker.fusing:
             self._inputs.append(graph.subscribe(name, "slam_pose", self._take_pose))
         self._token = graph.session.liveliness().declare_token(f"omnibench/{name}/alive")
 
-    def tick(self) -> None:
-        """Publish the diagnostics, and log what has changed; once a second."""
+    def publish_diagnostics(self) -> None:
+        """Publish the diagnostics and log what has changed; called once a second."""
         health = self.tracker.health(time.monotonic())
         status = diagnostic(health, hardware=self.tracker.calibration.robot.name)
         self._diagnostics.put(Diagnostics(time.time_ns(), (status,)))

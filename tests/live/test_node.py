@@ -203,7 +203,7 @@ def test_a_robot_whose_diagnostics_fail_does_not_end_those_of_the_others(
             failed.append(1)
             "\ud800".encode()
 
-        monkeypatch.setattr(node._services[0], "tick", failing)
+        monkeypatch.setattr(node._services[0], "publish_diagnostics", failing)
         heard = ReceivedMessages(session, bob__diagnostics=DIAGNOSTICS)
         until(lambda: len(failed) >= 2 and len(heard["bob__diagnostics"]) >= 2, "diagnostics after a failure")
     assert caplog.text.count("apr: diagnostics: UnicodeEncodeError: ") == 1

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,19 +93,18 @@ def demonstrate(
     recording: Recording,
     stop: threading.Event | None = None,
     watch: Callable[[Progress, Health], None] | None = None,
-    beside: Callable[[LiveNode], AbstractContextManager[None]] | None = None,
 ) -> Demonstration:
     """Run the node of ``config``, play ``recording`` to it as the config's ``replay`` says, and judge what comes out.
 
-    The node begins afresh. beside: what is open while it runs, a recorder for example. ConfigError when the recording
-    is of other wheels than the robot's calibration; other errors as LiveNode's and Player's.
+    The node begins afresh. ConfigError when the recording is of other wheels than the robot's calibration; other errors
+    as LiveNode's and Player's.
     """
     stop = stop or threading.Event()
     robot = robot_called(config, config.replay.robot)
     load_effects(config)
     _check_wheels(recording, read_calibration(robot.calibration), robot.name)
     drive = concatenate_recording(recording, pause=config.replay.pause, split=config.replay.split)
-    with LiveNode(config, remember=False) as node, beside(node) if beside else nullcontext():
+    with LiveNode(config, remember=False) as node:
         tracker = node.trackers[robot.name]
         guarded = config.zenoh.users_file is not None and config.zenoh.user is None
         session = node.session if guarded else open_session(client_session(config.zenoh), "replay")
