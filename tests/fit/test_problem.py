@@ -88,7 +88,7 @@ def test_a_candidate_that_cannot_be_evaluated_leaves_the_others_alone(
     candidates[1] = value
     costs = problem.cost(candidates)
     assert costs[0] == pytest.approx(problem.values(problem.start[None])[0], rel=1e-12)
-    assert costs[2] == costs[0]
+    assert costs[2] == pytest.approx(costs[0], rel=1e-14)  # some processors' BLAS rounds rows of a product apart
     assert not costs[1] <= costs[0]
 
 

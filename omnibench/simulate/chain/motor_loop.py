@@ -14,8 +14,8 @@ from numba import njit
 from scipy.linalg import expm
 
 from omnibench.robot.kinematics import Array
+from omnibench.simulate.chain.true_step import TRUE_STEP
 
-TRUE_STEP = 1e-3  # s between the recorded true angles
 _INNER = 10  # steps within it
 _STEP = TRUE_STEP / _INNER
 _STANDING = 1e-6  # ticks a sample; less is the rounding of a wheel across the motion

@@ -17,11 +17,12 @@ from pydantic import Field, model_validator
 from omnibench.config import Model
 from omnibench.errors import ConfigError
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
+from omnibench.simulate.chain.true_step import TRUE_STEP
 from omnibench.simulate.config import Positive
 from omnibench.simulate.flower import Command
 
 if TYPE_CHECKING:  # it is compiled, and loads slowly: for those who drive, not for those who read a config
-    from omnibench.simulate.chain.motor_loop import TRUE_STEP, MotorSteps, Pid
+    from omnibench.simulate.chain.motor_loop import MotorSteps, Pid
 
 _RESERVE = 0.1  # share of the fastest rate that is left to the controller
 

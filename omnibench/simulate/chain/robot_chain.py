@@ -19,9 +19,9 @@ from omnibench.robot.odometry import WheelLog
 from omnibench.simulate.chain.floor_plan import FloorPlan, make_plan
 from omnibench.simulate.chain.lidar import PoseTrack, measure_scans, scan_stamps
 from omnibench.simulate.chain.motion_commands import CommandedMotion, command_motion, target_rates
-from omnibench.simulate.chain.motor_loop import TRUE_STEP
 from omnibench.simulate.chain.motors import DrivenRun, check_reach, drive_session
 from omnibench.simulate.chain.robot_config import Placement, RobotConfig, RobotSession
+from omnibench.simulate.chain.true_step import TRUE_STEP
 from omnibench.simulate.flower import PAUSE, Command, grid_of, runs_of
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.truth import TrueRobot, true_record
