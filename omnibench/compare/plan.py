@@ -17,8 +17,8 @@ from pydantic import BaseModel
 from omnibench.compare.config import CalibratorEntry, CompareConfig, DatasetSource
 from omnibench.config import read_model, validate
 from omnibench.data.dataset import Dataset
+from omnibench.data.progress import Watch, unwatched
 from omnibench.data.storage import load_dataset
-from omnibench.data.watch import Watch, unwatched
 from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
 from omnibench.fit.calibrator import unloadable
 from omnibench.fit.parameterisation import ParameterisationName

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import Discriminator, Tag
 
 from omnibench.config import CHOSEN
-from omnibench.data.watch import Watch, unwatched
+from omnibench.data.progress import Watch, unwatched
 from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.flower import simulate_flower
@@ -41,6 +41,6 @@ def simulate_dataset(
     """
     if isinstance(config, FlowerConfig):
         return simulate_flower(config, name, description)
-    from omnibench.simulate.chain.robot_chain import simulate_robot  # and what it takes a second to load
+    from omnibench.simulate.chain.robot_simulator import simulate_robot  # and what it takes a second to load
 
     return simulate_robot(config, name, description, watch)

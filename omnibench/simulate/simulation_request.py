@@ -9,9 +9,9 @@ from pathlib import Path
 
 from omnibench.config import to_json, to_yaml
 from omnibench.data.dataset import Dataset
+from omnibench.data.progress import Watch, unwatched
 from omnibench.data.storage import check_dataset_folder, load_dataset, save_dataset
 from omnibench.data.true_poses import TRUTH_FILE, write_true_poses
-from omnibench.data.watch import Watch, unwatched
 from omnibench.errors import ConfigError
 from omnibench.files import TableFormat, write_text
 from omnibench.robot.calibration import read_calibration

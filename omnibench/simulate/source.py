@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field
 
 from omnibench.config import Model, parse_yaml, read_yaml, validate
-from omnibench.data.watch import Watch, unwatched
+from omnibench.data.progress import Watch, unwatched
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.robot.calibration import EffectTerm
 from omnibench.simulate.chain.robot_config import RobotConfig

@@ -9,15 +9,15 @@ from itertools import pairwise
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.data.progress import Watch
 from omnibench.data.scans import Scanner, TrajectoryScans
-from omnibench.data.watch import Watch
 from omnibench.errors import DataError
 from omnibench.processes import in_processes
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.planar import relative
-from omnibench.slam.doubts import Doubt, together
 from omnibench.slam.motion_prior import length, odometry_deviations
+from omnibench.slam.path_warnings import Doubt, together
 from omnibench.slam.pose_errors import FLOOR
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.slam_run import SlamPath, run_slam

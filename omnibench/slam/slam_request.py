@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from omnibench.data.dataset import Dataset
+from omnibench.data.progress import Watch
 from omnibench.data.storage import check_dataset_folder, load_dataset, save_dataset
 from omnibench.data.true_poses import TruePath, read_true_poses, robot_of_truth
-from omnibench.data.watch import Watch
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import TableFormat
 from omnibench.robot.calibration import read_calibration

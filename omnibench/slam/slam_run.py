@@ -10,12 +10,12 @@ import numpy as np
 from omnibench.data.scans import Ranges, Scanner, TrajectoryScans
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
-from omnibench.slam.doubts import Doubt, doubts_of
 from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints, noise_factor, scan_points
 from omnibench.slam.matching.scan_matching import Match, refine, search
 from omnibench.slam.motion_prior import Motion, OdometryMotion, UnknownMotion
 from omnibench.slam.motion_within_scan import WithinScan
+from omnibench.slam.path_warnings import Doubt, doubts_of
 from omnibench.slam.pose_errors import PoseErrors
 from omnibench.slam.slam_options import SlamOptions
 

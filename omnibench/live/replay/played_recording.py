@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from omnibench.data.dataset import Dataset
+from omnibench.data.progress import Watch, unwatched
 from omnibench.data.storage import load_dataset
 from omnibench.data.true_poses import TruePath
-from omnibench.data.watch import Watch, unwatched
 from omnibench.errors import ConfigError
 from omnibench.registry import load_plugins
 from omnibench.simulate.source import read_simulation

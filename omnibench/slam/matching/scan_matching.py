@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.robot.kinematics import Array
+from omnibench.slam.matching.correspondences import Pairs
 from omnibench.slam.matching.map import ScanMap
-from omnibench.slam.matching.pairs import Pairs
 from omnibench.slam.matching.points import ScanPoints
 from omnibench.slam.slam_options import SlamOptions
 

@@ -17,8 +17,8 @@ from omnibench.data.scans import Scanner, ScansInMemory, TrajectoryScans
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.chain.lidar import Lidar, PoseTrack, measure_scans
+from omnibench.slam.matching.correspondences import Pairs
 from omnibench.slam.matching.map import ScanMap
-from omnibench.slam.matching.pairs import Pairs
 from omnibench.slam.matching.points import ScanPoints, scan_points
 from omnibench.slam.motion_within_scan import WithinScan
 from omnibench.slam.slam_dataset import slam_dataset

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omnibench.data.dataset import Split, Trajectory, make_dataset
+from omnibench.data.progress import Watch, unwatched
 from omnibench.data.scans import ScansInMemory, TrajectoryScans
 from omnibench.data.true_poses import TruePath
-from omnibench.data.watch import Watch, unwatched
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
