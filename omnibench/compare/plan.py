@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from omnibench.compare.config import CalibratorEntry, CompareConfig, DatasetSource
 from omnibench.config import read_model, validate
 from omnibench.data.dataset import Dataset
-from omnibench.data.progress import Watch, unwatched
+from omnibench.data.progress import ProgressCallback, no_progress
 from omnibench.data.storage import load_dataset
 from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
 from omnibench.fit.calibrator import unloadable
@@ -98,7 +98,7 @@ def _names_in(plugin: Path) -> set[str]:
     return {plugin.stem, *re.findall(r"""calibrators\s*\.\s*register\(\s*["']([^"']+)["']""", text)}
 
 
-def load_datasets(config: CompareConfig, watch: Watch = unwatched) -> dict[str, Dataset]:
+def load_datasets(config: CompareConfig, watch: ProgressCallback = no_progress) -> dict[str, Dataset]:
     """Read, import or simulate every data set. DataError when one has no training data."""
     loaded = {}
     for name, source in config.datasets.items():
@@ -107,7 +107,9 @@ def load_datasets(config: CompareConfig, watch: Watch = unwatched) -> dict[str, 
     return loaded
 
 
-def load_source(name: str, source: DatasetSource, description: str = "", watch: Watch = unwatched) -> Dataset:
+def load_source(
+    name: str, source: DatasetSource, description: str = "", watch: ProgressCallback = no_progress
+) -> Dataset:
     """One data set from its source."""
     if source.simulate is not None:
         return simulate_dataset(source.simulate, name, description, watch).dataset

@@ -1,15 +1,15 @@
-"""Those who are told how long work gets on."""
+"""The callback by which long work reports its progress."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
 
-class Watch(Protocol):
-    """Told how long work gets on: what is being done, and how many of how many steps are done."""
+class ProgressCallback(Protocol):
+    """Called with what is being done, and how many of how many steps of it are done."""
 
     def __call__(self, what: str, done: int, total: int) -> None: ...
 
 
-def unwatched(what: str, done: int, total: int) -> None:
-    """Nobody watches."""
+def no_progress(what: str, done: int, total: int) -> None:
+    """Ignore the progress."""

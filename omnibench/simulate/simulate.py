@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import Discriminator, Tag
 
 from omnibench.config import CHOSEN
-from omnibench.data.progress import Watch, unwatched
+from omnibench.data.progress import ProgressCallback, no_progress
 from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.flower import simulate_flower
@@ -32,7 +32,10 @@ SimulatedConfig = Annotated[
 
 
 def simulate_dataset(
-    config: FlowerConfig | RobotConfig, name: str = "flower", description: str = "", watch: Watch = unwatched
+    config: FlowerConfig | RobotConfig,
+    name: str = "flower",
+    description: str = "",
+    watch: ProgressCallback = no_progress,
 ) -> Simulation:
     """Simulate the training session and, if there is one, the validation session.
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field
 
 from omnibench.config import Model, parse_yaml, read_yaml, validate
-from omnibench.data.progress import Watch, unwatched
+from omnibench.data.progress import ProgressCallback, no_progress
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.robot.calibration import EffectTerm
 from omnibench.simulate.chain.robot_config import RobotConfig
@@ -66,7 +66,7 @@ class SimulationSource:
         changed = validate(Truth, {**truth.model_dump(), "effects": effects}, "--effect")
         return replace(self, config=self.config.model_copy(update={"truth": changed}))
 
-    def simulate(self, watch: Watch = unwatched) -> Simulation:
+    def simulate(self, watch: ProgressCallback = no_progress) -> Simulation:
         """Simulate it. ConfigError or DataError as for ``simulate_dataset``."""
         return simulate_dataset(self.config, self.name, self.description, watch)
 

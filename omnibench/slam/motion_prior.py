@@ -13,7 +13,7 @@ import numpy as np
 
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import compose, relative, unit_twist
-from omnibench.slam.motion_within_scan import WithinScan, smoothed
+from omnibench.slam.motion_within_scan import MotionWithinScan, smoothed
 from omnibench.slam.slam_options import SlamOptions
 
 _ARM = 0.3  # m; a turn counts as what it moves there
@@ -23,32 +23,32 @@ _FOUND: Array = np.array([1e-3, 1e-3, 5e-4])  # m, m, rad; standard deviations o
 
 
 @dataclass(frozen=True, eq=False)
-class Expected:
+class MotionPrediction:
     """Of a scan before it is matched. start (3,): where the robot may be. deviations (3,): standard deviations of its
     motion since the last scan, in the robot's frame, m, m, rad. within: its motion during the scan.
     """
 
     start: Array
     deviations: Array
-    within: WithinScan
+    within: MotionWithinScan
 
 
-class Motion(ABC):
+class MotionPrior(ABC):
     """Of one run, scan by scan. The first scan is number 0."""
 
     def __init__(self, times: Array, duration: float) -> None:
         self._periods, self._duration = np.diff(times, prepend=times[0]), duration
 
     @abstractmethod
-    def first(self) -> tuple[WithinScan, Array]:
+    def first(self) -> tuple[MotionWithinScan, Array]:
         """The motion during the first scan, and the standard deviations (3,) of its twist."""
 
     @abstractmethod
-    def expected(self, scan: int, last: Array) -> Expected:
+    def predict(self, scan: int, last: Array) -> MotionPrediction:
         """What to expect of a scan after the first, the robot's last pose (3,) known."""
 
     @abstractmethod
-    def corrected(self, scan: int, last: Array, found: Array, before: Array) -> tuple[Array, Array]:
+    def correct(self, scan: int, last: Array, found: Array, before: Array) -> tuple[Array, Array]:
         """What a scan whose pose is roughly known tells of the motion during it.
 
         The twist (3,) that is to be added to what was expected, and the standard deviations (3,) of what is then left.
@@ -60,7 +60,7 @@ class Motion(ABC):
         return self._duration / (2 * self._periods[scan]) * np.abs(change)
 
 
-class OdometryMotion(Motion):
+class OdometryPrior(MotionPrior):
     """Odometry, which may be uncalibrated (wrong in scale and direction by a few per cent) and coarse.
 
     times (S,): of the scans, each of which takes ``duration``, s.
@@ -73,14 +73,14 @@ class OdometryMotion(Motion):
         self._error = options.odometry_error
         super().__init__(times, duration)
 
-    def first(self) -> tuple[WithinScan, Array]:
+    def first(self) -> tuple[MotionWithinScan, Array]:
         return self._within[0], self._doubt(0, self._within[0].mean)
 
-    def expected(self, scan: int, last: Array) -> Expected:
+    def predict(self, scan: int, last: Array) -> MotionPrediction:
         driven = relative(self._poses[scan - 1], self._poses[scan])
-        return Expected(compose(last, driven), odometry_deviations(driven, self._error), self._within[scan])
+        return MotionPrediction(compose(last, driven), odometry_deviations(driven, self._error), self._within[scan])
 
-    def corrected(self, scan: int, last: Array, found: Array, before: Array) -> tuple[Array, Array]:
+    def correct(self, scan: int, last: Array, found: Array, before: Array) -> tuple[Array, Array]:
         """As wrong as the odometry was since the last scan, in proportion to the motion.
 
         The less the robot has moved since, or the less its odometry's error exceeds that of the pose found, the less is
@@ -101,7 +101,7 @@ class OdometryMotion(Motion):
         return np.hypot(odometry_deviations(unknown, self._error), self._within[scan].deviations)
 
 
-class UnknownMotion(Motion):
+class LastPosePrior(MotionPrior):
     """Only the poses so far are known; the last one is where the search starts. At the first scan the robot stands."""
 
     def __init__(self, times: Array, duration: float, options: SlamOptions) -> None:
@@ -110,17 +110,17 @@ class UnknownMotion(Motion):
         self._mean: Array = np.zeros(3)  # twist between the last two scans
         self._before: Array | None = None  # the pose of the first of them
 
-    def first(self) -> tuple[WithinScan, Array]:
-        return WithinScan.steady(self._mean, self._duration), np.zeros(3)
+    def first(self) -> tuple[MotionWithinScan, Array]:
+        return MotionWithinScan.steady(self._mean, self._duration), np.zeros(3)
 
-    def expected(self, scan: int, last: Array) -> Expected:
+    def predict(self, scan: int, last: Array) -> MotionPrediction:
         if self._before is not None:
             self._mean = unit_twist(relative(self._before, last)) / self._periods[scan - 1]
         self._before = last
-        within = WithinScan.steady(self._mean, self._duration)
-        return Expected(last, self._deviations * self._periods[scan], within)
+        within = MotionWithinScan.steady(self._mean, self._duration)
+        return MotionPrediction(last, self._deviations * self._periods[scan], within)
 
-    def corrected(self, scan: int, last: Array, found: Array, before: Array) -> tuple[Array, Array]:
+    def correct(self, scan: int, last: Array, found: Array, before: Array) -> tuple[Array, Array]:
         """The mean twist since the last scan, carried on as it changes; it may as well have changed otherwise."""
         period = self._periods[scan]
         mean = unit_twist(relative(last, found)) / period

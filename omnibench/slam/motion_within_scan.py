@@ -17,7 +17,7 @@ _ALIKE = 4.0  # instants one after another whose errors are the same, as those o
 
 
 @dataclass(frozen=True, eq=False)
-class WithinScan:
+class MotionWithinScan:
     """The motion since a scan's stamp: until a delay t the one that the twist c_1 t + c_2 t^2 + ... makes in unit time.
 
     coefficients (k, 3): m/s^k, m/s^k, rad/s^k, in the robot's frame at the stamp. duration: of the scan, s. deviations
@@ -29,7 +29,7 @@ class WithinScan:
     deviations: Array
 
     @classmethod
-    def steady(cls, twist: Array, duration: float) -> WithinScan:
+    def steady(cls, twist: Array, duration: float) -> MotionWithinScan:
         """With a constant twist (3,), m/s, m/s, rad/s."""
         return cls(twist[None], duration, np.zeros(3))
 
@@ -45,14 +45,14 @@ class WithinScan:
         return mean
 
 
-def smoothed(odometry: Callable[[Array], Array], times: Array, duration: float) -> tuple[list[WithinScan], Array]:
+def smoothed(odometry: Callable[[Array], Array], times: Array, duration: float) -> tuple[list[MotionWithinScan], Array]:
     """The motion within each scan, and standard deviations (3,) of the odometry's poses, which tell how coarse it is.
 
     A motion is the cubic through the odometry about a scan, by least squares; what is left over is coarse.
     times (S,): of the scans, s. duration: of each, s. There is no odometry before t = 0.
     """
     if not duration:
-        return [WithinScan.steady(np.zeros(3), 0.0)] * len(times), np.zeros(3)
+        return [MotionWithinScan.steady(np.zeros(3), 0.0)] * len(times), np.zeros(3)
     count = 2 + int((_AROUND + duration) / _INSTANT)
     delays = np.linspace(-_AROUND / 2, duration + _AROUND / 2, count)
     delays = np.maximum(times[:, None] + delays, 0.0) - times[:, None]  # (S, count)
@@ -69,7 +69,7 @@ def smoothed(odometry: Callable[[Array], Array], times: Array, duration: float) 
     parts = duration * np.linspace(0.2, 1.0, 5)
     means = parts[:, None] ** np.arange(_DEGREE) @ inverse[:, 1:]  # twists of parts of the scan: (S, 5, count)
     deviations = np.sqrt(_ALIKE * (means**2).sum(axis=2).mean(axis=1)[:, None] * squares)
-    motions_within = [WithinScan(each[1:], duration, of) for each, of in zip(fitted, deviations, strict=True)]
+    motions_within = [MotionWithinScan(each[1:], duration, of) for each, of in zip(fitted, deviations, strict=True)]
     return motions_within, np.sqrt(coarse)
 
 

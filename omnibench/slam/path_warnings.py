@@ -1,4 +1,4 @@
-"""What makes poses of SLAM doubtful, in words."""
+"""Warnings about the path that SLAM found for a run: lost scans, degenerate scans, disagreement with the odometry."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from omnibench.slam.matching.scan_matching import LOST, Match
 from omnibench.slam.motion_prior import length
 from omnibench.slam.slam_options import SlamOptions
 
-_UNTOLD = 0.5  # share of a direction that scans tell: when it is less,
-_OFTEN = 0.1  # in more than this share of the scans, it is said
-_BEYOND = 5.0  # times the odometry's error, which it may be wrong by
-_NOISE = 0.01  # m; the same of poses, from scan to scan
-_MOST_SHARE = 10.0  # that is told; odometry may even stand still
-_FEWEST = 3  # motions that are judged
+_DEGENERATE = 0.5  # observability below which a direction counts as not measured by a scan (chosen)
+_OFTEN = 0.1  # share of a run's scans that may be degenerate without a warning (chosen)
+_BEYOND = 5.0  # times the odometry's stated error: a larger disagreement is no error of calibration (chosen)
+_NOISE = 0.01  # m; noise of the motion between two poses of SLAM, at most
+_MOST_SHARE = 10.0  # largest disagreement that is reported: the odometry may even stand still
+_FEWEST = 3  # motions that are needed for a judgement
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """A problem of one run or of several. along: the square of a direction's x + iy in the run's frame, if it has one.
+class PathWarning:
+    """A problem of one run, or of several.
 
-    A direction and its opposite are the same; their squares are, too, and can be added up. share: how large it is, if
-    that is told; its place in the problem is {share}.
+    along: its direction, if it has one, as the square of x + iy in the run's frame: a direction and its opposite have
+    the same square, so that squares of several runs can be added up. share: size of the problem, if it has one; it is
+    put where the problem's text has {share}.
     """
 
     problem: str
@@ -43,52 +44,52 @@ class Doubt:
         return f"{self.problem} along {degrees} deg of the run's frame"
 
 
-def doubts_of(matches: Sequence[Match], options: SlamOptions, odometry: Array | None) -> tuple[Doubt, ...]:
-    """What is doubtful of a run. odometry (S, 3): poses at the stamps of its scans, if it has any."""
-    return (*_doubts(matches), *([] if odometry is None else _disagreement(matches, options, odometry)))
+def path_warnings(matches: Sequence[Match], options: SlamOptions, odometry: Array | None) -> tuple[PathWarning, ...]:
+    """Warnings about a run. odometry (S, 3): poses at the stamps of its scans, if it has any."""
+    return (*_weak_matches(matches), *([] if odometry is None else _disagreement(matches, options, odometry)))
 
 
-def together(doubts: Sequence[Doubt]) -> Doubt:
-    """The same problem of several runs, along their mean direction, as large as in the mean."""
-    directions = [doubt.along for doubt in doubts if doubt.along is not None]
-    shares = [doubt.share for doubt in doubts if doubt.share is not None]
-    return Doubt(
-        doubts[0].problem, sum(directions) if directions else None, sum(shares) / len(shares) if shares else None
+def merged_warning(warnings: Sequence[PathWarning]) -> PathWarning:
+    """One warning for several runs with one problem: along their mean direction, with the mean of their shares."""
+    directions = [warning.along for warning in warnings if warning.along is not None]
+    shares = [warning.share for warning in warnings if warning.share is not None]
+    return PathWarning(
+        warnings[0].problem, sum(directions) if directions else None, sum(shares) / len(shares) if shares else None
     )
 
 
-def _doubts(matches: Sequence[Match]) -> Iterator[Doubt]:
+def _weak_matches(matches: Sequence[Match]) -> Iterator[PathWarning]:
     if any(match.matched < LOST for match in matches):
-        yield Doubt("less than a fifth of a scan lies on the map, and its pose is the start of the search")
-    untold = [match for match in matches if match.matched >= LOST and match.told.min() < _UNTOLD]
-    if len(untold) <= _OFTEN * len(matches):
+        yield PathWarning("less than a fifth of a scan lies on the map, and its pose is the start of the search")
+    degenerate = [match for match in matches if match.matched >= LOST and match.observability.min() < _DEGENERATE]
+    if len(degenerate) <= _OFTEN * len(matches):
         return
-    worst = np.array([match.directions[:, match.told.argmin()] for match in untold])
+    worst = np.array([match.directions[:, match.observability.argmin()] for match in degenerate])
     x, y, heading = worst.T
     if (np.abs(heading) > np.hypot(x, y)).mean() > 0.5:
-        yield Doubt("scans tell too little of the heading")
+        yield PathWarning("scans tell too little of the heading")
     else:
-        yield Doubt("scans tell too little", complex(((x + 1j * y) ** 2).sum()))
+        yield PathWarning("scans tell too little", complex(((x + 1j * y) ** 2).sum()))
 
 
-def _disagreement(matches: Sequence[Match], options: SlamOptions, odometry: Array) -> Iterator[Doubt]:
-    """Motions from scan to scan, in the robot's frame, so that an early error does not count again later."""
+def _disagreement(matches: Sequence[Match], options: SlamOptions, odometry: Array) -> Iterator[PathWarning]:
+    """Compare motions from scan to scan in the robot's frame, so that an early error does not count again later."""
     motions = [
         (relative(*ours), relative(*theirs))
-        for ours, theirs, told in zip(
+        for ours, theirs, measured in zip(
             pairwise(match.pose for match in matches),
             pairwise(odometry),
-            pairwise(match.matched >= LOST and match.told.min() >= _UNTOLD for match in matches),
+            pairwise(match.matched >= LOST and match.observability.min() >= _DEGENERATE for match in matches),
             strict=True,
         )
-        if all(told) or options.start == "odometry"  # else what is not told is no motion
+        if all(measured) or options.start == "odometry"  # else a direction that is not measured shows no motion
     ]
     if len(motions) < _FEWEST:
         return
     apart = _typical([ours - theirs for ours, theirs in motions])
     driven = _typical([theirs for _, theirs in motions])
     if apart > _BEYOND * options.odometry_error * driven + _NOISE:
-        yield Doubt(
+        yield PathWarning(
             "poses and odometry disagree by {share} of the motion: is the scanner mirrored, or is its mount or the "
             "robot's wheels given wrongly?",
             share=min(apart / max(driven, _NOISE / _MOST_SHARE), _MOST_SHARE),

@@ -1,4 +1,4 @@
-"""SLAM of a whole data set: every run's reference poses from its scans."""
+"""SLAM of a whole data set: reference poses of every run from its scans."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.progress import Watch
+from omnibench.data.progress import ProgressCallback
 from omnibench.data.scans import Scanner, TrajectoryScans
 from omnibench.errors import DataError
 from omnibench.processes import in_processes
@@ -17,14 +17,14 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.planar import relative
 from omnibench.slam.motion_prior import length, odometry_deviations
-from omnibench.slam.path_warnings import Doubt, together
+from omnibench.slam.path_warnings import PathWarning, merged_warning
 from omnibench.slam.pose_errors import FLOOR
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.slam_run import SlamPath, run_slam
 
-_AT_START = 1e-6  # s; a scan that is nearer to t = 0 is taken there
-_STEP = 0.05  # s between poses that the way before the first scan is added up from
-_FAR = 5e-3  # m; who moves farther before the first scan is told
+_AT_START = 1e-6  # s; a scan that is nearer to t = 0 counts as taken at t = 0
+_STEP = 0.05  # s between the odometry poses whose distances add up to the way before the first scan
+_FAR = 5e-3  # m; a longer way before the first scan is warned of (chosen)
 
 
 def slam_dataset(
@@ -33,11 +33,11 @@ def slam_dataset(
     *,
     model: OdometryModel | None = None,
     workers: int = 2,
-    watch: Watch | None = None,
+    watch: ProgressCallback | None = None,
 ) -> Dataset:
     """The data set with poses, pose times and covariances computed from its scans; each run keeps its start pose.
 
-    As ``slam_paths`` and ``with_paths``. DataError as for them.
+    Arguments and errors are those of ``slam_paths``, warnings those of ``with_paths``.
     """
     return with_paths(dataset, slam_paths(dataset, options, model=model, workers=workers, watch=watch))
 
@@ -48,13 +48,13 @@ def slam_paths(
     *,
     model: OdometryModel | None = None,
     workers: int = 2,
-    watch: Watch | None = None,
+    watch: ProgressCallback | None = None,
 ) -> list[SlamPath]:
-    """The path of every run, from its scans and from its start pose on.
+    """The path of every run by SLAM, from its start pose on.
 
     model: the odometry that the search starts from; default: the robot's design matrix, in arcs. workers: processes;
-    the result does not depend on their number. watch: told what is done, how many runs of how many. DataError in one
-    line: there are no scans, of some run or at all, or they are bad.
+    the result does not depend on their number. watch: called after every run. DataError in one line: the data set or
+    one of its runs has no scans, or they are bad.
     """
     scans = dataset.scans
     if scans is None:
@@ -78,7 +78,7 @@ def slam_paths(
 
 
 def with_paths(dataset: Dataset, paths: Sequence[SlamPath]) -> Dataset:
-    """The data set with the poses, times and covariances of ``paths``; what is doubtful is among its warnings."""
+    """The data set with the poses, times and covariances of ``paths``, whose warnings are added to its own."""
     made = make_dataset(
         dataset.name,
         dataset.robot,
@@ -90,7 +90,7 @@ def with_paths(dataset: Dataset, paths: Sequence[SlamPath]) -> Dataset:
         simulated=dataset.simulated,
         scans=dataset.scans,
     )
-    return replace(made, warnings=made.warnings + _doubts(dataset.trajectories, paths))
+    return replace(made, warnings=made.warnings + _warnings(dataset.trajectories, paths))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +128,10 @@ def _locate(job: _Job) -> SlamPath:
 
 @dataclass(frozen=True, eq=False)
 class _Before:
-    """The motion from t = 0 to the first scan. driven (3,): m, m, rad, ways there and back added up. end (3,): pose."""
+    """The motion from t = 0 to the first scan.
+
+    driven (3,): way along x and y and turn, m, m, rad; motion back and forth adds up. end (3,): the pose there.
+    """
 
     driven: Array
     end: Array
@@ -141,12 +144,12 @@ def _before_first_scan(odometry: Callable[[Array], Array], until: float) -> _Bef
 
 
 def _from_start(path: SlamPath, start: Array, before: _Before) -> SlamPath:
-    """The path with a row for t = 0, when the first scan came later."""
+    """The path with the start pose at t = 0 in front, for a run whose first scan comes later."""
     far = length(before.driven) > _FAR
     late = "the robot moves before the first scan, whose pose is therefore as uncertain as the odometry"
     return replace(
         path,
-        doubts=(*path.doubts, Doubt(late)) if far else path.doubts,
+        warnings=(*path.warnings, PathWarning(late)) if far else path.warnings,
         times=np.concatenate([[0.0], path.times]),
         poses=np.vstack([start, path.poses]),
         covariances=np.concatenate([FLOOR[None], path.covariances]),
@@ -159,14 +162,14 @@ def _with_path(trajectory: Trajectory, path: SlamPath) -> Trajectory:
     return replace(trajectory, pose_times=path.times, poses=path.poses, pose_covariances=symmetric)
 
 
-def _doubts(trajectories: Sequence[Trajectory], paths: Sequence[SlamPath]) -> tuple[str, ...]:
-    """What went wrong, the same of many runs in one sentence."""
-    found: dict[str, list[tuple[str, Doubt]]] = {}
+def _warnings(trajectories: Sequence[Trajectory], paths: Sequence[SlamPath]) -> tuple[str, ...]:
+    """The warnings about all paths, one sentence for a problem that several runs have."""
+    by_problem: dict[str, list[tuple[str, PathWarning]]] = {}
     for trajectory, path in zip(trajectories, paths, strict=True):
-        for doubt in path.doubts:
-            found.setdefault(doubt.problem, []).append((trajectory.id, doubt))
+        for warning in path.warnings:
+            by_problem.setdefault(warning.problem, []).append((trajectory.id, warning))
     return tuple(
-        f"SLAM: {together([doubt for _, doubt in each])}: {len(each)} of {len(paths)} runs, "
-        f"e.g. {', '.join(name for name, _ in each[:3])}"
-        for each in found.values()
+        f"SLAM: {merged_warning([warning for _, warning in concerned])}: {len(concerned)} of {len(paths)} runs, "
+        f"e.g. {', '.join(run for run, _ in concerned[:3])}"
+        for concerned in by_problem.values()
     )

@@ -13,17 +13,17 @@ from omnibench.robot.kinematics import Array
 from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints, noise_factor, scan_points
 from omnibench.slam.matching.scan_matching import Match, refine, search
-from omnibench.slam.motion_prior import Motion, OdometryMotion, UnknownMotion
-from omnibench.slam.motion_within_scan import WithinScan
-from omnibench.slam.path_warnings import Doubt, doubts_of
+from omnibench.slam.motion_prior import LastPosePrior, MotionPrior, OdometryPrior
+from omnibench.slam.motion_within_scan import MotionWithinScan
+from omnibench.slam.path_warnings import PathWarning, path_warnings
 from omnibench.slam.pose_errors import PoseErrors
 from omnibench.slam.slam_options import SlamOptions
 
-_SKEWED = 1e-3  # m or rad, from the first ray of a scan to its last
-_CORRECTIONS = 4  # of the motion within a scan, at most
-_KEYFRAMES = 300  # whose errors are told apart
-_SAMPLE = 100  # scans that tell the noise
-_NEEDED = 0.6  # of the points: when fewer match, the map needs more
+_SKEWED = 1e-3  # m or rad of unknown motion between a scan's first and last ray: less does not matter
+_CORRECTIONS = 4  # times at most that the motion within a scan is corrected
+_KEYFRAMES = 300  # keyframes with an error of their own; older ones are merged
+_SAMPLE = 100  # scans that the noise of ranges is estimated from
+_NEEDED = 0.6  # share of matched points: with fewer, the scan goes into the map even if it may be skewed
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +31,14 @@ class SlamPath:
     """Poses of the robot at the stamps of its scans.
 
     times (S,): s. poses (S, 3): m, m, rad, in the run's frame, headings continuous. covariances (S, 3, 3).
-    matched (S,): share of each scan's points that lie on the map. doubts: what went wrong.
+    matched (S,): share of each scan's points that lie on the map. warnings: what went wrong.
     """
 
     times: Array
     poses: Array
     covariances: Array
     matched: Array
-    doubts: tuple[Doubt, ...] = ()
+    warnings: tuple[PathWarning, ...] = ()
 
 
 def run_slam(
@@ -51,16 +51,17 @@ def run_slam(
 ) -> SlamPath:
     """The poses at which a run's scans lie best on the map that they make.
 
-    start (3,): the robot's pose at the first scan. odometry: poses (K, 3) at times (K,) >= 0 in s, in any frame, of
-    which only the increments are used, to begin the search, to deskew, and where scans tell nothing; needed unless the
-    search starts from the last pose. deviations (3,): standard deviations of the start, along the robot's axes, m, m,
-    rad; default: it is exact. DataError in one line: no scan, or one without returns.
+    start (3,): the robot's pose at the first scan. odometry: function from times (K,) >= 0, s, to poses (K, 3) in any
+    frame. Only its increments are used: to start the search, to deskew, and along directions that scans do not
+    measure. It is needed unless the search starts from the last pose. deviations (3,): standard deviations of the
+    start pose along the robot's axes, m, m, rad; default: it is exact. DataError in one line: no scan, or one without
+    returns.
     """
     _check(scans, scanner, options, odometry)
     duration = float(scanner.delays[-1])
-    motion: Motion = UnknownMotion(scans.times, duration, options)
+    motion: MotionPrior = LastPosePrior(scans.times, duration, options)
     if options.start == "odometry" and odometry is not None:
-        motion = OdometryMotion(odometry, scans.times, duration, options)
+        motion = OdometryPrior(odometry, scans.times, duration, options)
     noise = noise_factor(scans.ranges[:: 1 + len(scans.times) // _SAMPLE], scanner)
     errors = PoseErrors(start, deviations)
     slam = _Slam(scanner, noise, options, motion, np.asarray(start, dtype=float), errors)
@@ -71,19 +72,19 @@ def run_slam(
         np.array([match.pose for match, _ in located]),
         np.array([covariance for _, covariance in located]),
         np.array([match.matched for match, _ in located]),
-        doubts_of([match for match, _ in located], options, _at(odometry, scans.times)),
+        path_warnings([match for match, _ in located], options, _at(odometry, scans.times)),
     )
 
 
 class _Slam:
-    """A run on its way: the map so far, and how wrong it is."""
+    """SLAM in progress: the map so far, the last pose, and the errors of both."""
 
     def __init__(
         self,
         scanner: Scanner,
         noise: float,
         options: SlamOptions,
-        motion: Motion,
+        motion: MotionPrior,
         start: Array,
         errors: PoseErrors,
     ) -> None:
@@ -94,68 +95,74 @@ class _Slam:
 
     def begin(self, ranges: Ranges) -> tuple[Match, Array]:
         """The first scan, with which the map begins, at the start pose; its covariance (3, 3)."""
-        within, doubt = self._motion.first()
+        within, deviations = self._motion.first()
         if not self._options.deskew:
-            doubt = within.mean
+            deviations = within.mean
         scan = self._points(ranges, within)
-        self._add(scan, doubt)
+        self._add(scan, deviations)
         match = replace(refine(self._map, scan, self._pose, self._pose, self._options), pose=self._pose)
-        # To what the start is known come the errors that scans which are matched to this one see.
-        seen = np.linalg.inv(match.information + np.diag(self._options.limits**-2.0))
-        return match, self._errors.covariance + seen
+        # Uncertainty of the start pose, and of this scan, to which the following are matched.
+        scatter = np.linalg.inv(match.information + np.diag(self._options.limits**-2.0))
+        return match, self._errors.covariance + scatter
 
     def go_on(self, number: int, ranges: Ranges) -> tuple[Match, Array]:
         """The next scan: its match and the covariance of its pose (3, 3)."""
         options, motion, last = self._options, self._motion, self._pose
-        expected = motion.expected(number, last)
-        scan = self._points(ranges, expected.within)
-        found = search(self._map, scan, expected.start, options)
+        predicted = motion.predict(number, last)
+        scan = self._points(ranges, predicted.within)
+        pose = search(self._map, scan, predicted.start, options)
         raw = scan
         correction: Array = np.zeros(3)
         for _ in range(_CORRECTIONS):
-            found = refine(self._map, scan, found, expected.start, options, steps=1).pose
+            pose = refine(self._map, scan, pose, predicted.start, options, steps=1).pose
             before = correction
-            correction, doubt = motion.corrected(number, last, found, before)
+            correction, deviations = motion.correct(number, last, pose, before)
             if not options.deskew:
-                doubt = expected.within.mean + correction
+                deviations = predicted.within.mean + correction  # the motion that is not undone
                 break
             scan = raw.deskewed(correction)
             if not self._skews(correction - before):
                 break
-        match = refine(self._map, scan, found, expected.start, options)
-        covariance = self._errors.step(match, expected.deviations, doubt)
+        match = refine(self._map, scan, pose, predicted.start, options)
+        covariance = self._errors.step(match, predicted.deviations, deviations)
         self._pose = match.pose
-        if self._is_keyframe(match, doubt):
-            self._add(scan, doubt)
+        if self._is_keyframe(match, deviations):
+            self._add(scan, deviations)
         return match, covariance
 
-    def _is_keyframe(self, match: Match, doubt: Array) -> bool:
-        """Whether the robot has come far enough for new surfaces; a scan that may be skewed waits while it can."""
+    def _is_keyframe(self, match: Match, deviations: Array) -> bool:
+        """True if the robot has come far enough for new surfaces; a scan that may be skewed waits while it can.
+
+        deviations (3,): of the twist within the scan, m/s, m/s, rad/s.
+        """
         x, y, turned = match.pose - self._keyframe
         far = np.hypot(x, y) > self._options.keyframe_distance or abs(turned) > self._options.keyframe_angle
-        return bool(far and (match.matched < _NEEDED or not self._skews(doubt))) or not self._map.is_usable
+        return bool(far and (match.matched < _NEEDED or not self._skews(deviations))) or not self._map.is_usable
 
     def _skews(self, twist: Array) -> bool:
-        """Whether a twist (3,) more or less during a scan matters."""
+        """True if an error (3,) of the twist during a scan, m/s, m/s, rad/s, matters."""
         return bool(np.abs(twist).max() * self._scanner.delays[-1] > _SKEWED)
 
-    def _points(self, ranges: Ranges, within: WithinScan) -> ScanPoints:
-        still = WithinScan.steady(np.zeros(3), within.duration)
+    def _points(self, ranges: Ranges, within: MotionWithinScan) -> ScanPoints:
+        still = MotionWithinScan.steady(np.zeros(3), within.duration)
         return scan_points(ranges, self._scanner, self._noise, within if self._options.deskew else still)
 
-    def _add(self, scan: ScanPoints, doubt: Array) -> None:
-        """The last pose becomes a keyframe, if its scan saw something new. doubt (3,): of the twist within the scan."""
+    def _add(self, scan: ScanPoints, deviations: Array) -> None:
+        """Make the last pose a keyframe, if its scan saw something new.
+
+        deviations (3,): of the twist within the scan, m/s, m/s, rad/s.
+        """
         self._keyframe = self._pose
         if not self._map.add(scan.lines, self._pose, self._errors.keyframes):
             return
-        self._errors.keep(doubt * self._scanner.delays[-1] / 2)
+        self._errors.keep(deviations * self._scanner.delays[-1] / 2)
         if self._errors.keyframes > _KEYFRAMES:
             self._map.merge_oldest()
             self._errors.merge_oldest()
 
 
 def _at(odometry: Callable[[Array], Array] | None, times: Array) -> Array | None:
-    """The odometry at times (S,), of which several may be the same."""
+    """Poses (S, 3) of the odometry at times (S,), among which several may be equal."""
     stamps, place = np.unique(times, return_inverse=True)
     return None if odometry is None else odometry(stamps)[place]
 

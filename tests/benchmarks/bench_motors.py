@@ -21,7 +21,8 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from omnibench.robot.kinematics import Array, Robot, Wheel
 from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
-from omnibench.simulate.chain.motors import Controller, DrivenRun, Encoder, Motor, drive_session
+from omnibench.simulate.chain.motors import Controller, Encoder, Motor
+from omnibench.simulate.chain.wheel_drive import DrivenRun, drive_session
 from omnibench.simulate.flower import Command
 
 PERIOD = 0.01

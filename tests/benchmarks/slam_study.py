@@ -110,7 +110,7 @@ def study(room: str, options: SlamOptions, runs: int, seed: int = 0) -> dict[str
         "bias_final": _bias(np.array([error[-1] for error in along])),
         "stated_final_mm_deg": _in_mm_deg(np.sqrt(np.mean([np.diag(path.covariances[-1]) for path in paths], axis=0))),
         "matched_min": round(min(float(path.matched.min()) for path in paths), 2),
-        "problems": sorted({str(doubt) for path in paths for doubt in path.doubts}),
+        "problems": sorted({str(warning) for path in paths for warning in path.warnings}),
         "ms_per_scan": round(1000 * seconds / sum(len(path.times) for path in paths), 2),
     }
 

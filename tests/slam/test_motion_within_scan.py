@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import advance
 from omnibench.robot.planar import compose, relative
-from omnibench.slam.motion_prior import OdometryMotion, UnknownMotion
+from omnibench.slam.motion_prior import LastPosePrior, OdometryPrior
 from omnibench.slam.motion_within_scan import smoothed
 from omnibench.slam.slam_options import SlamOptions
 
@@ -78,30 +78,30 @@ class TestCorrected:
     LAST = np.array([0.4, -0.3, 1.0])
 
     def test_odometry_that_is_short_is_put_right_within_the_scan(self) -> None:
-        motion = OdometryMotion(circle(0.27, 0.9), TIMES, 0.1, SlamOptions())  # of 0.3 m/s and 1 rad/s
+        motion = OdometryPrior(circle(0.27, 0.9), TIMES, 0.1, SlamOptions())  # of 0.3 m/s and 1 rad/s
         found = compose(self.LAST, advance(np.zeros(3), np.array([0.3, 0.0, 1.0]) * 0.25, "arc"))
-        twist, doubt = motion.corrected(1, self.LAST, found, np.array([0.03, 0.0, 0.1]))
+        twist, deviations = motion.correct(1, self.LAST, found, np.array([0.03, 0.0, 0.1]))
         np.testing.assert_allclose(twist, [0.03, 0.0, 0.1], rtol=0.05, atol=1e-6)
-        assert (doubt < [0.01, 0.01, 0.05]).all()
+        assert (deviations < [0.01, 0.01, 0.05]).all()
 
     def test_of_a_robot_that_only_now_begins_to_move_nothing_is_known_but_the_odometrys_error(self) -> None:
         def begins(times: Array) -> Array:
             return np.column_stack([0.5 * np.maximum(times - 1.25, 0.0) ** 2, 0 * times, 0 * times])
 
-        motion = OdometryMotion(begins, TIMES, 0.2, SlamOptions(odometry_error=0.1))
-        twist, doubt = motion.corrected(1, self.LAST, compose(self.LAST, np.array([1e-3, 0.0, 0.0])), np.zeros(3))
-        speed = motion.expected(1, self.LAST).within.mean[0]
+        motion = OdometryPrior(begins, TIMES, 0.2, SlamOptions(odometry_error=0.1))
+        twist, deviations = motion.correct(1, self.LAST, compose(self.LAST, np.array([1e-3, 0.0, 0.0])), np.zeros(3))
+        speed = motion.predict(1, self.LAST).within.mean[0]
         assert 0.05 < speed < 0.15
         assert np.abs(twist).max() < 1e-3
-        assert doubt[0] > 0.1 * speed
+        assert deviations[0] > 0.1 * speed
 
     def test_a_twist_between_scans_is_that_of_the_arc_and_not_of_its_chord(self) -> None:
-        motion = UnknownMotion(TIMES, 0.1, SlamOptions())
+        motion = LastPosePrior(TIMES, 0.1, SlamOptions())
         path = circle(0.3, 1.0)(TIMES)
-        assert motion.expected(1, path[0]).within.mean == pytest.approx(0.0)
-        twist, _ = motion.corrected(1, path[0], path[1], np.zeros(3))
-        then = motion.expected(2, path[1]).within.mean
+        assert motion.predict(1, path[0]).within.mean == pytest.approx(0.0)
+        twist, _ = motion.correct(1, path[0], path[1], np.zeros(3))
+        then = motion.predict(2, path[1]).within.mean
         np.testing.assert_allclose(then, [0.3, 0.0, 1.0], atol=1e-12)
-        twist, _ = motion.corrected(2, path[1], path[2], np.zeros(3))
+        twist, _ = motion.correct(2, path[1], path[2], np.zeros(3))
         np.testing.assert_allclose(twist, 0.0, atol=1e-12)
         assert abs(relative(path[0], path[1])[1]) > 0.009  # m, which a chord would take for a motion to the left

@@ -53,7 +53,7 @@ def errors(path: SlamPath, run: Run) -> Array:
 
 
 def problems(path: SlamPath) -> list[str]:
-    return [str(doubt) for doubt in path.doubts]
+    return [str(warning) for warning in path.warnings]
 
 
 def nees(path: SlamPath, run: Run) -> Array:
@@ -188,7 +188,7 @@ class TestCorridor:
         assert re.fullmatch(r"scans tell too little along ([0-6]|17\d) deg of the run's frame", problem)
 
     def test_nothing_is_said_of_a_furnished_room(self) -> None:
-        assert located(driven("furnished_room", 2)).doubts == ()
+        assert located(driven("furnished_room", 2)).warnings == ()
 
 
 class TestHall:

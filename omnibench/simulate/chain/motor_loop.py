@@ -14,9 +14,9 @@ from numba import njit
 from scipy.linalg import expm
 
 from omnibench.robot.kinematics import Array
-from omnibench.simulate.chain.true_step import TRUE_STEP
+from omnibench.simulate.chain.motors import TRUE_STEP
 
-_INNER = 10  # steps within it
+_INNER = 10  # steps of the motor's equations within TRUE_STEP
 _STEP = TRUE_STEP / _INNER
 _STANDING = 1e-6  # ticks a sample; less is the rounding of a wheel across the motion
 

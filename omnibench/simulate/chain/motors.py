@@ -1,15 +1,9 @@
-"""Brushed DC motors under PID with magnetic encoders: what wheels do when they are told rates, and what is measured.
-
-The wheels are told apart: each motor moves its own share of the robot's inertia. Wheel angles are continuous within
-a session; between its runs the robot stands.
-"""
+"""Parameters of a wheel's drive (brushed DC motor, PID controller, encoder), and which commands it can follow."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -17,13 +11,10 @@ from pydantic import Field, model_validator
 from omnibench.config import Model
 from omnibench.errors import ConfigError
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
-from omnibench.simulate.chain.true_step import TRUE_STEP
 from omnibench.simulate.config import Positive
 from omnibench.simulate.flower import Command
 
-if TYPE_CHECKING:  # it is compiled, and loads slowly: for those who drive, not for those who read a config
-    from omnibench.simulate.chain.motor_loop import MotorSteps, Pid
-
+TRUE_STEP = 1e-3  # s between the true wheel angles that are kept (chosen: a tenth of the usual sample period)
 _RESERVE = 0.1  # share of the fastest rate that is left to the controller
 
 
@@ -101,80 +92,12 @@ class Encoder(Model):
         return 2 * math.pi / self.ticks
 
 
-@dataclass(frozen=True, eq=False)
-class DrivenRun:
-    """What the N wheels did in a run of F samples.
-
-    wheel_angles (M F + 1, N): true absolute angles at every millisecond from the begin, rad; M ms are a sample.
-    rates (F, N): measured mean rates, rad/s. angles (F, N): measured absolute angles at the samples' ends, rad.
-    voltages (F, N): of the motors, V.
-    """
-
-    wheel_angles: Array
-    rates: Array
-    angles: Array
-    voltages: Array
-
-
-def drive_session(
-    motor: Motor | Sequence[Motor],
-    controller: Controller,
-    encoder: Encoder,
-    targets: Sequence[Array],
-    sample_period: float,
-    start_angles: Array,
-) -> list[DrivenRun]:
-    """The runs of a session, one after the other, each from rest at the angles where the one before has ended.
-
-    motor: of all wheels, or one for each. targets: rates of each run (F, N), rad/s. start_angles: (N,), rad.
-    ConfigError: a sample period that is not a whole number of milliseconds, or not as many motors as wheels.
-    """
-    from omnibench.simulate.chain.motor_loop import drive_wheel
-
-    steps = round(sample_period / TRUE_STEP)
-    if steps < 1 or abs(sample_period - steps * TRUE_STEP) > 1e-9:
-        raise ConfigError(f"sample_period {sample_period:g} s: the motors need a whole number of milliseconds")
-    drives = [(_steps_of(each), _pid_of(controller, each)) for each in _of_wheels(motor, len(start_angles))]
-    angles, runs = np.asarray(start_angles, float), []
-    for rates in targets:
-        wheels = [
-            drive_wheel(*drive, encoder.tick, told, angle, steps)
-            for drive, told, angle in zip(drives, rates.T, angles, strict=True)
-        ]
-        true, counts, voltages = (np.column_stack(columns) for columns in zip(*wheels, strict=True))
-        seen = np.vstack([np.floor(angles / encoder.tick), counts])
-        measured = np.diff(seen, axis=0) * encoder.tick / sample_period
-        runs.append(DrivenRun(true, measured, counts * encoder.tick, voltages))
-        angles = true[-1]
-    return runs
-
-
-def _steps_of(motor: Motor) -> MotorSteps:
-    from omnibench.simulate.chain.motor_loop import motor_steps
-
-    return motor_steps(
-        motor.resistance,
-        motor.inductance,
-        motor.wheel_torque_constant,
-        motor.inertia,
-        motor.static_friction,
-        motor.coulomb_friction,
-        motor.viscous_friction,
-    )
-
-
-def _pid_of(controller: Controller, motor: Motor) -> Pid:
-    from omnibench.simulate.chain.motor_loop import Pid
-
-    return Pid(controller.proportional, controller.integral, controller.derivative, motor.supply_voltage)
-
-
 def check_reach(robot: Robot, commands: Sequence[Command], motor: Motor | Sequence[Motor]) -> None:
     """ConfigError in one line for a command that asks more of a wheel than its motor gives.
 
     A tenth of the fastest rate is left to the controller.
     """
-    motors = _of_wheels(motor, len(robot.wheels))
+    motors = motors_of_wheels(motor, len(robot.wheels))
     limits = (1 - _RESERVE) * np.array([each.fastest_rate for each in motors])
     for command in commands:
         rates = wheel_equations(robot.wheels) @ command.twist
@@ -210,7 +133,8 @@ def _rounded_down(value: float) -> str:
     return f"{math.floor(value * 10.0**digits) / 10.0**digits:g}"
 
 
-def _of_wheels(motor: Motor | Sequence[Motor], wheels: int) -> list[Motor]:
+def motors_of_wheels(motor: Motor | Sequence[Motor], wheels: int) -> list[Motor]:
+    """The motor of each wheel. ConfigError: there are not as many motors as wheels."""
     motors = [motor] * wheels if isinstance(motor, Motor) else list(motor)
     if len(motors) != wheels:
         raise ConfigError(f"{len(motors)} motors for {wheels} wheels; give one for each, or one for all")

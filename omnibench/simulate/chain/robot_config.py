@@ -11,8 +11,7 @@ from omnibench.config import Model
 from omnibench.simulate.chain.floor_plan import RoomPlan
 from omnibench.simulate.chain.lidar import Lidar
 from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile
-from omnibench.simulate.chain.motors import Controller, Encoder, Motor
-from omnibench.simulate.chain.true_step import TRUE_STEP
+from omnibench.simulate.chain.motors import TRUE_STEP, Controller, Encoder, Motor
 from omnibench.simulate.config import MotionGrid, NamedRobot, Positive, Truth
 from omnibench.slam.slam_options import SlamOptions
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omnibench.data.dataset import Split, Trajectory, make_dataset
-from omnibench.data.progress import Watch, unwatched
+from omnibench.data.progress import ProgressCallback, no_progress
 from omnibench.data.scans import ScansInMemory, TrajectoryScans
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
@@ -19,9 +19,9 @@ from omnibench.robot.odometry import WheelLog
 from omnibench.simulate.chain.floor_plan import FloorPlan, make_plan
 from omnibench.simulate.chain.lidar import PoseTrack, measure_scans, scan_stamps
 from omnibench.simulate.chain.motion_commands import CommandedMotion, command_motion, target_rates
-from omnibench.simulate.chain.motors import DrivenRun, check_reach, drive_session
+from omnibench.simulate.chain.motors import TRUE_STEP, check_reach
 from omnibench.simulate.chain.robot_config import Placement, RobotConfig, RobotSession
-from omnibench.simulate.chain.true_step import TRUE_STEP
+from omnibench.simulate.chain.wheel_drive import DrivenRun, drive_session
 from omnibench.simulate.flower import PAUSE, Command, grid_of, runs_of
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.truth import TrueRobot, true_record
@@ -33,7 +33,7 @@ _DENSE = 0.01  # s, at most, between true poses that are kept
 
 
 def simulate_robot(
-    config: RobotConfig, name: str = "robot", description: str = "", watch: Watch = unwatched
+    config: RobotConfig, name: str = "robot", description: str = "", watch: ProgressCallback = no_progress
 ) -> Simulation:
     """Simulate the training session and, if there is one, the validation session.
 
@@ -50,7 +50,7 @@ def simulate_robot(
         for session in sessions.values():
             _check_way(config, plan, command, session)
     truth = true_record(config.truth, config.robot, config.sample_period, tuple(sessions), name)
-    chain = _Chain(config, truth.true_robot(TRUE_STEP), plan, commands)
+    chain = _RobotSimulator(config, truth.true_robot(TRUE_STEP), plan, commands)
     runs: list[_Recorded] = []
     for split, session in sessions.items():
         for run in chain.session(split, session):
@@ -96,7 +96,7 @@ class _Recorded:
 
 
 @dataclass(frozen=True, eq=False)
-class _Chain:
+class _RobotSimulator:
     """The robot, its room and its commands."""
 
     config: RobotConfig

@@ -15,8 +15,8 @@ _FEIGNED = 4.0  # standard deviations of a normal that may be no more than its e
 _GRAZING = 0.25  # least share of a range's variance that counts across a surface
 
 
-class Pairs:
-    """Pairs at a pose (3,) of the robot, whose deviations are (m, m, rad) along the axes of the run's frame.
+class Correspondences:
+    """Correspondences at a pose (3,) of the robot, whose deviations are (m, m, rad) along the axes of the run's frame.
 
     matched: share of the scan's points that have a surface.
     """

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from omnibench.data.scans import Ranges, Scanner
 from omnibench.robot.kinematics import Array
 from omnibench.slam.matching.lines import Lines, fit_lines
-from omnibench.slam.motion_within_scan import WithinScan
+from omnibench.slam.motion_within_scan import MotionWithinScan
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class ScanPoints:
         return replace(self, points=_moved(self.points, motions), rays=_turned(self.rays, motions[:, 2]), lines=lines)
 
 
-def scan_points(ranges: Ranges, scanner: Scanner, noise_factor: float, within: WithinScan) -> ScanPoints:
+def scan_points(ranges: Ranges, scanner: Scanner, noise_factor: float, within: MotionWithinScan) -> ScanPoints:
     """Points and lines of a scan (R,).
 
     noise_factor: by which ranges are noisier than the scanner says. within: the robot's motion during the scan.

@@ -1,4 +1,4 @@
-"""One scan against the map: its pose, and what the match tells of it."""
+"""Matching of one scan against the map: its pose, and how well the scan determines it."""
 
 from __future__ import annotations
 
@@ -7,40 +7,42 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.robot.kinematics import Array
-from omnibench.slam.matching.correspondences import Pairs
+from omnibench.slam.matching.correspondences import Correspondences
 from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints
 from omnibench.slam.slam_options import SlamOptions
 
-LOST = 0.2  # of the points: when fewer match, the scan tells nothing
-_CONVINCING = 0.6  # of the points: when more match, no other pose is looked for
-_FEWEST = 30  # points that small_gicp is asked to match
-_COARSE = 4  # of so many points one, for the search from afar
-_ROUGHLY = 1e-3  # m and rad; how finely that ends
-_SINGULAR = 1e-12  # of the largest information
-_SUSPECT = 0.02  # of the largest information: what is less is tried out, and so is
-_CERTAIN = 0.98  # what is certain to a lesser share than this
-_NOTHING = 1e-3  # that is told is not
-_TRIED: Array = np.array([0.1, 0.1, 0.05])  # m, m, rad; how far
-_MOST = 200  # points that are asked
-_FALSE, _TRUE = 0.5, 0.8  # of the rise promised: what is less is no information, what is more is taken as it is
+LOST = 0.2  # share of matched points below which a scan does not count as matched (chosen)
+_CONVINCING = 0.6  # share of matched points above which no other pose is searched for (chosen)
+_FEWEST = 30  # points that a scan needs for small_gicp to match it
+_COARSE = 4  # every fourth point takes part in the search from afar
+_ROUGHLY = 1e-3  # m and rad; smallest step of the search from afar
+_SINGULAR = 1e-12  # share of the largest information below which a direction has none
+# A direction of little information is tested by moving the scan along it (values chosen):
+_SUSPECT = 0.02  # share of the largest information below which a direction is tested,
+_CERTAIN = 0.98  # or share of its information that errors of the map's normals cannot explain;
+_NOTHING = 1e-3  # observability below which it is not worth a test
+_TESTED: Array = np.array([0.1, 0.1, 0.05])  # m, m, rad; how far the scan is moved
+_MOST = 200  # points that are moved
+_FALSE, _TRUE = 0.5, 0.8  # actual by predicted rise: below the first no information is left, above the second all
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
     """A pose (3,) at which a scan lies on the map, and the algebra of its least squares about that pose.
 
-    Deviations are (m, m, rad) of the robot's pose, along the axes of the run's frame. gain (3, 3): how far the scan and
-    not the start of the search tells the pose. told (3,): the same along each of ``directions`` (3, 3; columns, in
-    units of the limits), 0 to 1. weight (3, 3): gain @ information^-1. information (3, 3): of the scan's points.
-    by_keyframe {keyframe: (3, 3)}: its parts. scatter (3, 3): covariance of information @ deviation. delayed (3, 3):
-    what a twist along the same axes that was not deskewed makes of information @ deviation, s. matched: share of the
-    scan's points.
+    Deviations of the pose are (m, m, rad) along the axes of the run's frame. gain (3, 3): share of the pose that comes
+    from the scan, the rest comes from the start of the search. observability (3,): this share along each of
+    ``directions`` (3, 3; columns, in units of the limits), 0 to 1. information (3, 3): Fisher information of the scan's
+    points about the pose. weight (3, 3): gain @ information^-1. by_keyframe {keyframe: (3, 3)}: the information's parts
+    by the keyframe that saw the surface. scatter (3, 3): covariance of the gradient. delayed (3, 3): change of the
+    gradient with a twist along the same axes that was not deskewed, s. matched: share of the scan's points that lie on
+    the map.
     """
 
     pose: Array
     gain: Array
-    told: Array
+    observability: Array
     directions: Array
     weight: Array
     information: Array
@@ -51,43 +53,42 @@ class Match:
 
 
 def search(surroundings: ScanMap, scan: ScanPoints, start: Array, options: SlamOptions) -> Array:
-    """The pose (3,) of a scan by small_gicp from a start (3,): near it, and from afar if that is not convincing."""
+    """The pose (3,) of a scan by small_gicp, from a start (3,); searched from farther away if too few points match."""
     if len(scan.points) < _FEWEST or not surroundings.is_usable:
         return start
     near = surroundings.align(scan.points, start, options.match_distance)
-    matched = Pairs(surroundings, scan, near).matched
+    matched = Correspondences(surroundings, scan, near).matched
     if matched > _CONVINCING:
         return near
     some = scan.points[:: min(_COARSE, len(scan.points) // _FEWEST)]
     rough = surroundings.align(some, start, options.search_distance, _ROUGHLY)
     far = surroundings.align(scan.points, rough, options.match_distance)
-    return far if Pairs(surroundings, scan, far).matched > matched else near
+    return far if Correspondences(surroundings, scan, far).matched > matched else near
 
 
 def refine(
-    surroundings: ScanMap, scan: ScanPoints, found: Array, start: Array, options: SlamOptions, steps: int = 2
+    surroundings: ScanMap, scan: ScanPoints, pose: Array, start: Array, options: SlamOptions, steps: int = 2
 ) -> Match:
-    """The pose near the one that was found, every point weighted by its noise and outliers left out.
+    """Improve a pose (3,) by weighted Gauss-Newton without outliers.
 
-    Along directions that the scan does not tell it is that of ``start`` (3,), at every step: so these do not disturb
-    the others. steps: of Gauss-Newton, at least 1.
+    Along directions that the scan does not determine, the pose is that of ``start`` (3,) at every step, so that these
+    do not disturb the others. steps: of Gauss-Newton, at least 1.
     """
     limits = options.limits
-    pose = found
     for _ in range(steps):
-        pairs = Pairs(surroundings, scan, pose)
+        pairs = Correspondences(surroundings, scan, pose)
         information = pairs.information()
         values, directions = np.linalg.eigh(limits[:, None] * information * limits)
-        told = _told(pairs, limits[:, None] * directions, values)
-        gain = (limits[:, None] * directions) @ (told[:, None] * directions.T) / limits
-        tells = values > _SINGULAR * values[-1]
-        inverses = np.divide(1.0, values, out=np.zeros(3), where=tells)
-        weight = (limits[:, None] * directions) @ ((told * inverses)[:, None] * directions.T) * limits
+        observability = _observability(pairs, limits[:, None] * directions, values)
+        gain = (limits[:, None] * directions) @ (observability[:, None] * directions.T) / limits
+        informative = values > _SINGULAR * values[-1]
+        inverses = np.divide(1.0, values, out=np.zeros(3), where=informative)
+        weight = (limits[:, None] * directions) @ ((observability * inverses)[:, None] * directions.T) * limits
         pose = start + gain @ (pose - start) - weight @ pairs.gradient()
     return Match(
         pose,
         gain,
-        told,
+        observability,
         directions,
         weight,
         information,
@@ -98,26 +99,28 @@ def refine(
     )
 
 
-def _told(pairs: Pairs, directions: Array, information: Array) -> Array:
-    """How far points tell the pose along directions (3, 3; columns) as long as the limits: (3,).
+def _observability(pairs: Correspondences, directions: Array, information: Array) -> Array:
+    """How far (3,), 0 to 1, the points determine the pose along directions (3, 3; columns) as long as the limits.
 
-    The share rises so steeply with the information (3,) that, where scans tell the pose, nothing of the start remains.
+    It is I^2 / (1 + I^2) of the certain information I, so steep that nothing of the start remains where a scan
+    determines the pose.
     """
     if pairs.matched < LOST:
         return np.zeros(3)
     certain = pairs.certain_information(directions)
     squares = np.square(certain)
-    told: Array = squares / (1 + squares)
+    observability: Array = squares / (1 + squares)
     suspect = (information < _SUSPECT * information[-1]) | (certain < _CERTAIN * information)
-    for number in np.flatnonzero(suspect & (told > _NOTHING)):
-        told[number] *= _borne_out(pairs, directions[:, number])
-    return told
+    for number in np.flatnonzero(suspect & (observability > _NOTHING)):
+        observability[number] *= _confirmed_share(pairs, directions[:, number])
+    return observability
 
 
-def _borne_out(pairs: Pairs, direction: Array) -> float:
-    """How far the information along a direction (3,) is true, 0 to 1, tried out some way along it.
+def _confirmed_share(pairs: Correspondences, direction: Array) -> float:
+    """Share of the information along a direction (3,), 0 to 1, that a move of the scan along it confirms.
 
-    Straight pieces of a round wall lock with those of the map as if the wall had edges, but only near where they are.
+    The straight pieces fitted to a round wall lock with those of the map as if the wall had edges, but only close to
+    where they are.
     """
-    step = direction / np.max(np.abs(direction) / _TRIED)
+    step = direction / np.max(np.abs(direction) / _TESTED)
     return float(np.clip((pairs.rise(step, _MOST) - _FALSE) / (_TRUE - _FALSE), 0.0, 1.0))

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from omnibench.config import validate
 from omnibench.errors import ConfigError
 from omnibench.robot.kinematics import Robot, Wheel
-from omnibench.simulate.chain.motors import Controller, Encoder, Motor, check_reach, drive_session
+from omnibench.simulate.chain.motors import Controller, Encoder, Motor, check_reach
+from omnibench.simulate.chain.wheel_drive import drive_session
 from omnibench.simulate.flower import Command
 
 APR_02 = Robot(

@@ -13,7 +13,8 @@ from scipy.integrate import solve_ivp
 
 from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
-from omnibench.simulate.chain.motors import Controller, DrivenRun, Encoder, Motor, drive_session
+from omnibench.simulate.chain.motors import Controller, Encoder, Motor
+from omnibench.simulate.chain.wheel_drive import DrivenRun, drive_session
 from omnibench.simulate.flower import Command
 
 PERIOD, STEP = 0.01, 0.001

@@ -15,11 +15,11 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import compose, relative
 from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
 from omnibench.simulate.chain.lidar import Lidar, PoseTrack, measure_scans
-from omnibench.slam.matching.correspondences import Pairs
+from omnibench.slam.matching.correspondences import Correspondences
 from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints, noise_factor, scan_points
 from omnibench.slam.matching.scan_matching import Match, refine, search
-from omnibench.slam.motion_within_scan import WithinScan
+from omnibench.slam.motion_within_scan import MotionWithinScan
 from omnibench.slam.pose_errors import FLOOR, PoseErrors
 from omnibench.slam.slam_options import SlamOptions
 
@@ -46,7 +46,7 @@ def _along(twist: Array, time: float) -> Array:
 
 
 def points_of(ranges: Ranges, twist: Array | None = None) -> ScanPoints:
-    within = WithinScan.steady(np.zeros(3) if twist is None else twist, float(SCANNER.delays[-1]))
+    within = MotionWithinScan.steady(np.zeros(3) if twist is None else twist, float(SCANNER.delays[-1]))
     return scan_points(ranges, SCANNER, 1.0, within)
 
 
@@ -107,7 +107,7 @@ class TestMap:
         scan = points_of(ranges_at(np.zeros(3)))
         surroundings.add(scan.lines, np.zeros(3), keyframe=0)
         behind = compose(np.zeros(3), np.array([0.0, 0.0, np.pi]))
-        pairs = Pairs(surroundings, scan, behind)  # surfaces that face away from the scanner are not matched
+        pairs = Correspondences(surroundings, scan, behind)  # surfaces that face away from the scanner are not matched
         assert pairs.matched < 0.3
 
 

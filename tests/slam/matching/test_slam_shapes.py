@@ -17,10 +17,10 @@ from omnibench.data.scans import Scanner, ScansInMemory, TrajectoryScans
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.chain.lidar import Lidar, PoseTrack, measure_scans
-from omnibench.slam.matching.correspondences import Pairs
+from omnibench.slam.matching.correspondences import Correspondences
 from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints, scan_points
-from omnibench.slam.motion_within_scan import WithinScan
+from omnibench.slam.motion_within_scan import MotionWithinScan
 from omnibench.slam.slam_dataset import slam_dataset
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.slam_run import SlamPath, run_slam
@@ -58,7 +58,7 @@ def mirrored(run: Run) -> Run:
 
 
 def problems(path: SlamPath) -> list[str]:
-    return [str(doubt) for doubt in path.doubts]
+    return [str(warning) for warning in path.warnings]
 
 
 def since_start(headings: Array) -> Array:
@@ -126,22 +126,22 @@ class TestNearlyRoundRoom:
             path = located(run)
             assert np.abs(path.poses - run.true)[-1, 2] < 0.2 * DEGREE
             assert path.covariances[-1, 2, 2] < (0.2 * DEGREE) ** 2
-            assert path.doubts == ()
+            assert path.warnings == ()
 
 
 def scan_of(plan: FloorPlan, seed: int) -> ScanPoints:
     """A noisy scan from the room's start."""
     track = PoseTrack(np.linspace(0.0, 0.025, 2), np.tile(plan.start, (2, 1)))
     ranges = measure_scans(plan, LIDAR, track, np.zeros(1), np.random.default_rng(seed)).ranges[0]
-    return scan_points(ranges, LIDAR.scanner, 1.0, WithinScan.steady(np.zeros(3), 0.025))
+    return scan_points(ranges, LIDAR.scanner, 1.0, MotionWithinScan.steady(np.zeros(3), 0.025))
 
 
 @cache
-def pairs_at_start(plan: FloorPlan) -> Pairs:
+def pairs_at_start(plan: FloorPlan) -> Correspondences:
     """A scan on the map of another."""
     surroundings = ScanMap(SlamOptions().spacing)
     surroundings.add(scan_of(plan, 0).lines, np.zeros(3), keyframe=0)
-    return Pairs(surroundings, scan_of(plan, 1), np.zeros(3))
+    return Correspondences(surroundings, scan_of(plan, 1), np.zeros(3))
 
 
 class TestRise:
@@ -190,7 +190,7 @@ class TestDisagreementWithTheOdometry:
             def odometry(times: Array, run: Run = run) -> Array:
                 return run.odometry(times) * np.array([scale, scale, 1.0])
 
-            assert run_slam(run.scans, LIDAR.scanner, options, np.zeros(3), odometry).doubts == ()
+            assert run_slam(run.scans, LIDAR.scanner, options, np.zeros(3), odometry).warnings == ()
 
     def test_along_what_scans_do_not_tell_is_not_said(self) -> None:
         run = driven(make_plan(RoomPlan(plan="corridor"), "room"), 0)
@@ -201,7 +201,7 @@ class TestDisagreementWithTheOdometry:
         shares, trajectories, scans = [], [], {}
         for number in (0, 1, 3):
             run = mirrored(driven(furnished(), number))
-            shares += [doubt.share for doubt in located(run).doubts if doubt.share is not None]
+            shares += [warning.share for warning in located(run).warnings if warning.share is not None]
             ends = np.array([0.0, float(run.log.times[-1])])
             trajectories.append(
                 Trajectory(f"run-{number}", "train", run.log.times, run.log.rates, ends, np.zeros((2, 3)), command="")

@@ -12,7 +12,7 @@ import numpy as np
 from omnibench.config import validate
 from omnibench.data.importers.rosbag.bag import Bag, Topic, open_bag
 from omnibench.data.importers.rosbag.message_streams import Sieve, Stamps, header_stamp
-from omnibench.data.importers.rosbag.scanner_frames import Seat, seat_of
+from omnibench.data.importers.rosbag.scanner_frames import ScannerMounting, scanner_mounting
 from omnibench.data.scans import Mount, Ranges, Scanner, Scans, TrajectoryScans
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import Array
@@ -211,19 +211,19 @@ def _pace(paces: list[float], scan_time: float, place: str, warnings: list[str])
     return pace
 
 
-def _seat(bag: Bag, frame: str, mount: Mount | None, place: str, warnings: list[str]) -> Seat:
+def _seat(bag: Bag, frame: str, mount: Mount | None, place: str, warnings: list[str]) -> ScannerMounting:
     if mount is not None:
-        return Seat(mount)
-    seat = seat_of(bag, frame)
+        return ScannerMounting(mount)
+    seat = scanner_mounting(bag, frame)
     if seat is None:
         warnings.append(
             f"{place}: nothing tells where the scanner ({frame or 'a frame without a name'}) is mounted (no /tf_static "
             "from base_link); the robot's middle is taken; set scanner_mount={x: 0.1, y: 0, yaw: 0} (m, rad)"
         )
-    return seat or Seat(Mount())
+    return seat or ScannerMounting(Mount())
 
 
-def _scanner(shape: _Shape, pace: float, seat: Seat, topic: Topic, place: str) -> Scanner:
+def _scanner(shape: _Shape, pace: float, seat: ScannerMounting, topic: Topic, place: str) -> Scanner:
     sign = -1.0 if seat.upside_down else 1.0
     try:
         return validate(

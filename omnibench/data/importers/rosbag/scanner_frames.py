@@ -18,14 +18,14 @@ _LARGEST_TILT = math.radians(20)
 
 
 @dataclass(frozen=True)
-class Seat:
+class ScannerMounting:
     """A mount. upside_down: rays that count counter-clockwise for the scanner run clockwise for the robot."""
 
     mount: Mount
     upside_down: bool = False
 
 
-def seat_of(bag: Bag, frame: str) -> Seat | None:
+def scanner_mounting(bag: Bag, frame: str) -> ScannerMounting | None:
     """Where the frame of a scanner is in the robot's; None when the bag does not tell. DataError: it is tilted."""
     parents = _fixed_transforms(bag)
     child, whole = frame.strip("/"), np.eye(4)
@@ -59,7 +59,7 @@ def _fixed_transforms(bag: Bag) -> dict[str, tuple[str, Array]]:
     return found
 
 
-def _planar(transform: Array, bag: Bag, frame: str) -> Seat:
+def _planar(transform: Array, bag: Bag, frame: str) -> ScannerMounting:
     tilt = math.acos(np.clip(transform[2, 2], -1.0, 1.0))
     upside_down = tilt > math.pi / 2
     if min(tilt, math.pi - tilt) > _LARGEST_TILT:
@@ -68,4 +68,4 @@ def _planar(transform: Array, bag: Bag, frame: str) -> Seat:
             "not scan the plane of the floor; if it does, set scanner_mount; scans=false leaves the scans out"
         )
     yaw = math.atan2(transform[1, 0], transform[0, 0])
-    return Seat(Mount(x=float(transform[0, 3]), y=float(transform[1, 3]), yaw=yaw), upside_down)
+    return ScannerMounting(Mount(x=float(transform[0, 3]), y=float(transform[1, 3]), yaw=yaw), upside_down)
