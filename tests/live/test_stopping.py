@@ -1,4 +1,4 @@
-"""Ending what runs until it is told to stop."""
+"""Stopping commands by signals."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_ticks_come_at_once_and_then_every_period_until_the_time_is_over() -> No
     assert 0.35 <= time.monotonic() - began < 1.0
 
 
-def test_ticks_end_when_told_to() -> None:
+def test_ticks_end_when_stopped() -> None:
     stop = threading.Event()
     seen = []
     for passed in ticks(stop, 0.01):

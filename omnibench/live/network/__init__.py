@@ -1,1 +1,1 @@
-"""Zenoh sessions: how they are opened, who may do what, who is there."""
+"""Zenoh sessions: opening them, access rights, and which robots are present."""

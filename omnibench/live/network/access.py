@@ -1,7 +1,7 @@
-"""Access rules as Zenoh's access control takes them: rights by key, message and peer, all else refused.
+"""Zenoh's access control from a config's access rules: rights by key, message and peer; all else is refused.
 
-What a peer sends is checked. What is sent to a peer is not, beyond that: it could only come because the peer was
-allowed to subscribe to it or to ask for it.
+Messages from a peer (ingress) are checked. Messages to a peer (egress) are not: a peer only receives what it was
+allowed to subscribe to or to query.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ _READ: Final = ("declare_subscriber", "query", "declare_liveliness_subscriber", 
 _ALIVE: Final = "omnibench/{}/alive"
 _ANSWERS: Final = tuple("omnibench/{}/" + service for service in ("info", "calibration", "health", "pose"))
 _SERVICES: Final = "omnibench/{}/*"
-_ROS_GRAPH: Final = "@ros2_lv/**"  # rmw_zenoh's tokens: who is there, no data
-_ADVANCED: Final = "/@adv/**"  # below a key: what advanced publishers and subscribers say to each other
+_ROS_GRAPH: Final = "@ros2_lv/**"  # rmw_zenoh's liveliness tokens: nodes and their topics, no data
+_ADVANCED: Final = "/@adv/**"  # below a key: messages between Zenoh's advanced publishers and subscribers
 
 _OUTPUTS: Final = tuple(topic for topic in TOPICS if topic not in INPUTS)
 
 Rights = dict[str, dict[str, list[str]]]
-"""who -> write, read -> keys"""
+"""Peer's name -> "write" or "read" -> key expressions."""
 
 
 def rights_of(access: Access) -> Rights:
-    """Every name's keys, the shorthands written out. ConfigError when a key expression is not one."""
+    """The key expressions that each peer may write and read. ConfigError: a rule's key expression is not valid."""
     rights: Rights = defaultdict(lambda: {"write": [], "read": []})
 
     def grant(who: Iterable[str], *, write: Iterable[str] = (), read: Iterable[str] = ()) -> None:
@@ -41,14 +41,15 @@ def rights_of(access: Access) -> Rights:
             rights[name]["read"] += read
 
     for robot, name in access.robots.items():
-        own = (f"{robot}/**", f"*/{robot}/**", *_topics(robot, ("tf",)), *_services(robot, *_ANSWERS))
-        grant([name], write=[*_topics(robot, INPUTS), _ROS_GRAPH], read=[*own, *_services("*", _ALIVE), _ROS_GRAPH])
-    every = [*_topics("*", TOPICS), _ROS_GRAPH]
-    answers = _services("*", *_ANSWERS, _ALIVE)
-    grant(access.nodes, write=[*_topics("*", _OUTPUTS), *_services("*", _SERVICES), _ROS_GRAPH])
-    grant(access.nodes, read=[*every, *_services("*", _SERVICES)])
-    grant(access.viewers, write=[_ROS_GRAPH], read=[*every, *answers])
-    grant(access.operators, write=[_ROS_GRAPH, "omnibench/*/calibration"], read=[*every, *_services("*", _SERVICES)])
+        robot_keys = (f"{robot}/**", f"*/{robot}/**", *_topics(robot, ("tf",)), *_services(robot, *_ANSWERS))
+        tokens = _services("*", _ALIVE)
+        grant([name], write=[*_topics(robot, INPUTS), _ROS_GRAPH], read=[*robot_keys, *tokens, _ROS_GRAPH])
+    all_topics = [*_topics("*", TOPICS), _ROS_GRAPH]
+    answers, services = _services("*", *_ANSWERS, _ALIVE), _services("*", _SERVICES)
+    grant(access.nodes, write=[*_topics("*", _OUTPUTS), *services, _ROS_GRAPH])
+    grant(access.nodes, read=[*all_topics, *services])
+    grant(access.viewers, write=[_ROS_GRAPH], read=[*all_topics, *answers])
+    grant(access.operators, write=[_ROS_GRAPH, "omnibench/*/calibration"], read=[*all_topics, *services])
     for rule in access.rules:
         grant(rule.who, write=rule.write, read=rule.read)
     return {
@@ -60,8 +61,8 @@ def rights_of(access: Access) -> Rights:
 def access_control(access: Access, *, by_certificate: bool, own_name: str | None = None) -> dict[str, Any]:
     """Zenoh's setting ``access_control``.
 
-    by_certificate: names are certificates' common names, else users'. own_name: the router's own. Who can show it holds
-    the router's key or password, and may do all: other programs on the router's machine.
+    by_certificate: the rules' names are common names of certificates, else user names. own_name: the router's name;
+    a peer that has it holds the router's key or password, as other programs on its machine do, and may do everything.
     """
     property_name = "cert_common_names" if by_certificate else "usernames"
     rights = rights_of(access)
@@ -70,21 +71,22 @@ def access_control(access: Access, *, by_certificate: bool, own_name: str | None
         rights[own_name] = {"write": everything, "read": everything}
     named = {key for granted in rights.values() for keys in granted.values() for key in keys if "@" in key}
     rules = [
-        # Whoever is not named is somebody, too: else its refusals would not be logged.
+        # Peers without a rule are a subject too, or Zenoh would not log that they are refused.
         _rule("nothing", "deny", "ingress", _WRITE + _READ, ["**"]),
         _rule("outgoing", "allow", "egress", _WRITE + _READ, sorted({"**", "**" + _ADVANCED, *named})),
     ]
     policies = [{"id": "anyone", "subjects": ["anyone"], "rules": ["nothing"]}]
     subjects: list[dict[str, Any]] = [{"id": "anyone"}]
     for number, (who, granted) in enumerate(rights.items()):
-        mine = [
+        peer_rules = [
             _rule(f"{number} {kind}", "allow", "ingress", messages, granted[kind])
             for kind, messages in (("write", _WRITE), ("read", _READ))
             if granted[kind]
         ]
-        rules += mine
+        rules += peer_rules
+        names = [rule["id"] for rule in peer_rules]
         subjects.append({"id": f"{number}", property_name: [who]})
-        policies.append({"id": f"{number}", "subjects": [f"{number}"], "rules": ["outgoing", *(r["id"] for r in mine)]})
+        policies.append({"id": f"{number}", "subjects": [f"{number}"], "rules": ["outgoing", *names]})
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -99,7 +101,7 @@ def _rule(name: str, permission: str, flow: str, messages: tuple[str, ...], keys
 
 
 def _topics(robot: str, topics: Iterable[str]) -> list[str]:
-    """A robot's topics in all profiles: by name alone, and with domain, type and hash."""
+    """The keys of a robot's topics in all profiles: the name alone, and with domain, type and hash around it."""
     names = [topic_name(robot, topic) for topic in topics]
     return [*names, *(f"*/{name}/*/*" for name in names)]
 
@@ -109,11 +111,12 @@ def _services(robot: str, *patterns: str) -> list[str]:
 
 
 def _with_advanced(keys: Iterable[str]) -> set[str]:
-    return {each for key in keys for each in ((key,) if "@" in key else (key, key + _ADVANCED))}
+    keys = set(keys)
+    return keys | {key + _ADVANCED for key in keys if "@" not in key}
 
 
 def _checked(key: str) -> str:
     try:
         return str(zenoh.KeyExpr.autocanonize(key))
     except zenoh.ZError as error:
-        raise ConfigError(f"access: {key!r} is no key expression: {str(error).split(': ', 1)[-1]}") from None
+        raise ConfigError(f"access: {key!r} is not a key expression: {str(error).split(': ', 1)[-1]}") from None

@@ -1,7 +1,7 @@
-"""Telling who was refused: Zenoh refuses in silence, but its log can be made to tell, and is read here.
+"""A log of refused access, read from Zenoh's own log: Zenoh has no other way to report whom it refuses.
 
-Zenoh writes its log to file descriptor 1 and nowhere else, and of access control it tells what it refuses only along
-with all that it allows. So, while refusals are logged, descriptor 1 is a pipe, from which a thread picks what matters.
+Zenoh writes its log to file descriptor 1 only, and logs refused messages only together with all allowed ones.
+Therefore descriptor 1 is a pipe while access is logged: a thread reads it, picks the refusals and passes on all else.
 """
 
 from __future__ import annotations
@@ -33,28 +33,29 @@ _DECISION = re.compile(
 )
 _HANDSHAKE = re.compile(r"Establishment Accept \w+: \S+ => (?P<address>\S+)\. ")
 _ACCEPTED = re.compile(r"New transport link accepted from (?P<zid>[0-9a-f]+) .*? dst: (?P<address>\S+?),")
-_REASONS: Final = (  # what Zenoh says of users, and what it means
+_REASONS: Final = (  # Zenoh's words when a user is refused, and their meaning
     ("Invalid password", "wrong password"),
     ("Invalid user", "unknown user"),
     ("Expected extension", "no user and password given"),
 )
-_CONSEQUENCES: Final = ("Unknown subscriber", "Unknown queryable", "Unknown token")  # undeclared, and never let in
+_CONSEQUENCES: Final = ("Unknown subscriber", "Unknown queryable", "Unknown token")
+"""Errors that follow a refusal: the peer undeclares something that was refused when it was declared."""
 _IDENTITIES: Final = (("CertCommonName", "certificate"), ("Username", "user"))
 _PIPE_SIZE: Final = 1 << 20
-_PAUSE: Final = 0.02  # s; many lines at a time cost less than one by one
-_QUIET: Final = 10.0  # s in which the same refusal is not told again
-_MOST: Final = 20  # refusals told in that time
-_MOST_KNOWN: Final = 10_000  # peers; a node runs for long
+_READ_PERIOD: Final = 0.02  # s between two reads of the pipe; many lines at a time cost less than one by one
+_REPEAT_PERIOD: Final = 10.0  # s in which the same refusal is logged once; chosen
+_MOST_LINES: Final = 20  # refusals logged in that time; chosen
+_MOST_PEERS: Final = 10_000  # peers whose addresses and names are kept; a node runs for long
 
 _one_at_a_time = threading.Lock()
 
 
 @contextmanager
 def log_refused_access(config: SessionConfig) -> Iterator[AccessLog]:
-    """While it is open, log a warning for everybody whom this process's sessions refuse, and for what.
+    """Log a warning for every peer that this process's sessions refuse, with what it asked for.
 
-    For the main program of a node, around ``open_session``; no other session may be open. Does nothing when there is
-    nobody to refuse, or when RUST_LOG is set: then Zenoh's own log comes out as it is.
+    For the main program of a node, around ``open_session``; no other session may be open. Does nothing if the config
+    refuses nobody, or if RUST_LOG is set: Zenoh's own log is then printed unchanged.
     """
     access_log = AccessLog(LOG.warning)
     guarded = config.users_file is not None or (config.tls is not None and bool(config.listening))
@@ -73,31 +74,31 @@ def log_refused_access(config: SessionConfig) -> Iterator[AccessLog]:
 
 
 class AccessLog:
-    """Picks refusals from the lines of Zenoh's log. count: so far, repetitions included."""
+    """Picks refusals from the lines of Zenoh's log and calls ``warn`` with each. count: refusals, repeated ones too."""
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
+    def __init__(self, warn: Callable[[str], None]) -> None:
         self.count = 0
-        self._tell = tell
-        self._told: dict[str, float] = {}
-        self._untold = 0
-        self._since = 0.0
-        self._decisions: dict[str, re.Match[str]] = {}  # thread -> the refusal it wrote last
-        self._addresses: dict[str, str] = {}  # thread -> whom it talks to; Zenoh's id -> where it is
-        self._names: dict[str, str] = {}  # Zenoh's id -> certificate or user
+        self._warn = warn
+        self._logged: set[str] = set()  # since _period_start
+        self._suppressed = 0  # since _period_start
+        self._period_start = 0.0
+        self._decisions: dict[str, re.Match[str]] = {}  # thread -> the last refusal that it logged
+        self._addresses: dict[str, str] = {}  # thread, or Zenoh's id of a peer -> the peer's address
+        self._names: dict[str, str] = {}  # Zenoh's id of a peer -> its certificate or user
 
     def read(self, line: str) -> bool:
-        """Whether the line is of Zenoh's log; a refusal in it is told."""
-        found = _LINE.fullmatch(line)
-        if found is None:
+        """True if the line is one of Zenoh's log; a refusal in it is logged."""
+        parts = _LINE.fullmatch(line)
+        if parts is None:
             return False
-        target, thread, text = found["target"], found["thread"], found["text"]
+        target, thread, text = parts["target"], parts["thread"], parts["text"]
         if target.startswith("zenoh::net::routing::interceptor"):
             self._take_decision(thread, text)
         elif target.endswith("::accept"):
             self._take_handshake(thread, text)
         elif target.startswith("zenoh_link"):
             self._refuse(f"a connection: {text.split('. Hint:')[0]}")
-        elif found["level"] == "ERROR" and not text.startswith(_CONSEQUENCES):
+        elif parts["level"] == "ERROR" and not text.startswith(_CONSEQUENCES):
             self._refuse(f"zenoh: {text}", refused=False)
         return True
 
@@ -107,7 +108,7 @@ class AccessLog:
             if decision["subject"]:
                 _remember(self._names, decision["zid"], _identity(decision["subject"]))
         elif text == "Msg intercepted!" and (decision := self._decisions.pop(thread, None)) is not None:
-            # What was decided without a message being intercepted was only looked up beforehand.
+            # A decision that no intercepted message follows was only looked up in advance.
             zid = decision["zid"]
             who = f"{self._names.get(zid, 'somebody')} at {self._addresses.get(zid, 'an unknown address')}"
             self._refuse(f"{who}: may not {_described(decision)} {decision['key']}")
@@ -124,41 +125,40 @@ class AccessLog:
     def _refuse(self, text: str, *, refused: bool = True) -> None:
         self.count += refused
         now = time.monotonic()
-        if now - self._since > _QUIET:
-            if self._untold:
-                self._tell(f"refused: {self._untold} more in the last {now - self._since:.0f} s")
-            self._told, self._since, self._untold = {}, now, 0
-        # a port is another one with every connection
-        same = re.sub(r":\d+\b", "", text)
-        if same in self._told or len(self._told) >= _MOST:
-            self._untold += 1
+        if now - self._period_start > _REPEAT_PERIOD:
+            if self._suppressed:
+                self._warn(f"refused: {self._suppressed} more in the last {now - self._period_start:.0f} s")
+            self._logged, self._period_start, self._suppressed = set(), now, 0
+        without_port = re.sub(r":\d+\b", "", text)  # each connection of a peer has another port
+        if without_port in self._logged or len(self._logged) >= _MOST_LINES:
+            self._suppressed += 1
             return
-        self._told[same] = now
-        self._tell(one_line(f"refused: {text}" if refused else text))
+        self._logged.add(without_port)
+        self._warn(one_line(f"refused: {text}" if refused else text))
 
 
 def _remember(known: dict[str, str], key: str, value: str) -> None:
     known[key] = value
-    if len(known) > _MOST_KNOWN:
+    if len(known) > _MOST_PEERS:
         del known[next(iter(known))]
 
 
 def _identity(subject: str) -> str:
     for name, kind in _IDENTITIES:
-        if (found := re.search(rf"{name}\((.*?)\)(?:\+|$)", subject)) is not None:
-            return f"{kind} {found[1]!r}"
+        if (match := re.search(rf"{name}\((.*?)\)(?:\+|$)", subject)) is not None:
+            return f"{kind} {match[1]!r}"
     return "somebody without certificate or user"
 
 
 def _described(decision: re.Match[str]) -> str:
     action = decision["action"]
     if decision["flow"] == "egress":
-        return "be told of" if "Declare" in action or "Liveliness" in action else "receive"
+        return "receive declarations of" if "Declare" in action or "Liveliness" in action else "receive"
     return {"Put": "write", "Delete": "delete", "Query": "ask", "Reply": "answer for"}.get(action, action.lower())
 
 
 def _start_log(directives: str) -> None:
-    """Zenoh's log, without colours."""
+    """Start Zenoh's log without colours."""
     before = os.environ.get("NO_COLOR")
     os.environ["NO_COLOR"] = "1"
     try:
@@ -172,16 +172,16 @@ def _start_log(directives: str) -> None:
 
 @contextmanager
 def _descriptor_1_read_by(take: Callable[[str], bool]) -> Iterator[None]:
-    """Give ``take`` the lines that are written to descriptor 1, and pass on those that it does not want.
+    """Give ``take`` each line that is written to descriptor 1, and pass on those for which it returns False.
 
-    Python's own output goes where it went before, not through the pipe.
+    Python's own output bypasses the pipe.
     """
     sys.stdout.flush()
     outside, (reading, writing) = os.dup(1), os.pipe()
     with suppress(OSError, AttributeError):
         fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
-    stdout, own = sys.stdout, _is_descriptor_1(sys.stdout)
-    if own:
+    stdout, replaced = sys.stdout, _is_descriptor_1(sys.stdout)
+    if replaced:
         sys.stdout = os.fdopen(
             os.dup(outside), "w", encoding=stdout.encoding, errors=stdout.errors, buffering=1 if stdout.isatty() else -1
         )
@@ -192,13 +192,13 @@ def _descriptor_1_read_by(take: Callable[[str], bool]) -> Iterator[None]:
     try:
         yield
     finally:
-        if own:
+        if replaced:
             sys.stdout.flush()
             sys.stdout.close()
             sys.stdout = stdout
         else:
             sys.stdout.flush()
-        os.dup2(outside, 1)  # the pipe has no writer any more, so that the thread ends
+        os.dup2(outside, 1)  # closes the pipe's last writer, which ends the thread
         thread.join(timeout=1.0)
         os.close(outside)
 
@@ -215,17 +215,17 @@ def _read(reading: int, outside: int, take: Callable[[str], bool]) -> None:
     while chunk := os.read(reading, _PIPE_SIZE):
         *lines, rest = (rest + chunk).split(b"\n")
         for line in lines:
-            if b" is authorized to " in line:  # most lines: cheap to pass over
+            if b" is authorized to " in line:  # most lines, skipped cheaply
                 continue
             try:
-                known = take(line.decode(errors="replace"))
-            except Exception:  # whatever a line is: who does not read on holds up Zenoh
+                is_zenohs = take(line.decode(errors="replace"))
+            except Exception:  # reading must go on, whatever the line is: a full pipe would stop Zenoh
                 LOG.exception("a line of Zenoh's log could not be read")
                 continue
-            if not known:
+            if not is_zenohs:
                 with suppress(OSError):  # nobody reads the program's output any more
                     os.write(outside, line + b"\n")
-        time.sleep(_PAUSE)
+        time.sleep(_READ_PERIOD)
     os.close(reading)
     if rest:
         with suppress(OSError):

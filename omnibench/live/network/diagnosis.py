@@ -1,4 +1,4 @@
-"""Why a session did not open: Zenoh only says that it could not connect, so the way there is tried step by step."""
+"""The reason why a session did not open, found by trying each step: Zenoh only reports that it could not connect."""
 
 from __future__ import annotations
 
@@ -9,30 +9,33 @@ from typing import Final
 
 from omnibench.live.network.session_config import SessionConfig, Tls, address_of
 
-_TIMEOUT: Final = 2.0  # s
-_ALERTS: Final = {  # what TLS says when the other side refuses us
+_TIMEOUT: Final = 2.0  # s to wait for a TCP connection; chosen
+_ALERTS: Final = {  # ends of OpenSSL's reasons when the other side refuses our certificate, and what to do
     "CERTIFICATE_REQUIRED": "it asks for a certificate; give tls: certificate, key and mutual: true",
     "HANDSHAKE_FAILURE": "it asks for a certificate; give tls: certificate, key and mutual: true",
-    "CERTIFICATE_EXPIRED": "our certificate has expired there; look at the clocks",
-    "UNKNOWN_CA": "our certificate is not from its authority; have it made with its ca.pem",
-    "DECRYPT_ERROR": "our certificate is not from its authority; have it made with its ca.pem",
-    "BAD_CERTIFICATE": "it takes our certificate for a bad one; have it made with its ca.pem",
+    "CERTIFICATE_EXPIRED": "it says that our certificate has expired; check the clocks",
+    "UNKNOWN_CA": "our certificate is not from its authority; make one with its ca.pem",
+    "DECRYPT_ERROR": "our certificate is not from its authority; make one with its ca.pem",
+    "BAD_CERTIFICATE": "it rejects our certificate as bad; make one with its ca.pem",
 }
 
 
 def why_not_connected(config: SessionConfig) -> str:
-    """One line on the endpoints that a session did not reach, or was refused at."""
+    """One line with the reason for each endpoint that a session did not reach or that refused it."""
     return "; ".join(f"{endpoint}: {_why(endpoint, config)}" for endpoint in config.connecting)
 
 
 def why_not_listening(endpoints: Sequence[str], text: str) -> str | None:
-    """One line on an endpoint that cannot be listened at, from Zenoh's ``text``; None when it is not that."""
+    """One line with the reason why an endpoint cannot be listened on, from Zenoh's error ``text``; None if unknown."""
     place = next((endpoint for endpoint in endpoints if endpoint in text), ", ".join(endpoints))
     for sign, reason in (
-        ("Address already in use", "is in use; another omnibench live may run there: stop it, or listen elsewhere"),
-        ("Cannot assign requested address", "is no address of this machine; listen at one that is"),
-        ("lookup address information", "is no known host; listen at an address of this machine"),
-        ("Permission denied", "is not allowed to us; take a port from 1024 on"),
+        (
+            "Address already in use",
+            "is in use; another omnibench live may run there: stop it, or listen elsewhere",
+        ),
+        ("Cannot assign requested address", "is not an address of this machine; listen on one that is"),
+        ("lookup address information", "is not a known host; listen on an address of this machine"),
+        ("Permission denied", "is not permitted; take a port from 1024 on"),
     ):
         if sign in text:
             return f"{place} {reason}"
@@ -42,7 +45,7 @@ def why_not_listening(endpoints: Sequence[str], text: str) -> str | None:
 def _why(endpoint: str, config: SessionConfig) -> str:
     address = address_of(endpoint)
     if address is None or address[0] not in ("tcp", "tls", "ws"):
-        return f"no answer, or we are refused; start omnibench live there, {_elsewhere(config)}"
+        return f"no answer, or it refuses us; start omnibench live there, {_elsewhere(config)}"
     protocol, host, port = address
     try:
         with socket.create_connection((host, port), _TIMEOUT) as connection:
@@ -51,11 +54,11 @@ def _why(endpoint: str, config: SessionConfig) -> str:
             if protocol == "tcp" and _speaks_tls(connection):
                 return "asks for TLS; connect to tls/... and give tls"
     except socket.gaierror:
-        return f"no host of the name {host} is known"
+        return f"there is no host called {host}"
     except ConnectionRefusedError:
         return f"nothing listens there; start omnibench live, {_elsewhere(config)}"
     except TimeoutError:
-        return f"no answer within {_TIMEOUT:.0f} s; look at the address, the network and its firewalls"
+        return f"no answer within {_TIMEOUT:.0f} s; check the address, the network and its firewalls"
     except OSError as error:
         return f"cannot be reached: {error.strerror or error}"
     return _refused(config)
@@ -68,7 +71,7 @@ def _elsewhere(config: SessionConfig) -> str:
 def _refused(config: SessionConfig) -> str:
     if config.user is not None:
         return f"refuses user {config.user.name!r}: wrong name or password; compare with the router's users_file"
-    return "refuses us: it may ask for a user and password (user: name, password_file), or is no Zenoh router"
+    return "refuses us: it may ask for a user and password (user: name, password_file), or it is not a Zenoh router"
 
 
 def _why_not_tls(connection: socket.socket, host: str, tls: Tls) -> str | None:
@@ -81,15 +84,15 @@ def _why_not_tls(connection: socket.socket, host: str, tls: Tls) -> str | None:
             encrypted.settimeout(0.5)  # with TLS 1.3 a refusal comes after the handshake
             encrypted.recv(1)
     except ssl.SSLCertVerificationError as error:
-        return f"its certificate is refused: {error.verify_message.rstrip('.')}; look at tls: ca ({tls.ca})"
+        return f"we refuse its certificate: {error.verify_message.rstrip('.')}; check tls: ca ({tls.ca})"
     except TimeoutError:
         return None
     except ssl.SSLError as error:
         reason = error.reason or str(error)
-        found = next((text for sign, text in _ALERTS.items() if reason.endswith(sign)), None)
-        return found or f"no TLS can be agreed on: {reason.replace('_', ' ').lower()}"
+        explanation = next((text for sign, text in _ALERTS.items() if reason.endswith(sign)), None)
+        return explanation or f"the TLS handshake fails: {reason.replace('_', ' ').lower()}"
     except OSError as error:
-        return f"no TLS can be agreed on: {error.strerror or error}"
+        return f"the TLS handshake fails: {error.strerror or error}"
     return None
 
 

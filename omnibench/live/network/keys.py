@@ -1,4 +1,4 @@
-"""A certificate authority for tests and small fleets, and certificates for its members."""
+"""Making a certificate authority for tests and small fleets, and certificates signed by it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from omnibench.live.network.tls_files import read_certificate, read_key
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _RESERVED: Final = ("ca", "users")
 _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
-_SLACK: Final = timedelta(hours=1)  # clocks differ
+_CLOCK_TOLERANCE: Final = timedelta(hours=1)  # certificates are valid since so long ago, as clocks differ; chosen
 
 
 def make_keys(
@@ -38,11 +38,13 @@ def make_keys(
 ) -> list[Path]:
     """Write a certificate (``<name>.pem``) and its private key (``<name>.key``, for its owner only) for every name.
 
-    The authority (``ca.pem``, ``ca.key``) is made where it is missing, else goes on: so robots are added to a fleet.
-    hosts: names and addresses that the certificates hold for, besides loopback; those of the router. days: validity.
-    users: add passwords (``<name>.password``, and ``users.txt`` for the router). overwrite: replace what is there, the
-    authority too. Returns the files written. ConfigError when a name cannot be, or a file is there already; DataError
-    when the disk refuses.
+    The authority (``ca.pem``, ``ca.key``) is made if it is missing; else it signs the new certificates, which adds
+    robots to a fleet. hosts: the router's host names and addresses, for which the certificates are valid besides
+    loopback. days: validity. users: write passwords too (``<name>.password``, and ``users.txt`` for the router).
+    overwrite: replace existing files, the authority's too.
+
+    Returns the files written. ConfigError: a name is not valid, or a file exists already; DataError: a file cannot be
+    written.
     """
     _check(names, days)
     until = datetime.now(UTC) + timedelta(days=days)
@@ -60,10 +62,10 @@ def make_keys(
         contents[folder / f"{name}.key"] = _pem(key)
     if users:
         contents |= _passwords(folder, names, keep=not overwrite)
-    there = [path for path in contents if path.exists() and path.name != "users.txt"]
-    if there and not overwrite:
+    existing = [path for path in contents if path.exists() and path.name != "users.txt"]
+    if existing and not overwrite:
         raise ConfigError(
-            f"{there[0]}: is there already; choose other names, or --overwrite to replace all in {folder}"
+            f"{existing[0]}: is there already; choose other names, or --overwrite to replace all in {folder}"
         )
     for path, content in contents.items():
         _write(path, content, private=path.suffix != ".pem")
@@ -73,7 +75,7 @@ def make_keys(
 def _check(names: Sequence[str], days: int) -> None:
     for name in names:
         if not _NAME.fullmatch(name) or name in _RESERVED:
-            raise ConfigError(f"{name!r} cannot name a certificate; take letters, digits, _ . and - as apr02")
+            raise ConfigError(f"{name!r} cannot name a certificate; use letters, digits, _ . and - as in apr02")
     if len(set(names)) < len(names):
         raise ConfigError(f"a name is given twice: {', '.join(names)}")
     if not 1 <= days <= 36500:
@@ -82,7 +84,7 @@ def _check(names: Sequence[str], days: int) -> None:
 
 def _authority(until: datetime) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
     key = ec.generate_private_key(ec.SECP256R1())
-    name = _common_name(f"omnibench test CA {secrets.token_hex(4)}")  # two authorities are told apart by it
+    name = _common_name(f"omnibench test CA {secrets.token_hex(4)}")  # distinguishes two authorities
     builder = (
         _builder(name, name, key, until)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
@@ -122,7 +124,7 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(datetime.now(UTC) - _SLACK)
+        .not_valid_before(datetime.now(UTC) - _CLOCK_TOLERANCE)
         .not_valid_after(until)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )
@@ -154,7 +156,7 @@ def _general_name(host: str) -> x509.GeneralName:
 def _existing_authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
     certificate = read_certificate(folder / "ca.pem")
     if not (folder / "ca.key").exists():
-        raise ConfigError(f"{folder}/ca.key is missing, so that ca.pem can sign nobody; choose another folder")
+        raise ConfigError(f"{folder}/ca.key is missing, without which ca.pem cannot sign; choose another folder")
     key = read_key(folder / "ca.key")
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
         raise ConfigError(f"{folder}/ca.key is not the key of ca.pem; choose another folder")
@@ -166,7 +168,7 @@ def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _passwords(folder: Path, names: Sequence[str], *, keep: bool) -> dict[Path, bytes]:
-    """A password for each name, and the router's file with all of them; ``keep`` those that are in it."""
+    """Files with a password for each name, and the router's file with all; ``keep`` the passwords it holds already."""
     path = folder / "users.txt"
     passwords = {name: secrets.token_urlsafe(18) for name in names}
     lines = path.read_text(encoding="utf-8").splitlines() if keep and path.exists() else []

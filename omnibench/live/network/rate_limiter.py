@@ -1,4 +1,4 @@
-"""A log that a flood of mistakes does not flood."""
+"""Limiting how often a message of the same kind is logged."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import threading
 import time
 from typing import Final
 
-PATIENCE: Final = 10.0  # s between two lines of the same kind
+PERIOD: Final = 10.0  # s between two lines of the same kind; chosen
 
 
 class RateLimiter:
-    """Lets a line of each kind through, and the next one ``patience`` s later (infinity: never). Any thread may ask."""
+    """Allows one line of each kind every ``period`` s (infinity: one in all). Safe to call from any thread."""
 
-    def __init__(self, patience: float = PATIENCE) -> None:
-        self._patience = patience
-        self._told: dict[str, float] = {}
+    def __init__(self, period: float = PERIOD) -> None:
+        self._period = period
+        self._last: dict[str, float] = {}  # kind -> when a line was last allowed
         self._lock = threading.Lock()
 
     def allows(self, kind: str) -> bool:
-        """Whether a line of this kind, of which there are few, is due; then it counts as told."""
+        """True if a line of this kind may be logged now, which then counts as logged. Kinds are kept for ever."""
         now = time.monotonic()
         with self._lock:
-            if now - self._told.get(kind, -math.inf) < self._patience:
+            if now - self._last.get(kind, -math.inf) < self._period:
                 return False
-            self._told[kind] = now
+            self._last[kind] = now
             return True

@@ -1,4 +1,4 @@
-"""Opening Zenoh sessions: loopback only and no scouting unless told otherwise, and one clear line when it fails."""
+"""Opening Zenoh sessions, by default on loopback and without scouting; one line says why a session does not open."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ _PRIORITIES: Final = (
 )
 _SETTINGS: Final[dict[str, Any]] = {
     "timestamping/enabled": True,  # advanced publishers need it
-    # A client finds its router again within half a second of its return; Zenoh's own periods are 1 s to 4 s.
+    # A client reconnects within 0.5 s after its router has returned; with Zenoh's defaults it takes 1 s to 4 s.
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
-    # Room for bursts: with Zenoh's 2 batches a healthy subscriber loses samples at 1 kHz. Then a message to one that
-    # does not read is given up soon, and holds up nobody.
+    # Room for bursts: with Zenoh's default of 2 batches a healthy subscriber loses samples at 1 kHz. A message to a
+    # subscriber that does not read is dropped soon, so that it delays no other.
     "transport/link/tx/queue/size": dict.fromkeys(_PRIORITIES, 16),
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 200,  # us
 }
-_SCOUTING_DELAY: Final = 500  # ms; Zenoh's own
-_PATIENCE: Final = 3.0  # s, for the others of a router or peer
-_SOURCE = re.compile(r"\s+at /\S+\.rs:\d+\.?")  # where in its source Zenoh found an error
+_SCOUTING_DELAY: Final = 500  # ms; Zenoh's default
+_CONNECT_TIMEOUT: Final = 3.0  # s for a router or peer to reach an endpoint it connects to; chosen
+_SOURCE = re.compile(r"\s+at /\S+\.rs:\d+\.?")  # the place in Zenoh's source at the end of its errors
 
 
 def open_session(config: SessionConfig, purpose: str) -> zenoh.Session:
-    """Open a session. purpose: who opens it or what for, before the message of an error.
+    """Open a session. purpose: who opens it or what for; an error's message begins with it.
 
-    A client connects again by itself after its router was gone. ConfigError in one line when a file is missing or
-    wrong, the address is in use, nothing listens where to connect, or we are refused there.
+    A client reconnects by itself after its router was away. ConfigError in one line: a file is missing or wrong, the
+    address is in use, nothing listens at the endpoint to connect to, or it refuses us.
     """
     try:
         settings = zenoh_config(config)
@@ -68,7 +68,7 @@ def open_session(config: SessionConfig, purpose: str) -> zenoh.Session:
 
 
 def zenoh_config(config: SessionConfig) -> zenoh.Config:
-    """Zenoh's own settings. ConfigError when a file or a setting is wrong."""
+    """Zenoh's settings for a session's config. ConfigError: a file or a setting is wrong."""
     settings = zenoh.Config()
     for key, value in _settings(config):
         settings.insert_json5(key, json.dumps(value))
@@ -130,7 +130,7 @@ def _password(user: User) -> str:
             return os.environ[user.password_env]
         except KeyError:
             raise ConfigError(f"user: the environment variable {user.password_env} is not set") from None
-    assert user.password_file is not None  # User sees to it
+    assert user.password_file is not None  # User has checked it
     lines = _lines(user.password_file, "user")
     if not lines or not lines[0]:
         raise ConfigError(f"user: {user.password_file} is empty; its first line is the password")
@@ -138,10 +138,10 @@ def _password(user: User) -> str:
 
 
 def _check_users(path: Path) -> None:
-    """Zenoh would refuse everybody when the file is empty, and name no line when one is wrong."""
+    """ConfigError: the users' file is empty (Zenoh would refuse everybody) or has a wrong line (Zenoh names none)."""
     lines = _lines(path, "users_file")
     if not any(lines):
-        raise ConfigError(f"users_file: {path} names nobody; write lines of user:password")
+        raise ConfigError(f"users_file: {path} holds no user; write lines of user:password")
     for number, line in enumerate(lines, 1):
         user, _, password = line.partition(":")
         if line and not (user and password):
@@ -158,10 +158,10 @@ def _lines(path: Path, what: str) -> list[str]:
 
 
 def _check_connected(session: zenoh.Session, config: SessionConfig) -> None:
-    """A router or a peer opens even if it is refused where it connects to, and tries for ever."""
+    """ConfigError: no connection. Zenoh opens a router or peer even if it is refused, and retries for ever."""
     if not config.connecting:
         return
-    deadline = time.monotonic() + (0.0 if config.mode == "client" else max(_PATIENCE, config.wait))
+    deadline = time.monotonic() + (0.0 if config.mode == "client" else max(_CONNECT_TIMEOUT, config.wait))
     while not (session.info.routers_zid() or session.info.peers_zid()):
         if time.monotonic() >= deadline:
             raise ConfigError(why_not_connected(config))
@@ -172,10 +172,10 @@ def _why_not_open(config: SessionConfig, error: zenoh.ZError) -> str:
     text = _SOURCE.sub("", str(error)).strip()
     if "Unable to connect" in text and config.connecting:
         return why_not_connected(config)
-    found = why_not_listening(config.listening, text)
-    if found is None and config.mode == "client" and config.scouting:
+    reason = why_not_listening(config.listening, text)
+    if reason is None and config.mode == "client" and config.scouting:
         return f"no router was found by scouting; start omnibench live, or give connect ({text})"
-    return found or text
+    return reason or text
 
 
 def _wrong_setting(key: str, error: Exception) -> str:

@@ -1,4 +1,4 @@
-"""Certificates and keys as files, checked before Zenoh is given them: it would only say that nobody could connect."""
+"""Files of certificates and keys, checked before Zenoh gets them: it would only report that it could not connect."""
 
 from __future__ import annotations
 
@@ -17,43 +17,45 @@ from omnibench.errors import ConfigError
 from omnibench.live.network.session_config import Tls
 
 LOG = logging.getLogger("omnibench.live")
-_SOON: Final = timedelta(days=14)
+_SOON: Final = timedelta(days=14)  # before a certificate expires, from when on a warning is logged; chosen
 
 
 def check_files(tls: Tls) -> None:
-    """ConfigError in one line when a file is missing, unreadable or expired, or a key is not the certificate's."""
+    """ConfigError in one line: a file is missing, unreadable or expired, or the key is not the certificate's."""
     authority = read_certificate(tls.ca)
     if tls.certificate is None or tls.key is None:
         return
     certificate, key = read_certificate(tls.certificate), read_key(tls.key)
-    ours, its = (
-        each.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
-        for each in (key.public_key(), certificate.public_key())
+    key_bytes, certificate_bytes = (
+        public_key.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+        for public_key in (key.public_key(), certificate.public_key())
     )
-    if ours != its:
+    if key_bytes != certificate_bytes:
         raise ConfigError(f"tls: {tls.key} is not the key of {tls.certificate}; give the two that belong together")
     _check_issuer(certificate, authority, tls)
 
 
 def _check_issuer(certificate: x509.Certificate, authority: x509.Certificate, tls: Tls) -> None:
-    """A warning when a lone certificate is not of a lone authority: whoever trusts that one alone will refuse it."""
+    """Log a warning if the authority did not issue the certificate; chains of several certificates are not checked."""
     chains = (x509.load_pem_x509_certificates(_content(path)) for path in (tls.ca, tls.certificate) if path is not None)
     if any(len(chain) > 1 for chain in chains):
         return
     try:
         certificate.verify_directly_issued_by(authority)
     except (ValueError, TypeError, InvalidSignature):
-        LOG.warning("tls: %s was not issued by %s; whoever trusts that one alone refuses us", tls.certificate, tls.ca)
+        LOG.warning(
+            "tls: %s was not issued by %s; peers that trust only that authority refuse us", tls.certificate, tls.ca
+        )
 
 
 def common_name(path: Path) -> str | None:
-    """The common name in a certificate, by which access rules call its holder. ConfigError as ``read_certificate``."""
+    """The common name in a certificate, used in access rules, or None. ConfigError as ``read_certificate``."""
     names = read_certificate(path).subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if names else None
 
 
 def read_certificate(path: Path) -> x509.Certificate:
-    """The first certificate of a PEM file. ConfigError when there is none, or it is not valid now."""
+    """The first certificate of a PEM file. ConfigError: there is none, or it is not valid now."""
     try:
         certificate = x509.load_pem_x509_certificates(_content(path))[0]
     except ValueError:
@@ -72,7 +74,7 @@ def read_certificate(path: Path) -> x509.Certificate:
 
 
 def read_key(path: Path) -> PrivateKeyTypes:
-    """The private key of a PEM file. ConfigError when there is none, or it is encrypted."""
+    """The private key of a PEM file. ConfigError: there is none, or it is encrypted."""
     try:
         return load_pem_private_key(_content(path), password=None)
     except TypeError:

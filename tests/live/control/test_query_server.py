@@ -172,7 +172,7 @@ def test_a_calibration_that_is_put_runs_from_the_next_sample_on_and_odom_does_no
     np.testing.assert_allclose(steps[50:], 1.2 * before[50:], rtol=1e-3)
 
 
-def test_a_bad_calibration_that_is_put_is_refused_and_told_in_health(tmp_path: Path) -> None:
+def test_a_bad_calibration_that_is_put_is_refused_and_stands_in_health(tmp_path: Path) -> None:
     with running(config_of(tmp_path)) as (node, session):
         session.put("omnibench/apr/calibration", as_text(calibration(wheels=4)))
         until(lambda: node.health("apr").counts["swaps_refused"] == 1, "the refusal")
@@ -190,7 +190,7 @@ def test_a_flood_of_bad_calibrations_does_not_flood_the_log(tmp_path: Path, capl
     assert caplog.text.count("apr: calibration refused, synthetic 1 runs on: ") == 1
 
 
-def test_a_calibration_too_long_to_be_put_is_refused_and_told_in_health(tmp_path: Path) -> None:
+def test_a_calibration_too_long_to_be_put_is_refused_and_stands_in_health(tmp_path: Path) -> None:
     with running(config_of(tmp_path)) as (node, session):
         session.put("omnibench/apr/calibration", "#" * 70_000)
         until(lambda: node.health("apr").counts["swaps_refused"] == 1, "the refusal")

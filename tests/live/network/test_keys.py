@@ -65,7 +65,7 @@ def test_names_are_added_under_the_authority_that_is_there(tmp_path: Path) -> No
     assert users == {name: (tmp_path / f"{name}.password").read_text().strip() for name in ("node", "apr03")}
 
 
-def test_nothing_is_replaced_unless_told(tmp_path: Path) -> None:
+def test_nothing_is_replaced_unless_asked(tmp_path: Path) -> None:
     make_keys(tmp_path, ["node", "apr02"])
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.raises(ConfigError, match=r"apr02\.pem: is there already"):
@@ -139,7 +139,7 @@ class TestCheckedFiles:
         expire(folder, "node", datetime.now(UTC) + timedelta(days=2))
         assert "set the clock" in self.refusal(tls(folder, "node"))
 
-    def test_one_that_expires_soon_is_told(self, folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def test_one_that_expires_soon_is_logged(self, folder: Path, caplog: pytest.LogCaptureFixture) -> None:
         expire(folder, "node", datetime.now(UTC) - timedelta(hours=12))
         check_files(tls(folder, "node"))
         assert "node.pem expires on" in caplog.text

@@ -147,7 +147,7 @@ def test_clients_come_back_soon_after_the_router_was_gone(address: str) -> None:
             assert time.monotonic() - began < 3.0  # 0.5 s; Zenoh's own settings may take 4 s
 
 
-def test_a_client_waits_for_its_router_when_told_to(address: str) -> None:
+def test_a_client_waits_for_its_router_when_asked_to(address: str) -> None:
     opened: list[zenoh.Session] = []
     late = threading.Timer(0.3, lambda: opened.append(open_session(router(address), "router")))
     late.start()
@@ -216,26 +216,26 @@ class TestOneClearLine:
             assert f"{address} is in use; another omnibench live" in self.refusal(router(address))
 
     def test_address_of_another_machine(self) -> None:
-        assert "is no address of this machine" in self.refusal(router("tcp/192.0.2.1:7447"))
+        assert "is not an address of this machine" in self.refusal(router("tcp/192.0.2.1:7447"))
 
     def test_nothing_listens(self, address: str) -> None:
         text = self.refusal(client(address))
         assert f"{address}: nothing listens there; start omnibench live, or --connect" in text
 
     def test_nothing_listens_where_a_router_connects_to(self, address: str, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("omnibench.live.network.session._PATIENCE", 0.1)
+        monkeypatch.setattr("omnibench.live.network.session._CONNECT_TIMEOUT", 0.1)
         elsewhere = f"tcp/127.0.0.1:{free_port()}"
         assert "nothing listens there" in self.refusal(router(address, connect=(elsewhere,)))
         with socket.create_server(("127.0.0.1", int(address.rsplit(":", 1)[1]))):
             pass  # the session that failed does not listen any more
 
     def test_unknown_host(self) -> None:
-        assert "no host of the name nowhere.invalid is known" in self.refusal(client("tcp/nowhere.invalid:7447"))
+        assert "there is no host called nowhere.invalid" in self.refusal(client("tcp/nowhere.invalid:7447"))
 
     def test_something_else_listens(self) -> None:
         with socket.create_server(("127.0.0.1", 0)) as server:
             text = self.refusal(client(f"tcp/127.0.0.1:{server.getsockname()[1]}", extra=_SOON))
-        assert "is no Zenoh router" in text
+        assert "is not a Zenoh router" in text
 
     def test_missing_password_file(self, address: str, tmp_path: Path) -> None:
         user = User(name="apr02", password_file=tmp_path / "secret")
@@ -247,7 +247,7 @@ class TestOneClearLine:
 
     @pytest.mark.parametrize(
         ("content", "reason"),
-        [("", "names nobody"), ("\n\n", "names nobody"), ("a:b\napr02\n", "line 2: expected user:password")],
+        [("", "holds no user"), ("\n\n", "holds no user"), ("a:b\napr02\n", "line 2: expected user:password")],
     )
     def test_users_file_that_is_none(self, address: str, tmp_path: Path, content: str, reason: str) -> None:
         users = tmp_path / "users.txt"
@@ -279,22 +279,22 @@ def test_settings_of_zenoh_reach_it(address: str) -> None:
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        ({"listen": "127.0.0.1:7447"}, "'127.0.0.1:7447' is no endpoint; write protocol/host:port"),
-        ({"listen": "tcp:127.0.0.1:7447"}, "is no endpoint"),
-        ({"listen": ["tcp/127.0.0.1"]}, "is no endpoint"),
-        ({"connect": "tcp/127.0.0.1:70000"}, "is no endpoint"),
-        ({"connect": "http/127.0.0.1:80"}, "is no endpoint"),
+        ({"listen": "127.0.0.1:7447"}, "'127.0.0.1:7447' is not an endpoint; write protocol/host:port"),
+        ({"listen": "tcp:127.0.0.1:7447"}, "is not an endpoint"),
+        ({"listen": ["tcp/127.0.0.1"]}, "is not an endpoint"),
+        ({"connect": "tcp/127.0.0.1:70000"}, "is not an endpoint"),
+        ({"connect": "http/127.0.0.1:80"}, "is not an endpoint"),
         ({"listne": "tcp/127.0.0.1:7447"}, "unknown key 'listne'; did you mean 'listen'?"),
         ({"mode": "broker"}, "mode"),
         ({"mode": "client", "listen": "tcp/127.0.0.1:1"}, "nobody connects to a client"),
         ({"mode": "client", "users_file": "users.txt"}, "users_file: nobody connects to a client"),
         ({"listen": "tls/127.0.0.1:7447"}, "give tls"),
-        ({"tls": {"ca": "ca.pem", "mutual": False}}, "who listens needs a certificate and its key"),
+        ({"tls": {"ca": "ca.pem", "mutual": False}}, "a session that listens needs a certificate and its key"),
         ({"tls": {"ca": "ca.pem"}}, "give our certificate and key, or mutual: false"),
         ({"tls": {"ca": "a", "certificate": "b"}}, "give certificate and key together"),
         ({"tls": {"ca": "a", "certificate": "b", "key": "c"}, "listen": "tcp/127.0.0.1:1"}, "is not encrypted"),
-        ({"access": {"robots": ["apr02"]}}, "nobody can be told apart"),
-        ({"users_file": "u", "access": {}}, "nobody is named"),
+        ({"access": {"robots": ["apr02"]}}, "peers cannot be identified"),
+        ({"users_file": "u", "access": {}}, "it names nobody"),
         ({"users_file": "u", "access": {"rules": [{"who": "me"}]}}, "give keys to write or to read"),
         ({"user": {"name": "me"}}, "give one of password, password_file, password_env (given: none)"),
         ({"mode": "peer", "connect": "tcp/h:1", "user": {"name": "a", "password": "b"}}, "use client"),
@@ -315,7 +315,7 @@ def test_a_key_expression_that_is_none_is_refused(address: str, tmp_path: Path) 
     users = tmp_path / "users.txt"
     users.write_text("me:secret\n")
     rules = config(listen=address, users_file=users, access={"rules": [{"who": "me", "read": "a//b"}]})
-    with pytest.raises(ConfigError, match="'a//b' is no key expression"):
+    with pytest.raises(ConfigError, match="'a//b' is not a key expression"):
         open_session(rules, "node")
 
 
@@ -336,7 +336,7 @@ def test_a_password_is_not_written_into_an_effective_config() -> None:
     assert "tops3cret" not in to_yaml(config(user={"name": "me", "password": "tops3cret"}))
 
 
-def test_listening_to_a_network_without_any_protection_is_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_listening_to_a_network_without_any_protection_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     endpoint = f"tcp/0.0.0.0:{free_port()}"
     assert config(listen=endpoint).unprotected == (endpoint,)
     assert config(listen=endpoint, users_file="users.txt").unprotected == ()

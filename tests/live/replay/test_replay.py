@@ -169,7 +169,7 @@ class TestEvents:
         with pytest.raises(ConfigError, match="give each of the wheels a, b, c a name"):
             events(DRIVE, config(), names=names)
 
-    def test_stamps_begin_with_the_time_of_the_replay_unless_told(self) -> None:
+    def test_stamps_begin_with_the_time_of_the_replay_unless_given(self) -> None:
         before = time.time_ns()
         first = next(events(DRIVE, ReplayConfig()))
         assert before <= first.message.stamp <= time.time_ns()
@@ -361,7 +361,7 @@ class TestPlayer:
         until(lambda: len(samples) == report.sent["joint_states"], "all wheel samples")
         subscriber.undeclare()
 
-    def test_nobody_who_subscribes_is_told_in_one_line(self, loopback: Loopback) -> None:
+    def test_nobody_who_subscribes_is_one_line(self, loopback: Loopback) -> None:
         begin = time.perf_counter()
         with pytest.raises(ConfigError, match=r"nobody subscribes to apr02/joint_states after 0\.3 s; start omnibench"):
             player(loopback, wait=0.3).play()
@@ -395,7 +395,7 @@ class TestStopping:
         middle = progress[len(progress) // 2]
         assert middle.data_seconds == pytest.approx(4 * middle.wall_seconds, rel=0.2)
 
-    def test_it_stops_at_once_when_told(self, loopback: Loopback, node: Listener, progress: list[Progress]) -> None:
+    def test_it_stops_at_once_when_asked(self, loopback: Loopback, node: Listener, progress: list[Progress]) -> None:
         stop = threading.Event()
         timer = threading.Timer(0.5, stop.set)
         timer.start()

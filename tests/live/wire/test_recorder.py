@@ -151,15 +151,15 @@ def fill(recorder: Recorder, publisher: Publisher[Any]) -> None:
 def test_a_full_disk_ends_the_recording_with_one_line_and_a_file_that_can_be_read(
     loopback: Loopback, tmp_path: Path
 ) -> None:
-    told: list[str] = []
+    failures: list[str] = []
     path = tmp_path / "run.mcap"
-    recorder = Recorder(loopback.client(), KEYS, ["apr02"], path, on_failure=told.append)
+    recorder = Recorder(loopback.client(), KEYS, ["apr02"], path, on_failure=failures.append)
     joints = publishers(loopback)["joint_states"]
     with recorder, disk_with_room_for(1_500_000):
         fill(recorder, joints)
-    assert told == [recorder.failure]
-    assert "run.mcap: cannot be written" in told[0]
-    assert "\n" not in told[0]
+    assert failures == [recorder.failure]
+    assert "run.mcap: cannot be written" in failures[0]
+    assert "\n" not in failures[0]
     recorded = messages_of(path)["/apr02/joint_states"]
     assert 0 < len(recorded) <= recorder.counts["/apr02/joint_states"]
     assert TOPICS["joint_states"].encode(sample("joint_states")) == recorded[0]

@@ -252,7 +252,7 @@ def test_a_session_of_its_own_closes_with_it(loopback: Loopback, odom: Publisher
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ({"topic": "odm"}, "unknown odometry topic 'odm'; did you mean 'odom'"),
         ({"topic": "joint_states"}, "unknown odometry topic 'joint_states'"),
@@ -261,8 +261,8 @@ def test_a_session_of_its_own_closes_with_it(loopback: Loopback, odom: Publisher
         ({"connect": "127.0.0.1:7447"}, "subscribing to apr02: connect.*protocol/host:port"),
     ],
 )
-def test_an_argument_that_cannot_be_is_one_line(options: dict[str, Any], told: str) -> None:
-    with pytest.raises(ConfigError, match=told) as refused:
+def test_an_argument_that_cannot_be_is_one_line(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as refused:
         subscribe("apr02", **options)
     assert "\n" not in str(refused.value)
 
