@@ -1,4 +1,4 @@
-"""Intruders against a router in a process of its own: refused, which it logs on its standard error; peers with rights work."""
+"""Intruders against a router in its own process: they are refused and logged, and peers with rights work."""
 
 from __future__ import annotations
 
