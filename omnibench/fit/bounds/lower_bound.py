@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from omnibench.errors import ConfigError
-from omnibench.fit.bounds.impulses import cut, impulses, make_path, quadrature
 from omnibench.fit.cost import SumOfNorms
+from omnibench.fit.evaluator.impulses import cut, impulses, make_path, quadrature
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.robot.kinematics import Array

@@ -20,8 +20,8 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.fit.bounds.expansion import Basis, degree_for
-from omnibench.fit.bounds.impulses import Path, Segment, cut, impulses, make_path, quadrature
+from omnibench.fit.evaluator.expansion import Basis, degree_for
+from omnibench.fit.evaluator.impulses import Path, Segment, cut, impulses, make_path, quadrature
 from omnibench.fit.parameterisation import Parameterisation
 from omnibench.processes import one_thread
 from omnibench.robot.kinematics import Array
