@@ -15,7 +15,8 @@ from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.cost import Cost, SumOfNorms
-from omnibench.fit.evaluator.evaluator import ElementBox, PoseEvaluator, make_evaluator
+from omnibench.fit.evaluator.element_box import ElementBox
+from omnibench.fit.evaluator.evaluator import PoseEvaluator, make_evaluator
 from omnibench.fit.parameterisation import (
     Box,
     GeometryLimits,

@@ -1,1 +1,1 @@
-"""Costs and poses of many candidate matrices at once."""
+"""Poses of many candidate matrices at once."""

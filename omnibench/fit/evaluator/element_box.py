@@ -1,0 +1,50 @@
+"""The box of matrices in which the fast evaluator answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from omnibench.fit.parameterisation import Parameterisation
+from omnibench.robot.kinematics import Array
+
+_MARGIN = 0.1  # share by which the box of a curved parameterisation is widened beyond its linear reach; chosen
+
+
+@dataclass(frozen=True, eq=False)
+class ElementBox:
+    """Bounds ``lower`` and ``upper`` (3, N) of the matrix elements."""
+
+    lower: Array
+    upper: Array
+
+    @classmethod
+    def of(cls, parameterisation: Parameterisation, lower: Array, upper: Array) -> ElementBox:
+        """The box around the matrices of all vectors between ``lower`` and ``upper`` (n,).
+
+        It holds all of them where the matrix is linear in the vector, and nearly all where it is curved.
+        """
+        middle, half = (lower + upper) / 2, (upper - lower) / 2
+        centre, *moved = parameterisation.matrices(middle + np.vstack([np.zeros(len(half)), np.diag(half)]))
+        reach: Array = np.abs(np.array(moved) - centre).sum(axis=0)
+        reach *= 1 + (1e-9 if parameterisation.name == "matrix" else _MARGIN)
+        slack = 1e-15 * np.abs(centre).max(axis=1, keepdims=True)
+        return cls(centre - reach - slack, centre + reach + slack)
+
+    @property
+    def centre(self) -> Array:
+        """The middle (3, N)."""
+        return (self.lower + self.upper) / 2
+
+    @property
+    def reach(self) -> Array:
+        """Half-widths (3, N)."""
+        return (self.upper - self.lower) / 2
+
+    @property
+    def speed(self) -> Array:
+        """The largest |m1j + i m2j| (N,) in the box, m per rad."""
+        largest = np.maximum(np.abs(self.lower[:2]), np.abs(self.upper[:2]))
+        speed: Array = np.hypot(largest[0], largest[1])
+        return speed
