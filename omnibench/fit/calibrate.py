@@ -1,4 +1,4 @@
-"""Calibrating one robot from one data set, with one calibrator."""
+"""Calibration of one robot from one data set, with one calibrator."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from omnibench.robot.odometry import Integration
 
 @dataclass(frozen=True, eq=False)
 class CalibrationRun:
-    """A calibration, how it was found and, where asked for, 95 % intervals of its elements.
+    """A calibration, the calibrator's result and, where asked for, 95 % bootstrap intervals of the elements.
 
-    parameters: radius, distance and angle of each wheel, where these were searched. uncertainty: covariance of the
-    elements and of the physical parameters; None where warnings say why there is none. warnings: what of the
-    calibration does not rest on the data, one sentence each.
+    parameters: radius, distance and angle of each wheel, if these were searched. uncertainty: covariance of the
+    elements and of the physical parameters; None if there is none, then a warning says why. warnings: one sentence for
+    every part of the calibration that the data do not determine.
     """
 
     calibration: Calibration
@@ -65,8 +65,8 @@ def calibrate(
     """Fit the odometry model of a data set's training split.
 
     intervals: also draw bootstrap intervals about the optimum (closed_form only).
-    unidentified: what becomes of motions that the data drive so little that slip alone may have done it: the design
-    values are kept there, or they are fitted (see make_parameterisation). The run's warnings name them.
+    unidentified: for motions that the data drive so little that slip alone may explain them, ``keep`` the design values
+    or ``fit`` them (see make_parameterisation). The run's warnings name them.
 
     Raises UnknownNameError or ConfigError for wrong arguments, DataError for an empty training split, and ConfigError
     when the calibrator gives no answer.
@@ -134,7 +134,7 @@ def calibrate(
 def _uncertainty(
     problem: CalibrationProblem, result: RunResult, calibrator: Calibrator
 ) -> tuple[Uncertainty | None, tuple[str, ...]]:
-    """The uncertainty of an answer, or why it has none; no word of that where nothing was fitted."""
+    """The uncertainty of an answer, or a warning why it has none; neither if nothing was fitted."""
     if not calibrator.bounded:
         return None, ()
     try:
@@ -144,6 +144,7 @@ def _uncertainty(
 
 
 def _cost(objective: Cost, model: OdometryModel, trajectories: Sequence[Trajectory]) -> float:
+    """The cost of a model's matrix on some trajectories."""
     odometry = objective.batch(trajectories, model.integration)
     errors = odometry.poses(model.matrix[None]) - objective.reference(trajectories)
     return float(objective.combine(errors, odometry.trajectory)[0])

@@ -1,4 +1,4 @@
-"""What a calibrator is, and how one is run so that every end of a run is a row."""
+"""The interface of calibrators, and how one is run so that every run, failed or not, gives a result."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True)
 class Solution:
-    """A calibrator's answer: the vector (n,) and why it stopped there.
+    """A calibrator's answer: the vector (n,) and the reason why it stopped there.
 
-    converged: False when a limit of the calibrator's own (generations, programs) came before its stopping rule.
-    covariance (n, n) of the vector, degrees_of_freedom of its variances, noise of the reference poses: of calibrators
-    that estimate them.
+    converged: False when the calibrator hit a limit of its own (generations, programs) before its stopping rule held.
+    Calibrators that estimate them also give the covariance (n, n) of the vector, the degrees_of_freedom of its
+    variances and the noise of the reference poses.
     """
 
     vector: Array
@@ -48,10 +48,10 @@ class Solution:
 class Calibrator(ABC):
     """Finds a vector of low cost. Made with validated options; ``calibrate`` may be called more than once.
 
-    parameterisation: what it searches unless the config says otherwise.
-    bounded: False for answers that do not depend on the box (a published matrix).
-    stochastic: False where the seed makes no difference, so that one run is enough.
-    exact: True where a converged answer is the optimum in the box, which others are measured against.
+    parameterisation: the one it searches unless the config names another.
+    bounded: False if the answer does not depend on the box (a published matrix).
+    stochastic: False if the seed makes no difference, so that one run is enough.
+    exact: True if a converged answer is the optimum in the box, against which others are measured.
     """
 
     Options: ClassVar[type[BaseModel]] = Options
@@ -66,9 +66,10 @@ class Calibrator(ABC):
 
     @abstractmethod
     def calibrate(self, problem: CalibrationProblem) -> Solution:
-        """Minimise ``problem.cost`` within the box; BudgetSpent, raised by it, is to be let through.
+        """Minimise ``problem.cost`` within the box and return the best vector.
 
-        Raise OmnibenchError when the problem cannot be solved this way.
+        ``problem.cost`` raises BudgetSpent when the budget is spent: do not catch it. Raise OmnibenchError when the
+        calibrator cannot solve such a problem.
         """
 
 
@@ -77,9 +78,10 @@ calibrators.contract = Calibrator
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """How one calibrator did on one problem. ``vector``, ``matrix`` and ``cost`` are None unless there is an answer.
+    """Result of one calibrator on one problem. ``vector``, ``matrix`` and ``cost`` are None if there is no answer.
 
-    covariance (n, n) of the vector, its degrees_of_freedom and noise: of calibrators that estimate them.
+    at_bounds, held: names of elements on a bound of the box, and of those kept at their start values.
+    covariance (n, n), degrees_of_freedom, noise: as in Solution, None if the calibrator does not estimate them.
     """
 
     outcome: Outcome
@@ -98,7 +100,7 @@ class RunResult:
 
 
 def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunResult:
-    """Run a calibrator to its end, whatever that is."""
+    """Run a calibrator; whatever it raises becomes the outcome and reason of its result."""
     answer: Any = None
     solution: Solution | None = None
     try:
@@ -144,7 +146,7 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
 
 
 def describe_error(error: BaseException) -> str:
-    """Type and message of whatever was raised, in one line."""
+    """Type and message of an exception, in one line."""
     try:
         return one_line(f"{type(error).__name__}: {error}").removesuffix(":")
     except Exception:  # its own __str__ raises
@@ -152,7 +154,7 @@ def describe_error(error: BaseException) -> str:
 
 
 def unloadable(failure: PluginFailure) -> type[Calibrator]:
-    """A calibrator that stands for a plug-in which cannot be imported: each of its runs fails with the reason."""
+    """A stand-in for a plug-in that cannot be imported: each of its runs fails with the reason."""
 
     class Unloadable(Calibrator):
         """A plug-in that cannot be imported."""
@@ -169,7 +171,7 @@ def unloadable(failure: PluginFailure) -> type[Calibrator]:
 def _examine(
     calibrator: Calibrator, problem: CalibrationProblem, answer: Any
 ) -> tuple[Array | None, float | None, str]:
-    """The answer as a vector, its cost, and what is wrong with it."""
+    """The answer as a vector (n,), its cost, and its flaw in words; vector and cost are None if there is a flaw."""
     try:
         vector = np.array(answer, dtype=float)
     except (TypeError, ValueError):

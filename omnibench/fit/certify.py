@@ -1,7 +1,8 @@
-"""The proven optimum: how much better than a calibration any matrix of a box could be.
+"""Certificate of optimality: a proven bound on how much better than a calibration any matrix in a box could be.
 
-Branch and bound on row 3 of the matrix: the box with the lowest bound (lower_bound.py) is cut in two until no box can
-hold a matrix that is better than the best known one by more than the wanted gap. What is proven holds at any time.
+Branch and bound on the matrix elements: the box with the lowest bound (bounds/lower_bound.py) is cut in two until no
+box can hold a matrix that is better than the best known one by more than the wanted gap. The bound proven so far holds
+at any time.
 """
 
 from __future__ import annotations
@@ -23,14 +24,15 @@ from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 
 Watch = Callable[["Proof"], None]
-_NO_ERROR = 1e-9  # m, rad: below it a cost is rounding, and no share of it can be proven
+_NO_ERROR = 1e-9  # m, rad: a smaller cost is rounding, of which no share can be proven
 
 
 @dataclass(frozen=True, eq=False)
 class Proof:
-    """No matrix of the box costs less than ``lower_bound``.
+    """State of the branch and bound: no matrix of the box costs less than ``lower_bound``.
 
-    best_cost, best_vector (n,): the best matrix that is known. boxes: looked at. finished: False when time ran out.
+    best_cost, best_vector (n,): the best matrix that is known. boxes: number of boxes bounded so far. finished: False
+    when time ran out.
     """
 
     lower_bound: float
@@ -42,9 +44,9 @@ class Proof:
 
 
 class Certificate(Model):
-    """How far a calibration's cost can be from the optimum: ``gap`` = 1 - lower_bound / cost.
+    """Largest possible distance of a calibration's cost from the optimum: ``gap`` = 1 - lower_bound / cost.
 
-    cost: on the training split. lower_bound: of every matrix in the box.
+    cost: on the training split. lower_bound: no matrix in the box costs less.
     """
 
     cost: float
@@ -56,7 +58,7 @@ class Certificate(Model):
 
 @dataclass(frozen=True, eq=False)
 class CertifiedCalibration:
-    """A certificate, how it was proven, and whether the calibration lies in the box that it speaks of."""
+    """A certificate with its proof. inside: True if the calibration lies in the box. held: names of fixed elements."""
 
     certificate: Certificate
     proof: Proof
@@ -75,10 +77,10 @@ def certify_optimum(
     seconds: float = 60.0,
     watch: Watch | None = None,
 ) -> CertifiedCalibration:
-    """Prove how much better than a calibration any matrix of the box could be, on a data set's training split.
+    """Bound how much better than a calibration any matrix of the box could be, on a data set's training split.
 
-    The cost and the integration are the calibration's. ``box``: default the one that it was searched in, or ``row``.
-    gap: stop when the best known matrix is proven to be this close to the optimum. seconds: or after this time.
+    Cost and integration are those of the calibration. box: default the one that was searched, or ``row``.
+    gap: stop when the best known matrix is proven to be this close to the optimum. seconds: stop after this time.
     Raises DataError when the wheels differ, the calibration has effects or the training split is empty, ConfigError for
     a cost that is no sum of norms.
     """
@@ -125,7 +127,7 @@ def certify_optimum(
 
 
 def proven_gap(cost: float, lower_bound: float) -> float:
-    """What share of a cost could be saved at most; negative for a cost below the bound (of a matrix not in the box)."""
+    """Largest share of a cost that could be saved; negative for a matrix outside the box that beats the bound."""
     return 1 - lower_bound / cost if cost > 0 else 0.0
 
 
@@ -139,7 +141,7 @@ def prove(
     began = time.perf_counter()
     with one_thread():
         bounds = LowerBounds(problem)
-        looked_at = 1
+        count = 1
         best_cost, best_vector = float(problem.values(known[None])[0]), known
         root = bounds.root(known)
         boxes: list[tuple[float, int, Node]] = [(root.bound, 0, root)]
@@ -148,7 +150,7 @@ def prove(
             proven = min(lowest, best_cost)
             spent = time.perf_counter() - began
             finished = proven >= (1 - gap) * best_cost or best_cost < _NO_ERROR or not node.looseness.any()
-            proof = Proof(proven, best_cost, best_vector, looked_at, spent, finished)
+            proof = Proof(proven, best_cost, best_vector, count, spent, finished)
             if watch:
                 watch(proof)
             if finished or spent > seconds:
@@ -156,7 +158,7 @@ def prove(
             heapq.heappop(boxes)
             for part in bounds.split(node):
                 vector = bounds.vector(part.good)
-                if problem.inside(vector[None])[0] and (found := float(problem.values(vector[None])[0])) < best_cost:
-                    best_cost, best_vector = found, vector
-                heapq.heappush(boxes, (part.bound, looked_at, part))  # the number, as nodes cannot be compared
-                looked_at += 1
+                if problem.inside(vector[None])[0] and (cost := float(problem.values(vector[None])[0])) < best_cost:
+                    best_cost, best_vector = cost, vector
+                heapq.heappush(boxes, (part.bound, count, part))  # count breaks ties: nodes cannot be compared
+                count += 1

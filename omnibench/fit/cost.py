@@ -1,4 +1,4 @@
-"""What a calibration minimises: Eq. (6) of the paper and its relatives, all sums of norms of pose errors."""
+"""Costs that a calibration minimises: Eq. (6) of the paper and its relatives, all sums of norms of pose errors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
 class Cost(ABC):
     """One number for the pose errors of a set of trajectories.
 
-    ``stamps`` says where along a trajectory poses are compared: at the last reference pose or at all after the start.
+    stamps: where along a trajectory poses are compared, ``final`` (last reference pose) or ``reference`` (all after the
+    start).
     """
 
     Options: ClassVar[type[Options]] = Options
@@ -30,12 +31,12 @@ class Cost(ABC):
 
     @abstractmethod
     def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
-        """Costs (P,) from pose errors (P, S, 3) in m, m, rad; ``trajectory`` (S,) tells whose stamp each is."""
+        """Costs (P,) from pose errors (P, S, 3) in m, m, rad; ``trajectory`` (S,): index of each stamp's trajectory."""
 
     def of_each(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
         """The cost (Z,) of every trajectory by itself, from errors (S, 3) of one candidate."""
-        own = (errors[None, trajectory == index] for index in range(int(trajectory[-1]) + 1))
-        return np.array([self.combine(part, np.zeros(part.shape[1], dtype=np.intp))[0] for part in own])
+        parts = (errors[None, trajectory == index] for index in range(int(trajectory[-1]) + 1))
+        return np.array([self.combine(part, np.zeros(part.shape[1], dtype=np.intp))[0] for part in parts])
 
     def logs(self, trajectories: Sequence[Trajectory]) -> list[WheelLog]:
         """The wheel logs of the trajectories with this cost's stamps."""
@@ -54,9 +55,9 @@ costs.contract = Cost
 
 
 class SumOfNorms(Cost):
-    """The mean over trajectories of the mean norm of weighted pose errors at the stamps.
+    """Mean over trajectories of the mean norm of the weighted pose errors at the stamps.
 
-    ``weights`` (3,) multiply the errors of x (m), y (m) and heading (rad) before the norm is taken.
+    weights (3,): factors of the errors of x (m), y (m) and heading (rad) before the norm is taken.
     """
 
     weights: ClassVar[tuple[float, float, float]] = (1.0, 1.0, 1.0)

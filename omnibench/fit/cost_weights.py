@@ -1,4 +1,4 @@
-"""Weighting the pose errors of runs as a cost does, in squares: what a fit minimises when no matrix fits the runs."""
+"""Least-squares weights that imitate a cost: a fit uses them where no matrix fits the runs within their noise."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from omnibench.robot.kinematics import Array
 
 @dataclass(frozen=True, eq=False)
 class CostWeighting:
-    """Pose residuals of a run times ``scale`` (3,): of all poses, or of the last alone."""
+    """Scales a run's pose residuals by ``scale`` (3,); last_alone: all but the last pose are left out."""
 
     scale: Array
     last_alone: bool
@@ -28,9 +28,9 @@ class CostWeighting:
 
 
 def cost_weightings(cost: Cost, trajectories: Sequence[Trajectory], residuals: Sequence[Array]) -> list[CostWeighting]:
-    """The weighting of every run: at the cost's stamps, each run counting the same, of unit mean square over the runs.
+    """The weighting of every run, at the cost's stamps: equal for all runs, normalised to unit mean square over them.
 
-    A cost that is no sum of norms has no weights of its own: m and rad count alike.
+    A cost that is no sum of norms has no weights; m and rad then count alike.
     """
     weights = np.array(cost.weights if isinstance(cost, SumOfNorms) else (1.0, 1.0, 1.0))
     last_alone = cost.stamps == "final"
@@ -38,6 +38,6 @@ def cost_weightings(cost: Cost, trajectories: Sequence[Trajectory], residuals: S
         CostWeighting(weights / np.sqrt(1 if last_alone else len(run.pose_times) - 1), last_alone)
         for run in trajectories
     ]
-    squares = [float(np.square(weigh(own)).sum()) for weigh, own in zip(raw, residuals, strict=True)]
+    squares = [float(np.square(weigh(errors)).sum()) for weigh, errors in zip(raw, residuals, strict=True)]
     size = max(float(np.sqrt(np.mean(squares))), LEAST_WHITE)
     return [CostWeighting(weigh.scale / size, last_alone) for weigh in raw]

@@ -1,4 +1,4 @@
-"""How good a calibration is on a data set: Eq. (6) and the errors of the final pose."""
+"""Evaluation of a calibration on a data set: Eq. (6) and the errors of the final pose."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class SplitErrors(Model):
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A calibration's errors, and those of the design values, by split; ``all`` is every trajectory.
+    """Errors of a calibration and of the design values, by split; the split ``all`` is every trajectory.
 
-    warnings: in words, where the calibration's effects are not known to hold.
+    warnings: one sentence if runs lie outside the training domain of the calibration's effects.
     """
 
     dataset: str
@@ -67,7 +67,7 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
 
 
 def final_errors(model: OdometryModel, trajectories: Sequence[Trajectory]) -> Array:
-    """What the model reports minus the reference (Z, 3) at the last pose of each trajectory, m, m, rad."""
+    """Final pose errors (Z, 3): reported by the model minus reference, at each trajectory's last pose, m, m, rad."""
     ends = np.concatenate(model.reported([trajectory.final_log for trajectory in trajectories]))
     return ends - np.array([trajectory.final_pose for trajectory in trajectories])
 

@@ -1,4 +1,4 @@
-"""What is in a data set, and what can be identified from it."""
+"""Inspection of a data set: its content, and which parameters its runs can identify."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from omnibench.fit.uncertainty.identifiability import Identifiability, identifia
 
 
 class SplitContent(Model):
-    """What one split holds."""
+    """Content of one split."""
 
     trajectories: int
     commands: int
@@ -25,7 +25,7 @@ class SplitContent(Model):
 
 
 class ScansContent(Model):
-    """The scans of a data set. seen_share: of the rays, that measured something; the period is the median."""
+    """The scans of a data set. scan_period_s: the median. seen_share: share of the rays that measured a range."""
 
     trajectories: int
     scans: int
@@ -37,9 +37,9 @@ class ScansContent(Model):
 
 
 class Inspection(Model):
-    """A data set in numbers. Periods in s; shares are of the most driven direction of wheel rates.
+    """A data set in numbers. driven_shares: RMS along each direction of wheel rates, relative to the strongest.
 
-    identifiability: what the training runs (all runs, if none is marked so) can tell of the robot.
+    identifiability: how well the training runs (all runs, if none is marked train) determine the robot's parameters.
     """
 
     dataset: str
@@ -68,16 +68,16 @@ class Inspection(Model):
 
 
 def inspect_dataset(dataset: Dataset) -> Inspection:
-    """Count, measure, and predict what the training runs can tell of the robot, and what they leave open.
+    """Count and measure a data set's content, and predict how well its training runs determine the robot.
 
-    Every scan is read. DataError in one line: one is broken.
+    Every scan is read; DataError names one that is broken.
     """
     trajectories = dataset.trajectories
     periods = np.concatenate([np.diff(t.times, prepend=0.0) for t in trajectories])
     pose_periods = np.concatenate([np.diff(t.pose_times) for t in trajectories])
     training = dataset.split("train") or trajectories
     span = driven_span(training)
-    told = identifiability(dataset.robot, training)
+    identifiable = identifiability(dataset.robot, training)
     undriven = tuple(direction_in_words(direction, dataset.robot.wheel_names) for direction in span.null)
     return Inspection(
         dataset=dataset.name,
@@ -100,8 +100,8 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
         driven_directions=len(span.driven),
         driven_shares=tuple(span.shares.tolist()),
         undriven=undriven,
-        identifiability=told,
-        findings=tuple(_findings(dataset, told)),
+        identifiability=identifiable,
+        findings=tuple(_findings(dataset, identifiable)),
         warnings=dataset.warnings,
     )
 
@@ -125,10 +125,10 @@ def _content(dataset: Dataset, split: Split) -> SplitContent:
 def _scans(scans: Scans) -> ScansContent:
     scanner = scans.scanner
     periods, count, seen = [np.zeros(0)], 0, 0
-    for _, found in scans:
-        periods.append(np.diff(found.times))
-        count += len(found.times)
-        seen += sum(int(scanner.valid(ranges).sum()) for ranges in found.ranges)
+    for _, scans_of_run in scans:
+        periods.append(np.diff(scans_of_run.times))
+        count += len(scans_of_run.times)
+        seen += sum(int(scanner.valid(ranges).sum()) for ranges in scans_of_run.ranges)
     steps = np.concatenate(periods)
     return ScansContent(
         trajectories=len(scans.trajectories),
@@ -141,8 +141,8 @@ def _scans(scans: Scans) -> ScansContent:
     )
 
 
-def _findings(dataset: Dataset, told: Identifiability) -> list[str]:
-    findings = list(told.sentences)
+def _findings(dataset: Dataset, identifiable: Identifiability) -> list[str]:
+    findings = list(identifiable.sentences)
     if not dataset.split("train"):
         findings.append("no trajectory is marked train: nothing can be calibrated")
     if not dataset.split("validation"):

@@ -1,4 +1,4 @@
-"""Running an NLopt algorithm on a calibration problem, in the unit cube of its free elements."""
+"""Search of a calibration problem by an NLopt algorithm, in the unit cube of its free elements."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options
 from omnibench.robot.kinematics import Array
 
-_LARGE = 1e10  # stands for a cost that is not finite; NLopt's searches cannot compare NaN
+_LARGE = 1e10  # replaces a cost that is not finite: NLopt's searches cannot compare NaN
 _REASONS = {
     nlopt.SUCCESS: "done",
     nlopt.STOPVAL_REACHED: "stop value reached",

@@ -1,4 +1,4 @@
-"""What is searched, apart from how: a vector of numbers, what matrix it means and the box it lies in."""
+"""Parameterisations: the vector that a calibrator searches, its box, and the matrix that it stands for."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Deviation = FiniteFloat | tuple[FiniteFloat, FiniteFloat]
 
 
 class GeometryLimits(Model):
-    """How far the physical parameters may lie from their design values: +-number, or [low, high]."""
+    """Largest deviation of the physical parameters from their design values: +-number, or [low, high]."""
 
     radius: Deviation = Field(0.10, description="share of the wheel radius")
     distance: Deviation = Field(0.20, description="share of the distance from wheel to centre")
@@ -44,7 +44,7 @@ class GeometryLimits(Model):
 
 @dataclass(frozen=True)
 class Bounds:
-    """A box: ``lower`` and ``upper`` (n,), and the name it goes by in tables."""
+    """A box: ``lower`` and ``upper`` (n,), and its name in tables."""
 
     name: str
     lower: Array
@@ -52,13 +52,13 @@ class Bounds:
 
 
 class Parameterisation(Protocol):
-    """A vector of n numbers and the matrix that it means."""
+    """A mapping from vectors of n numbers to inverse kinematic matrices."""
 
     @property
     def name(self) -> ParameterisationName: ...
     @property
     def names(self) -> tuple[str, ...]:
-        """What each number is called."""
+        """Names of the n numbers."""
 
     @property
     def start(self) -> Array:
@@ -72,10 +72,10 @@ class Parameterisation(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class MatrixElements:
-    """The elements of the matrix row by row, Eq. (4) and (5): the paper's non-parametric way.
+    """Elements of the matrix row by row, Eq. (4) and (5): the paper's non-parametric calibration.
 
-    ``null`` (q, N): orthonormal directions of wheel rates that the data do not drive, or too little to identify; along
-    them the start values are kept.
+    null (q, N): orthonormal directions of wheel rates that the data do not identify; along them the matrix keeps its
+    start values.
     """
 
     robot: Robot
@@ -96,7 +96,7 @@ class MatrixElements:
         return _checked(make_bounds(self.robot, self.box), self.start, self.names)
 
     def matrices(self, vectors: Array) -> Array:
-        """Matrices (P, 3, N); on data that drive every direction simply the elements."""
+        """Matrices (P, 3, N): the elements, with their deviation along ``null`` removed."""
         matrices = np.asarray(vectors, dtype=float).reshape(len(vectors), 3, -1)
         if len(self.null) == 0:
             return matrices
@@ -106,7 +106,7 @@ class MatrixElements:
 
 @dataclass(frozen=True, eq=False)
 class WheelGeometry:
-    """Radius, distance and angle of each wheel, Eq. (3), within physical limits: the parametric way."""
+    """Radius, distance and angle of each wheel, Eq. (3), within physical limits: parametric calibration."""
 
     robot: Robot
     limits: GeometryLimits | None = None
@@ -142,7 +142,7 @@ class WheelGeometry:
 
 @dataclass(frozen=True)
 class FittedParameter:
-    """A physical parameter and how far it lies from its design value, as in section 4.2 of the paper."""
+    """A physical parameter and its deviation from the design value, as in section 4.2 of the paper."""
 
     name: str
     value: float
@@ -152,7 +152,7 @@ class FittedParameter:
 
 
 def fitted_parameters(robot: Robot, vector: Array) -> tuple[FittedParameter, ...]:
-    """The physical parameters that a vector (3N,) of the geometry parameterisation means."""
+    """The physical parameters in a vector (3N,) of the geometry parameterisation."""
     geometry = WheelGeometry(robot)
     return tuple(
         FittedParameter(
@@ -182,10 +182,12 @@ def make_bounds(robot: Robot, box: Box) -> Bounds:
 
 
 def _range(deviation: float | tuple[float, float]) -> tuple[float, float]:
+    """Lowest and highest deviation."""
     return deviation if isinstance(deviation, tuple) else (-abs(deviation), abs(deviation))
 
 
 def _checked(bounds: Bounds, start: Array, names: Sequence[str]) -> Bounds:
+    """The bounds; ConfigError if they are reversed or exclude the start."""
     for name, low, high, value in zip(names, bounds.lower, bounds.upper, start, strict=True):
         if low > high:
             raise ConfigError(f"box: lower bound {low:g} of {name} is above its upper bound {high:g}")

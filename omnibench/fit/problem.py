@@ -1,4 +1,4 @@
-"""CalibrationProblem: what every calibrator is given, and all it is given."""
+"""The calibration problem: all that a calibrator is given, and the only way to evaluate candidates."""
 
 from __future__ import annotations
 
@@ -29,20 +29,22 @@ from omnibench.fit.span import Unidentified, directions_kept, driven_span
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration
 
-_PROGRESS_PERIOD = 0.1  # s
-# From so many evaluations on the fast evaluator is worth the time that it takes to build.
-_WORTH_BUILDING = 50
+_PROGRESS_PERIOD = 0.1  # s, least time between two reports of progress
+_WORTH_BUILDING = 50  # evaluations from which on the fast evaluator repays the time it takes to build; chosen
 
 
 class Budget(Model):
-    """What one run may spend."""
+    """Limits of one run of a calibrator."""
 
     evaluations: int = Field(60_000, gt=0, description="candidates that may be evaluated")
     seconds: float = Field(600.0, gt=0, description="wall time, s")
 
 
 class BudgetSpent(Exception):  # noqa: N818 (not an error: the run is over)
-    """Raised by ``problem.cost`` when nothing is left; calibrators let it pass."""
+    """Raised by ``problem.cost`` when the budget is spent; calibrators let it pass.
+
+    kind: ``budget`` (evaluations) or ``time``.
+    """
 
     def __init__(self, kind: str, reason: str) -> None:
         super().__init__(reason)
@@ -51,7 +53,7 @@ class BudgetSpent(Exception):  # noqa: N818 (not an error: the run is over)
 
 @dataclass(frozen=True)
 class Improvement:
-    """The best cost so far, and when it was found."""
+    """A new best cost, and after how many evaluations and seconds it was found."""
 
     evaluations: int
     seconds: float
@@ -61,10 +63,13 @@ class Improvement:
 class CalibrationProblem:
     """Training trajectories, a start, a box, a budget and a cost to be minimised.
 
-    trajectories: the training data; the validation data are nowhere in reach.
-    start, lower, upper (n,): the vector that is searched and its box. names: what its numbers are.
-    cost(candidates): what is minimised. rng: the only source of randomness a calibrator may use.
+    trajectories: the training runs; a calibrator cannot reach the validation runs.
+    start (n,): the vector of the design values; lower, upper (n,): its box; names: of its n elements.
+    free (n,): True for elements that may be searched; the others keep their start values.
+    cost(candidates): the objective, counted against the budget.
+    rng: the only source of randomness that a calibrator may use.
     best_vector, best_cost: the best candidate in the box so far; the start and infinity before the first.
+    history: every improvement of the best cost.
     """
 
     def __init__(
@@ -93,13 +98,12 @@ class CalibrationProblem:
         self.box = bounds.name
         self.names = parameterisation.names
         self.odometry = cost.batch(self.trajectories, integration)
-        self.reference = _frozen(
-            np.ascontiguousarray(cost.reference(self.trajectories).T)
-        ).T  # components apart, as poses have them
+        # x, y and heading contiguous, the memory order in which the odometry returns poses.
+        self.reference = _frozen(np.ascontiguousarray(cost.reference(self.trajectories).T)).T
         self.start = _frozen(parameterisation.start)
-        matters = self._matters()
-        self.lower = _frozen(np.where(matters, bounds.lower, self.start))
-        self.upper = _frozen(np.where(matters, bounds.upper, self.start))
+        relevant = self._relevant()
+        self.lower = _frozen(np.where(relevant, bounds.lower, self.start))
+        self.upper = _frozen(np.where(relevant, bounds.upper, self.start))
         self.free: NDArray[np.bool_] = _frozen(self.upper > self.lower)
         self.evaluations = 0
         self.best_vector = self.start
@@ -113,7 +117,7 @@ class CalibrationProblem:
 
     @property
     def size(self) -> int:
-        """The number n of values that are searched."""
+        """The length n of the vector."""
         return len(self.start)
 
     @property
@@ -123,7 +127,7 @@ class CalibrationProblem:
 
     @property
     def is_fast(self) -> bool:
-        """Whether ``cost`` uses the fast evaluator by now."""
+        """True once ``cost`` uses the fast evaluator."""
         return self._evaluator is not None
 
     @property
@@ -134,8 +138,8 @@ class CalibrationProblem:
     def cost(self, candidates: Array) -> Array:
         """Costs (P,) of candidates (P, n), counted against the budget.
 
-        A candidate that cannot be evaluated costs NaN. Raises BudgetSpent when the budget is spent; a population
-        that is larger than what remains is evaluated as far as it goes.
+        A candidate that cannot be evaluated costs NaN. BudgetSpent is raised when the budget is spent; of a population
+        that is larger than the remaining budget the first candidates are evaluated, and count, before it is raised.
         """
         candidates = np.array(candidates, dtype=float, ndmin=2)
         if candidates.shape[1:] != self.start.shape:
@@ -145,19 +149,19 @@ class CalibrationProblem:
         candidates = candidates[: self.remaining]
         if self.evaluations + len(candidates) >= _WORTH_BUILDING and not self._evaluator_tried:
             self.build_evaluator()
-        values = self._fast_values(candidates) if self._evaluator else self.values(candidates)
+        values = self._fast_values(candidates, self._evaluator) if self._evaluator else self.values(candidates)
         self._record(candidates, values)
         if len(candidates) < asked:
             self._check_budget()
         return values
 
     def values(self, candidates: Array) -> Array:
-        """Costs (P,) of candidates (P, n), uncounted and by direct integration: for the verdict on a run."""
+        """Costs (P,) of candidates (P, n) by direct integration, not counted: for scoring an answer."""
         with np.errstate(all="ignore"):
-            return self._combined(self.odometry.poses(self.parameterisation.matrices(candidates)))
+            return self._costs_of_poses(self.odometry.poses(self.parameterisation.matrices(candidates)))
 
     def build_evaluator(self) -> PoseEvaluator | None:
-        """The fast evaluator that ``cost`` uses from now on; None where direct integration is the faster way.
+        """The fast evaluator, which ``cost`` uses from now on; None where direct integration is faster.
 
         ``cost`` builds it by itself when a search asks for many candidates. Both ways give the same costs to 1e-11.
         """
@@ -169,13 +173,13 @@ class CalibrationProblem:
         return self._evaluator
 
     def to_unit(self, vectors: Array) -> Array:
-        """Vectors (P, n) as points (P, free) of the unit cube over the free elements; never outside it."""
+        """Vectors (P, n) as points (P, f) of the unit cube over the f free elements, clipped to it."""
         free = self.free
         points = (np.atleast_2d(vectors)[:, free] - self.lower[free]) / (self.upper - self.lower)[free]
         return np.clip(points, 0.0, 1.0)
 
     def from_unit(self, points: Array) -> Array:
-        """Vectors (P, n) of points (P, free) of the unit cube; never outside the box."""
+        """Points (P, f) of the unit cube over the free elements as vectors (P, n), clipped to the box."""
         points = np.atleast_2d(points)
         vectors = np.empty((len(points), self.size))
         vectors[:] = self.start
@@ -197,32 +201,32 @@ class CalibrationProblem:
 
     @property
     def held(self) -> tuple[str, ...]:
-        """Names of the elements that keep their start value: the box leaves no width, or the cost does not see them."""
+        """Names of the elements that keep their start value, since the box has no width or the cost ignores them."""
         return tuple(name for name, free in zip(self.names, self.free, strict=True) if not free)
 
     def matrix(self, vector: Array) -> Array:
         """The inverse kinematic matrix (3, N) of one vector (n,)."""
         return self.parameterisation.matrices(vector[None])[0]
 
-    def _fast_values(self, candidates: Array) -> Array:
-        """Costs (P,) by the evaluator in its box, and by direct integration outside it."""
-        assert self._evaluator is not None  # cost asks only then
+    def _fast_values(self, candidates: Array, evaluator: PoseEvaluator) -> Array:
+        """Costs (P,) by the fast evaluator for candidates in its box, by direct integration for the others."""
         with np.errstate(all="ignore"):
             matrices = self.parameterisation.matrices(candidates)
-            covered = self._evaluator.covers(matrices)
+            covered = evaluator.covers(matrices)
             if covered.all():
-                return self._combined(self._evaluator.poses(matrices))
+                return self._costs_of_poses(evaluator.poses(matrices))
             values = np.empty(len(candidates))
-            values[covered] = self._combined(self._evaluator.poses(matrices[covered]))
-            values[~covered] = self._combined(self.odometry.poses(matrices[~covered]))
+            values[covered] = self._costs_of_poses(evaluator.poses(matrices[covered]))
+            values[~covered] = self._costs_of_poses(self.odometry.poses(matrices[~covered]))
             return values
 
-    def _combined(self, poses: Array) -> Array:
+    def _costs_of_poses(self, poses: Array) -> Array:
+        """Costs (P,) of poses (P, S, 3) at the cost's stamps; ``poses`` is overwritten."""
         poses -= self.reference
         return self.objective.combine(poses, self.odometry.trajectory)
 
-    def _matters(self) -> NDArray[np.bool_]:
-        """Which elements (n,) the cost depends on: a cost of headings alone sees row 3 of the matrix only."""
+    def _relevant(self) -> NDArray[np.bool_]:
+        """Which elements (n,) the cost depends on: a cost of headings alone depends on row 3 of the matrix only."""
         cost = self.objective
         if not (
             isinstance(cost, SumOfNorms) and 0.0 in cost.weights and isinstance(self.parameterisation, MatrixElements)
@@ -232,12 +236,14 @@ class CalibrationProblem:
         return np.asarray((np.abs(cost.weights) @ slopes.reshape(3, -1)) > 0)
 
     def _check_budget(self) -> None:
+        """Raise BudgetSpent if no evaluations or no seconds are left."""
         if self.remaining <= 0:
             raise BudgetSpent("budget", f"budget of {self.budget.evaluations} evaluations spent")
         if self.seconds > self.budget.seconds:
             raise BudgetSpent("time", f"time budget of {self.budget.seconds:g} s spent")
 
     def _record(self, candidates: Array, values: Array) -> None:
+        """Count evaluated candidates (P, n) with their costs (P,), keep the best one and report progress."""
         self._note_improvements(candidates, values)
         self.evaluations += len(candidates)
         if self._watch and self.seconds - self._shown > _PROGRESS_PERIOD:
@@ -245,6 +251,7 @@ class CalibrationProblem:
             self._watch(self.evaluations, self.best_cost)
 
     def _note_improvements(self, candidates: Array, values: Array) -> None:
+        """Append to the history every candidate in the box that is better than all before it."""
         if not (values < self.best_cost).any():
             return
         eligible = np.where(np.isfinite(values) & self.inside(candidates), values, np.inf)
@@ -256,7 +263,7 @@ class CalibrationProblem:
 
 
 def training_split(dataset: Dataset) -> tuple[Trajectory, ...]:
-    """The training trajectories; DataError when there are none."""
+    """The training trajectories of a data set; DataError when there are none."""
     trajectories = dataset.split("train")
     if not trajectories:
         raise DataError(
@@ -276,9 +283,9 @@ def make_parameterisation(
 ) -> Parameterisation:
     """The parameterisation called ``name``. ConfigError when its box excludes the start.
 
-    unidentified: what becomes of the directions of wheel rates that the trajectories drive so little that slip alone
-    may have done it. Matrix elements keep the design values there, or (fit) are fitted to what there is. The geometry
-    cannot keep values along a direction, and fits them.
+    unidentified: for directions of wheel rates that the trajectories drive so little that slip alone may explain it,
+    ``keep`` holds the matrix at the design values along them, ``fit`` fits it. The geometry always fits them: it cannot
+    hold values along a direction.
     """
     if name == "geometry":
         return WheelGeometry(robot, limits)
@@ -286,6 +293,7 @@ def make_parameterisation(
 
 
 def _frozen(array: NDArray[Any]) -> NDArray[Any]:
+    """A read-only copy."""
     array = np.array(array)
     array.flags.writeable = False
     return array

@@ -1,4 +1,4 @@
-"""Which directions of wheel rates a set of recordings drives: outside them the matrix is not determined."""
+"""Span of the wheel rates that recordings drive: outside it the matrix is not determined."""
 
 from __future__ import annotations
 
@@ -16,18 +16,17 @@ from omnibench.robot.kinematics import Array, Robot, wheel_equations
 Unidentified = Literal["keep", "fit"]
 State = Literal["driven", "weak", "undriven"]
 
-# Below this share of the strongest direction a direction is noise, not motion.
+# Share of the strongest direction below which a direction holds noise and no motion. Chosen.
 _NULL_SHARE = 1e-2
 
-# Below this share slip may be all there is. A wheel that slips by 1 % of the strongest motion changes what a direction
-# driven with a tenth of it seems to do by 10 %, far more than calibrations are about. Runs of the Festo Robotino that
-# were told not to turn drive the common turn of its wheels with a share of 0.051 and 0.053 (slip, uneven motors);
-# recordings that turn on purpose have 0.53 (omni3) and 0.56 (the flower of the APR-02).
+# Share of the strongest direction below which slip alone may explain what was driven. Slip of 1 % of the strongest
+# motion changes the matrix along a direction driven with a tenth of it by 10 %, more than a calibration corrects. Festo
+# Robotino runs without commanded turns have 0.051 and 0.053 along the direction that turns the robot (slip, uneven
+# motors); recordings with commanded turns have 0.53 (omni3) and 0.56 (flower of the APR-02).
 WEAK_SHARE = 0.1
 
-# A direction this close (cosine) to one of the robot's own motions is taken for that motion.
-_SAME_DIRECTION = 0.99
-_ALMOST = math.tan(math.radians(5))
+_SAME_DIRECTION = 0.99  # cosine from which on a direction is called by one of the robot's motions; chosen
+_ALMOST = math.tan(math.radians(5))  # ratio of speeds below which the smaller one is not mentioned; chosen
 
 
 @dataclass(frozen=True)
@@ -43,16 +42,16 @@ class DrivenSpan:
 
     @property
     def weak(self) -> Array:
-        """The driven directions (q, N) that slip alone may have driven: with less than a tenth of the strongest."""
+        """Driven directions (q, N) that slip alone may explain: less than a tenth of the strongest."""
         return self.driven[self.shares[: len(self.driven)] < WEAK_SHARE]
 
     @property
     def strong(self) -> Array:
-        """The driven directions that are left (rank - q, N)."""
+        """Driven directions (rank - q, N) that are not weak."""
         return self.driven[: len(self.driven) - len(self.weak)]
 
     def state(self, direction: Array) -> State:
-        """How much a direction (N,) of length one is driven."""
+        """Driven, weak or undriven: the state of a direction (N,) of length one."""
         share = self.share(direction)
         return "driven" if share >= WEAK_SHARE else "weak" if share > _NULL_SHARE else "undriven"
 
@@ -63,15 +62,15 @@ class DrivenSpan:
 
 
 def driven_span(trajectories: Sequence[Trajectory]) -> DrivenSpan:
-    """The span of the wheel angles driven between reference poses. DataError when there are no trajectories.
+    """Span of the wheel angles driven between reference poses. DataError when there are no trajectories.
 
-    Angles between poses, not rates: encoder noise averages out of them, motion does not.
+    Angles between poses are used rather than rates, since encoder noise averages out of them.
     """
     if not trajectories:
         raise DataError("no trajectories; nothing can be calibrated")
     increments = [np.diff(_angles_at_poses(trajectory), axis=0) for trajectory in trajectories]
     wheels = increments[0].shape[1]
-    # Rows of zeros, so that there are directions for every wheel however few the increments.
+    # Rows of zeros give N directions even if there are fewer increments than wheels.
     _, strengths, directions = np.linalg.svd(
         np.concatenate([*increments, np.zeros((wheels, wheels))]), full_matrices=False
     )
@@ -83,7 +82,7 @@ def driven_span(trajectories: Sequence[Trajectory]) -> DrivenSpan:
 def directions_kept(robot: Robot, span: DrivenSpan, unidentified: Unidentified) -> Array:
     """Directions (q, N), orthonormal, along which a calibration keeps the design values.
 
-    fit: those that the data do not drive. keep: also those driven so little that slip alone may have done it.
+    unidentified: ``fit`` keeps them along undriven directions only, ``keep`` along weak ones too.
     """
     if unidentified == "fit" or len(span.weak) == 0:
         return span.null
@@ -91,15 +90,15 @@ def directions_kept(robot: Robot, span: DrivenSpan, unidentified: Unidentified) 
 
 
 def unidentified_directions(robot: Robot, span: DrivenSpan) -> Array:
-    """Directions (q, N), orthonormal, that are not driven, or so little that slip alone may have done it."""
+    """Weak and undriven directions (q, N), orthonormal."""
     return aligned(np.concatenate([span.weak, span.null]), robot)
 
 
 def aligned(space: Array, robot: Robot) -> Array:
-    """Orthonormal directions for those of ``space`` (q, N), turned to the robot's own motions: they read better.
+    """Orthonormal directions of ``space`` (q, N), rotated towards the robot's motions, which have names.
 
-    They span the same, but for this: a motion (along x, along y, on the spot) within a few degrees of the space is
-    taken for part of it.
+    They span the same space, except that a motion (along x, along y, on the spot) within a few degrees of the space
+    counts as part of it.
     """
     chosen = np.zeros((0, space.shape[1]))
     motions = _motions(robot)
@@ -107,9 +106,9 @@ def aligned(space: Array, robot: Robot) -> Array:
     while len(left):
         inside = motions @ left.T
         reach = np.linalg.norm(inside, axis=1)
-        best = int((reach + np.array([0.0, 0.0, 1e-9])).argmax())  # of equals the turn
+        best = int((reach + np.array([0.0, 0.0, 1e-9])).argmax())  # ties go to turning on the spot
         direction = motions[best] if reach[best] > _SAME_DIRECTION else inside[best] @ left
-        if reach[best] < 1e-6:  # nothing that the robot does without slip
+        if reach[best] < 1e-6:  # no motion without slip is left
             direction = left[0]
         direction = direction - chosen.T @ (chosen @ direction)
         direction = direction / np.linalg.norm(direction)
@@ -120,7 +119,7 @@ def aligned(space: Array, robot: Robot) -> Array:
 
 
 def direction_in_words(direction: Array, wheels: Sequence[str]) -> str:
-    """A direction of wheel rates as ``a - b + 0.5 c``, scaled to its largest element; its sign has no meaning."""
+    """A direction of wheel rates (N,) as text like ``a - b + 0.5 c``, its largest element 1 and its sign arbitrary."""
     large = np.abs(direction) > 0.5 * np.abs(direction).max()
     scaled = direction * np.sign(direction[large][0]) / np.abs(direction).max()
     terms = [(value, name) for value, name in zip(scaled, wheels, strict=True) if abs(value) > 0.02]
@@ -132,9 +131,9 @@ def direction_in_words(direction: Array, wheels: Sequence[str]) -> str:
 
 
 def motion_in_words(direction: Array, robot: Robot) -> str:
-    """What wheel rates along a direction (N,) make the designed robot do: ``turning on the spot``, ``moving along x``.
+    """Motion of the design robot under wheel rates along a direction (N,), like ``turning on the spot``.
 
-    The empty text where it does nothing: the wheels would only slip.
+    Empty if the robot would not move because the wheels only slip.
     """
     x, y, turn = robot.inverse_kinematic_matrix @ direction
     reach = float(np.mean([wheel.distance for wheel in robot.wheels]))
@@ -160,7 +159,7 @@ def _motions(robot: Robot) -> Array:
 
 
 def _signed(directions: Array) -> Array:
-    """The sign is that of the first large element, so that a direction has the same name on any data."""
+    """Directions (q, N) with their first large element positive, so that their names do not depend on the data."""
     leading = (np.abs(directions) > 0.5 * np.abs(directions).max(axis=1, keepdims=True)).argmax(axis=1)
     signed: Array = directions * np.sign(directions[np.arange(len(directions)), leading])[:, None]
     return signed

@@ -14,7 +14,7 @@ from omnibench.robot.kinematics import Array
 # Tighter than Clarabel's defaults (1e-8): the optimum is a reference that searches are measured against.
 _ACCURACY = {"tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12, "tol_feas": 1e-12}
 
-_MOST_PREPARED = 5000
+_MOST_PREPARED = 5000  # stamps; beyond it the program is compiled anew for every step, to save memory; chosen
 
 
 class SolverError(OmnibenchError):
@@ -53,14 +53,14 @@ class SumOfNormsProgram:
     def step(self, shares: Array) -> Array:
         """The best step (n,) for shares (S,) >= 0. Raises SolverError."""
         self._shares.value = shares / shares.sum()
-        # cvxpy prepares a program for other shares at a memory that grows with the square of their number.
+        # A program that cvxpy prepares for changing shares takes memory that grows with the square of their number.
         _solve(self._program, ignore_dpp=len(shares) > _MOST_PREPARED)
         return np.clip(self._step.value * self._unit, self._lower, self._upper)
 
 
 def _solve(problem: Any, ignore_dpp: bool = False) -> None:
     try:
-        with warnings.catch_warnings():  # the status is looked at below, and steps are only taken downhill
+        with warnings.catch_warnings():  # the status is checked below, and only steps that lower the cost are taken
             warnings.simplefilter("ignore", UserWarning)
             problem.solve(solver=cp.CLARABEL, ignore_dpp=ignore_dpp, **_ACCURACY)
     except cp.error.SolverError as error:

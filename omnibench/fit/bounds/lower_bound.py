@@ -1,22 +1,22 @@
-"""A number that no matrix of a box can beat: lower bounds of a sum of norms over a box of row 3.
+"""Lower bounds of a sum of norms over a box of matrices.
 
 The cost is F = sum_s share_s |W e_s|, with e_s the pose error at stamp s and W its weights. For any vectors u_s in the
 unit ball
 
     F >= phi(z, d) = sum_s share_s u_s.W e_s
 
-(duality of the norm), whatever they are: how well they are chosen decides how tight the bound is, never whether it
-holds. With the headings about the middle of the box, d away from it, and rows 1 and 2 as zeta_j = z_1j + i z_2j,
+(duality of the norm). The choice of u_s decides how tight the bound is, not whether it holds. With d the deviation of
+row 3 from the middle of the box, and rows 1 and 2 as zeta_j = z_1j + i z_2j,
 
     phi = Re H_0(d) + sum_j Re(zeta_j H_j(d)) + k_0 + k.d,     H_j(d) = H_j + dH_j.d + R_j(d),
 
 where the H_j are sums over all stamps, and |R_j| <= 1/2 sum_lm rho_l rho_m B_jlm with B_jlm from sums of
 |a_j c_l c_m|, since each term of H_j is an exponential exp(i m3.c). Without R_j, phi is linear in d for given z and
 linear in z for given d: its least value over z is concave in d, so that it lies at a corner of the box of d, and is
-found exactly. Headings alone have no R_j; with u_s that look at nothing else, boxes far off are ruled out early.
+found exactly. Headings have no R_j; u_s with heading components alone rule out distant boxes early.
 
-Everything is in deviations from the design along the directions of wheel rates that are driven, so that four wheels
-on three degrees of freedom are three-dimensional, too.
+All matrices are given as deviations (3, r) from the design along the r directions of wheel rates that are driven, so
+that four wheels on three degrees of freedom have r = 3, too.
 """
 
 from __future__ import annotations
@@ -38,22 +38,23 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex
 
-_QUADRATURE = 1e-9  # m: of arcs; counted in the bound
-_CUT_OFF = 3.0  # how much rather rows 1 and 2 are cut than row 3
-_IMBALANCE = 1e-9  # m or rad per rad: what u_s may leave unbalanced, so that a box of any width can still be cut
-_STEPS = 25  # of reweighted least squares, in search of good u_s
-_LOOSE = 0.9  # a bound below this share of what it bounds is tried with headings alone
-_SMOOTHING = 3.0  # digits: below that share of the mean length, norms are rounded off
-_SETTLED = 1e-5  # m or rad, as the change of a norm, at which it ends
-_RIDGE = 1e-13  # keeps its normal equations solvable where data leave a direction open
+_QUADRATURE = 1e-9  # m, error of the quadrature of arcs, which the bound subtracts
+# The other numbers are chosen; they change how fast the bound becomes tight, not whether it holds.
+_CUT_OFF = 3.0  # preference for cutting rows 1 and 2 over row 3
+_IMBALANCE = 1e-9  # m or rad per rad: assumed imbalance of u_s, so that no width of a box counts as exactly harmless
+_STEPS = 25  # of the reweighted least squares that find u_s
+_LOOSE = 0.9  # share of the expected cost below which a bound is tried again with headings alone
+_SMOOTHING = 3.0  # digits: norms are smoothed below this negative power of ten of their mean
+_SETTLED = 1e-5  # change of a norm, m or rad, that ends the reweighting
+_RIDGE = 1e-13  # added to the normalised normal equations, which are singular where the data leave a direction open
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """A part of the box: ``lower`` and ``upper`` (3, r) of the deviations, and what is proven there.
+    """A part of the box, between the deviations ``lower`` and ``upper`` (3, r), with its proven bound.
 
-    bound: no matrix in it costs less. good (3, r): deviations of a matrix in it that looks good. looseness (3, r): what
-    the width in each deviation may cost the bound.
+    bound: no matrix in it costs less. good (3, r): deviations of a matrix in it with a low cost. looseness (3, r): by
+    how much the width in each deviation may lower the bound.
     """
 
     lower: Array
@@ -74,7 +75,7 @@ class Node:
 
 
 class LowerBounds:
-    """Lower bounds of a problem's cost over boxes of row 3.
+    """Lower bounds of a problem's cost over parts of its box.
 
     ConfigError for another parameterisation than the matrix, or a cost that is no sum of norms.
     """
@@ -102,25 +103,25 @@ class LowerBounds:
         self._rounding = self._stamps.rounding * (1.0 + size) + self._stamps.quadrature
 
     def root(self, vector: Array) -> Node:
-        """The whole box; ``vector`` (n,) is where a good matrix is looked for first."""
+        """The whole box; ``vector`` (n,): first guess of a good matrix."""
         near = (vector.reshape(3, -1) - self._design) @ self._driven.T
         return self._node(self.lower, self.upper, np.clip(near, self.lower, self.upper))
 
     def split(self, node: Node) -> tuple[Node, Node]:
-        """The node cut where its width costs the bound most; a part is bounded by the whole, too.
+        """The node cut in two where its width lowers the bound most; both parts inherit the node's bound.
 
-        Row 3 is halved. From rows 1 and 2, in which the cost is convex, the half that is farther from the good matrix
-        is cut off: little is lost where it is ruled out at once.
+        Row 3 is halved. Rows 1 and 2, in which the cost is convex, are cut halfway between the good matrix and the
+        farther side: the part without the good matrix is usually ruled out at once.
         """
         worth = node.looseness * np.array([[_CUT_OFF], [_CUT_OFF], [1.0]])
         row, column = np.unravel_index(int(np.argmax(worth)), worth.shape)
         low, high = float(node.lower[row, column]), float(node.upper[row, column])
-        place = (low + high) / 2
+        border = (low + high) / 2
         if row < 2:
             good = float(node.good[row, column])
-            place = (good + (high if high - good > good - low else low)) / 2
+            border = (good + (high if high - good > good - low else low)) / 2
         below, above = node.upper.copy(), node.lower.copy()
-        below[row, column] = above[row, column] = place
+        below[row, column] = above[row, column] = border
         return self._node(node.lower, below, node.good, node.bound), self._node(
             above, node.upper, node.good, node.bound
         )
@@ -131,13 +132,14 @@ class LowerBounds:
         return matrix.ravel()
 
     def _deviations_of_box(self, problem: CalibrationProblem) -> tuple[Array, Array]:
-        """Bounds (3, r) of the deviations along the driven directions: of all vectors in the box, or of more."""
+        """Bounds (3, r) of the deviations along the driven directions that contain all vectors in the box."""
         low = problem.lower.reshape(3, -1) - self._design
         high = problem.upper.reshape(3, -1) - self._design
         positive, negative = np.maximum(self._driven, 0).T, np.minimum(self._driven, 0).T
         return low @ positive + high @ negative, high @ positive + low @ negative
 
     def _node(self, lower: Array, upper: Array, near: Array, proven: float = 0.0) -> Node:
+        """A part of the box with its bound; near (3, r): first guess of a good matrix; proven: bound of the whole."""
         centre, reach = (lower[2] + upper[2]) / 2, (upper[2] - lower[2]) / 2
         rows_12 = np.clip(near[:2], lower[:2], upper[:2])
         sums, slopes = self._stamps.at(centre)
@@ -175,11 +177,11 @@ class LowerBounds:
         return residuals * self._weights, jacobian * self._weights[:, None]
 
     def _dual_bound(self, part: _Part, directions: Array) -> tuple[float, Array]:
-        """The least phi in a part of the box, and what each deviation's width (3, r) may cost it."""
+        """The least phi in a part of the box for u_s = ``directions`` (S, 3), and its looseness (3, r) (see Node)."""
         lower, upper = part.lower[:2], part.upper[:2]
         centre, reach = (part.lower[2] + part.upper[2]) / 2, (part.upper[2] - part.lower[2]) / 2
         weighted = directions * self._weights * self._shares[:, None]
-        along = weighted[:, 0] - 1j * weighted[:, 1]  # Re(along * (x + iy)) is the part of the position errors
+        along = weighted[:, 0] - 1j * weighted[:, 1]  # Re(along * (x + iy)) is the share of the position errors in phi
         value = along @ part.sums
         slope = np.tensordot(along, part.slopes, (0, 0))  # (1 + r, r)
         curvature = np.tensordot(np.abs(along), self._stamps.curvature, (0, 0))  # (1 + r, r, r)
@@ -192,11 +194,11 @@ class LowerBounds:
             total += np.minimum(factor * lower[row][:, None], factor * upper[row][:, None]).sum(axis=0)
         largest = np.maximum(np.abs(lower), np.abs(upper))
         bending = np.tensordot(np.append(1.0, np.hypot(*largest)), curvature, (0, 0))  # (r, r)
-        left_out = reach @ bending @ reach / 2
+        remainder = reach @ bending @ reach / 2
         bilinear = (upper - lower)[..., None] * np.abs([slope[1:].real, slope[1:].imag]) * reach  # (2, r, r)
         in_row_3 = bilinear.sum(axis=(0, 1)) + reach * (bending @ reach + _IMBALANCE)
         looseness = np.vstack([bilinear.sum(axis=2), in_row_3])
-        return float(total.min() - left_out - self._rounding), looseness
+        return float(total.min() - remainder - self._rounding), looseness
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,9 +212,10 @@ class _Part:
 
 
 class _StampSums:
-    """Sums over the samples up to each stamp, and their slopes in the deviations of row 3.
+    """Sums over the samples up to each stamp, and their derivatives by the deviations of row 3.
 
-    curvature (S, 1 + r, r, r): bounds of their second derivatives. rounding: of a sum, as a share of the sizes in it.
+    curvature (S, 1 + r, r, r): bounds of their second derivatives. rounding: error of a sum relative to its terms.
+    quadrature: error of the quadrature, m.
     """
 
     def __init__(self, problem: CalibrationProblem, driven: Array) -> None:
@@ -254,9 +257,9 @@ class _StampSums:
 
         The first of the 1 + r is the design's displacement, the others are the regressors of rows 1 and 2.
         """
-        found = np.concatenate([_up_to_stamps(*run, row_3) for run in self._runs])  # (S, (2 + r)(1 + r))
+        sums = np.concatenate([_up_to_stamps(*run, row_3) for run in self._runs])  # (S, (2 + r)(1 + r))
         size = len(row_3)
-        parts = found.reshape(len(found), 1 + size, 2 + size)
+        parts = sums.reshape(len(sums), 1 + size, 2 + size)
         whole = np.concatenate([parts[:, :, :1] + 1j * parts[:, :, 1:2], parts[:, :, 2:]], axis=2)
         return whole[:, 0], 1j * np.moveaxis(whole[:, 1:], 1, 2)
 
@@ -270,12 +273,12 @@ def _up_to_stamps(columns: Array, phase: Array, turns: Array, ends: NDArray[np.i
         return (cosine[:last] @ columns[:last] + 1j * (sine[:last] @ columns[:last]))[None]
     firsts = np.concatenate([[0], ends[:-1]])
     between = np.add.reduceat(columns * cosine[:, None], firsts) + 1j * np.add.reduceat(columns * sine[:, None], firsts)
-    between[firsts == ends] = 0.0  # reduceat gives an empty part its first row
+    between[firsts == ends] = 0.0  # reduceat returns the first row for an empty part
     return np.cumsum(between, axis=0)
 
 
 def _complement(null: Array, wheels: int) -> Array:
-    """Orthonormal directions (r, N) of wheel rates across the null ones; the wheels themselves where there are none."""
+    """Orthonormal directions (r, N) of wheel rates across the null ones; the unit vectors if there are none."""
     if len(null) == 0:
         return np.eye(wheels)
     _, _, directions = np.linalg.svd(np.eye(wheels) - null.T @ null)
@@ -285,11 +288,11 @@ def _complement(null: Array, wheels: int) -> Array:
 def _least_sum_of_norms(
     residuals: Array, jacobian: Array, shares: Array, lower: Array, upper: Array, begin: Array
 ) -> tuple[Array, Array]:
-    """About the v (n,) in the box that minimises sum_s shares_s |residuals_s + jacobian_s v|, and its dual (S, k).
+    """An approximate minimiser v (n,) of sum_s shares_s |residuals_s + jacobian_s v| in the box, and its dual (S, k).
 
     Iteratively reweighted least squares: the weighted residuals of the last step solve its normal equations exactly,
-    so that shrunk into the unit ball they are good duals even where residuals vanish. What it leaves undone costs
-    tightness only.
+    so that scaled into the unit ball they are good duals even where residuals vanish. An unfinished minimisation only
+    makes the bound less tight.
     """
     free = (upper > lower) & (np.abs(jacobian).max(axis=(0, 1)) > 0)
     point = np.clip(begin, lower, upper)
@@ -317,11 +320,11 @@ def _least_sum_of_norms(
 
 
 def _into_unit_ball(directions: Array) -> tuple[Array, Array]:
-    """Vectors (S, k), of length about one, all shrunk by one factor, or each that is too long by its own.
+    """Vectors (S, k) of length about one, scaled into the unit ball: all by one factor, or each by its own.
 
-    The one keeps what the vectors balance, the other their lengths.
+    The first keeps the balance between the vectors, the second their lengths.
     """
     lengths = np.linalg.norm(directions, axis=1)
-    inside = 1 - 1e-14  # so that rounding does not carry them out
-    own = directions / np.maximum(1.0, lengths)[:, None] * inside
-    return directions / max(1.0, float(lengths.max())) * inside, own
+    inside = 1 - 1e-14  # margin for rounding
+    one_by_one = directions / np.maximum(1.0, lengths)[:, None] * inside
+    return directions / max(1.0, float(lengths.max())) * inside, one_by_one

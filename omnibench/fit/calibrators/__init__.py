@@ -1,1 +1,1 @@
-"""The calibrators, one a file. Importing a module registers it."""
+"""The calibrators, one in each file. Importing a module registers its calibrator."""

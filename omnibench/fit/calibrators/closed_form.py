@@ -1,9 +1,9 @@
 """The exact minimiser: linear least squares with known headings, then second-order cone programs.
 
 For a given row 3 of the matrix positions are linear in rows 1 and 2, and headings are linear in row 3. With the
-headings of the reference poses the fit is therefore two linear least squares. A cost that is a sum of norms is, with
-the poses linearised about the present matrix, a second-order cone program; its step bends the path so little that
-the sequence converges in a few programs.
+headings of the reference poses the first fit is therefore two linear least squares problems. Then the poses are
+linearised about the present matrix, which makes the minimisation of a sum of norms a second-order cone program. Its
+steps are so small that a few programs converge.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from omnibench.fit.sum_of_norms import SumOfNormsProgram
 
 _MOST_HALVINGS = 30
-_FLAT = 1e-6  # of the matrix: a step this small that leads nowhere is the solver's last digits, not a way down
-_NO_ERROR = 1e-10  # m, rad: next to rounding, where a program finds no direction
+_FLAT = 1e-6  # share of the matrix's range: a smaller step that does not lower the cost is rounding of the solver
+_NO_ERROR = 1e-10  # m, rad: a smaller cost is close to rounding, and a program finds no direction
 
 
 class ClosedFormOptions(Options):
-    """When to stop."""
+    """Stopping rule."""
 
     tolerance: float = Field(1e-9, gt=0, description="largest change of an element in the last step, m or rad per rad")
     programs: int = Field(50, gt=0, description="most second-order cone programs")
@@ -47,10 +47,10 @@ class ClosedForm(Calibrator):
 
     def __init__(self, options: ClosedFormOptions) -> None:
         super().__init__(options)
-        import omnibench.fit.sum_of_norms  # noqa: F401 (cvxpy takes a second to import: before the clock runs)
+        import omnibench.fit.sum_of_norms  # noqa: F401 (importing cvxpy takes a second: do it before time is measured)
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
-        """The minimiser. ConfigError for another parameterisation or a cost that is no sum of norms."""
+        """The optimum in the box. ConfigError for another parameterisation or a cost that is no sum of norms."""
         if not isinstance(problem.parameterisation, MatrixElements):
             raise ConfigError("closed_form works on the matrix parameterisation; search the geometry with another")
         if not isinstance(problem.objective, SumOfNorms):
@@ -76,12 +76,13 @@ class ClosedForm(Calibrator):
 
     @staticmethod
     def _better(problem: CalibrationProblem, *vectors: Array) -> Array:
+        """The vector of lowest cost."""
         costs = problem.cost(np.array(vectors))
         return vectors[int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))]
 
 
 def linear_start(problem: CalibrationProblem) -> Array:
-    """Least squares of headings on row 3, then of positions on rows 1 and 2 with the reference's headings: (n,)."""
+    """Vector (n,) by least squares: headings give row 3, then positions, with reference headings, rows 1 and 2."""
     from omnibench.fit.sum_of_norms import least_squares
 
     lower, upper = (bound.reshape(3, -1) for bound in (problem.lower, problem.upper))
@@ -102,23 +103,23 @@ def linear_start(problem: CalibrationProblem) -> Array:
 
 
 def cone_program(problem: CalibrationProblem, objective: SumOfNorms, vector: Array) -> SumOfNormsProgram:
-    """The cost with the poses linearised about ``vector``, as a program for the best step from there."""
+    """A program for the best step from ``vector``: the cost with the poses linearised there."""
     from omnibench.fit.sum_of_norms import SumOfNormsProgram
 
-    assert isinstance(problem.parameterisation, MatrixElements)  # calibrate refuses others
+    assert isinstance(problem.parameterisation, MatrixElements)  # calibrate has refused others
     matrix = problem.matrix(vector)
     used = np.flatnonzero(objective.weights)
     scale = np.array(objective.weights)[used]
     residuals = (problem.odometry.poses(matrix[None])[0] - problem.reference)[:, used] * scale
     jacobian = problem.odometry.jacobian(matrix)[:, used] * scale[:, None, None]
-    # Of a step along directions that the data do not drive, the matrix takes no notice.
+    # The matrix ignores steps along the directions that the data do not identify.
     null = problem.parameterisation.null
     jacobian = (jacobian - jacobian @ null.T @ null).reshape(len(residuals), len(used), -1)
     return SumOfNormsProgram(residuals, jacobian, problem.lower - vector, problem.upper - vector)
 
 
 def _descend(problem: CalibrationProblem, vector: Array, cost: float, step: Array) -> tuple[Array, float, bool]:
-    """Take the step, or as much of it as lowers the cost; whether any does."""
+    """The vector and cost after the step, halved until the cost does not rise; False if no part of it lowers it."""
     trial = _settled(problem, vector + step)
     for _ in range(_MOST_HALVINGS):
         trial_cost = float(problem.cost(trial[None])[0])
@@ -131,7 +132,7 @@ def _descend(problem: CalibrationProblem, vector: Array, cost: float, step: Arra
 
 
 def _settled(problem: CalibrationProblem, vector: Array) -> Array:
-    """A vector (n,) in the box that means the same matrix: its elements, where these lie in the box too."""
+    """The elements of the vector's matrix, or the vector itself (n,) where these lie outside the box."""
     vector = np.clip(vector, problem.lower, problem.upper)
     elements = problem.matrix(vector).ravel()
     return elements if bool(problem.inside(elements[None])[0]) else vector

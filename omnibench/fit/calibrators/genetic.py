@@ -13,11 +13,11 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array
 
-_SMALLEST_STEP = 1e-8  # of the box
+_SMALLEST_STEP = 1e-8  # least step of the mutation, as a share of the box; chosen
 
 
 class GeneticOptions(Options):
-    """Defaults are those of a standard real-coded GA; section 3 of the paper names the last."""
+    """Options of a real-coded GA, with defaults of a standard toolbox; the paper (section 3) gives ``tolerance``."""
 
     population: int | None = Field(None, ge=4, description="default: 200 for more than five variables, else 50")
     elite: float = Field(0.05, gt=0, lt=1, description="share that survives unchanged")
@@ -61,6 +61,7 @@ class Genetic(Calibrator):
     def _next_generation(
         self, problem: CalibrationProblem, people: Array, scores: Array, mutate: _Mutation
     ) -> tuple[Array, Array]:
+        """Elite, crossed and mutated children (count, f) and their costs (count,)."""
         count, rng = len(people), problem.rng
         elite = max(1, int(np.ceil(self.options.elite * count)))
         crossed = round(self.options.crossover * (count - elite))
@@ -76,6 +77,7 @@ class Genetic(Calibrator):
         )
 
     def _stalled(self, best: list[float]) -> bool:
+        """True if the best costs of the last generations changed by the tolerance or less on average."""
         window = best[-self.options.stall_generations - 1 :]
         if len(window) <= self.options.stall_generations or not np.isfinite(window).all():
             return False
@@ -120,7 +122,7 @@ _Mutation = _AdaptiveFeasible | _Gaussian
 
 
 def _scores(problem: CalibrationProblem, points: Array) -> Array:
-    """Costs of points of the unit cube; what cannot be evaluated is worst."""
+    """Costs (P,) of points (P, f) of the unit cube; infinity for those that cannot be evaluated."""
     costs = problem.cost(problem.from_unit(points))
     return np.where(np.isfinite(costs), costs, np.inf)
 

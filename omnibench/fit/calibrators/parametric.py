@@ -1,4 +1,4 @@
-"""The paper's section 4.2: the physical parameters of Eq. (3) within feasible limits, by any of the searches."""
+"""Parametric calibration (paper, section 4.2): search of the physical parameters of Eq. (3) within limits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from omnibench.registry import Options, calibrators
 
 
 class ParametricOptions(Options):
-    """Which search; the limits are the entry's ``limits``."""
+    """The search and its options; the limits are those of the entry in the config."""
 
     search: str = Field("crs", description="a calibrator that searches")
     search_options: dict[str, Any] = Field({}, description="options of that search")

@@ -13,7 +13,7 @@ from omnibench.robot.published_matrices import PUBLISHED, published_matrix
 
 
 class PublishedOptions(Options):
-    """Which matrix: by name, or its rows."""
+    """The matrix, by name or by its rows."""
 
     matrix: str | tuple[tuple[FiniteFloat, ...], ...] = Field(
         "palacin2023_eq9", description=f"{' or '.join(PUBLISHED)}, or 3 rows of N values"
@@ -31,7 +31,7 @@ class PublishedOptions(Options):
 
 @calibrators.register("published")
 class Published(Calibrator):
-    """A published matrix, as it stands: the paper's Eq. (8) or (9), or one given in the config."""
+    """A published matrix, unchanged: the paper's Eq. (8) or (9), or one given in the config."""
 
     Options = PublishedOptions
     options: PublishedOptions
@@ -39,7 +39,7 @@ class Published(Calibrator):
     stochastic = False
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
-        """The published matrix as a vector; ConfigError when it is for another number of wheels."""
+        """The published matrix as a vector; ConfigError if it is for another number of wheels."""
         given = self.options.matrix
         matrix = published_matrix(given) if isinstance(given, str) else np.array(given)
         if problem.parameterisation.name != "matrix" or matrix.size != problem.size:

@@ -1,4 +1,4 @@
-"""The simplest search: what any other must beat, and the shortest example of a calibrator."""
+"""Random search: the baseline that any other search must beat, and the shortest example of a calibrator."""
 
 import numpy as np
 from pydantic import Field
@@ -9,7 +9,7 @@ from omnibench.registry import Options, calibrators
 
 
 class RandomSearchOptions(Options):
-    """How many candidates are tried."""
+    """Number of candidates."""
 
     candidates: int | None = Field(None, gt=0, description="candidates in all; default: the whole budget")
     batch: int = Field(100, gt=0, description="candidates evaluated at once")
@@ -24,7 +24,7 @@ class RandomSearch(Calibrator):
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Draw candidates until their number is reached or the budget is spent."""
-        problem.cost(problem.start[None])  # so that the answer is never worse
+        problem.cost(problem.start[None])  # so that the answer is never worse than the start
         wanted = self.options.candidates or problem.budget.evaluations
         for first in range(0, wanted, self.options.batch):
             count = min(self.options.batch, wanted - first)

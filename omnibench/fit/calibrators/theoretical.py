@@ -7,7 +7,7 @@ from omnibench.registry import calibrators
 
 @calibrators.register("theoretical")
 class Theoretical(Calibrator):
-    """The design values, unchanged: what every calibration is measured against."""
+    """The design values, unchanged, against which every calibration is measured."""
 
     bounded = False
     stochastic = False

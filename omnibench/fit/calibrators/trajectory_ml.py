@@ -1,18 +1,19 @@
 """Maximum likelihood over whole trajectories: every reference pose, weighted by the noise that repetitions show.
 
-The reference errors of a run are white noise, a random walk and a bias (fit/noise.py), of variances that come from the
-differences between repetitions of a command. The generalised least squares that they weight is the statistically
-efficient estimator as long as the model is right. Nuisances of each run:
+The reference errors of a run are white noise, a random walk and a bias (least_squares/noise.py), whose variances are
+estimated from the differences between repetitions of a command. Generalised least squares with these variances is
+statistically efficient as long as the model is right. Nuisances of each run:
 
-- The start pose. The reference at t = 0 is an observation, too; its position error is a bias of the run, exactly, and
-  so is in the noise model already. Its heading error also turns the path, which tells it from a biased heading: its
-  variance is estimated from the repetitions and is zero where none shows, so that exact starts (simulation) lose no
+- The start pose. The reference at t = 0 is an observation, too. Its position error is exactly a bias of the run, which
+  the noise model contains. Its heading error also turns the path, which distinguishes it from a biased heading: its
+  variance is estimated from the repetitions and is zero if insignificant, so that exact starts (simulation) lose no
   information and noisy ones (real recordings) do no harm.
-- Offset and slope of the reference's clock, where asked for, about zero with a weak expectation of their size.
+- Offset and slope of the reference's clock, where asked for, with a weak prior about zero.
 
-Where the runs scatter more than their noise explains, no matrix is right, and the best one depends on what it is for:
-then the squared pose errors at the stamps of the problem's cost are minimised, starts and clocks left as the
-likelihood had them. In both cases the covariance is honest: that of the noise, or of the scatter (fit/sandwich.py).
+Where the runs scatter more than their noise explains, no matrix is right, and the best one depends on its purpose: the
+squared pose errors at the stamps of the problem's cost are then minimised, with starts and clocks kept as the
+likelihood found them. The covariance is that of the noise model, or the sandwich of the scatter
+(uncertainty/sandwich.py).
 """
 
 from __future__ import annotations
@@ -36,14 +37,14 @@ from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
-# Before anything is known of the noise: 1 cm or 0.01 rad, and as much again in a second.
+# First guess of the noise, replaced after one fit: 1 cm or 0.01 rad, and as much again in a second.
 _FIRST = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.01, walk_heading=0.01)
 _MOST_ROUNDS = 10
-_STILL = 0.1  # standard errors: what the noise moves the vector by no longer matters
+_STILL = 0.1  # standard errors: a smaller change of the vector ends the rounds of noise and fit; chosen
 
 
 class TrajectoryMLOptions(Options):
-    """What is a nuisance of each run, and what weights and covariance rest on."""
+    """Nuisances of each run, weights and covariance."""
 
     start: Literal["auto", "exact", "noisy"] = Field(
         "auto", description="start headings of the runs: noisy where repetitions show it, exact, or at least as poses"
@@ -68,12 +69,13 @@ class TrajectoryMLOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryEstimate:
-    """All that is estimated.
+    """The estimate with its nuisances and covariance.
 
-    vector (n,), covariance (n, n) of it with its degrees_of_freedom. noise: of the reference. start_heading: standard
-    deviation of the start headings, rad. start_corrections (Z, 3): what is to be added to the start poses, m, m, rad;
+    vector (n,), its covariance (n, n) and degrees_of_freedom. noise: of the reference. start_heading: standard
+    deviation of the start headings, rad. start_corrections (Z, 3): corrections added to the start poses, m, m, rad.
     clocks (Z, 2): offset (s) and slope of each run's reference clock. trajectories: ids of the Z runs.
-    misfit: what shows that the model is wrong, or empty. description: what the covariance rests on.
+    misfit: evidence in words that the model is wrong, or empty. description: source of the covariance, in words.
+    rounds: of noise and fit. settled: True if they converged.
     """
 
     vector: Array
@@ -99,45 +101,50 @@ class TrajectoryML(Calibrator):
     stochastic = False
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
-        """The estimate, whatever the problem's cost is unless the model misfits. DataError without reference poses."""
-        found = self.estimate(problem)
-        state = "settled" if found.settled else "not settled"
-        reason = f"{state} after {found.rounds} rounds of noise and fit; covariance from {found.description}"
+        """The estimate, which depends on the problem's cost only if the model misfits. DataError without poses."""
+        estimate = self.estimate(problem)
+        state = "settled" if estimate.settled else "not settled"
+        reason = f"{state} after {estimate.rounds} rounds of noise and fit; covariance from {estimate.description}"
         return Solution(
-            found.vector, reason, found.settled, found.covariance, found.noise.noise, found.degrees_of_freedom
+            estimate.vector,
+            reason,
+            estimate.settled,
+            estimate.covariance,
+            estimate.noise.noise,
+            estimate.degrees_of_freedom,
         )
 
     def estimate(self, problem: CalibrationProblem) -> TrajectoryEstimate:
-        """The estimate with all that belongs to it."""
+        """Fit and noise estimated in turn until neither changes, then weights and covariance chosen."""
         fit = TrajectoryFit(problem.trajectories, problem.parameterisation, problem.integration)
         begin = Estimate(problem.start, np.zeros((len(fit.trajectories), 3)))
         now = descend(problem, fit, begin, fit.whiteners(_FIRST), self._deviations(0.0), 0.1)
-        found: _Noise | None = None
+        noise: _Noise | None = None
         rounds, settled = 0, False
         while not settled and rounds < _MOST_ROUNDS:
-            before, earlier = now.estimate, found
-            found = self._noise(fit, before, earlier)
-            deviations = self._deviations(found.start_heading)
+            before, earlier = now.estimate, noise
+            noise = self._noise(fit, before, earlier)
+            deviations = self._deviations(noise.start_heading)
             held = Estimate(before.vector, np.where(deviations > 0, before.nuisances, 0.0))
-            now = descend(problem, fit, held, fit.whiteners(found.estimate.noise), deviations, self.options.tolerance)
+            now = descend(problem, fit, held, fit.whiteners(noise.estimate.noise), deviations, self.options.tolerance)
             moved = now.estimate.vector - before.vector
             still = float(moved @ now.linear.information.sum(axis=0) @ moved) < _STILL**2
-            settled = now.settled and (still or (earlier is not None and found.is_near(earlier)))
+            settled = now.settled and (still or (earlier is not None and noise.is_near(earlier)))
             rounds += 1
-        assert found is not None  # there is at least one round
-        return self._judged(problem, fit, now, found, rounds, settled)
+        assert noise is not None  # there is at least one round
+        return self._conclude(problem, fit, now, noise, rounds, settled)
 
-    def _judged(
+    def _conclude(
         self,
         problem: CalibrationProblem,
         fit: TrajectoryFit,
         now: Descent,
-        found: _Noise,
+        with_starts: _Noise,
         rounds: int,
         settled: bool,
     ) -> TrajectoryEstimate:
-        """The likeliest estimate, or another where it misfits, with its covariance."""
-        options, noise = self.options, found.estimate
+        """The maximum likelihood estimate, or the one weighted by the cost if the model misfits; its covariance."""
+        options, noise = self.options, with_starts.estimate
         corrections = _start_corrections(fit, now.estimate, noise.noise)
         covariance = FitCovariance(problem, now.linear, fit.trajectories)
         misfit = covariance.scatter.words if covariance.lack_of_fit and covariance.scatter else ""
@@ -154,7 +161,7 @@ class TrajectoryML(Calibrator):
             covariance=matrix,
             degrees_of_freedom=freedom,
             noise=noise,
-            start_heading=found.start_heading,
+            start_heading=with_starts.start_heading,
             start_corrections=corrections,
             clocks=now.estimate.nuisances[:, [OFFSET, SLOPE]],
             trajectories=tuple(run.id for run in fit.trajectories),
@@ -165,7 +172,7 @@ class TrajectoryML(Calibrator):
         )
 
     def _covariance(self, covariance: FitCovariance, noise: NoiseEstimate, by_cost: bool) -> tuple[Array, int, str]:
-        """The covariance (n, n), its degrees of freedom and what it rests on."""
+        """The covariance (n, n), its degrees of freedom and its source in words."""
         asked, scatter = self.options.covariance, covariance.scatter
         robust = by_cost or asked == "robust" or (asked == "auto" and covariance.scatter_is_wider)
         if not robust:
@@ -176,24 +183,24 @@ class TrajectoryML(Calibrator):
         return scatter.covariance, scatter.degrees_of_freedom, words
 
     def _deviations(self, start_heading: float) -> Array:
-        """Expected sizes (3,) of the nuisances; 0 for those that are none."""
+        """Standard deviations (3,) of the nuisances; 0 for those that are not estimated."""
         clock = self.options.clock
         offset = 0.0 if clock == "none" else self.options.clock_offset
         return np.array([start_heading, offset, self.options.clock_slope if clock == "offset_and_slope" else 0.0])
 
     def _noise(self, fit: TrajectoryFit, estimate: Estimate, earlier: _Noise | None) -> _Noise:
-        """The noise and the deviation of the start headings, by the residuals of an estimate."""
+        """The noise and the deviation of the start headings, from the residuals of an estimate."""
         straight = estimate.nuisances.copy()
         straight[:, TURN] = 0.0
         estimate = Estimate(estimate.vector, straight)
         residuals = fit.residuals(estimate)
         near = None if earlier is None else earlier.estimate.noise
-        found = estimate_noise(fit.trajectories, residuals, near)
+        noise = estimate_noise(fit.trajectories, residuals, near)
         if self.options.start == "exact":
-            return _Noise(found, 0.0)
-        apart = separate_start_noise(fit.trajectories, residuals, fit.turning(estimate), found.noise)
+            return _Noise(noise, 0.0)
+        apart = separate_start_noise(fit.trajectories, residuals, fit.turning(estimate), noise.noise)
         least = apart.noise.pose_heading if self.options.start == "noisy" else 0.0
-        return _Noise(replace(found, noise=apart.noise), max(apart.start_heading, least))
+        return _Noise(replace(noise, noise=apart.noise), max(apart.start_heading, least))
 
 
 @dataclass(frozen=True)
@@ -204,20 +211,21 @@ class _Noise:
     start_heading: float
 
     def is_near(self, other: _Noise) -> bool:
-        """Whether no component differs by more than 1 % of the largest of its kind."""
+        """True if no component differs by more than 1 % of the largest component."""
         ours, theirs = (
-            np.array([*each.estimate.noise.model_dump().values(), each.start_heading]) for each in (self, other)
+            np.array([*noise.estimate.noise.model_dump().values(), noise.start_heading]) for noise in (self, other)
         )
         return bool((np.abs(ours - theirs) <= 0.01 * np.maximum(ours, theirs).max()).all())
 
 
 def _start_corrections(fit: TrajectoryFit, estimate: Estimate, noise: Noise) -> Array:
-    """What is to be added to the start poses (Z, 3), m, m, rad: the likeliest shift of each run, and its turn."""
-    found = np.zeros((len(fit.trajectories), 3))
-    found[:, 2] = estimate.nuisances[:, TURN]
+    """Corrections (Z, 3) that are added to the start poses, m, m, rad: the likeliest shift and turn of each run."""
+    corrections = np.zeros((len(fit.trajectories), 3))
+    corrections[:, 2] = estimate.nuisances[:, TURN]
     if noise.bias_position:
         weightings = fit.whiteners(noise.model_copy(update={"bias_position": 0.0}))
-        for row, (weigh, own) in enumerate(zip(weightings, fit.residuals(estimate), strict=True)):
-            ones, residuals = weigh(np.ones_like(own))[:, :2], weigh(own)[:, :2]
-            found[row, :2] = -(ones * residuals).sum(axis=0) / (noise.bias_position**-2 + np.square(ones).sum(axis=0))
-    return found
+        for row, (weigh, errors) in enumerate(zip(weightings, fit.residuals(estimate), strict=True)):
+            ones, residuals = weigh(np.ones_like(errors))[:, :2], weigh(errors)[:, :2]
+            information = noise.bias_position**-2 + np.square(ones).sum(axis=0)
+            corrections[row, :2] = -(ones * residuals).sum(axis=0) / information
+    return corrections

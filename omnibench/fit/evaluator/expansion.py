@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array
 
-_MOST_TERMS = 3000
-_LARGEST_ANGLE = 4.0  # rad; beyond it the power series of J_n loses digits
+_MOST_TERMS = 3000  # of a basis; chosen
+_LARGEST_ANGLE = 4.0  # rad: beyond it the power series of J_n loses digits
 
 
 @dataclass(frozen=True)
 class Basis:
-    """Products of Chebyshev polynomials of total degree ``degree`` or less.
+    """Products of Chebyshev polynomials, one for each wheel, of total degree ``degree`` or less.
 
-    orders (n, N): the order in each wheel. A wheel whose element has no width has order 0 throughout.
+    orders (n, N): order of each wheel's polynomial in the n products; always 0 for an element without width.
     """
 
     degree: int
@@ -69,10 +69,10 @@ class Basis:
 def degree_for(
     zeta: Array, steps: Array, firsts: NDArray[np.intp], tolerance: float, wheels: int
 ) -> tuple[int | None, float]:
-    """The degree that expands every path to ``tolerance``, and the bound of what it leaves out (m).
+    """Lowest degree whose truncation error over every path is within ``tolerance`` (m), and the bound of that error.
 
-    zeta (M,): angles in all of each exponential, rad. steps (M,): the lengths that they multiply, m. firsts (Z,):
-    where each path begins. The degree is None where too many terms would be needed.
+    zeta (M,): sum of the angles |z_j| of each exponential, rad. steps (M,): its factor, m. firsts (Z,): index of each
+    path's first exponential. The degree is None if it would need too many terms.
     """
     if zeta.max(initial=0.0) > _LARGEST_ANGLE:
         return None, 0.0
@@ -83,15 +83,15 @@ def degree_for(
         if comb(degree + wheels, wheels) > _MOST_TERMS:
             return None, 0.0
         power = power * half / (degree + 1)
-        left_out = float(np.add.reduceat(power, firsts).max())
-        if left_out <= tolerance:
-            return degree, left_out
+        neglected = float(np.add.reduceat(power, firsts).max())
+        if neglected <= tolerance:
+            return degree, neglected
 
 
 def truncation_factor(zeta: Array, wheels: int) -> Array:
-    """What (zeta/2)^(D + 1) / (D + 1)! is to be multiplied with for the bound of the terms above degree D.
+    """The factor of (zeta/2)^(D + 1) / (D + 1)! in the bound of the terms above degree D.
 
-    sum_{n > D} x^n / n! is at most x^(D + 1) / (D + 1)! * exp(x).
+    It follows from sum_{n > D} x^n / n! <= x^(D + 1) / (D + 1)! * exp(x).
     """
     factor: Array = 2.0**wheels * np.exp(zeta / 2)
     return factor

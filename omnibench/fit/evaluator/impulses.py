@@ -1,4 +1,4 @@
-"""Odometry as a sum of exponentials: cut into rows (what is wanted) and segments (what one expansion can express).
+"""Odometry as a sum of exponentials, and its cutting into segments that one expansion can express.
 
 The displacement up to a stamp is x + iy = sum_i (m1 + i m2).a_i exp(i m3.c_i): an impulse a_i (wheel angles driven,
 rad) in the heading that the robot has after the wheel angles c_i. An Euler step is one impulse. An arc is an integral
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, WheelLog
 
-_MOST_NODES = 8
-_LONGEST_SEGMENT = 4096  # pieces, so that cutting stays linear in the length of a recording
+_MOST_NODES = 8  # of the quadrature; chosen
+_LONGEST_SEGMENT = 4096  # pieces: keeps the time of cutting linear in the length of a recording; chosen
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def make_path(log: WheelLog, integration: Integration) -> Path:
 
 
 def quadrature(paths: list[Path], row: Array, weight: Array, tolerance: float, integration: Integration) -> int | None:
-    """How many Gauss-Legendre nodes a piece needs so that a whole path is right to ``tolerance`` (m); None: too many.
+    """Gauss-Legendre nodes that a piece needs for an error of at most ``tolerance`` (m) over a path; None: too many.
 
     row (N,): the largest absolute elements of row 3; weight (N,): those of rows 1 and 2 together (m per rad).
     """
@@ -81,7 +81,7 @@ def quadrature(paths: list[Path], row: Array, weight: Array, tolerance: float, i
 
 
 def cut(path: Path, reach: Array, limit: float) -> list[Segment]:
-    """Segments whose headings differ from that of their anchor by ``limit`` (rad) at most, wherever row 3 is.
+    """Segments in which the box turns headings about the anchor's by at most ``limit``, rad.
 
     reach (N,): half-width of row 3's box. An infinite limit leaves the path whole, anchored at its start.
     """

@@ -13,15 +13,16 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.robot.kinematics import Array
 
 _MOST_STEPS = 25
-_MOST_HALVINGS = 8
-_SHARES = (1.0, 0.3, 0.0)  # of a run's nuisance steps
-_RANK = 1e-12  # share of the strongest direction below which one is not determined at all
-_NO_GAIN, _NO_SHARE = 1e-2, 1e-5  # of the objective, which is in units of the noise, and as a share of it
+_MOST_HALVINGS = 8  # of one step
+_SHARES = (1.0, 0.3, 0.0)  # parts of the nuisances' step that every run tries
+_RANK = 1e-12  # share of the largest eigenvalue of the information below which a direction is undetermined
+# Decrease of chi2 that ends the steps with free nuisances: absolute, and as a share of chi2. Chosen.
+_NO_GAIN, _NO_SHARE = 1e-2, 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class Descent:
-    """Where the steps led: the estimate, the fit about it, and whether it has settled there."""
+    """Result of a descent: the estimate, the fit linearised about it, and settled: True if it has converged."""
 
     estimate: Estimate
     linear: Linearisation
@@ -36,23 +37,23 @@ def descend(
     deviations: Array,
     tolerance: float,
 ) -> Descent:
-    """Steps within the box until one of the vector is smaller than ``tolerance`` standard errors.
+    """Gauss-Newton steps within the box until a step of the vector is below ``tolerance`` standard errors.
 
-    deviations (3,): of the nuisances, 0 for one that is held. The recorded path has a kink at every sample, and so has
-    the objective as a function of a clock's offset. Every run therefore goes as far along its nuisances' steps as does
-    it good; where they gain no more, the vector is settled with the nuisances held.
+    deviations (3,): standard deviations of the nuisances, 0 for one that is held. The recorded path has a kink at every
+    sample, and so has the objective as a function of a clock's offset. Every run therefore takes the part of its
+    nuisances' step that lowers chi2 most; when that lowers chi2 no more, the vector converges with the nuisances held.
 
-    Every vector that is tried is counted by ``problem.cost``; where that is not finite no way leads.
+    ``problem.cost`` counts every vector that is tried; a vector whose cost is not finite is rejected.
     """
     move = _Move(problem, fit, weightings)
     linear = fit.linearise(estimate, weightings, deviations)
     if (deviations > 0).any():
         for _ in range(_MOST_STEPS):
             before = float(linear.chi2.sum())
-            found, size = move.step(estimate, linear, deviations)
-            if found is None:
+            lower, size = move.step(estimate, linear, deviations)
+            if lower is None:
                 break
-            estimate = found
+            estimate = lower
             linear = fit.linearise(estimate, weightings, deviations)
             after = float(linear.chi2.sum())
             if size < tolerance or before - after < _NO_GAIN + _NO_SHARE * after:
@@ -60,12 +61,12 @@ def descend(
     settled = False
     for _ in range(_MOST_STEPS):
         held = fit.linearise(estimate, weightings, np.zeros(3))
-        found, size = move.step(estimate, held, np.zeros(3))
-        settled = size < tolerance and found is not None
-        if found is None:
-            settled = size < 10 * tolerance and move.leads(estimate.vector)  # but for rounding
+        lower, size = move.step(estimate, held, np.zeros(3))
+        settled = size < tolerance and lower is not None
+        if lower is None:
+            settled = size < 10 * tolerance and move.is_finite(estimate.vector)  # rounding hides the decrease
             break
-        estimate = found
+        estimate = lower
         if settled:
             break
     return Descent(estimate, fit.linearise(estimate, weightings, deviations), settled)
@@ -73,16 +74,18 @@ def descend(
 
 @dataclass(frozen=True, eq=False)
 class _Move:
+    """Steps of one fit that lower its chi2 within the box."""
+
     problem: CalibrationProblem
     fit: TrajectoryFit
     weightings: Sequence[Weighting]
 
-    def leads(self, vector: Array) -> bool:
-        """Whether a vector (n,) has a finite cost."""
+    def is_finite(self, vector: Array) -> bool:
+        """True if a vector (n,) has a finite cost."""
         return bool(np.isfinite(self.problem.cost(vector[None])[0]))
 
     def step(self, estimate: Estimate, linear: Linearisation, deviations: Array) -> tuple[Estimate | None, float]:
-        """One step down from an estimate, or None if there is none, and how many standard errors the whole step is."""
+        """The estimate after one step, None if no part of it lowers chi2, and the step's size in standard errors."""
         problem, total = self.problem, linear.information.sum(axis=0)
         whole = bounded_step(problem, estimate.vector, total, linear.scores.sum(axis=0))
         size = float(np.sqrt(max(whole @ total @ whole, 0.0)))
@@ -90,11 +93,11 @@ class _Move:
         for halvings in range(_MOST_HALVINGS):
             step = 0.5**halvings * whole
             vector = np.clip(estimate.vector + step, problem.lower, problem.upper)
-            if not self.leads(vector):
+            if not self.is_finite(vector):
                 continue
             shares = _SHARES if (deviations > 0).any() else (0.0,)
-            turns = linear.nuisance_steps(step)
-            trials = [Estimate(vector, estimate.nuisances + share * turns) for share in shares]
+            nuisance_steps = linear.nuisance_steps(step)
+            trials = [Estimate(vector, estimate.nuisances + share * nuisance_steps) for share in shares]
             values = np.array([self.fit.chi2(trial, self.weightings, deviations) for trial in trials])
             best = values.argmin(axis=0)
             if values.min(axis=0).sum() <= limit:
@@ -104,7 +107,10 @@ class _Move:
 
 
 def bounded_step(problem: CalibrationProblem, vector: Array, information: Array, score: Array) -> Array:
-    """The step (n,) within the box that minimises d'A d / 2 + g'd; none along directions that A does not know."""
+    """The step d (n,) within the box that minimises d'A d / 2 + g'd; zero along directions without information.
+
+    information (n, n): A. score (n,): g.
+    """
     free = problem.free
     step = np.zeros(len(vector))
     if not free.any():
@@ -117,7 +123,7 @@ def bounded_step(problem: CalibrationProblem, vector: Array, information: Array,
     inner = directions @ (target / roots)
     low, high = ((bound - vector)[free] / unit for bound in (problem.lower, problem.upper))
     if ((inner < low) | (inner > high)).any() and known.any():
-        room = 1e-9  # of the box: lsq_linear wants some, and the vector is clipped
+        room = 1e-9  # share of the box: lsq_linear needs an interior, and the vector is clipped afterwards
         bounds = (np.minimum(low, 0.0) - room, np.maximum(high, 0.0) + room)
         inner = lsq_linear(roots[:, None] * directions.T, target, bounds=bounds, tol=1e-12).x
     step[free] = inner * unit

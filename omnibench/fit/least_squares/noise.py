@@ -1,11 +1,12 @@
 """The noise of reference poses: whitening of residuals, and variance components from repetitions.
 
-The errors of one run at its stamps t_i > 0, of x and y alike and of the heading apart, have the covariance
+The errors of one run at its stamps t_i > 0 have the covariance
 
-    white^2 I + walk^2 min(t_i, t_j) + bias^2 1 1^T.
+    white^2 I + walk^2 min(t_i, t_j) + bias^2 1 1^T,
 
-Of (r_1, r_2 - r_1, r_3 - r_2, ...) it is tridiagonal, so that all that follows takes a time proportional to K.
-A shift of the start pose is a bias, exactly.
+with the same components for x and y, and others for the heading. The covariance of the differences
+(r_1, r_2 - r_1, r_3 - r_2, ...) is tridiagonal, so that whitening takes a time proportional to K. A shift of the start
+pose is a bias, exactly.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from omnibench.fit.least_squares.repetitions import Difference, differences_betw
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
-# White noise, m or rad, that stands in where there is neither white noise nor walk and the covariance is singular.
+# White noise, m or rad, that keeps the covariance regular where there is neither white noise nor walk.
 LEAST_WHITE = 1e-9
-# Components as shares of the residuals' size, on a logarithmic scale.
+# Range of the search: logarithms of the components as shares of the residuals' RMS. Chosen wide.
 _LOGARITHMS = (np.log(1e-4), np.log(1e2))
-_NO_LOSS = 1e-3  # of twice the logarithm of the likelihood
+_NO_LOSS = 1e-3  # change of twice the log-likelihood below which a component is set to zero; chosen
 _COORDINATES = (("position", slice(0, 2)), ("heading", slice(2, 3)))
 
 
@@ -93,9 +94,9 @@ def _differences(residuals: Array) -> Array:
 
 @dataclass(frozen=True)
 class NoiseEstimate:
-    """A noise model and where it comes from.
+    """A noise model and its source.
 
-    degrees_of_freedom: independent differences between runs, or the runs themselves where none is repeated.
+    degrees_of_freedom: number of independent differences between runs, or of runs if no command is repeated.
     """
 
     noise: Noise
@@ -110,11 +111,11 @@ def estimate_noise(
     """Variance components by restricted maximum likelihood from the differences between repetitions of a command.
 
     residuals: for every trajectory (K, 3) at its pose_times[1:], odometry minus reference, m, m, rad, of any decent
-    fit: what the model gets wrong of a command drops out of the differences. Repetitions are runs of one command
-    within a session (within a split if no session repeats a command). Runs whose stamps differ are compared at the
-    nearest ones, without interpolation, which would take away white noise. Without repetitions the residuals
-    themselves are taken for noise, and the estimate says so. near: an earlier estimate, from which to search; without
-    one the search begins in several places. DataError without trajectories.
+    fit, since errors of the model are the same in all repetitions and cancel. Repetitions are runs of one command
+    within a session (within a split if no session repeats a command). Runs with different stamps are compared at the
+    nearest ones; interpolation would reduce white noise. Without repetitions the residuals themselves count as noise,
+    and the estimate says so. near: an earlier estimate, where the search starts; without one it starts from several
+    points. DataError without trajectories.
     """
     differences = differences_between_repetitions(trajectories, residuals)
     if not differences.each:
@@ -125,24 +126,24 @@ def estimate_noise(
 
 
 def _components(differences: Sequence[Difference], near: Noise | None) -> Noise:
-    """The noise model that makes the differences most likely, position and heading each by itself."""
+    """The noise model of largest likelihood, position and heading independent."""
     groups: dict[bytes, tuple[Array, list[Array]]] = {}
-    for each in differences:
-        groups.setdefault(each.stamps.tobytes(), (each.stamps, []))[1].append(each.values)
-    found: dict[str, float] = {}
+    for difference in differences:
+        groups.setdefault(difference.stamps.tobytes(), (difference.stamps, []))[1].append(difference.values)
+    components: dict[str, float] = {}
     for name, columns in _COORDINATES:
         samples = [
             (stamps, np.stack(values, axis=-1)[:, columns].reshape(len(stamps), -1))
             for stamps, values in groups.values()
         ]
         names = [f"{kind}_{name}" for kind in ("pose", "walk", "bias")]
-        start = None if near is None else np.array([getattr(near, each) for each in names])
-        found |= dict(zip(names, _most_likely(samples, start), strict=True))
-    return Noise(**found)
+        start = None if near is None else np.array([getattr(near, component) for component in names])
+        components |= dict(zip(names, _most_likely(samples, start), strict=True))
+    return Noise(**components)
 
 
 def _most_likely(groups: list[tuple[Array, Array]], near: Array | None) -> tuple[float, float, float]:
-    """White noise, walk and bias for which samples (K, n) at stamps (K,) are most likely; near (3,): where to begin."""
+    """White noise, walk and bias of largest likelihood for samples (K, n) at stamps (K,); near (3,): first guess."""
     count = sum(values.size for _, values in groups)
     size = float(np.sqrt(sum(np.square(values).sum() for _, values in groups) / count))
     if size < LEAST_WHITE:
@@ -153,6 +154,7 @@ def _most_likely(groups: list[tuple[Array, Array]], near: Array | None) -> tuple
     prepared = [(np.diff(stamps, prepend=0.0), np.asfortranarray(_differences(values))) for stamps, values in groups]
 
     def negative_log_likelihood(components: Array) -> float:
+        """Twice the negative log-likelihood for each value, up to a constant."""
         white, walk, bias = components
         total = 0.0
         for steps, differences in prepared:
@@ -162,7 +164,7 @@ def _most_likely(groups: list[tuple[Array, Array]], near: Array | None) -> tuple
 
     if near is not None and near.any():
         starts = np.log(np.clip(near / units, 0.05, 50.0))[None]
-    else:  # the likelihood may have a hill for each component that could dominate
+    else:  # the likelihood may have a local maximum for each component that could dominate
         starts = np.log(0.1 + 0.6 * np.eye(3))
     tries = [
         minimize(
@@ -174,8 +176,8 @@ def _most_likely(groups: list[tuple[Array, Array]], near: Array | None) -> tuple
         )
         for start in starts
     ]
-    best = units * np.exp(min(tries, key=lambda each: float(each.fun)).x)
-    for index in np.argsort(best / units):  # on a logarithmic scale none is ever zero
+    best = units * np.exp(min(tries, key=lambda attempt: float(attempt.fun)).x)
+    for index in np.argsort(best / units):  # try zero, which a logarithmic scale never reaches
         without = np.where(np.arange(3) == index, 0.0, best)
         if count * (negative_log_likelihood(without) - negative_log_likelihood(best)) < _NO_LOSS:
             best = without

@@ -1,4 +1,4 @@
-"""Repetitions of a command, and their differences: combinations of runs that hold noise and nothing of the model."""
+"""Repetitions of a command, and differences between them, which contain the noise but no error of the model."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from omnibench.robot.kinematics import Array
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """A combination of runs that is distributed as the noise of one run.
+    """A linear combination of runs that is distributed as the noise of one run.
 
-    stamps (K,): s. values (K, 3): m, m, rad. companion (K, 3): the mean over these runs of what came with them.
+    stamps (K,): s. values (K, 3): m, m, rad. companion (K, 3): mean over these runs of a second quantity, for example
+    the derivatives by the start heading.
     """
 
     stamps: Array
@@ -27,7 +28,7 @@ class Difference:
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """Independent differences, where they come from, and of how many runs of how many commands."""
+    """Independent differences, their source, and in words from how many runs and commands they come."""
 
     each: tuple[Difference, ...]
     source: Literal["repetitions", "within runs"]
@@ -39,32 +40,33 @@ def differences_between_repetitions(
 ) -> Differences:
     """Independent differences of residuals (K, 3), given at every trajectory's pose_times[1:].
 
-    Where no command is repeated, the residuals themselves stand for the differences.
+    companions (K, 3): a second quantity of every trajectory, averaged alongside; default the residuals. Without
+    repeated commands the residuals themselves stand in for the differences.
     """
     companions = residuals if companions is None else companions
     runs = [
-        (run.pose_times[1:], np.stack([own, other], axis=-1))
-        for run, own, other in zip(trajectories, residuals, companions, strict=True)
+        (run.pose_times[1:], np.stack([residual, companion], axis=-1))
+        for run, residual, companion in zip(trajectories, residuals, companions, strict=True)
     ]
     repeated = repetitions_of_commands(trajectories)
     measured = [[runs[index] for index in members if len(runs[index][0])] for members in repeated.groups]
-    if found := tuple(each for members in measured for each in _contrasts(members)):
+    if contrasts := tuple(contrast for members in measured for contrast in _contrasts(members)):
         words = (
-            f"{len(found)} independent differences between repetitions ({repeated.description}, each within one "
+            f"{len(contrasts)} independent differences between repetitions ({repeated.description}, each within one "
             f"{repeated.within})"
         )
-        return Differences(found, "repetitions", words)
-    found = tuple(Difference(stamps, values[..., 0], values[..., 1]) for stamps, values in runs if len(stamps))
+        return Differences(contrasts, "repetitions", words)
+    whole = tuple(Difference(stamps, values[..., 0], values[..., 1]) for stamps, values in runs if len(stamps))
     words = (
-        f"the residuals within {len(found)} runs: no command is repeated, so what the model cannot express counts as "
+        f"the residuals within {len(whole)} runs: no command is repeated, so what the model cannot express counts as "
         "noise"
     )
-    return Differences(found, "within runs", words)
+    return Differences(whole, "within runs", words)
 
 
 @dataclass(frozen=True)
 class Repetitions:
-    """Indices of the runs of every command that is driven more than once, within one session or one split."""
+    """Groups of run indices, one for every command driven more than once within one session or one split."""
 
     groups: tuple[tuple[int, ...], ...]
     within: Literal["session", "split"]
@@ -78,7 +80,7 @@ def repetitions_of_commands(trajectories: Sequence[Trajectory]) -> Repetitions:
     """The repetitions within sessions; if no session repeats a command, those within splits. Runs need a command."""
     for within in ("session", "split"):
         keys = [(run.split, run.session if within == "session" else None, run.command) for run in trajectories]
-        repeated = [each for each in grouped(keys) if len(each) > 1 and trajectories[each[0]].command is not None]
+        repeated = [group for group in grouped(keys) if len(group) > 1 and trajectories[group[0]].command is not None]
         if repeated:
             return Repetitions(tuple(repeated), within)
     return Repetitions((), "split")
@@ -107,15 +109,15 @@ def _contrasts(runs: list[tuple[Array, Array]]) -> Iterator[Difference]:
 
 
 def _common(runs: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Stamps (K,) of the run that has the fewest, and the values (n, K, ...) of all runs at the nearest of their own.
+    """Stamps (K,) of the run with the fewest, and values (n, K, ...) of all runs at their nearest stamps.
 
-    Nothing is interpolated: the mean of two poses has less white noise than a pose.
+    Interpolating would average two poses, which have less white noise than one.
     """
     end = min(stamps[-1] for stamps, _ in runs)
     coarsest = min((stamps for stamps, _ in runs), key=lambda stamps: int((stamps <= end).sum()))
     grid = coarsest[coarsest <= end]
     chosen = np.array([_nearest(stamps, grid) for stamps, _ in runs], dtype=np.intp)
-    # A pose stands for one stamp only: the same white noise twice would look like less of it.
+    # A pose is used for one stamp only: using it twice would correlate the white noise.
     fresh = (np.diff(chosen, axis=1, prepend=-1) > 0).all(axis=0)
     return grid[fresh], np.array([values[index[fresh]] for (_, values), index in zip(runs, chosen, strict=True)])
 

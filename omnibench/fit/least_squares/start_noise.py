@@ -1,8 +1,8 @@
-"""How far the start headings of runs are off, beside the other noise: one variance more.
+"""Noise of the start headings, as one more variance component beside those of noise.py.
 
 An error e of a run's start position shifts its poses by e: a bias. An error of its start heading shifts the headings
-alike, and also turns the path about the start: with u the derivative of the poses by the start heading, the
-covariance of a run grows by deviation^2 u u', which the turned path tells from a biased heading.
+by as much, and also turns the path about the start: with u the derivative of the poses by the start heading, the
+covariance of a run grows by deviation^2 u u'. The turned path distinguishes it from a biased heading.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _LARGEST = 0.3  # rad, largest start heading error that is searched; chosen
 
 @dataclass(frozen=True)
 class StartNoise:
-    """The noise with the start headings apart; start_heading: their standard deviation, rad, 0 where none shows."""
+    """The noise without that of the start headings, whose standard deviation is start_heading, rad."""
 
     noise: Noise
     start_heading: float
@@ -37,11 +37,11 @@ class StartNoise:
 def separate_start_noise(
     trajectories: Sequence[Trajectory], residuals: Sequence[Array], turning: Sequence[Array], noise: Noise
 ) -> StartNoise:
-    """The noise and the start headings' deviation that make the differences between repetitions most likely.
+    """Maximum likelihood estimate of the noise and of the start headings' deviation, from repetitions.
 
     residuals (K, 3) of every trajectory as for estimate_noise; turning (K, 3): derivatives of its poses by its start
-    heading; noise: the estimate without start noise, where the search begins. A deviation that does not raise the
-    likelihood beyond chance (5 %) is none.
+    heading; noise: the estimate without start noise, where the search begins. The deviation is 0 unless a likelihood
+    ratio test (5 %) rejects that.
     """
     groups = by_stamps(differences_between_repetitions(trajectories, residuals, turning).each)
     constant = noise.bias_heading
@@ -59,19 +59,19 @@ def separate_start_noise(
     )
     if before - float(first.fun) < _CHI_SQUARE / 4:  # fitting the other components again will not add that much
         return StartNoise(noise, 0.0)
-    found, deviation, after = _polished(groups, apart(float(first.x)), float(first.x))
-    return StartNoise(found, deviation) if before - after > _CHI_SQUARE else StartNoise(noise, 0.0)
+    likeliest, deviation, after = _polished(groups, apart(float(first.x)), float(first.x))
+    return StartNoise(likeliest, deviation) if before - after > _CHI_SQUARE else StartNoise(noise, 0.0)
 
 
 def by_stamps(differences: Sequence[Difference]) -> list[tuple[Array, Array]]:
-    """Stamps (K,) and, of the n differences that have these, values (K, 3, n) beside derivatives (K, 3, n)."""
+    """Differences grouped by their stamps (K,): values (K, 3, n) and companions (K, 3, n) of n, as one (K, 3, 2n)."""
     groups: dict[bytes, list[Difference]] = {}
-    for each in differences:
-        groups.setdefault(each.stamps.tobytes(), []).append(each)
+    for difference in differences:
+        groups.setdefault(difference.stamps.tobytes(), []).append(difference)
     return [
         (
             members[0].stamps,
-            np.stack([*(each.values for each in members), *(each.companion for each in members)], axis=-1),
+            np.stack([*(member.values for member in members), *(member.companion for member in members)], axis=-1),
         )
         for members in groups.values()
     ]
@@ -93,9 +93,9 @@ def _twice_negative_log_likelihood(groups: list[tuple[Array, Array]], noise: Noi
 
 
 def _polished(groups: list[tuple[Array, Array]], noise: Noise, deviation: float) -> tuple[Noise, float, float]:
-    """All components together, from a good start."""
+    """All components estimated together, from a good start: the noise, the deviation and the likelihood there."""
     start = np.array([*(getattr(noise, name) for name in _NAMES), deviation])
-    # From zero there is no way up on a logarithmic scale.
+    # The search is on a logarithmic scale, where zero cannot be left.
     start[:3] = np.maximum(start[:3], 0.1 * max(start[:3].max(), LEAST_WHITE))
     start[3:] = np.maximum(start[3:], 0.1 * max(start[3:].max(), LEAST_WHITE))
 
@@ -111,5 +111,5 @@ def _polished(groups: list[tuple[Array, Array]], noise: Noise, deviation: float)
         bounds=[(-5.0, 5.0)] * 7,
         options={"eps": 1e-5, "ftol": 1e-10},
     )
-    found, deviation = described(answer.x)
-    return found, deviation, _twice_negative_log_likelihood(groups, found, deviation)
+    likeliest, deviation = described(answer.x)
+    return likeliest, deviation, _twice_negative_log_likelihood(groups, likeliest, deviation)

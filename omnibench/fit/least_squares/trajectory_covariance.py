@@ -1,4 +1,4 @@
-"""Covariance of a trajectory fit: what the noise means, and what the scatter of the runs shows."""
+"""Covariance of a trajectory fit, from its noise model or from the scatter of the runs."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.uncertainty.sandwich import Sandwich, Scores, sandwich
 from omnibench.robot.kinematics import Array
 
-# Scatter counts as more than noise where chance exceeds it once in a thousand times.
-_CHANCE = 0.001
-_RANK = 1e-12
-_TOLD = 1e-3  # of what a command tells most sharply: what it tells by encoder noise alone is less
+_CHANCE = 0.001  # level of the tests that decide whether runs scatter more than the noise; chosen strict
+_RANK = 1e-12  # share of the largest eigenvalue of the information below which a direction is undetermined
+# Share of the largest eigenvalue of a command's information below which a direction has information from encoder noise
+# alone. Chosen.
+_DETERMINED = 1e-3
 
 
 class FitCovariance:
-    """The covariances (n, n) of the vector that a linearised fit gives; zero in rows and columns of held elements.
+    """Covariances (n, n) of the vector of a linearised fit; zero in rows and columns of held elements.
 
-    model: the inverse of the information, none along directions that the data do not tell at all. scatter: the
-    sandwich of fit/sandwich.py, None for too few runs.
+    model: inverse of the information, zero along undetermined directions. scatter: the sandwich of
+    uncertainty/sandwich.py, None if there are too few runs.
     """
 
     def __init__(self, problem: CalibrationProblem, linear: Linearisation, trajectories: Sequence[Trajectory]) -> None:
@@ -37,8 +38,8 @@ class FitCovariance:
         values, vectors = np.linalg.eigh(information.sum(axis=0))
         known = values > _RANK * values.max(initial=0.0)
         self._roots, self._directions = np.sqrt(values[known]), vectors[:, known]
-        turn = self._directions / self._roots  # to numbers whose covariance, by the model, is the unit matrix
-        self._chance_of_misfit = _chance_of_misfit(scores @ turn, turn.T @ information @ turn, trajectories)
+        whiten = self._directions / self._roots  # to coordinates in which the model's covariance is the unit matrix
+        self._chance_of_misfit = _chance_of_misfit(scores @ whiten, whiten.T @ information @ whiten, trajectories)
         self._scatter: Sandwich | None = None
         if known.any():
             try:
@@ -54,23 +55,23 @@ class FitCovariance:
     def scatter(self) -> Sandwich | None:
         if self._scatter is None:
             return None
-        found = self._scatter
-        return Sandwich(self._whole(found.covariance), found.degrees_of_freedom, found.words, found.lack_of_fit)
+        free = self._scatter
+        return Sandwich(self._whole(free.covariance), free.degrees_of_freedom, free.words, free.lack_of_fit)
 
     @property
     def lack_of_fit(self) -> bool:
-        """Whether commands scatter more than their repetitions explain, by the likelihood as well as by the sandwich.
+        """True if commands scatter more than their repetitions explain, by the likelihood and by the sandwich.
 
-        The likelihood's is an F test on what every command by itself says of the vector, each direction in units of
-        its noise, so that the noise's size does not matter.
+        The likelihood's test is an F test between and within commands on the vectors that single commands would give,
+        each direction in units of its noise, so that the size of the noise does not matter.
         """
         return self._scatter is not None and self._scatter.lack_of_fit and self._chance_of_misfit < _CHANCE
 
     @property
     def scatter_is_wider(self) -> bool:
-        """Whether the runs scatter more than the noise means, by more than chance.
+        """True if the runs scatter significantly more than the noise model predicts.
 
-        Scatter between commands counts only where the likelihood's test bears it out.
+        Scatter between commands counts only if the likelihood's test confirms it.
         """
         if self._scatter is None or self._scatter.lack_of_fit:
             return self.lack_of_fit
@@ -81,27 +82,28 @@ class FitCovariance:
         return total / len(values) > float(stats.chi2.isf(_CHANCE, freedom)) / freedom
 
     def _whole(self, covariance: Array) -> Array:
+        """A covariance of the free elements, in units of the box, as one (n, n) of the vector."""
         whole = np.zeros((self._size, self._size))
         whole[np.ix_(self._free, self._free)] = covariance * np.outer(self._unit, self._unit)
         return whole
 
 
 def _chance_of_misfit(scores: Array, information: Array, trajectories: Sequence[Trajectory]) -> float:
-    """The chance that commands differ from one vector as much as they do; 1 where no repetitions show the noise.
+    """p-value of the F test that one vector fits all commands; 1 where no repetitions show the noise.
 
-    scores (Z, k) and information (Z, k, k) of the runs, summed up to 0 and the unit matrix.
+    scores (Z, k) and information (Z, k, k) of the runs, whose sums are 0 and the unit matrix.
     """
     groups = grouped([(run.session, run.command, run.id if run.command is None else None) for run in trajectories])
     between, within, between_freedom, within_freedom = 0.0, 0.0, -scores.shape[1], 0
     for members in map(list, groups):
         values, vectors = np.linalg.eigh(information[members].sum(axis=0))
-        told = values > _TOLD * values.max(initial=0.0)
-        own, rank = scores[members] @ vectors[:, told], int(told.sum())
-        common = float((own.sum(axis=0) ** 2 / values[told]).sum())
+        determined = values > _DETERMINED * values.max(initial=0.0)
+        turned, rank = scores[members] @ vectors[:, determined], int(determined.sum())
+        common = float((turned.sum(axis=0) ** 2 / values[determined]).sum())
         between, between_freedom = between + common, between_freedom + rank
         if len(members) > 1:
-            each = vectors[:, told].T @ information[members] @ vectors[:, told]
-            within += sum(float(s @ np.linalg.lstsq(m, s)[0]) for s, m in zip(own, each, strict=True)) - common
+            of_runs = vectors[:, determined].T @ information[members] @ vectors[:, determined]
+            within += sum(float(s @ np.linalg.lstsq(m, s)[0]) for s, m in zip(turned, of_runs, strict=True)) - common
             within_freedom += (len(members) - 1) * rank
     if between_freedom <= 0 or within_freedom <= 0 or within <= 0:
         return 1.0

@@ -1,4 +1,4 @@
-"""Weighted least squares of whole reference trajectories, with nuisances of every run eliminated.
+"""Weighted least squares of whole reference trajectories, with the nuisances of every run eliminated.
 
 With r the residuals of a run (odometry minus reference), W their weighting, J their derivatives by the vector, N those
 by the run's nuisances eta, and S the standard deviations that eta is expected to have, a Gauss-Newton step (d, e)
@@ -27,8 +27,8 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
 
 TURN, OFFSET, SLOPE = range(3)
-_LAST = 5  # samples whose mean rate tells how the robot goes on after the last
-# Residuals (K, 3) of a run, or derivatives of them (K, 3, n), to weighted ones: (k, 3) or (k, 3, n).
+_LAST = 5  # samples whose mean rate continues the path after the last sample; chosen
+# A function from a run's residuals (K, 3), or their derivatives (K, 3, n), to weighted ones (k, 3) or (k, 3, n).
 Weighting = Callable[[Array], Array]
 
 
@@ -36,9 +36,9 @@ Weighting = Callable[[Array], Array]
 class Estimate:
     """A vector (n,) and the nuisances of every run (Z, 3).
 
-    Nuisances: what is to be added to the start heading (rad); offset tau (s) and slope s of the reference's clock: a
-    pose with stamp t was taken at t - tau - s t on the clock of the wheels. A shift of the start position is a bias of
-    the run, which the noise model has, and so is no nuisance.
+    Nuisances: correction that is added to the start heading (rad); offset tau (s) and slope s of the reference's clock,
+    by which a pose with stamp t was taken at t - tau - s t on the clock of the wheels. A shift of the start position is
+    no nuisance: it is a bias of the run, which the noise model contains.
     """
 
     vector: Array
@@ -47,9 +47,9 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """A fit about an estimate, the nuisances eliminated.
+    """A fit linearised about an estimate, the nuisances eliminated, run by run.
 
-    Of every run: chi2 (Z,), its share in the objective; information (Z, n, n), J'V^-1 J; scores (Z, n), J'V^-1 r.
+    chi2 (Z,): shares of the objective. information (Z, n, n): J'V^-1 J. scores (Z, n): J'V^-1 r.
     """
 
     chi2: Array
@@ -66,9 +66,9 @@ class Linearisation:
 
 
 class TrajectoryFit:
-    """The reference poses of some runs against the odometry of any estimate. DataError when there are none to fit.
+    """Residuals between the reference poses of some runs and the odometry of an estimate, and their derivatives.
 
-    trajectories: the runs that have reference poses after their start.
+    trajectories: the runs that have reference poses after their start; DataError when there are none.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class TrajectoryFit:
         self._reference = np.concatenate([run.poses[1:] for run in self.trajectories])
         ends = np.cumsum([0, *(len(run.pose_times) - 1 for run in self.trajectories)])
         self._parts = [slice(first, last) for first, last in pairwise(ends)]
-        # Velocities are taken over two samples: the rate of one holds its encoder noise in full.
+        # Velocities are differences over two samples: the rate of a single one has its full encoder noise.
         self._period = float(np.median(np.concatenate([np.diff(run.times, prepend=0.0) for run in self.trajectories])))
         self._plain = self._batch(np.zeros((len(self.trajectories), 3)))
 
@@ -109,22 +109,22 @@ class TrajectoryFit:
         """Every run's share (Z,) in the objective at an estimate, with deviations as for ``linearise``."""
         known = deviations > 0
         shares: Array = np.square(estimate.nuisances[:, known] / deviations[known]).sum(axis=1)
-        for row, own in enumerate(self.residuals(estimate)):
-            shares[row] += float(np.square(weightings[row](own)).sum())
+        for row, residuals in enumerate(self.residuals(estimate)):
+            shares[row] += float(np.square(weightings[row](residuals)).sum())
         return shares
 
     def linearise(self, estimate: Estimate, weightings: Sequence[Weighting], deviations: Array) -> Linearisation:
-        """Information and scores about an estimate.
+        """The fit linearised about an estimate.
 
-        deviations (3,): S, the standard deviations of the nuisances; 0 for one that is held where it is.
+        deviations (3,): S, the standard deviations of the nuisances; 0 for one that keeps its value.
         """
         size, known = len(estimate.vector), deviations > 0
         jacobian, columns = self._jacobian(estimate), self._nuisance_columns(estimate, known)
         expected, scale = estimate.nuisances[:, known] / deviations[known], np.diag(1 / deviations[known])
         chi2, information, scores, solved = [], [], [], []
-        for row, own in enumerate(self.residuals(estimate)):
+        for row, errors in enumerate(self.residuals(estimate)):
             part = self._parts[row]
-            everything = weightings[row](np.concatenate([own[..., None], jacobian[part], columns[part]], axis=-1))
+            everything = weightings[row](np.concatenate([errors[..., None], jacobian[part], columns[part]], axis=-1))
             white = everything.reshape(-1, everything.shape[-1])
             residuals, slopes = white[:, 0], white[:, 1 : 1 + size]
             if known.any():
@@ -154,13 +154,13 @@ class TrajectoryFit:
         for run, (turn, offset, slope) in zip(self.trajectories, nuisances, strict=True):
             stamps = run.pose_times[1:] * (1 - slope) - offset + later
             times, rates = run.times, run.rates
-            if stamps[-1] > times[-1]:  # the robot went on; without this the path would have a kink at its last pose
+            if stamps[-1] > times[-1]:  # the robot drove on; the path must not stop at the last sample
                 times, rates = np.append(times, stamps[-1]), np.vstack([rates, rates[-_LAST:].mean(axis=0)])
             logs.append(WheelLog(times, rates, run.start + np.array([0.0, 0.0, turn]), stamps))
         return OdometryBatch(logs, self._integration)
 
     def _jacobian(self, estimate: Estimate) -> Array:
-        """Derivatives (S, 3, n) of the poses by the vector; those of the matrix by the vector by differences."""
+        """Derivatives (S, 3, n) of the poses by the vector; the matrix is differentiated by central differences."""
         vector, size = estimate.vector, len(estimate.vector)
         steps = 1e-5 * np.maximum(np.abs(self._parameterisation.start), 1e-3)
         matrices = self._parameterisation.matrices(np.concatenate([vector + np.diag(steps), vector - np.diag(steps)]))
@@ -169,7 +169,7 @@ class TrajectoryFit:
         return by_elements.reshape(len(by_elements), 3, -1) @ slopes.reshape(size, -1).T
 
     def _nuisance_columns(self, estimate: Estimate, known: NDArray[np.bool_]) -> Array:
-        """Derivatives (S, 3, m) of the poses by the nuisances that are known (3,)."""
+        """Derivatives (S, 3, m) of the poses by the m nuisances that are estimated, True in ``known`` (3,)."""
         columns: list[Array] = []
         if known[TURN]:
             columns.append(self._turning(estimate))

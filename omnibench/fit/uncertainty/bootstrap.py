@@ -1,4 +1,4 @@
-"""How far an exact optimum would move on other recordings: bootstrap intervals over trajectories."""
+"""Bootstrap intervals of an exact optimum: how far it would move on other recordings."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def bootstrap_intervals(
 ) -> ElementIntervals:
     """Percentile intervals of the matrix elements about closed_form's ``optimum`` (n,).
 
-    Trajectories are drawn with replacement and the optimum is found again, with the poses linearised about the first
-    one: resampling moves it so little that bending is far below the width of the intervals. ConfigError for another
-    parameterisation or a cost that is no sum of norms.
+    Trajectories are drawn with replacement and the optimum is found again, with the poses linearised about
+    ``optimum``: the error of that is far below the width of the intervals. ConfigError for another parameterisation or
+    a cost that is no sum of norms.
     """
     objective = problem.objective
     if not isinstance(problem.parameterisation, MatrixElements) or not isinstance(objective, SumOfNorms):

@@ -1,4 +1,4 @@
-"""What recordings can tell of a robot before anything is fitted: of which motions, how well, and what stays open."""
+"""Identifiability: how precisely recordings determine a robot's matrix and geometry, before anything is fitted."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from omnibench.fit.span import (
 )
 from omnibench.fit.uncertainty.information import information_of_runs
 from omnibench.fit.uncertainty.physical import (
+    identified_parameters,
     matrix_slopes,
     parameter_scale,
-    told_parameters,
     unit_of,
 )
 from omnibench.fit.uncertainty.unidentified import open_directions
@@ -33,17 +33,17 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration, OdometryBatch
 
 ROWS = ("x", "y", "heading")
-# A row that the data tell no better than this along a direction is not told: calibrations are about a few per cent,
-# and the box about the design is +-25 % wide.
+# Standard deviation, as a share of a row's largest element, above which the row counts as rough along a direction:
+# calibrations change rows by a few per cent, and the box about the design is +-25 % wide. Chosen.
 LARGEST_DEVIATION = 0.10
 
 
 class DirectionIdentifiability(Model):
-    """What the data tell of the matrix along one direction of wheel rates.
+    """How precisely the data determine the matrix along one direction of wheel rates.
 
-    motion: what the designed robot does there (``turning on the spot``; empty: the wheels only slip). share: how much
-    it is driven, RMS, of the most driven direction. state: driven; weak (driven so little that slip alone may have
-    done it); undriven. deviations: the predicted standard deviation of each row (x, y, heading) along the direction, as
+    motion: of the design robot under these rates (``turning on the spot``; empty: the wheels only slip). share: RMS
+    wheel angle along it, relative to the strongest direction. state: driven; weak (so little that slip alone may
+    explain it); undriven. deviations: predicted standard deviation of each row (x, y, heading) along the direction, as
     a share of the row's largest element, when every reference pose is used; None where undriven.
     """
 
@@ -55,10 +55,7 @@ class DirectionIdentifiability(Model):
 
 
 class ParameterIdentifiability(Model):
-    """Whether the data tell a physical parameter by itself, and the standard deviation (its unit) to be expected.
-
-    deviation: None where it is not told.
-    """
+    """A physical parameter. told: True if the data identify it; deviation: predicted, standard; None if not told."""
 
     name: str
     unit: str
@@ -68,9 +65,9 @@ class ParameterIdentifiability(Model):
 
 
 class Identifiability(Model):
-    """What can be told from some runs, predicted at the design or at a quick linear fit.
+    """Predicted precision of a calibration on some runs.
 
-    sentences: what cannot be told, in words, and which runs would help.
+    sentences: what the runs do not determine, in words, and which runs would help.
     """
 
     directions: tuple[DirectionIdentifiability, ...]
@@ -83,20 +80,20 @@ class Identifiability(Model):
 def identifiability(
     robot: Robot, trajectories: Sequence[Trajectory], integration: Integration = "arc"
 ) -> Identifiability:
-    """What the runs tell of the matrix, along every direction of wheel rates, and of the wheels' geometry.
+    """How precisely runs determine the matrix, along every direction of wheel rates, and the wheels' geometry.
 
-    Standard deviations are those of the Cramer-Rao bound: no estimator without bias has smaller ones. The noise is what
-    the repetitions of commands show, or, where none is repeated, all that a quick linear fit leaves. A model that does
-    not fit adds to them. DataError when there are no trajectories.
+    Standard deviations are those of the Cramer-Rao bound: no unbiased estimator has smaller ones, and a model that does
+    not fit has larger ones. The noise is estimated from repetitions of commands or, without any, from all residuals of
+    a quick linear fit. DataError when there are no trajectories.
     """
     span = driven_span(trajectories)
     estimate, matrix = _quick_noise(robot, trajectories, span, integration)
     information = information_of_runs(trajectories, matrix, integration, estimate.noise).sum(axis=0)
     rows = np.abs(robot.inverse_kinematic_matrix).max(axis=1)
-    found = np.concatenate([aligned(span.strong, robot), unidentified_directions(robot, span)])
-    driven = found[[span.state(direction) != "undriven" for direction in found]]
+    every = np.concatenate([aligned(span.strong, robot), unidentified_directions(robot, span)])
+    driven = every[[span.state(direction) != "undriven" for direction in every]]
     deviations = iter(_deviations(information, driven) / rows)
-    directions = tuple(_direction(robot, span, direction, deviations) for direction in found)
+    directions = tuple(_direction(robot, span, direction, deviations) for direction in every)
     parameters = _parameters(robot, span, information)
     return Identifiability(
         directions=directions,
@@ -112,39 +109,41 @@ def identifiability(
 
 
 def _rough_rows(directions: Sequence[DirectionIdentifiability]) -> Iterator[str]:
-    """A sentence for every direction that is driven, and yet told badly."""
-    for each in directions:
-        if each.state != "driven" or each.deviations is None:
+    """A sentence for every driven direction along which a row is only roughly determined."""
+    for direction in directions:
+        if direction.state != "driven" or direction.deviations is None:
             continue
         rough = [
             f"row {number} ({name}) to {100 * value:.0f} %"
-            for number, (name, value) in enumerate(zip(ROWS, each.deviations, strict=True), 1)
+            for number, (name, value) in enumerate(zip(ROWS, direction.deviations, strict=True), 1)
             if value > LARGEST_DEVIATION
         ]
         if rough:
-            motion = f" ({each.motion})" if each.motion else ""
+            motion = f" ({direction.motion})" if direction.motion else ""
             yield (
-                f"of {each.direction}{motion} the data tell {', '.join(rough)} of the row's largest element at best "
-                "(standard deviation): record more or longer runs"
+                f"of {direction.direction}{motion} the data tell {', '.join(rough)} of the row's largest element "
+                "at best (standard deviation): record more or longer runs"
             )
 
 
 def _open_parameters(robot: Robot, parameters: Sequence[ParameterIdentifiability]) -> Iterator[str]:
-    """A sentence about physical parameters that other recordings would tell."""
+    """A sentence about physical parameters that these recordings do not identify, but others could."""
     _, _, directions = np.linalg.svd(robot.inverse_kinematic_matrix)
-    ever = told_parameters(robot, directions[3:])
-    untold = [each.name for each, could in zip(parameters, ever, strict=True) if could and not each.told]
-    if untold:
-        yield f"of the wheels' geometry these recordings do not tell {', '.join(untold)}"
+    ever = identified_parameters(robot, directions[3:])
+    missing = [
+        parameter.name for parameter, could in zip(parameters, ever, strict=True) if could and not parameter.told
+    ]
+    if missing:
+        yield f"of the wheels' geometry these recordings do not tell {', '.join(missing)}"
 
 
 def _quick_noise(
     robot: Robot, trajectories: Sequence[Trajectory], span: DrivenSpan, integration: Integration
 ) -> tuple[NoiseEstimate, Array]:
-    """The noise of the poses by a linear fit, and the fit's matrix (3, N).
+    """Noise of the poses by a linear fit, and the fit's matrix (3, N).
 
-    Headings are linear in row 3; positions, with the headings of the reference, in rows 1 and 2. Directions that are
-    not driven keep the design values.
+    Headings are linear in row 3; positions, with the headings of the reference, are linear in rows 1 and 2. Undriven
+    directions keep the design values.
     """
     usable = [run for run in trajectories if len(run.pose_times) > 1]
     if not usable:
@@ -170,7 +169,7 @@ def _quick_noise(
 
 
 def _deviations(information: Array, driven: Array) -> Array:
-    """Standard deviations (q, 3) of the rows along orthonormal directions (q, N) that are fitted together."""
+    """Standard deviations (q, 3) of the three rows along orthonormal directions (q, N) that are fitted together."""
     basis = np.kron(np.eye(3), driven)
     variances = np.diag(_inverse(basis @ information @ basis.T))
     deviations: Array = np.sqrt(variances).reshape(3, -1).T
@@ -178,7 +177,7 @@ def _deviations(information: Array, driven: Array) -> Array:
 
 
 def _inverse(information: Array) -> Array:
-    """The inverse of an information matrix; enormous, not infinite, where nothing is known."""
+    """Inverse of an information matrix; huge but finite in directions without information."""
     values, vectors = np.linalg.eigh(information)
     values = np.maximum(values, 1e-14 * max(float(values.max(initial=0.0)), 1e-300))
     inverse: Array = (vectors / values) @ vectors.T
@@ -188,25 +187,25 @@ def _inverse(information: Array) -> Array:
 def _direction(
     robot: Robot, span: DrivenSpan, direction: Array, deviations: Iterator[Array]
 ) -> DirectionIdentifiability:
-    """One direction; if it is driven the next deviations (3,) are its own."""
+    """The identifiability along one direction; takes the next of ``deviations`` (3,) unless it is undriven."""
     state = span.state(direction)
-    own: tuple[float, float, float] | None = None
+    of_rows: tuple[float, float, float] | None = None
     if state != "undriven":
         x, y, heading = map(float, next(deviations))
-        own = x, y, heading
+        of_rows = x, y, heading
     return DirectionIdentifiability(
         direction=direction_in_words(direction, robot.wheel_names),
         motion=motion_in_words(direction, robot),
         share=span.share(direction),
         state=state,
-        deviations=own,
+        deviations=of_rows,
     )
 
 
 def _parameters(robot: Robot, span: DrivenSpan, information: Array) -> tuple[ParameterIdentifiability, ...]:
-    """The physical parameters, as the identified directions tell them, the rest of the matrix being unknown."""
+    """Identifiability of the physical parameters if the matrix is unknown along unidentified directions."""
     kept = unidentified_directions(robot, span)
-    told = told_parameters(robot, kept)
+    identified = identified_parameters(robot, kept)
     design = WheelGeometry(robot).start
     known = np.kron(np.eye(3), np.eye(kept.shape[1]) - kept.T @ kept)
     unit = parameter_scale(design)
@@ -218,8 +217,8 @@ def _parameters(robot: Robot, span: DrivenSpan, information: Array) -> tuple[Par
             name=name,
             unit=unit_of(name),
             design=float(value),
-            told=tells,
-            deviation=float(deviation) if tells else None,
+            told=told,
+            deviation=float(deviation) if told else None,
         )
-        for name, value, tells, deviation in zip(WheelGeometry(robot).names, design, told, deviations, strict=True)
+        for name, value, told, deviation in zip(WheelGeometry(robot).names, design, identified, deviations, strict=True)
     )

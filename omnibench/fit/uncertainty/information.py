@@ -1,4 +1,4 @@
-"""Fisher information of the matrix elements: how sharply runs tell them, given the noise of the reference poses."""
+"""Fisher information of the matrix elements, given the noise of the reference poses."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ def information_of_runs(
     *,
     stamps: Stamps = "reference",
 ) -> Array:
-    """Fisher information (Z, 3N, 3N) of each of the runs; that of all of them is its sum."""
+    """Fisher information (Z, 3N, 3N) of each run; their sum is that of all runs together."""
     size = matrix.size
-    each = [information_of_run(run, matrix, integration, noise, stamps=stamps) for run in runs]
-    return np.array(each).reshape(len(runs), size, size)
+    information = [information_of_run(run, matrix, integration, noise, stamps=stamps) for run in runs]
+    return np.array(information).reshape(len(runs), size, size)
 
 
 def _log(run: Trajectory, stamps: Stamps) -> WheelLog:

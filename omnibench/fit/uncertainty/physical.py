@@ -1,4 +1,4 @@
-"""Wheel geometry behind a matrix: radius, distance and angle of each wheel, and what of them the matrix tells."""
+"""Wheel geometry from a matrix: radius, distance and angle of each wheel, and which of them it identifies."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ from omnibench.errors import DataError
 from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrices
 
-_STEP = 1e-6
-# A parameter with more than this share in a combination that nothing tells is not told by itself.
-_UNTOLD = 1e-3
+_STEP = 1e-6  # of central differences, as a share of each parameter's scale
+_UNIDENTIFIED = 1e-3  # share of a parameter's axis in the unidentified space from which on it is not identified; chosen
 
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """A physical parameter of a wheel: value and standard deviation (m, or rad for angles), 95 % interval.
+    """A physical parameter of a wheel: value, standard deviation and 95 % interval, m, or rad for angles.
 
-    The last three are None where the data do not tell the parameter by itself.
+    standard_deviation, low and high are None if the data do not identify the parameter.
     """
 
     name: str
@@ -36,12 +35,12 @@ def unit_of(name: str) -> str:
 
 
 def is_invertible(robot: Robot) -> bool:
-    """Whether a matrix means one geometry: for three omni wheels, nine elements for nine parameters."""
+    """True if the matrix determines the geometry: three omni wheels, nine elements for nine parameters."""
     return len(robot.wheels) == 3 and not any(wheel.roller_angle for wheel in robot.wheels)
 
 
 def geometry_of(matrix: Array, robot: Robot) -> Array:
-    """The geometry (9,) of three omni wheels whose matrix (3, 3) this is, Eq. (3) turned round.
+    """Geometry (9,) of the three omni wheels that have a matrix (3, 3): the inverse of Eq. (3).
 
     The wheel equations (-sin d, cos d, R)/r are the rows of the matrix's inverse. Angles come out within half a turn of
     the design. DataError for other wheels and for a matrix that no wheels have.
@@ -72,23 +71,23 @@ def matrix_slopes(robot: Robot, geometry: Array) -> Array:
     return slopes
 
 
-def told_parameters(robot: Robot, kept: Array) -> tuple[bool, ...]:
-    """Which of the 3N parameters a matrix tells that is known but along the directions ``kept`` (q, N).
+def identified_parameters(robot: Robot, kept: Array) -> tuple[bool, ...]:
+    """Which of the 3N parameters are identified by a matrix that is unknown along the directions ``kept`` (q, N).
 
-    Judged near the design: a parameter is told by itself if no change of the geometry that moves it leaves the known
-    part of the matrix alone.
+    Linearised about the design: a parameter is identified if every change of the geometry that moves it changes the
+    known part of the matrix.
     """
     geometry = WheelGeometry(robot).start
     known = np.kron(np.eye(3), np.eye(kept.shape[1]) - kept.T @ kept)
     rows = np.repeat(np.abs(robot.inverse_kinematic_matrix).max(axis=1), kept.shape[1])
     slopes = known @ matrix_slopes(robot, geometry) * parameter_scale(geometry) / rows[:, None]
     _, strengths, directions = np.linalg.svd(slopes)
-    untold = directions[strengths <= 1e-6 * strengths[0]]
-    return tuple(bool(share < _UNTOLD) for share in np.square(untold).sum(axis=0))
+    unidentified = directions[strengths <= 1e-6 * strengths[0]]
+    return tuple(bool(share < _UNIDENTIFIED) for share in np.square(unidentified).sum(axis=0))
 
 
 def parameter_scale(geometry: Array) -> Array:
-    """Radii and distances in units of themselves, angles in rad."""
+    """Scale (3N,) of each parameter: radii and distances their own size in m, angles 1 rad."""
     scale: Array = np.abs(geometry)
     scale[2 * len(geometry) // 3 :] = 1.0
     return scale

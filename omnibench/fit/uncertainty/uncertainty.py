@@ -1,4 +1,4 @@
-"""How sure a calibration is: covariance of the matrix elements and of the physical parameters behind them."""
+"""Uncertainty of a calibration: covariance of the matrix elements and of the wheels' physical parameters."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from omnibench.fit.uncertainty.information import information_of_run, informatio
 from omnibench.fit.uncertainty.physical import (
     ParameterEstimate,
     geometry_of,
+    identified_parameters,
     is_invertible,
     matrix_slopes,
-    told_parameters,
     unit_of,
 )
 from omnibench.fit.uncertainty.sandwich import Scores, sandwich, scores_of_runs
@@ -33,28 +33,27 @@ from omnibench.robot.odometry import OdometryBatch
 
 __all__ = ["NoCovarianceError", "Uncertainty", "information_of_run", "information_of_runs", "uncertainty_of"]
 
-_INTERVAL = 0.95
-_MANY = 10**9  # degrees of freedom
-# How far to look for a lower cost than the answer's, and which gain is none.
-_MOST_STEPS = 20
-_NO_GAIN = 1e-4
-_NO_ERROR = 1e-9  # m, rad: rounding
+_INTERVAL = 0.95  # probability of the intervals
+_MANY = 10**9  # degrees of freedom that stand for infinity, where Student's t is the normal distribution
+_MOST_STEPS = 20  # steps of the check that an answer is a minimum; chosen
+_NO_GAIN = 1e-4  # relative decrease of the cost that ends these steps; chosen
+_NO_ERROR = 1e-9  # m, rad: a smaller cost is rounding
 
 
 class NoCovarianceError(DataError):
-    """Why a calibration has no covariance, in one line."""
+    """A calibration has no covariance; the message says why, in one line."""
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """How sure a calibration is, given that what it kept is right.
+    """Uncertainty of a calibration, given that the values it kept are right.
 
     covariance (3N, 3N): of the elements, row by row, m and rad per rad of wheel. Rows and columns of elements that are
     held at their start or lie on a bound are zero, and so is the variance along directions of wheel rates that were
     kept at the design values. standard_deviations (3, N). intervals: 95 %, by Student's t.
-    parameters: of the wheels' geometry, where the matrix means one (three omni wheels) or it was what was searched;
-    a parameter that the data do not tell by itself has no standard deviation. noise: of the reference poses.
-    basis: what the covariance comes from. source: what it rests on, in words.
+    parameters: the wheels' geometry, if it was searched or follows from the matrix (three omni wheels); a parameter
+    that the data do not identify has no standard deviation. noise: of the reference poses.
+    basis: likelihood (the calibrator's own covariance) or scatter of the runs. source: the data behind it, in words.
     """
 
     covariance: Array
@@ -68,11 +67,11 @@ class Uncertainty:
 
 
 def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertainty:
-    """The uncertainty of what a run found.
+    """The uncertainty of a calibrator's answer.
 
-    A covariance that the calibrator gives itself (trajectory_ml) is taken; otherwise it is the sandwich of an estimate
-    that minimises a sum of norms (fit/sandwich.py). Physical parameters that need directions of wheel rates which the
-    data do not identify have no standard deviation, whether or not these directions were fitted.
+    The covariance is the calibrator's own if it gives one (trajectory_ml), otherwise the sandwich of an estimate that
+    minimises a sum of norms (sandwich.py). Physical parameters that need directions of wheel rates which the data do
+    not identify have no standard deviation, whether or not these directions were fitted.
 
     NoCovarianceError, with the reason, when there is no answer, the cost is no sum of norms, the answer is no minimum
     (a published matrix, a search that stopped too early), or the runs are too few.
@@ -82,11 +81,11 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     slopes = element_slopes(problem, result.vector)
     freedom: int | None
     if result.covariance is not None:
-        found, freedom = result.covariance, None
+        of_vector, freedom = result.covariance, None
         source = "the calibrator's own (see its reason)"
     else:
-        found, freedom, source = _by_scatter(problem, result)
-    covariance = slopes @ found @ slopes.T
+        of_vector, freedom, source = _by_scatter(problem, result)
+    covariance = slopes @ of_vector @ slopes.T
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(result.matrix.shape)
     reach = _quantile(freedom) * deviations
     noise = result.noise or noise_of(problem, result.matrix).noise
@@ -94,7 +93,7 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
         covariance=covariance,
         standard_deviations=deviations,
         intervals=ElementIntervals(result.matrix - reach, result.matrix + reach),
-        parameters=_parameters(problem, result, found, covariance, _quantile(freedom)),
+        parameters=_parameters(problem, result, of_vector, covariance, _quantile(freedom)),
         noise=noise,
         basis="scatter" if result.covariance is None else "likelihood",
         degrees_of_freedom=freedom,
@@ -103,7 +102,7 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
 
 
 def noise_of(problem: CalibrationProblem, matrix: Array) -> NoiseEstimate:
-    """The noise of the reference poses of a problem's runs, by the residuals of ``matrix`` (3, N)."""
+    """Noise of the reference poses, estimated from the residuals that ``matrix`` (3, N) leaves in a problem's runs."""
     residuals = []
     for run in problem.trajectories:
         odometry = OdometryBatch([run.reference_log], problem.integration)
@@ -122,9 +121,9 @@ def element_slopes(problem: CalibrationProblem, vector: Array) -> Array:
 
 
 def _by_scatter(problem: CalibrationProblem, result: RunResult) -> tuple[Array, int, str]:
-    """Covariance (n, n) of the vector, its degrees of freedom, and what it rests on."""
+    """Sandwich covariance (n, n) of the vector, its degrees of freedom, and the data behind it, in words."""
     objective = problem.objective
-    assert result.vector is not None and result.matrix is not None  # noqa: PT018 (uncertainty_of has looked)
+    assert result.vector is not None and result.matrix is not None  # noqa: PT018 (uncertainty_of has checked)
     if not isinstance(objective, SumOfNorms):
         raise NoCovarianceError(f"no covariance: the cost {objective.name} is no sum of norms")
     free = problem.free & ~np.isin(problem.names, result.at_bounds)
@@ -157,7 +156,7 @@ def _scores(problem: CalibrationProblem, objective: SumOfNorms, vector: Array, f
 def _check_minimum(
     problem: CalibrationProblem, objective: SumOfNorms, vector: Array, free: NDArray[np.bool_], scores: Scores
 ) -> None:
-    """NoCovarianceError when a lower cost is more than a standard deviation away, as it is said to be there."""
+    """Raise NoCovarianceError if steps to a lower cost lead farther than a standard deviation, as estimated there."""
     better, cost = vector, float(problem.values(vector[None])[0])
     for _ in range(_MOST_STEPS):
         moved = better.copy()
@@ -179,8 +178,13 @@ def _check_minimum(
 def _parameters(
     problem: CalibrationProblem, result: RunResult, of_vector: Array, of_elements: Array, reach: float
 ) -> tuple[ParameterEstimate, ...] | None:
+    """The physical parameters with their intervals; None where the matrix does not determine them.
+
+    of_vector, of_elements: covariances of the searched vector and of the matrix elements. reach: half-width of the
+    interval in standard deviations.
+    """
     robot = problem.robot
-    assert result.vector is not None and result.matrix is not None  # noqa: PT018 (uncertainty_of has looked)
+    assert result.vector is not None and result.matrix is not None  # noqa: PT018 (uncertainty_of has checked)
     if problem.parameterisation.name == "geometry":
         values, covariance = result.vector, of_vector
     elif is_invertible(robot):
@@ -199,15 +203,16 @@ def _parameters(
             name=name,
             value=float(value),
             unit=unit_of(name),
-            standard_deviation=float(deviation) if told else None,
-            low=float(value - reach * deviation) if told else None,
-            high=float(value + reach * deviation) if told else None,
+            standard_deviation=float(deviation) if identified else None,
+            low=float(value - reach * deviation) if identified else None,
+            high=float(value + reach * deviation) if identified else None,
         )
-        for name, value, deviation, told in zip(
-            WheelGeometry(robot).names, values, deviations, told_parameters(robot, kept), strict=True
+        for name, value, deviation, identified in zip(
+            WheelGeometry(robot).names, values, deviations, identified_parameters(robot, kept), strict=True
         )
     )
 
 
 def _quantile(freedom: int | None) -> float:
+    """Half-width of the interval in standard deviations: quantile of Student's t, or normal without ``freedom``."""
     return float(stats.t.isf((1 - _INTERVAL) / 2, freedom or _MANY))

@@ -1,4 +1,4 @@
-"""What recordings leave open, and what a calibration makes of that, in words."""
+"""Sentences on directions of wheel rates that recordings do not identify, and how a calibration treats them."""
 
 from __future__ import annotations
 
@@ -17,12 +17,11 @@ from omnibench.fit.span import (
 )
 from omnibench.robot.kinematics import Robot
 
-# Below this share a driven direction is worth a word.
-_LITTLE_SHARE = 0.2
+_LITTLE_SHARE = 0.2  # of the strongest direction: one that is driven less is mentioned; chosen
 
 
 def open_directions(robot: Robot, span: DrivenSpan) -> Iterator[str]:
-    """A sentence for every direction that the runs do not drive, or hardly."""
+    """A sentence for every direction that the runs drive little or not at all."""
     kept = "calibration keeps the design values there"
     for direction in unidentified_directions(robot, span):
         state = span.state(direction)
@@ -56,12 +55,14 @@ def open_directions(robot: Robot, span: DrivenSpan) -> Iterator[str]:
 
 
 def _verb(motion: str) -> str:
+    """The motion as an imperative, like ``turn the robot``."""
     if motion == "turning on the spot":
         return "turn the robot"
     return motion.replace("moving", "move the robot", 1)
 
 
 def _advice(motion: str) -> str:
+    """The recordings that would identify a motion, as an imperative."""
     if motion == "turning on the spot":
         return "record turns, on the spot or while driving"
     return "record other motions, too" if "while" in motion else f"record runs {motion.removeprefix('moving ')}"
@@ -73,22 +74,22 @@ def warnings_of_calibration(
     parameterisation: ParameterisationName,
     unidentified: Unidentified,
 ) -> tuple[str, ...]:
-    """What a calibration on these runs does not rest on, and what became of it, one sentence a direction."""
+    """Warnings of a calibration on these runs: a sentence for every unidentified direction, and how it was treated."""
     span = driven_span(trajectories)
     sentences = []
     for direction in unidentified_directions(robot, span):
         state = span.state(direction)
         motion = motion_in_words(direction, robot)
-        if not motion:  # what no robot on these wheels does without slip is nobody's loss
+        if not motion:  # the wheels would only slip: no motion of the robot depends on it
             continue
-        what = f"{direction_in_words(direction, robot.wheel_names)} ({motion}) do"
+        subject = f"{direction_in_words(direction, robot.wheel_names)} ({motion}) do"
         if state == "weak":
-            what += f": {100 * span.share(direction):.1f} % of the strongest motion, which slip alone can make"
+            subject += f": {100 * span.share(direction):.1f} % of the strongest motion, which slip alone can make"
         if parameterisation == "geometry":
             end = "the geometry cannot keep design values there, so what was fitted to it rests on slip and noise"
         elif state == "weak" and unidentified == "fit":
             end = "what was fitted there rests on slip and noise"
         else:
             end = "kept at the design values"
-        sentences.append(f"these data do not identify what wheel rates along {what}; {end}")
+        sentences.append(f"these data do not identify what wheel rates along {subject}; {end}")
     return tuple(sentences)

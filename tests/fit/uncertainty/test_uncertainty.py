@@ -22,7 +22,7 @@ from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.fit.uncertainty.bootstrap import bootstrap_intervals
 from omnibench.fit.uncertainty.information import information_of_run, information_of_runs
-from omnibench.fit.uncertainty.physical import geometry_of, matrix_slopes, told_parameters
+from omnibench.fit.uncertainty.physical import geometry_of, identified_parameters, matrix_slopes
 from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import Noise
@@ -283,13 +283,13 @@ class TestParameters:
             assert one.standard_deviation == pytest.approx(other.standard_deviation, rel=1e-3)
 
     def test_every_parameter_is_told_when_every_direction_is(self) -> None:
-        assert all(told_parameters(ROBOT, np.zeros((0, 3))))
+        assert all(identified_parameters(ROBOT, np.zeros((0, 3))))
 
     def test_nothing_is_told_when_nothing_is_driven(self) -> None:
-        assert not any(told_parameters(ROBOT, np.eye(3)))
+        assert not any(identified_parameters(ROBOT, np.eye(3)))
 
     def test_without_turns_the_distances_are_not_told(self) -> None:
-        told = told_parameters(ROBOT, np.ones((1, 3)) / np.sqrt(3))
+        told = identified_parameters(ROBOT, np.ones((1, 3)) / np.sqrt(3))
         assert told == (True,) * 3 + (False,) * 3 + (True,) * 3
 
 
