@@ -4,7 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from omnibench.compare.plan import read_compare_config
+    from omnibench.compare.read_config import read_compare_config
     from omnibench.compare.run import run_comparison
     from omnibench.data.dataset import Dataset, Trajectory, make_dataset
     from omnibench.data.storage import load_dataset, save_dataset
@@ -48,7 +48,7 @@ __all__ = [
 # Imported when first asked for: the command line starts at once, and Ctrl-C finds it listening.
 _HOMES = {
     "design.design": ("design_experiment",),
-    "compare.plan": ("read_compare_config",),
+    "compare.read_config": ("read_compare_config",),
     "compare.run": ("run_comparison",),
     "data.dataset": ("Dataset", "Trajectory", "make_dataset"),
     "simulate.simulate": ("simulate_dataset",),

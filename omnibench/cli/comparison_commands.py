@@ -30,7 +30,7 @@ def compare(
     """Run every calibrator of a config on the same data and budget; score them and write a report."""
     from omnibench.cli.terminal.comparison_tables import print_result
     from omnibench.cli.terminal.progress import Bars, Lines
-    from omnibench.compare.plan import read_compare_config
+    from omnibench.compare.read_config import read_compare_config
     from omnibench.compare.run import run_comparison
 
     chosen = read_compare_config(config, _named_paths(data))

@@ -1,4 +1,4 @@
-"""How much lower any optimiser could get than the runs of a comparison: one proof for each box that was searched."""
+"""Proven lower bounds: how far below the runs of a comparison any optimiser could get, box by box."""
 
 from __future__ import annotations
 
@@ -9,37 +9,44 @@ import numpy as np
 
 from omnibench.compare.plan import PlannedRun
 from omnibench.compare.result import BoxCertificate, ScoredRun
-from omnibench.compare.run_problem import make_problem
-from omnibench.compare.scoring import box_contains, box_of, has_no_box
+from omnibench.compare.scoring import is_comparable
 from omnibench.fit.certify import prove, proven_gap
 from omnibench.fit.cost import SumOfNorms
+from omnibench.robot.kinematics import Array
 
 
 def certify(
     plan: Sequence[PlannedRun], scored: Sequence[ScoredRun]
 ) -> tuple[tuple[ScoredRun, ...], tuple[BoxCertificate, ...]]:
-    """The runs with what share of their cost any matrix of their box could save at most, and the proofs behind it.
+    """The runs with their proven gaps, and one proof for each box of matrix elements in which a run gave an answer.
 
-    A geometry, or an answer without a box, is held against a box that contains its matrix. Nothing is proven where the
-    config does not want it, or the cost is no sum of norms, of which no bound is known.
+    A geometry, or an answer without a box, is compared with a box that contains its matrix. Nothing is proven where the
+    config asks for no certificate, or the cost is no sum of norms: no bound is known for others.
     """
     proofs: list[tuple[PlannedRun, BoxCertificate]] = []
     for run, done in zip(plan, scored, strict=True):
-        wanted = run.config.certificate is not None and not has_no_box(run) and done.matrix is not None
+        wanted = run.config.certificate is not None and run.element_box is not None and done.matrix is not None
         if wanted and not any(_same_box(run, owner) for owner, _ in proofs):
-            rivals = zip(plan, scored, strict=True)
-            answers = [r.matrix for other, r in rivals if r.matrix is not None and _shares_data(run, other)]
-            proofs += [(run, proof) for proof in _proof(run, [matrix.ravel() for matrix in answers])]
+            answers = [
+                other.matrix.ravel()
+                for planned, other in zip(plan, scored, strict=True)
+                if other.matrix is not None and planned.dataset_name == run.dataset_name
+            ]
+            proofs += [(run, proof) for proof in _proof(run, answers)]
     return (
         tuple(_with_proven_gap(run, done, proofs) for run, done in zip(plan, scored, strict=True)),
         tuple(proof for _, proof in proofs),
     )
 
 
-def _proof(run: PlannedRun, answers: Sequence[np.ndarray]) -> list[BoxCertificate]:
-    """The lower bound over a run's box, if its cost has one; the better the known answers, the sooner."""
+def _same_box(run: PlannedRun, other: PlannedRun) -> bool:
+    return run.dataset_name == other.dataset_name and run.element_box == other.element_box
+
+
+def _proof(run: PlannedRun, answers: Sequence[Array]) -> list[BoxCertificate]:
+    """The lower bound over a run's box, if its cost has one. Good answers (3N,) that are known make it faster."""
     choice = run.config.certificate
-    problem = make_problem(run.config, run.entry, run.dataset.robot, run.dataset.split("train"), "matrix")
+    problem = run.task.problem()
     if choice is None or not isinstance(problem.objective, SumOfNorms):
         return []
     known = np.stack([problem.start, *answers])
@@ -49,7 +56,7 @@ def _proof(run: PlannedRun, answers: Sequence[np.ndarray]) -> list[BoxCertificat
     return [
         BoxCertificate(
             dataset=run.dataset_name,
-            box=run.box,
+            box=run.box_name,
             lower_bound=proof.lower_bound,
             best_cost=proof.best_cost,
             gap=proven_gap(proof.best_cost, proof.lower_bound),
@@ -67,17 +74,7 @@ def _with_proven_gap(
     if cost is None or matrix is None:
         return done
     for owner, proof in proofs:
-        if _shares_data(run, owner) and (
-            box_contains(owner, matrix) if has_no_box(run) else box_of(owner) == box_of(run)
-        ):
+        if is_comparable(run, matrix, owner):
             gap = proven_gap(cost, proof.lower_bound)
             return replace(done, record=done.record.model_copy(update={"proven_gap": gap}))
     return done
-
-
-def _shares_data(run: PlannedRun, other: PlannedRun) -> bool:
-    return run.dataset_name == other.dataset_name
-
-
-def _same_box(run: PlannedRun, other: PlannedRun) -> bool:
-    return _shares_data(run, other) and box_of(run) == box_of(other)

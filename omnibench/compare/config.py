@@ -1,4 +1,4 @@
-"""What a comparison's YAML says."""
+"""The config of a comparison, as its YAML file says it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from omnibench.config import Model
+from omnibench.data.dataset import Split
 from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
 from omnibench.fit.problem import Budget
 from omnibench.fit.span import Unidentified
@@ -85,9 +86,17 @@ class PublishedResult(Model):
     theoretical_validation_cost: Positive | None = None
     validation_cost: Positive | None = None
 
+    def costs(self, split: Split) -> tuple[float, float] | None:
+        """Costs of the design values and of the calibration on a split; None where one of them was not published."""
+        if split == "train":
+            return self.theoretical_train_cost, self.train_cost
+        if self.theoretical_validation_cost is None or self.validation_cost is None:
+            return None
+        return self.theoretical_validation_cost, self.validation_cost
+
 
 class CompareConfig(Model):
-    """Data sets x calibrators x seeds, with one cost and one budget for all."""
+    """A comparison: data sets x calibrators x seeds, with one cost and one budget for all."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=60)
     description: str = ""

@@ -12,16 +12,12 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from typing import Any, Protocol
 
-from omnibench.compare.config import CalibratorEntry, CompareConfig
-from omnibench.compare.plan import PlannedRun, load_calibrators
-from omnibench.compare.run_problem import make_problem
+from omnibench.compare.effective_config import load_calibrators
+from omnibench.compare.plan import PlannedRun, RunTask
 from omnibench.compare.store import RunStore, StoredRun
-from omnibench.data.dataset import Trajectory
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error, run_calibrator
-from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.processes import end_with_parent, main_module_hidden, one_thread_processes
 from omnibench.registry import calibrators
-from omnibench.robot.kinematics import Robot
 
 # A run that does not look at its budget is ended this long after its seconds are spent.
 _GRACE = 10.0
@@ -101,54 +97,28 @@ def execute(plan: Sequence[PlannedRun], store: RunStore, progress: Progress, wor
 
 def _start(context: Any, run: PlannedRun) -> _Active:
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(sender, _Job.of(run)), daemon=True)
+    process = context.Process(target=_work, args=(sender, run.task), daemon=True)
     with main_module_hidden():
         process.start()
     sender.close()
     return _Active(run, process, receiver, time.monotonic())
 
 
-@dataclass(frozen=True)
-class _Job:
-    """What the worker needs of a run: the training data, and nothing of the validation data or where they are."""
-
-    config: CompareConfig
-    robot: Robot
-    trajectories: tuple[Trajectory, ...]
-    entry: CalibratorEntry
-    parameterisation: ParameterisationName
-    seed: int
-
-    @classmethod
-    def of(cls, run: PlannedRun) -> _Job:
-        return cls(
-            config=run.config.model_copy(update={"datasets": {}}),
-            robot=run.dataset.robot,
-            trajectories=run.dataset.split("train"),
-            entry=run.entry,
-            parameterisation=run.parameterisation,
-            seed=run.seed,
-        )
-
-
-def _work(connection: Connection, job: _Job) -> None:
+def _work(connection: Connection, task: RunTask) -> None:
     """The worker process: solve one problem and send the result."""
     threading.Thread(target=end_with_parent, daemon=True).start()
     try:
-        answer = StoredRun.of(_solve(job, lambda evaluations, best: connection.send((evaluations, best))))
+        answer = StoredRun.of(_solve(task, lambda evaluations, best: connection.send((evaluations, best))))
     except BaseException as error:  # whatever a plug-in raises, wherever, is this run's outcome
         answer = StoredRun.of(RunResult(Outcome.FAILED, describe_error(error), None, None, None, 0, 0.0, ()))
     with suppress(OSError):  # a plug-in may have closed it
         connection.send(answer)
 
 
-def _solve(job: _Job, watch: Callable[[int, float], None]) -> RunResult:
-    load_calibrators(job.config)
-    calibrator = calibrators.create(job.entry.name, job.entry.options)
-    problem = make_problem(
-        job.config, job.entry, job.robot, job.trajectories, job.parameterisation, seed=job.seed, watch=watch
-    )
-    return run_calibrator(calibrator, problem)
+def _solve(task: RunTask, watch: Callable[[int, float], None]) -> RunResult:
+    load_calibrators(task.config)
+    calibrator = calibrators.create(task.entry.name, task.entry.options)
+    return run_calibrator(calibrator, task.problem(watch))
 
 
 def _collect(active: dict[int, _Active], progress: Progress) -> Iterator[tuple[int, RunResult]]:

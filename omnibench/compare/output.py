@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -14,7 +14,7 @@ import polars as pl
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.result import ComparisonResult, EntryStatistics, Interval, RunRecord, ScoredRun
 from omnibench.config import read_yaml, to_json, to_yaml
-from omnibench.data.dataset import Dataset
+from omnibench.data.dataset import SPLITS, Dataset
 from omnibench.errors import DataError
 from omnibench.files import (
     RESULTS,
@@ -27,7 +27,7 @@ from omnibench.files import (
 )
 from omnibench.robot.calibration import Calibration, Provenance, Row, covariance_rows, write_calibration
 
-# The first line of config.yaml tells a folder of results from a folder that happens to hold such a file.
+# First line of config.yaml in a folder of results. A folder whose config.yaml lacks it is not written to.
 _MARK = "# The effective config of a comparison; the results beside it were made with it."
 
 
@@ -118,7 +118,7 @@ def calibration_of(run: ScoredRun, result: ComparisonResult) -> Calibration:
 
 
 def _file_name(title: str, taken: set[str]) -> str:
-    """A title as a file name that is not taken yet, letter case aside; it is then."""
+    """A title as a file name that differs from those ``taken`` in more than letter case, and is added to them."""
     plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", title).strip("_")
     name, count = plain, 1
     while name.lower() in taken:
@@ -128,7 +128,7 @@ def _file_name(title: str, taken: set[str]) -> str:
     return name
 
 
-# Column types, which values alone do not tell where all are missing.
+# Column types, for columns in which every value may be missing.
 _RUN = {"dataset": pl.String, "label": pl.String, "seed": pl.Int64}
 _HISTORY_COLUMNS = _RUN | {"evaluations": pl.Int64, "seconds": pl.Float64, "best_cost": pl.Float64}
 _ERROR_COLUMNS = (
@@ -144,21 +144,24 @@ _COLUMN_OF: dict[Any, Any] = {
     tuple[Row, Row, Row] | None: pl.List(pl.List(pl.Float64)),
     Interval | None: pl.Struct(dict.fromkeys(("value", "low", "high"), pl.Float64)),
 }
+_INTERVAL_COLUMNS = {name: _COLUMN_OF[Interval | None] for split in SPLITS for name in (split, f"{split}_improvement")}
 
 
 def _tables(result: ComparisonResult) -> dict[str, pl.DataFrame]:
+    statistics = [_statistics_row(entry) for entry in result.statistics]
     return {
         "runs": _table([_run_row(run) for run in result.runs], RunRecord),
         "errors": pl.DataFrame(list(_error_rows(result)), _ERROR_COLUMNS),
         "history": pl.DataFrame(list(_history_rows(result.runs)), _HISTORY_COLUMNS),
-        "statistics": _table([_statistics_row(entry) for entry in result.statistics], EntryStatistics),
+        "statistics": _table(statistics, EntryStatistics, _INTERVAL_COLUMNS),
     }
 
 
-def _table(rows: list[dict[str, Any]], kind: type) -> pl.DataFrame:
-    """Rows of one kind, at least one."""
+def _table(rows: list[dict[str, Any]], kind: type, further: Mapping[str, Any] | None = None) -> pl.DataFrame:
+    """At least one row made from objects of a class; ``further``: types of columns that are no fields of it."""
     hints = get_type_hints(kind, include_extras=True).items()
     types = {name: _COLUMN_OF[hint] for name, hint in hints if hint in _COLUMN_OF and name in rows[0]}
+    types |= further or {}
     return pl.DataFrame(rows, schema_overrides=types, infer_schema_length=None)
 
 
@@ -170,21 +173,29 @@ def _run_row(run: ScoredRun) -> dict[str, Any]:
 
 
 def _statistics_row(entry: EntryStatistics) -> dict[str, Any]:
-    values = {item.name: getattr(entry, item.name) for item in fields(entry) if item.name != "typical"}
-    row = {name: asdict(value) if isinstance(value, Interval) else value for name, value in values.items()}
+    """An entry's statistics as a flat row, with two columns of intervals for each split."""
+    row: dict[str, Any] = {}
+    for name in (item.name for item in fields(entry)):
+        if name == "splits":
+            for split in SPLITS:
+                row[split] = _interval_cell(entry.cost(split))
+                row[f"{split}_improvement"] = _interval_cell(entry.improvement(split))
+        elif name != "typical":
+            value = getattr(entry, name)
+            row[name] = _interval_cell(value) if isinstance(value, Interval) else value
     return row | {"typical_seed": None if entry.typical is None else entry.typical.record.seed}
+
+
+def _interval_cell(interval: Interval | None) -> dict[str, float] | None:
+    return None if interval is None else asdict(interval)
 
 
 def _error_rows(result: ComparisonResult) -> Iterable[dict[str, Any]]:
     for run in result.runs:
-        for split, errors, costs in (
-            ("train", run.train_errors, run.train_costs),
-            ("validation", run.validation_errors, run.validation_costs),
-        ):
-            if errors is None or costs is None:
-                continue
-            trajectories = result.datasets[run.record.dataset].split("train" if split == "train" else "validation")
-            for trajectory, error, cost in zip(trajectories, errors.tolist(), costs.tolist(), strict=True):
+        for split, score in run.scores.items():
+            trajectories = result.datasets[run.record.dataset].split(split)
+            costs = score.costs.tolist()
+            for trajectory, error, cost in zip(trajectories, score.errors.tolist(), costs, strict=True):
                 yield {
                     "dataset": run.record.dataset,
                     "label": run.record.label,

@@ -1,4 +1,4 @@
-"""What a comparison yields: a record of every run, its errors, and statistics of every entry."""
+"""The result of a comparison: a record of every run, its scores on each split, and statistics of every entry."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from omnibench.compare.config import CompareConfig
+from omnibench.compare.plan import SearchSpace
 from omnibench.config import Model
-from omnibench.data.dataset import Dataset
+from omnibench.data.dataset import Dataset, Split
 from omnibench.environment import Environment
 from omnibench.fit.calibrator import Outcome
 from omnibench.fit.parameterisation import FittedParameter, ParameterisationName
@@ -22,7 +23,12 @@ from omnibench.robot.kinematics import Array
 
 
 class RunRecord(Model):
-    """One run: a row of the results. Costs and matrix are None where the run gave no answer."""
+    """One run as a flat row of summary.json. Costs and matrix are None where the run gave no answer.
+
+    held: elements that keep their start value, because the box or the cost leaves no choice. gap: train_cost divided by
+    the exact optimum in the box ``gap_box``, minus 1. proven_gap: the share of train_cost
+    that a matrix of the box could save at most, by proof.
+    """
 
     dataset: str
     label: str
@@ -48,17 +54,17 @@ class RunRecord(Model):
     matrix: tuple[Row, Row, Row] | None
     parameters: tuple[FittedParameter, ...] | None
     at_bounds: tuple[str, ...]
-    held: tuple[str, ...]  # elements that keep their start value: the box or the cost leaves no choice
-    gap: float | None  # train_cost / exact optimum in the box ``gap_box`` - 1
+    held: tuple[str, ...]
+    gap: float | None
     gap_box: str | None
-    proven_gap: float | None  # the share of train_cost that any matrix of the box could save at most
+    proven_gap: float | None
 
 
 class BoxCertificate(Model):
-    """No matrix of a box has a training cost below ``lower_bound``.
+    """Proof that no matrix of a box has a training cost below ``lower_bound``.
 
-    best_cost: the lowest one known. gap: 1 - lower_bound / best_cost. parts: of the box that were looked at. finished:
-    False when the config's seconds came before its gap.
+    best_cost: the lowest training cost known in the box. gap: 1 - lower_bound / best_cost. parts: how many parts of the
+    box were examined. finished: False when the config's time ran out before its gap was reached.
     """
 
     dataset: str
@@ -72,22 +78,31 @@ class BoxCertificate(Model):
 
 
 @dataclass(frozen=True, eq=False)
-class ScoredRun:
-    """A run with what its pictures need.
+class SplitScore:
+    """How well a matrix does on one split.
 
-    history: the best cost so far. train_errors, validation_errors (Z, 3): odometry minus reference at the last
-    reference pose of each trajectory of the split (m, m, rad). train_costs, validation_costs (Z,): the cost of each
-    trajectory; None where there is no answer, or no such split. theoretical_*_costs (Z,): the same of the design.
+    costs (Z,): the cost of each trajectory. errors (Z, 3): odometry minus reference at the last reference pose of each
+    trajectory, m, m, rad.
+    """
+
+    cost: float
+    costs: Array
+    errors: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredRun:
+    """A run with its scores.
+
+    history: the best cost so far. scores: by split, those with trajectories; empty without an answer. design: scores of
+    the design values, by split.
     """
 
     record: RunRecord
+    search_space: SearchSpace
     history: tuple[Improvement, ...]
-    train_errors: Array | None
-    train_costs: Array | None
-    validation_errors: Array | None
-    validation_costs: Array | None
-    theoretical_train_costs: Array
-    theoretical_validation_costs: Array | None
+    scores: Mapping[Split, SplitScore]
+    design: Mapping[Split, SplitScore]
 
     @property
     def matrix(self) -> Array | None:
@@ -105,12 +120,23 @@ class Interval:
 
 
 @dataclass(frozen=True)
+class SplitStatistics:
+    """Statistics of an entry's typical run on one split.
+
+    improvement: share of the design values' cost that is gone; None where that cost is zero.
+    """
+
+    cost: Interval
+    improvement: Interval | None
+
+
+@dataclass(frozen=True)
 class EntryStatistics:
     """One entry of the comparison (calibrator, parameterisation, box) on one data set, over its seeds.
 
-    ``typical`` is the run of median training cost; intervals and differences are of that run.
-    spread: interquartile range of the training cost over seeds. difference: paired mean difference in validation
-    cost (training cost where there is no validation split) against the best entry.
+    typical: the run of median training cost, to which intervals and differences refer. train_spread: interquartile
+    range of the training cost over seeds. splits: the typical run by split; empty without an answer. difference: paired
+    mean difference in validation cost (training cost where there is no validation split) from the best entry.
     """
 
     dataset: str
@@ -123,10 +149,7 @@ class EntryStatistics:
     typical: ScoredRun | None
     train_median: float | None
     train_spread: float | None
-    train: Interval | None
-    train_improvement: Interval | None
-    validation: Interval | None
-    validation_improvement: Interval | None
+    splits: Mapping[Split, SplitStatistics]
     difference: Interval | None
     practically_equal: bool | None
     is_best: bool
@@ -135,16 +158,29 @@ class EntryStatistics:
     evaluations_median: float | None
     seconds_median: float | None
 
+    def cost(self, split: Split) -> Interval | None:
+        """The mean cost on a split; None without an answer, or without such a split."""
+        return self.splits[split].cost if split in self.splits else None
+
+    def improvement(self, split: Split) -> Interval | None:
+        """The share by which the cost on a split lies below that of the design values; None where not known."""
+        return self.splits[split].improvement if split in self.splits else None
+
 
 @dataclass(frozen=True, eq=False)
 class ComparisonResult:
-    """Everything that the report shows. uncertainties: of the entries' typical runs, by data set and label."""
+    """Everything that the report shows.
+
+    design_costs: mean cost of the design values, by data set and split. uncertainties: of the entries' typical runs, by
+    data set and label.
+    """
 
     config: CompareConfig
     output: Path
     datasets: dict[str, Dataset]
     runs: tuple[ScoredRun, ...]
     statistics: tuple[EntryStatistics, ...]
+    design_costs: Mapping[str, Mapping[Split, Interval]]
     certificates: tuple[BoxCertificate, ...]
     uncertainties: Mapping[tuple[str, str], Uncertainty]
     environment: Environment

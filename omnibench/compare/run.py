@@ -9,13 +9,15 @@ from pathlib import Path
 
 from omnibench.compare.certificates import certify
 from omnibench.compare.config import CompareConfig
+from omnibench.compare.data_sources import load_datasets
+from omnibench.compare.effective_config import effective_config, load_calibrators
 from omnibench.compare.execute import PRELOAD, Progress, execute
 from omnibench.compare.output import prepare_output, write_results
-from omnibench.compare.plan import PlannedRun, effective_config, load_calibrators, load_datasets, make_plan
+from omnibench.compare.plan import PlannedRun, make_plan
 from omnibench.compare.report.comparison_report import write_report
 from omnibench.compare.result import ComparisonResult, ScoredRun
 from omnibench.compare.scoring import score
-from omnibench.compare.statistics import entry_statistics, is_mean
+from omnibench.compare.statistics import design_costs, entry_statistics, is_mean
 from omnibench.compare.store import RunStore
 from omnibench.compare.uncertainties import typical_uncertainties
 from omnibench.data.dataset import Dataset
@@ -27,7 +29,7 @@ from omnibench.registry import PluginFailure
 
 
 class Silent:
-    """Progress that nobody watches."""
+    """Progress that is shown nowhere."""
 
     def prepared(self, what: str, done: int, total: int) -> None: ...
     def planned(self, runs: int) -> None: ...
@@ -46,16 +48,17 @@ def run_comparison(
     """
     progress = progress or Silent()
     failures = load_calibrators(config)
-    with _blaming(failures):
+    with _with_failures(failures):
         config = effective_config(config)
-        with one_thread_processes(PRELOAD):  # those that simulate are to serve the calibrators, too
+        with one_thread_processes(PRELOAD):  # processes started for simulation serve the calibrators, too
             datasets = load_datasets(config, progress.prepared)
     plan = make_plan(config, datasets)
     folder = prepare_output(config, output)
     store = RunStore(folder / "runs")
     with _resumable(plan, store, folder):
         results = execute(plan, store, progress, config.workers or os.cpu_count() or 1)
-        runs, certificates = certify(plan, score(plan, results, datasets))
+        scored = score(plan, results, datasets)
+        runs, certificates = certify(plan, scored)
         statistics = entry_statistics(runs, config.bootstrap)
         result = ComparisonResult(
             config=config,
@@ -63,6 +66,7 @@ def run_comparison(
             datasets=datasets,
             runs=runs,
             statistics=statistics,
+            design_costs=design_costs(runs, config.bootstrap),
             certificates=certificates,
             uncertainties=typical_uncertainties(plan, results, runs, statistics),
             environment=environment(),
@@ -74,17 +78,17 @@ def run_comparison(
 
 
 @contextmanager
-def _blaming(failures: Sequence[PluginFailure]) -> Iterator[None]:
-    """A name that nobody knows may be that of a plug-in which cannot be imported."""
+def _with_failures(failures: Sequence[PluginFailure]) -> Iterator[None]:
+    """Add the plug-ins that failed to import to an error of an unknown name, which may be one of theirs."""
     try:
         yield
     except UnknownNameError as error:
-        raise ConfigError("; ".join([str(error), *map(_in_words, failures)])) from None
+        raise ConfigError("; ".join([str(error), *map(_described, failures)])) from None
 
 
 @contextmanager
 def _resumable(plan: Sequence[PlannedRun], store: RunStore, folder: Path) -> Iterator[None]:
-    """Ctrl-C says what is kept and how to go on."""
+    """Turn Ctrl-C into an error that says which runs are kept and how to continue."""
     try:
         yield
     except KeyboardInterrupt:
@@ -96,12 +100,12 @@ def _resumable(plan: Sequence[PlannedRun], store: RunStore, folder: Path) -> Ite
 def _warnings(
     failures: Iterable[PluginFailure], datasets: Mapping[str, Dataset], runs: Iterable[ScoredRun]
 ) -> Iterator[str]:
-    yield from map(_in_words, failures)
+    yield from map(_described, failures)
     for name, dataset in datasets.items():
         yield from (f"data set {name}: {warning}" for warning in dataset.warnings)
     if not all(is_mean(run) for run in runs):
         yield "the cost is no mean over trajectories: intervals and differences are of the mean of their own costs"
 
 
-def _in_words(failure: PluginFailure) -> str:
+def _described(failure: PluginFailure) -> str:
     return f"plug-in {failure.origin} cannot be imported: {failure.error}"

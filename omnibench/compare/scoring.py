@@ -1,20 +1,22 @@
-"""From a run's matrix to its row: costs, errors and improvements on both splits."""
+"""From a run's matrix to its row: costs, errors and improvements on each split."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from omnibench.compare.plan import UNBOUNDED, PlannedRun
-from omnibench.compare.result import RunRecord, ScoredRun
-from omnibench.data.dataset import Dataset, Split, Trajectory
+from omnibench.compare.config import CompareConfig
+from omnibench.compare.plan import PlannedRun
+from omnibench.compare.result import RunRecord, ScoredRun, SplitScore
+from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.errors import PluginError
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import positions_and_headings
-from omnibench.fit.parameterisation import Box, FittedParameter, fitted_parameters, make_bounds
+from omnibench.fit.parameterisation import FittedParameter, fitted_parameters, make_bounds
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import matrix_rows
 from omnibench.robot.kinematics import Array
@@ -45,6 +47,10 @@ class SplitScorer:
         """Odometry minus reference (Z, 3) at the last reference pose of every trajectory, m, m, rad."""
         return self._ends.poses(matrix[None])[0] - self._final
 
+    def score(self, matrix: Array) -> SplitScore:
+        """All of these of a matrix (3, N). PluginError when the cost raises or is not a finite number."""
+        return SplitScore(self.cost(matrix), self.costs(matrix), self.final_errors(matrix))
+
     def _errors(self, matrix: Array) -> Array:
         return self._odometry.poses(matrix[None])[0] - self._reference
 
@@ -64,16 +70,35 @@ def score(
     plan: Sequence[PlannedRun], results: Sequence[RunResult], datasets: Mapping[str, Dataset]
 ) -> tuple[ScoredRun, ...]:
     """Every run with its costs and errors, and its gap above the exact optimum where that is known."""
-    scorers: dict[tuple[str, Split], SplitScorer] = {}
+    scorers: dict[str, dict[Split, SplitScorer]] = {}
+    design: dict[str, dict[Split, SplitScore]] = {}
     for run in plan:
-        for split in ("train", "validation"):
-            trajectories = datasets[run.dataset_name].split(split)
-            if trajectories and (run.dataset_name, split) not in scorers:
-                cost = costs.create(run.config.cost.name, run.config.cost.options)
-                scorers[run.dataset_name, split] = SplitScorer(trajectories, cost, run.config.integration)
-    scored = [_score_one(run, result, scorers) for run, result in zip(plan, results, strict=True)]
-    exact = [(run, done) for run, done in zip(plan, scored, strict=True) if _is_exact(done.record)]
+        if run.dataset_name not in scorers:
+            dataset = datasets[run.dataset_name]
+            scorers[run.dataset_name] = _scorers(run.config, dataset)
+            design[run.dataset_name] = _scores(scorers[run.dataset_name], dataset.robot.inverse_kinematic_matrix)
+    scored = [
+        _scored(run, result, _scores(scorers[run.dataset_name], result.matrix), design[run.dataset_name])
+        for run, result in zip(plan, results, strict=True)
+    ]
+    exact = [(run, done) for run, done in zip(plan, scored, strict=True) if _is_exact(run, done.record)]
     return tuple(_with_gap(run, done, exact) for run, done in zip(plan, scored, strict=True))
+
+
+def _scorers(config: CompareConfig, dataset: Dataset) -> dict[Split, SplitScorer]:
+    """A scorer for each split that has trajectories."""
+    return {
+        split: SplitScorer(
+            dataset.split(split), costs.create(config.cost.name, config.cost.options), config.integration
+        )
+        for split in SPLITS
+        if dataset.split(split)
+    }
+
+
+def _scores(scorers: Mapping[Split, SplitScorer], matrix: Array | None) -> dict[Split, SplitScore]:
+    """A matrix's score on each split; none without a matrix."""
+    return {} if matrix is None else {split: scorer.score(matrix) for split, scorer in scorers.items()}
 
 
 def position_error(errors: Array) -> float:
@@ -86,40 +111,27 @@ def heading_error(errors: Array) -> float:
     return float(positions_and_headings(errors)[1].mean())
 
 
-def _score_one(run: PlannedRun, result: RunResult, scorers: Mapping[tuple[str, Split], SplitScorer]) -> ScoredRun:
-    train = scorers[run.dataset_name, "train"]
-    validation = scorers.get((run.dataset_name, "validation"))
-    design = run.dataset.robot.inverse_kinematic_matrix
-    matrix = result.matrix
-    train_errors = None if matrix is None else train.final_errors(matrix)
-    validation_errors = None if matrix is None or validation is None else validation.final_errors(matrix)
-    train_cost = None if matrix is None else train.cost(matrix)
-    validation_cost = None if matrix is None or validation is None else validation.cost(matrix)
-    theoretical_train = train.cost(design)
-    theoretical_validation = None if validation is None else validation.cost(design)
+def _scored(
+    run: PlannedRun,
+    result: RunResult,
+    scores: Mapping[Split, SplitScore],
+    design: Mapping[Split, SplitScore],
+) -> ScoredRun:
     record = RunRecord(
         dataset=run.dataset_name,
         label=run.label,
         calibrator=run.entry.name,
         parameterisation=run.parameterisation,
-        box=run.box,
+        box=run.box_name,
         seed=run.seed,
         options=run.entry.options,
         outcome=result.outcome,
         reason=result.reason,
-        train_cost=train_cost,
-        validation_cost=validation_cost,
-        theoretical_train_cost=theoretical_train,
-        theoretical_validation_cost=theoretical_validation,
-        train_improvement=_improvement(train_cost, theoretical_train),
-        validation_improvement=_improvement(validation_cost, theoretical_validation),
-        train_position_m=None if train_errors is None else position_error(train_errors),
-        train_heading_rad=None if train_errors is None else heading_error(train_errors),
-        validation_position_m=None if validation_errors is None else position_error(validation_errors),
-        validation_heading_rad=None if validation_errors is None else heading_error(validation_errors),
+        **_columns("train", scores, design),
+        **_columns("validation", scores, design),
         evaluations=result.evaluations,
         seconds=result.seconds,
-        matrix=None if matrix is None else matrix_rows(matrix),
+        matrix=None if result.matrix is None else matrix_rows(result.matrix),
         parameters=_parameters(run, result),
         at_bounds=result.at_bounds,
         held=result.held,
@@ -127,20 +139,23 @@ def _score_one(run: PlannedRun, result: RunResult, scorers: Mapping[tuple[str, S
         gap_box=None,
         proven_gap=None,
     )
-    return ScoredRun(
-        record=record,
-        history=result.history,
-        train_errors=train_errors,
-        train_costs=None if matrix is None else train.costs(matrix),
-        validation_errors=validation_errors,
-        validation_costs=None if matrix is None or validation is None else validation.costs(matrix),
-        theoretical_train_costs=train.costs(design),
-        theoretical_validation_costs=None if validation is None else validation.costs(design),
-    )
+    return ScoredRun(record, run.search_space, result.history, scores, design)
 
 
-def _improvement(cost: float | None, theoretical: float | None) -> float | None:
-    return None if cost is None or not theoretical else 1 - cost / theoretical
+def _columns(split: Split, scores: Mapping[Split, SplitScore], design: Mapping[Split, SplitScore]) -> dict[str, Any]:
+    """The columns of a run's row that a split has; None where it has no trajectories, or the run no answer."""
+    score, theoretical = scores.get(split), design.get(split)
+    return {
+        f"{split}_cost": None if score is None else score.cost,
+        f"theoretical_{split}_cost": None if theoretical is None else theoretical.cost,
+        f"{split}_improvement": _improvement(score, theoretical),
+        f"{split}_position_m": None if score is None else position_error(score.errors),
+        f"{split}_heading_rad": None if score is None else heading_error(score.errors),
+    }
+
+
+def _improvement(score: SplitScore | None, theoretical: SplitScore | None) -> float | None:
+    return 1 - score.cost / theoretical.cost if score and theoretical and theoretical.cost else None
 
 
 def _parameters(run: PlannedRun, result: RunResult) -> tuple[FittedParameter, ...] | None:
@@ -149,40 +164,33 @@ def _parameters(run: PlannedRun, result: RunResult) -> tuple[FittedParameter, ..
     return fitted_parameters(run.dataset.robot, result.vector)
 
 
-def _is_exact(record: RunRecord) -> bool:
-    """Whether a run's training cost is the optimum in its box, and one to divide by."""
-    exact = calibrators.entry(record.calibrator).cls.exact
+def _is_exact(run: PlannedRun, record: RunRecord) -> bool:
+    """Whether a run's training cost is the optimum in its box of matrix elements, and one to divide by."""
+    exact = calibrators.entry(record.calibrator).cls.exact and run.element_box is not None
     return exact and record.outcome is Outcome.CONVERGED and bool(record.train_cost)
 
 
 def _with_gap(run: PlannedRun, scored: ScoredRun, exact: Sequence[tuple[PlannedRun, ScoredRun]]) -> ScoredRun:
-    """The gap above the exact optimum in the same box.
-
-    A geometry, or an answer without a box, is compared with the optimum over a box that contains its matrix.
-    """
+    """The run with its gap above the first exact optimum that it can be compared with."""
     cost, matrix = scored.record.train_cost, scored.matrix
     if cost is None or matrix is None:
         return scored
     for other, optimum in exact:
-        if other.dataset_name != run.dataset_name or optimum.record.train_cost is None:
-            continue
-        if box_contains(other, matrix) if has_no_box(run) else box_of(other) == box_of(run):
+        if optimum.record.train_cost is not None and is_comparable(run, matrix, other):
             gap = cost / optimum.record.train_cost - 1
-            return replace(scored, record=scored.record.model_copy(update={"gap": gap, "gap_box": other.box}))
+            return replace(scored, record=scored.record.model_copy(update={"gap": gap, "gap_box": other.box_name}))
     return scored
 
 
-def has_no_box(run: PlannedRun) -> bool:
-    """Whether a run's matrix was not searched in a box of matrix elements: a geometry, or an answer that is given."""
-    return run.parameterisation == "geometry" or run.box == UNBOUNDED
+def is_comparable(run: PlannedRun, matrix: Array, other: PlannedRun) -> bool:
+    """Whether a run's matrix (3, N) can be compared with the lowest cost in the box of ``other``, which has one.
 
-
-def box_of(run: PlannedRun) -> Box:
-    """The box of a run that has one."""
-    return run.entry.box or run.config.box
-
-
-def box_contains(run: PlannedRun, matrix: Array) -> bool:
-    """Whether a matrix (3, N) lies in the box of a run that has one."""
-    bounds = make_bounds(run.dataset.robot, box_of(run))
+    The data must be the same, and so must the box; for a geometry, or an answer without a box, the other's box must
+    contain the matrix.
+    """
+    if run.dataset_name != other.dataset_name:
+        return False
+    if run.element_box is not None:
+        return run.element_box == other.element_box
+    bounds = make_bounds(other.dataset.robot, other.box)
     return bool(((matrix.ravel() >= bounds.lower) & (matrix.ravel() <= bounds.upper)).all())

@@ -1,4 +1,4 @@
-"""What can be said of the entries: medians over seeds, bootstrap intervals over trajectories, paired differences."""
+"""Statistics of the entries: medians over seeds, bootstrap intervals over trajectories, paired differences."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.compare.config import Bootstrap
-from omnibench.compare.result import EntryStatistics, Interval, ScoredRun
+from omnibench.compare.result import EntryStatistics, Interval, ScoredRun, SplitStatistics
+from omnibench.data.dataset import Split
 from omnibench.robot.kinematics import Array
 
 # A difference below this share of the best cost's own standard error is of no practical interest.
@@ -30,25 +31,35 @@ def entry_statistics(runs: Sequence[ScoredRun], bootstrap: Bootstrap) -> tuple[E
     draws = _Draws(bootstrap)
     statistics = []
     for (dataset, label), group in groups.items():
-        rivals = [run for (name, _), run in typical.items() if name == dataset and run is not None]
-        best = _best(rivals, draws)
+        competing = [run for (name, _), run in typical.items() if name == dataset and run is not None]
+        best = _best(competing, draws)
         statistics.append(_statistics(group, typical[dataset, label], best, draws))
     return tuple(statistics)
 
 
-def _best(rivals: Sequence[ScoredRun], draws: _Draws) -> ScoredRun | None:
-    """Noise does not choose between entries that are practically equal: the training cost does."""
-    if not rivals:
-        return None
-    lowest = min(rivals, key=_judged_cost)
-    level = [run for run in rivals if _against_best(run, lowest, draws)[1]]
-    return min(level, key=lambda run: (run.record.train_cost or 0.0, _judged_cost(run)))
+def design_costs(runs: Sequence[ScoredRun], bootstrap: Bootstrap) -> dict[str, dict[Split, Interval]]:
+    """The mean cost of the design values, by data set and split."""
+    designs = {run.record.dataset: run.design for run in runs}
+    draws = _Draws(bootstrap)
+    return {
+        dataset: {split: _mean(score.costs, draws) for split, score in design.items()}
+        for dataset, design in designs.items()
+    }
 
 
 def is_mean(run: ScoredRun) -> bool:
     """Whether the run's cost is the mean of its trajectories' costs, as the intervals and differences suppose."""
-    cost, costs = run.record.train_cost, run.train_costs
-    return cost is None or costs is None or bool(np.isclose(costs.mean(), cost, rtol=1e-6, atol=0.0))
+    train = run.scores.get("train")
+    return train is None or bool(np.isclose(train.costs.mean(), train.cost, rtol=1e-6, atol=0.0))
+
+
+def _best(competing: Sequence[ScoredRun], draws: _Draws) -> ScoredRun | None:
+    """The run of lowest training cost among those practically equal to the one of lowest judged cost."""
+    if not competing:
+        return None
+    lowest = min(competing, key=_judged_cost)
+    level = [run for run in competing if _against_best(run, lowest, draws)[1]]
+    return min(level, key=lambda run: (run.record.train_cost or 0.0, _judged_cost(run)))
 
 
 def _statistics(
@@ -61,8 +72,6 @@ def _statistics(
     costs = [run.record.train_cost for run in group if run.record.train_cost is not None]
     gaps = [run.record.gap for run in group if run.record.gap is not None]
     proven = [run.record.proven_gap for run in group if run.record.proven_gap is not None]
-    train = None if typical is None else typical.train_costs
-    validation = None if typical is None else typical.validation_costs
     difference, equal = None, None
     if typical is not None and best is not None:
         difference, equal = _against_best(typical, best, draws)
@@ -77,10 +86,7 @@ def _statistics(
         typical=typical,
         train_median=float(np.median(costs)) if costs else None,
         train_spread=float(np.subtract(*np.percentile(costs, [75, 25]))) if costs else None,
-        train=_mean(train, draws),
-        train_improvement=_improvement(train, group[0].theoretical_train_costs, draws),
-        validation=_mean(validation, draws),
-        validation_improvement=_improvement(validation, group[0].theoretical_validation_costs, draws),
+        splits={} if typical is None else _by_split(typical, draws),
         difference=difference,
         practically_equal=equal,
         is_best=typical is not None and typical is best,
@@ -91,21 +97,32 @@ def _statistics(
     )
 
 
+def _by_split(run: ScoredRun, draws: _Draws) -> dict[Split, SplitStatistics]:
+    return {
+        split: SplitStatistics(
+            cost=_mean(score.costs, draws),
+            improvement=_improvement(score.costs, run.design[split].costs, draws),
+        )
+        for split, score in run.scores.items()
+    }
+
+
 class _Draws:
-    """Bootstrap resamples of trajectories; the same for every entry, so that differences are paired."""
+    """Bootstrap resamples of trajectories, shared by all entries, so that differences are paired."""
 
     def __init__(self, bootstrap: Bootstrap) -> None:
         self._bootstrap = bootstrap
         self._by_size: dict[int, NDArray[np.intp]] = {}
 
     def of(self, count: int) -> NDArray[np.intp]:
-        """Indices (resamples, count) drawn with replacement."""
+        """Indices (resamples, count) of ``count`` trajectories, drawn with replacement."""
         if count not in self._by_size:
             rng = np.random.default_rng(self._bootstrap.seed)
             self._by_size[count] = rng.integers(count, size=(self._bootstrap.resamples, count))
         return self._by_size[count]
 
     def interval(self, count: int, value: float, statistic: Callable[[NDArray[np.intp]], Array]) -> Interval:
+        """``value`` with the 2.5 and 97.5 percentiles of a statistic over the resamples of ``count`` trajectories."""
         low, high = np.percentile(statistic(self.of(count)), [2.5, 97.5])
         return Interval(value, float(low), float(high))
 
@@ -118,23 +135,20 @@ def _typical(group: Sequence[ScoredRun]) -> ScoredRun | None:
 
 
 def _judged(run: ScoredRun) -> Array:
-    costs = run.validation_costs if run.validation_costs is not None else run.train_costs
-    assert costs is not None  # only runs with an answer are judged
-    return costs
+    """The costs (Z,) that an answer is judged by: validation costs where there are any."""
+    return run.scores["validation" if "validation" in run.scores else "train"].costs
 
 
 def _judged_cost(run: ScoredRun) -> float:
     return float(_judged(run).mean())
 
 
-def _mean(costs: Array | None, draws: _Draws) -> Interval | None:
-    if costs is None:
-        return None
+def _mean(costs: Array, draws: _Draws) -> Interval:
     return draws.interval(len(costs), float(costs.mean()), lambda chosen: costs[chosen].mean(1))
 
 
-def _improvement(costs: Array | None, theoretical: Array | None, draws: _Draws) -> Interval | None:
-    if costs is None or theoretical is None or not theoretical.any():
+def _improvement(costs: Array, theoretical: Array, draws: _Draws) -> Interval | None:
+    if not theoretical.any():
         return None
     return draws.interval(
         len(costs),
@@ -144,8 +158,9 @@ def _improvement(costs: Array | None, theoretical: Array | None, draws: _Draws) 
 
 
 def _against_best(run: ScoredRun, best: ScoredRun, draws: _Draws) -> tuple[Interval, bool]:
-    own, other = _judged(run), _judged(best)
-    paired = own - other
+    """The paired difference in judged cost from the best run, and whether the two are practically equal."""
+    costs, best_costs = _judged(run), _judged(best)
+    paired = costs - best_costs
     difference = draws.interval(len(paired), float(paired.mean()), lambda chosen: paired[chosen].mean(1))
-    negligible = NEGLIGIBLE_SHARE * float(other.std(ddof=1)) / np.sqrt(len(other)) if len(other) > 1 else 0.0
+    negligible = NEGLIGIBLE_SHARE * float(best_costs.std(ddof=1)) / np.sqrt(len(costs)) if len(costs) > 1 else 0.0
     return difference, bool(difference.low <= 0 <= difference.high or abs(difference.value) <= negligible)

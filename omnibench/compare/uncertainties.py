@@ -1,4 +1,4 @@
-"""How sure the answers of a comparison are."""
+"""Uncertainty of a comparison's answers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 from omnibench.compare.plan import UNBOUNDED, PlannedRun
 from omnibench.compare.result import EntryStatistics, ScoredRun
-from omnibench.compare.run_problem import make_problem
 from omnibench.fit.calibrator import RunResult
 from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 
@@ -17,16 +16,14 @@ def typical_uncertainties(
     scored: Sequence[ScoredRun],
     statistics: Sequence[EntryStatistics],
 ) -> dict[tuple[str, str], Uncertainty]:
-    """The uncertainty of every entry's typical run, by data set and label; none where it is no minimum."""
+    """The uncertainty of every entry's typical run, by data set and label; none where its answer is no minimum."""
     typical = [entry.typical for entry in statistics]
-    found = {}
+    uncertainties = {}
     for run, result, done in zip(plan, results, scored, strict=True):
-        if run.box == UNBOUNDED or not any(done is one for one in typical):
+        if run.box_name == UNBOUNDED or not any(done is one for one in typical):
             continue
-        training = run.dataset.split("train")
-        problem = make_problem(run.config, run.entry, run.dataset.robot, training, run.parameterisation)
         try:
-            found[run.dataset_name, run.label] = uncertainty_of(problem, result)
+            uncertainties[run.dataset_name, run.label] = uncertainty_of(run.task.problem(), result)
         except NoCovarianceError:
             continue
-    return found
+    return uncertainties

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from omnibench.compare.config import CompareConfig, DatasetSource
-from omnibench.compare.plan import load_source, read_compare_config
+from omnibench.compare.data_sources import load_source
+from omnibench.compare.read_config import read_compare_config
 from omnibench.config import read_model, read_yaml
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.storage import load_dataset

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from omnibench.compare.plan import load_source, read_compare_config
+from omnibench.compare.data_sources import load_source
+from omnibench.compare.read_config import read_compare_config
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.registry import costs
 from omnibench.robot.kinematics import Array

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binom
 
-from omnibench.compare.plan import read_compare_config
+from omnibench.compare.read_config import read_compare_config
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.fit.uncertainty.bootstrap import bootstrap_intervals

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from omnibench.compare.plan import load_source, read_compare_config
+from omnibench.compare.data_sources import load_source
+from omnibench.compare.read_config import read_compare_config
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import CalibrationProblem, make_parameterisation
 from omnibench.registry import calibrators, costs

@@ -1,4 +1,4 @@
-"""From a config to runs: what is refused in one line, what is a run, and what a run's key depends on."""
+"""From a config to runs: what is refused in one line, and what is a run."""
 
 from __future__ import annotations
 
@@ -9,17 +9,13 @@ from typing import Any
 import jsonschema
 import pytest
 import yaml
-from commands import CONFIGS, ROOT, flower, omnibench, search, small, write_config, write_plugin
+from commands import CONFIGS, ROOT, flower, omnibench, small, write_config
 
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.plan import (
-    PlannedRun,
-    effective_config,
-    load_calibrators,
-    load_datasets,
-    make_plan,
-    read_compare_config,
-)
+from omnibench.compare.data_sources import load_datasets
+from omnibench.compare.effective_config import effective_config, load_calibrators
+from omnibench.compare.plan import PlannedRun, make_plan
+from omnibench.compare.read_config import read_compare_config
 from omnibench.config import to_yaml
 from omnibench.errors import OmnibenchError
 
@@ -250,23 +246,9 @@ def test_labels_tell_boxes_and_parameterisations_apart(tmp_path: Path) -> None:
     entries = ["crs", {"name": "crs", "box": "paper"}, {"name": "crs", "parameterisation": "geometry"}]
     entries += [{"name": "crs", "label": "mine"}]
     runs = planned(tmp_path, calibrators=entries)
-    assert [(run.label, run.box) for run in runs] == [
+    assert [(run.label, run.box_name) for run in runs] == [
         ("crs", "row"),
         ("crs (paper box)", "paper"),
         ("crs (geometry)", "limits"),
         ("mine", "row"),
     ]
-
-
-def test_runs_of_the_same_work_share_a_key_whatever_they_are_called(tmp_path: Path) -> None:
-    first, second = planned(tmp_path, calibrators=[search("one"), search("two")])
-    assert first.key == second.key
-
-
-def test_the_key_of_a_run_changes_with_the_plugin_that_does_the_search(tmp_path: Path) -> None:
-    body = '@calibrators.register("inner")\nclass Inner(Calibrator):\n    def calibrate(self, problem): ...\n'
-    plugins = write_plugin(tmp_path / "plugins", "inner", body)
-    entry = {"name": "parametric", "options": {"search": "inner"}}
-    before = [run.key for run in planned(tmp_path, plugins=[str(plugins)], calibrators=[entry])]
-    write_plugin(plugins, "inner", body + "# changed\n")
-    assert [run.key for run in planned(tmp_path, plugins=[str(plugins)], calibrators=[entry])] != before

@@ -13,8 +13,11 @@ import pytest
 from commands import assert_refused, compared, compared_here, flower, omnibench, search, small, summary, write_config
 
 from omnibench.compare.config import CompareConfig
+from omnibench.compare.data_sources import load_datasets
+from omnibench.compare.effective_config import effective_config
 from omnibench.compare.output import prepare_output
-from omnibench.compare.plan import effective_config, load_datasets, make_plan, read_compare_config
+from omnibench.compare.plan import make_plan
+from omnibench.compare.read_config import read_compare_config
 from omnibench.compare.run import run_comparison
 from omnibench.errors import DataError
 from omnibench.fit.evaluate import evaluate

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from omnibench.compare.config import Bootstrap
-from omnibench.compare.result import EntryStatistics, RunRecord, ScoredRun
+from omnibench.compare.plan import SearchSpace
+from omnibench.compare.result import EntryStatistics, Interval, RunRecord, ScoredRun, SplitScore
 from omnibench.compare.statistics import NEGLIGIBLE_SHARE, entry_statistics, is_mean
+from omnibench.data.dataset import Split
 from omnibench.fit.calibrator import Outcome
 from omnibench.robot.kinematics import Array
 
@@ -59,7 +63,22 @@ def scored(
         gap_box=None,
         proven_gap=None,
     )
-    return ScoredRun(record, (), None, train, None, validation, design, None if validation is None else design)
+    costs: dict[Split, Array | None] = {"train": train, "validation": validation}
+    scores = {split: split_score(values) for split, values in costs.items() if values is not None}
+    designs: dict[Split, SplitScore] = {"train": split_score(design)}
+    if validation is not None:
+        designs["validation"] = split_score(design)
+    return ScoredRun(record, SearchSpace("matrix", "row", bounded=True), (), scores, designs)
+
+
+def split_score(costs: Array) -> SplitScore:
+    return SplitScore(float(costs.mean()), costs, np.zeros((len(costs), 3)))
+
+
+def train_cost(entry: EntryStatistics) -> Interval:
+    cost = entry.cost("train")
+    assert cost is not None
+    return cost
 
 
 def of(runs: list[ScoredRun], bootstrap: Bootstrap = BOOTSTRAP) -> dict[str, EntryStatistics]:
@@ -71,8 +90,8 @@ def test_the_intervals_hold_the_mean_as_often_as_they_say() -> None:
     held = 0
     for seed in range(300):
         (entry,) = entry_statistics([scored("a", rng.normal(5.0, 1.0, 60))], Bootstrap(resamples=400, seed=seed))
-        assert entry.train is not None
-        held += entry.train.low <= 5.0 <= entry.train.high
+        train = train_cost(entry)
+        held += train.low <= 5.0 <= train.high
     assert 0.90 <= held / 300 <= 0.98
 
 
@@ -85,18 +104,19 @@ def test_the_same_seed_draws_the_same_intervals() -> None:
 def test_an_interval_is_as_wide_as_the_standard_error_says() -> None:
     costs = np.random.default_rng(1).normal(5.0, 1.0, 400)
     entry = of([scored("a", costs)], Bootstrap(resamples=20_000))["a"]
-    assert entry.train is not None
+    train = train_cost(entry)
     error = costs.std(ddof=1) / np.sqrt(400)
-    assert entry.train.value == pytest.approx(costs.mean())
-    assert entry.train.low == pytest.approx(costs.mean() - 1.96 * error, abs=0.05 * error)
-    assert entry.train.high == pytest.approx(costs.mean() + 1.96 * error, abs=0.05 * error)
+    assert train.value == pytest.approx(costs.mean())
+    assert train.low == pytest.approx(costs.mean() - 1.96 * error, abs=0.05 * error)
+    assert train.high == pytest.approx(costs.mean() + 1.96 * error, abs=0.05 * error)
 
 
 def test_the_interval_of_an_improvement_pairs_each_trajectory_with_its_own_theoretical_cost() -> None:
     theoretical = np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0])
     entry = of([scored("a", 0.25 * theoretical, theoretical=theoretical)])["a"]
-    assert entry.train_improvement is not None
-    assert (entry.train_improvement.value, entry.train_improvement.low, entry.train_improvement.high) == (
+    improvement = entry.improvement("train")
+    assert improvement is not None
+    assert (improvement.value, improvement.low, improvement.high) == (
         pytest.approx(0.75),
         pytest.approx(0.75),
         pytest.approx(0.75),
@@ -197,7 +217,7 @@ def test_runs_without_an_answer_are_counted_and_left_out() -> None:
 
 def test_an_entry_without_any_answer_has_no_statistics_and_is_never_best() -> None:
     entry = of([scored("a", None), scored("b", np.full(8, 2.0))])["a"]
-    assert (entry.typical, entry.train, entry.train_median, entry.difference) == (None, None, None, None)
+    assert (entry.typical, entry.cost("train"), entry.train_median, entry.difference) == (None, None, None, None)
     assert (entry.practically_equal, entry.is_best) == (None, False)
 
 
@@ -208,8 +228,8 @@ def test_the_gap_of_an_entry_is_the_median_of_its_runs() -> None:
 
 def test_a_single_trajectory_has_an_interval_of_no_width() -> None:
     entry = of([scored("a", np.array([2.0]), theoretical=np.array([4.0]))])["a"]
-    assert entry.train is not None
-    assert (entry.train.low, entry.train.high) == (2.0, 2.0)
+    train = train_cost(entry)
+    assert (train.low, train.high) == (2.0, 2.0)
 
 
 @settings(max_examples=30)
@@ -217,14 +237,14 @@ def test_a_single_trajectory_has_an_interval_of_no_width() -> None:
 def test_the_value_of_an_interval_is_the_mean_and_lies_between_the_extremes(costs: list[float], seed: int) -> None:
     values = np.array(costs)
     (entry,) = entry_statistics([scored("a", values)], Bootstrap(resamples=100, seed=seed))
-    assert entry.train is not None
-    assert entry.train.value == pytest.approx(values.mean())
+    train = train_cost(entry)
+    assert train.value == pytest.approx(values.mean())
     slack = 1e-12 * values.max()
-    assert values.min() - slack <= entry.train.low <= entry.train.high <= values.max() + slack
+    assert values.min() - slack <= train.low <= train.high <= values.max() + slack
 
 
 def test_a_cost_that_is_no_mean_over_trajectories_is_noticed() -> None:
     run = scored("a", np.array([1.0, 2.0, 6.0]))
     assert is_mean(run)
-    root_mean_square = run.record.model_copy(update={"train_cost": float(np.sqrt(41 / 3))})
-    assert not is_mean(ScoredRun(root_mean_square, (), None, run.train_costs, None, None, np.ones(3), None))
+    root_mean_square = replace(run.scores["train"], cost=float(np.sqrt(41 / 3)))
+    assert not is_mean(replace(run, scores={"train": root_mean_square}))

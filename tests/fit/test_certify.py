@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from omnibench.compare.plan import load_source, read_compare_config
+from omnibench.compare.data_sources import load_source
+from omnibench.compare.read_config import read_compare_config
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.fit.bounds.lower_bound import LowerBounds

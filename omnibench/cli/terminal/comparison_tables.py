@@ -59,13 +59,8 @@ def _cost_table(title: str, entries: Iterable[EntryStatistics], split: Split) ->
         if entry.typical is None:
             table.add_row(entry.label, "", "no answer")
             continue
-        record = entry.typical.record
-        train = split == "train"
-        theoretical = record.theoretical_train_cost if train else record.theoretical_validation_cost
-        cost = entry.train if train else entry.validation
-        improvement = entry.train_improvement if train else entry.validation_improvement
-        cells = ["" if theoretical is None else f"{theoretical:.4f}"]
-        cells += _interval(cost, "{:.4f}") + _interval(improvement, "{:.2%}")
+        cells = [f"{entry.typical.design[split].cost:.4f}"]
+        cells += _interval(entry.cost(split), "{:.4f}") + _interval(entry.improvement(split), "{:.2%}")
         table.add_row(entry.label, *cells, style="bold" if entry.is_best else None)
     return table
 
@@ -100,12 +95,12 @@ def _search_table(result: ComparisonResult) -> Table:
     table = _new_table("How each was found", [*(["data set"] * several), "M^-1", "box", "outcome"], headings)
     for entry in result.statistics:
         records = [run.record for run in result.runs]
-        own = [record for record in records if (record.dataset, record.label) == (entry.dataset, entry.label)]
+        of_entry = [record for record in records if (record.dataset, record.label) == (entry.dataset, entry.label)]
         table.add_row(
             *([entry.dataset] * several),
             entry.label,
             entry.box,
-            ", ".join(dict.fromkeys(str(record.outcome) for record in own)),
+            ", ".join(dict.fromkeys(str(record.outcome) for record in of_entry)),
             f"{entry.answers}/{entry.runs}",
             f"{entry.evaluations_median:.0f}" if entry.evaluations_median is not None else "",
             f"{entry.seconds_median:.2f} s" if entry.seconds_median is not None else "",

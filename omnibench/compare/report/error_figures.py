@@ -1,4 +1,4 @@
-"""Final error by command, before and after: a flower where directions were commanded, boxes where not."""
+"""The section on final errors: a table, and errors before and after by command: polar plots or box plots."""
 
 from __future__ import annotations
 
@@ -9,12 +9,24 @@ from dataclasses import dataclass
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_LOOK, DatasetView, Look
-from omnibench.compare.report.wording import position_unit
+from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_STYLE, DatasetView, EntryStyle
+from omnibench.compare.report.wording import entry_cell, position_unit
 from omnibench.compare.result import EntryStatistics, ScoredRun
 from omnibench.data.dataset import Split, Trajectory
 from omnibench.fit.evaluate import positions_and_headings
-from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem, Paragraph
+from omnibench.report.blocks import (
+    Block,
+    Cell,
+    Column,
+    Details,
+    Figure,
+    FigureGrid,
+    LegendItem,
+    Paragraph,
+    Row,
+    Section,
+    Table,
+)
 from omnibench.report.numbers import fixed
 from omnibench.report.style import INK, plot, text
 from omnibench.robot.kinematics import Array
@@ -25,8 +37,51 @@ _MANY_GROUPS = 12
 _Motion = tuple[float, float]  # speed, m/s, and rate of turn, rad/s
 
 
-def error_blocks(view: DatasetView) -> tuple[Block, ...]:
-    """Final errors before and after, by command."""
+def error_section(view: DatasetView) -> Section:
+    """Final errors on the scored split as table and figures; the table of the other split is folded away."""
+    others = (
+        Details(f"The same on the {SPLIT_NAMES[split]} data", (final_error_table(view, split),))
+        for split in view.splits
+        if split != view.scored
+    )
+    blocks = (final_error_table(view, view.scored), *_figures(view), *others)
+    return Section("errors", "Final errors", blocks)
+
+
+def final_error_table(view: DatasetView, split: Split) -> Table:
+    """Mean and worst final errors in position and heading, design values first."""
+    errors: list[tuple[EntryStatistics | None, Array]] = [(None, view.design_errors[split])]
+    for entry, run in view.calibrated:
+        after = view.errors(run, split)
+        if after is not None:
+            errors.append((entry, after))
+    factor, unit, decimals = position_unit(*(float(positions_and_headings(rows)[0].mean()) for _, rows in errors))
+    rows = []
+    for entry_or_none, of_entry in errors:
+        positions, headings = positions_and_headings(of_entry)
+        cells = (
+            entry_cell(view, entry_or_none),
+            Cell(fixed(factor * positions.mean(), decimals)),
+            Cell(fixed(factor * positions.max(), decimals)),
+            Cell(fixed(np.degrees(headings.mean()), 2)),
+            Cell(fixed(np.degrees(headings.max()), 2)),
+        )
+        rows.append(Row(cells, "best" if entry_or_none and entry_or_none.is_best else "plain"))
+    return Table(
+        caption=f"Error of the final pose, {SPLIT_NAMES[split]}",
+        columns=(
+            Column("M⁻¹", numeric=False),
+            Column("position, mean", unit),
+            Column("position, worst", unit),
+            Column("heading, mean", "°"),
+            Column("heading, worst", "°"),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _figures(view: DatasetView) -> tuple[Block, ...]:
+    """Final errors before and after calibration: by direction where those were commanded, else in groups."""
     best = view.best
     if best is None or best.typical is None:
         return ()
@@ -36,7 +91,7 @@ def error_blocks(view: DatasetView) -> tuple[Block, ...]:
     trajectories = view.dataset.split(view.scored)
     if _is_flower(trajectories):
         return _flower_blocks(view, trajectories, after, best.label)
-    return (_boxes(view, best, best.typical),)
+    return (_box_plots(view, best, best.typical),)
 
 
 @dataclass(frozen=True)
@@ -67,7 +122,7 @@ def _is_flower(trajectories: Sequence[Trajectory]) -> bool:
     for trajectory in trajectories:
         if _moves(trajectory):
             directions.setdefault(_motion(trajectory), set()).add(round(math.degrees(trajectory.alpha or 0.0)) % 360)
-    return 0 < len(directions) <= len(_TURN_COLOURS) and all(len(found) >= 3 for found in directions.values())
+    return 0 < len(directions) <= len(_TURN_COLOURS) and all(len(driven) >= 3 for driven in directions.values())
 
 
 def _motion(trajectory: Trajectory) -> _Motion:
@@ -166,8 +221,8 @@ def _turns_on_the_spot(view: DatasetView, trajectories: Sequence[Trajectory], af
     return (Paragraph(f"Turns on the spot have no direction and are not drawn: {', '.join(parts)}.", "note"),)
 
 
-def _boxes(view: DatasetView, best: EntryStatistics, typical: ScoredRun) -> FigureGrid:
-    """Boxes over the trajectories of each command or session, both splits."""
+def _box_plots(view: DatasetView, best: EntryStatistics, typical: ScoredRun) -> FigureGrid:
+    """Box plots over the trajectories of each command or session, on both splits."""
     groups: list[str] = []
     before, after = [], []
     for split in view.design_errors:
@@ -177,17 +232,17 @@ def _boxes(view: DatasetView, best: EntryStatistics, typical: ScoredRun) -> Figu
             before.append(view.design_errors[split])
             after.append(errors)
     quantities = _quantities(np.concatenate(before), np.concatenate(after))
-    look = view.looks[best.label]
+    style = view.styles[best.label]
     figures = tuple(
         Figure(
             f"Final {quantity.name} ({quantity.unit})",
-            _box_figure(groups, quantity, look),
+            _box_figure(groups, quantity, style),
             f"Final {quantity.name} in {quantity.unit} of each group of trajectories, theoretical and {best.label}",
             80 + 44 * len(set(groups)),
         )
         for quantity in quantities
     )
-    items = (THEORETICAL_LOOK.legend,) if look is THEORETICAL_LOOK else (THEORETICAL_LOOK.legend, look.legend)
+    items = (THEORETICAL_STYLE.legend,) if style is THEORETICAL_STYLE else (THEORETICAL_STYLE.legend, style.legend)
     return FigureGrid(
         figures,
         items,
@@ -204,8 +259,8 @@ def _groups(view: DatasetView, split: Split) -> list[str]:
     return [SPLIT_NAMES[split]] * len(trajectories)
 
 
-def _box_figure(groups: Sequence[str], quantity: _Quantity, look: Look) -> go.Figure:
-    series = [(THEORETICAL_LOOK, quantity.before)] + ([] if look is THEORETICAL_LOOK else [(look, quantity.after)])
+def _box_figure(groups: Sequence[str], quantity: _Quantity, style: EntryStyle) -> go.Figure:
+    series = [(THEORETICAL_STYLE, quantity.before)] + ([] if style is THEORETICAL_STYLE else [(style, quantity.after)])
     traces = [
         go.Box(
             y=[text(group) for group in groups],

@@ -1,30 +1,33 @@
-"""The result in plain words."""
+"""The section on the result: the verdict in a sentence, the main figures, and what to keep in mind."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from omnibench.compare.report.tables import on_bounds
 from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_NAME, DatasetView
 from omnibench.compare.report.wording import (
-    cost,
     cost_decimals,
     difference_in_words,
-    improvement,
     improvement_in_words,
+    on_bounds,
     position_unit,
 )
 from omnibench.compare.result import EntryStatistics
 from omnibench.fit.evaluate import positions_and_headings
-from omnibench.report.blocks import Block, Callout, Fact, Facts, Paragraph
+from omnibench.report.blocks import Block, Callout, Fact, Facts, Paragraph, Section
 from omnibench.report.numbers import fixed, listing, percent, plural, span
 
-# A training cost this much above the lowest one was not the minimum.
-_ARRIVED = 0.01
+_ARRIVED = 0.01  # relative: a search whose training cost is further above the lowest one missed the minimum (chosen)
+# Share of the interval's width: seeds whose costs differ by more are worth a remark (chosen).
+_SEEDS_DIFFER = 0.25
 
 
-def headline(view: DatasetView) -> tuple[Block, ...]:
-    """Which calibrator is best, by how much the error fell and how sure that is, and who is as good."""
+def result_section(view: DatasetView) -> Section:
+    """Which calibrator is best, by how much the error fell and how sure that is, and which are as good."""
+    return Section("result", "Result", _blocks(view))
+
+
+def _blocks(view: DatasetView) -> tuple[Block, ...]:
     best = view.best
     if best is None or best.calibrator == THEORETICAL_NAME:
         return (Paragraph(_no_winner(view, best), "lead"), _remarks(view, best))
@@ -45,14 +48,14 @@ def _no_winner(view: DatasetView, best: EntryStatistics | None) -> str:
 
 def _verdict(view: DatasetView, best: EntryStatistics) -> str:
     split, decimals = view.scored, cost_decimals(view)
-    reached, before = cost(best, split), view.theoretical_cost(split)
-    words = f"{_place(view, best)}."
+    reached, before = best.cost(split), view.theoretical_cost(split)
+    words = f"{_standing(view, best)}."
     if reached is not None and before is not None:
         words += (
             f" On the {SPLIT_NAMES[split]} data its cost is {fixed(reached.value, decimals)}, where the design values "
             f"give {fixed(before, decimals)}"
         )
-        interval = improvement(best, split)
+        interval = best.improvement(split)
         if interval is not None:
             fell, sure = improvement_in_words(best, split, 1)
             words += f": the error fell by {fell} (95 % interval {sure})"
@@ -61,8 +64,8 @@ def _verdict(view: DatasetView, best: EntryStatistics) -> str:
     return words
 
 
-def _place(view: DatasetView, best: EntryStatistics) -> str:
-    """Who is best; where noise could have chosen, what else did."""
+def _standing(view: DatasetView, best: EntryStatistics) -> str:
+    """Which entry is best; where several are level, that the training cost decided."""
     if len(view.calibrated) == 1:
         return f"{best.label} is the only calibrator with an answer"
     level = [entry.label for entry in view.level]
@@ -81,7 +84,7 @@ def _number(number: int) -> str:
 
 def _tiles(view: DatasetView, best: EntryStatistics) -> tuple[Fact, ...]:
     split, decimals = view.scored, cost_decimals(view)
-    reached, before = cost(best, split), view.theoretical_cost(split)
+    reached, before = best.cost(split), view.theoretical_cost(split)
     tiles = []
     if reached is not None:
         tiles.append(
@@ -91,7 +94,7 @@ def _tiles(view: DatasetView, best: EntryStatistics) -> tuple[Fact, ...]:
                 f"95 % interval {span(reached.low, reached.high, decimals)}",
             )
         )
-    if improvement(best, split) is not None:
+    if best.improvement(split) is not None:
         fell, sure = improvement_in_words(best, split, 1)
         tiles.append(Fact("Improvement", fell, f"95 % interval {sure}"))
     after = None if best.typical is None else view.errors(best.typical, split)
@@ -114,14 +117,14 @@ def _tiles(view: DatasetView, best: EntryStatistics) -> tuple[Fact, ...]:
 
 
 def _doubts(view: DatasetView, best: EntryStatistics) -> list[str]:
-    """What speaks against reading the first place as merit: seeds that differ, a search that had not arrived."""
+    """Reasons to doubt the first place: seeds that differ, a minimum that was missed, others with a lower cost."""
     doubts = []
     split, decimals = view.scored, cost_decimals(view)
-    records = [run.record for run in view.runs if run.record.label == best.label]
-    found = [record.train_cost if split == "train" else record.validation_cost for record in records]
-    values = [value for value in found if value is not None]
-    reached = cost(best, split)
-    if len(values) > 1 and reached is not None and max(values) - min(values) > 0.25 * (reached.high - reached.low):
+    runs = [run for run in view.runs if run.record.label == best.label]
+    values = [run.scores[split].cost for run in runs if split in run.scores]
+    reached = best.cost(split)
+    width = 0.0 if reached is None else reached.high - reached.low
+    if len(values) > 1 and max(values) - min(values) > _SEEDS_DIFFER * width:
         doubts.append(
             f"{best.label} depends on its seed: over {len(values)} seeds its {SPLIT_NAMES[split]} cost goes from "
             f"{span(min(values), max(values), decimals)}. The verdict is about the run of median training cost."
@@ -151,24 +154,21 @@ def _worse_commands(view: DatasetView, best: EntryStatistics) -> list[str]:
     if best.typical is None or best.calibrator == THEORETICAL_NAME:
         return []
     split, run = view.scored, best.typical
-    before = run.theoretical_train_costs if split == "train" else run.theoretical_validation_costs
-    after = run.train_costs if split == "train" else run.validation_costs
+    before, after = run.design[split].costs, run.scores[split].costs
     rows: dict[str, list[int]] = {}
     for index, trajectory in enumerate(view.dataset.split(split)):
         if trajectory.command is not None:
             rows.setdefault(trajectory.command, []).append(index)
-    if before is None or after is None or not rows:
-        return []
     means = [(name, float(before[chosen].mean()), float(after[chosen].mean())) for name, chosen in rows.items()]
     worse = sorted((row for row in means if row[2] > row[1]), key=lambda row: row[1] - row[2])
     if not worse:
         return []
     digits = cost_decimals(view)
-    told = [f"{name} {fixed(was, digits)} → {fixed(now, digits)}" for name, was, now in worse]
+    changes = [f"{name} {fixed(was, digits)} → {fixed(now, digits)}" for name, was, now in worse]
     return [
         f"{best.label} does worse than the design values on {len(worse)} of {plural(len(means), 'command')} of the "
         f"{SPLIT_NAMES[split]} data, as the mean cost of each, design values → {best.label}: "
-        f"{listing(told, len(told))}."
+        f"{listing(changes, len(changes))}."
     ]
 
 

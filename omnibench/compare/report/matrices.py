@@ -1,4 +1,4 @@
-"""The report's matrices: elements, their differences by Eq. (10)-(11), physical parameters."""
+"""The section on matrices: elements, their differences by Eq. (10)-(11), physical parameters."""
 
 from __future__ import annotations
 
@@ -7,21 +7,25 @@ import math
 
 import numpy as np
 
-from omnibench.compare.report.tables import entry_cell, on_bounds
 from omnibench.compare.report.view import DatasetView
+from omnibench.compare.report.wording import entry_cell, on_bounds
 from omnibench.compare.result import RunRecord
 from omnibench.fit.parameterisation import FittedParameter
 from omnibench.fit.span import driven_span
-from omnibench.report.blocks import Block, Cell, Code, Column, Paragraph, Row, Table
+from omnibench.report.blocks import Block, Cell, Code, Column, Paragraph, Row, Section, Table
 from omnibench.report.numbers import NOTHING, fixed, significant
 from omnibench.robot.kinematics import Array
 
-# An element this much smaller than the largest of its row is a zero, up to rounding: Eq. (7) gives m12 as 1e-17.
+# Relative to the largest element of its row: a smaller one is zero up to rounding (Eq. (7) gives m12 as 1e-17).
 _ZERO_SHARE = 1e-9
 
 
-def matrix_blocks(view: DatasetView) -> tuple[Block, ...]:
-    """Everything that the report says of the matrices."""
+def matrix_section(view: DatasetView) -> Section:
+    """Matrices, their differences from the design values and from the reference entry, parameters, all digits."""
+    return Section("matrices", "Matrices", _blocks(view))
+
+
+def _blocks(view: DatasetView) -> tuple[Block, ...]:
     if not view.calibrated:
         return (Paragraph("No run gave a matrix.", "note"),)
     blocks: list[Block] = [_element_table(view), _difference_table(view, None)]
@@ -44,7 +48,7 @@ def differences(matrix: Array, reference: Array) -> Array:
 
 
 def matrices_as_text(view: DatasetView) -> str:
-    """Every matrix with the digits that bring back the same numbers, as YAML reads them."""
+    """Every matrix as YAML, with so many digits that reading it gives exactly the same numbers."""
     named = [("theoretical", view.design_matrix)]
     named += [(entry.label, run.matrix) for entry, run in view.calibrated if run.matrix is not None]
     parts = []
@@ -64,10 +68,10 @@ def parameter_table(view: DatasetView) -> Table | None:
     for name in names:
         kind, _, wheel = name.partition("_")
         cells = [Cell(f"{kind}, wheel {wheel}" if wheel else name)]
-        found = [next((p for p in record.parameters or () if p.name == name), None) for _, record in fitted]
-        known = next(parameter for parameter in found if parameter is not None)
+        values = [next((p for p in record.parameters or () if p.name == name), None) for _, record in fitted]
+        known = next(parameter for parameter in values if parameter is not None)
         cells.append(Cell(_shown(known.design, known.unit)))
-        for parameter, (_, record) in zip(found, fitted, strict=True):
+        for parameter, (_, record) in zip(values, fitted, strict=True):
             cells.append(_parameter_cell(parameter, _marks(record).get(name, "")))
         rows.append(Row(tuple(cells)))
     columns = (Column("Parameter", numeric=False), Column("design"), *(Column(entry.label) for entry, _ in fitted))
@@ -154,7 +158,7 @@ def _element_columns(view: DatasetView, with_units: bool) -> tuple[Column, ...]:
 
 
 def _shown(value: float, unit: str) -> str:
-    """A parameter's value with its unit as a person reads it: angles in degrees."""
+    """A parameter's value with its unit; angles in degrees."""
     return f"{fixed(math.degrees(value), 3)}°" if unit == "rad" else f"{fixed(value, 5)} {unit}"
 
 

@@ -1,4 +1,4 @@
-"""Fig. 5 to 7 of the paper: reference, theoretical and calibrated paths, and the detail of their ends."""
+"""The section on paths, as Fig. 5 to 7 of the paper: reference, theoretical and calibrated, and their ends."""
 
 from __future__ import annotations
 
@@ -8,58 +8,58 @@ from collections.abc import Sequence
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.compare.report.view import REFERENCE_LOOK, SPLIT_NAMES, THEORETICAL_LOOK, DatasetView, Look
+from omnibench.compare.report.view import REFERENCE_STYLE, SPLIT_NAMES, THEORETICAL_STYLE, DatasetView, EntryStyle
 from omnibench.data.dataset import Trajectory
-from omnibench.report.blocks import Figure, FigureGrid
+from omnibench.report.blocks import Figure, FigureGrid, Section
 from omnibench.report.recording.runs import describe
 from omnibench.report.style import INK, equal_aspect, plot, text
 from omnibench.robot.kinematics import Array
 
-_SHOWN = 4
-_POINTS = 160  # of a drawn path
-_TAIL = 0.15  # share of a run that the detail of its end is drawn from
+_SHOWN = 4  # trajectories
+_POINTS = 160  # points that a path is drawn with
+_TAIL = 0.15  # share of a run's duration that the figure of its end shows
 _PAPER_DIRECTIONS = (30, 210, 120, 300)  # deg, of Fig. 6 (a) to (d)
 _PAPER_TURN_RATE = 0.35  # rad/s
 
 
-def path_grid(view: DatasetView) -> FigureGrid:
+def path_section(view: DatasetView) -> Section:
     """A few trajectories of the scored split: whole paths, each beside the detail of its end."""
-    figures: list[Figure] = []
-    for trajectory in chosen_trajectories(view.dataset.split(view.scored)):
-        title = describe(trajectory)
-        figures.append(
-            Figure(
-                title,
-                _path(view, trajectory),
-                f"Paths of {title}: reference, theoretical and calibrated odometry, x and y in metres",
-                400,
-            )
-        )
-        figures.append(
-            Figure(
-                f"Its end: {_ends_in_words(view, trajectory)}",
-                _end(view, trajectory),
-                f"Final poses of {title} about the reference's final position, in millimetres",
-                400,
-            )
-        )
-    looks = [REFERENCE_LOOK, THEORETICAL_LOOK, *(view.looks[entry.label] for entry, _ in view.calibrated)]
-    return FigureGrid(
+    figures = [
+        figure(view, trajectory)
+        for trajectory in chosen_trajectories(view.dataset.split(view.scored))
+        for figure in (_path_figure, _end_figure)
+    ]
+    styles = [REFERENCE_STYLE, THEORETICAL_STYLE, *(view.styles[entry.label] for entry, _ in view.calibrated)]
+    grid = FigureGrid(
         tuple(figures),
-        tuple(look.legend for look in looks),
+        tuple(style.legend for style in styles),
         2,
         f"As Fig. 5 to 7 of the paper, on {SPLIT_NAMES[view.scored]} trajectories. Right: final poses about the "
         "reference's final position, the short strokes show the headings. The window holds the nearer ends; "
         "Autoscale, at the top right of a plot, shows all.",
     )
+    return Section("paths", "Paths", (grid,))
+
+
+def _path_figure(view: DatasetView, trajectory: Trajectory) -> Figure:
+    title = describe(trajectory)
+    description = f"Paths of {title}: reference, theoretical and calibrated odometry, x and y in metres"
+    return Figure(title, _path(view, trajectory), description, 400)
+
+
+def _end_figure(view: DatasetView, trajectory: Trajectory) -> Figure:
+    title = f"Its end: {_ends_in_words(view, trajectory)}"
+    description = f"Final poses of {describe(trajectory)} about the reference's final position, in millimetres"
+    return Figure(title, _end(view, trajectory), description, 400)
 
 
 def chosen_trajectories(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-    """Up to four trajectories worth a look: the paper's commands where they were driven, else a spread."""
+    """Up to four trajectories to draw: those of the paper's commands where they were driven, else a variety."""
     first_of = {t.command or t.session or t.id: t for t in reversed(trajectories)}
     distinct = [t for t in trajectories if first_of[t.command or t.session or t.id] is t]
     commanded = [t for t in distinct if t.alpha is not None and t.omega is not None and (t.v is None or t.v > 0)]
-    paper = [found for degrees in _PAPER_DIRECTIONS if (found := _with_command(commanded, degrees)) is not None]
+    by_direction = [_with_command(commanded, degrees) for degrees in _PAPER_DIRECTIONS]
+    paper = [trajectory for trajectory in by_direction if trajectory is not None]
     if len(paper) == _SHOWN:
         return paper
     # Turns show an error of the model best.
@@ -80,20 +80,20 @@ def _with_command(trajectories: Sequence[Trajectory], degrees: float) -> Traject
     return None
 
 
-def _models(view: DatasetView) -> list[tuple[Look, Array]]:
-    drawn = [(THEORETICAL_LOOK, view.design_matrix)]
+def _models(view: DatasetView) -> list[tuple[EntryStyle, Array]]:
+    drawn = [(THEORETICAL_STYLE, view.design_matrix)]
     calibrated = sorted(view.calibrated, key=lambda pair: pair[0].is_best)  # the best on top
-    drawn += [(view.looks[entry.label], run.matrix) for entry, run in calibrated if run.matrix is not None]
+    drawn += [(view.styles[entry.label], run.matrix) for entry, run in calibrated if run.matrix is not None]
     return drawn
 
 
 def _path(view: DatasetView, trajectory: Trajectory) -> go.Figure:
     reference = _thinned(trajectory.poses, 2 * _POINTS)
     stamps = np.linspace(0.0, trajectory.pose_times[-1], _POINTS)
-    traces = [_line(REFERENCE_LOOK, reference, 3.5), _ends(REFERENCE_LOOK, reference[-1:], 9)]
-    for look, matrix in _models(view):
+    traces = [_line(REFERENCE_STYLE, reference, 3.5), _ends(REFERENCE_STYLE, reference[-1:], 9)]
+    for style, matrix in _models(view):
         (poses,) = view.model(matrix).poses([trajectory.log(stamps)])
-        traces += [_line(look, poses, 1.8), _ends(look, poses[-1:], 7)]
+        traces += [_line(style, poses, 1.8), _ends(style, poses[-1:], 7)]
     start = trajectory.start
     traces.append(
         go.Scatter(
@@ -113,13 +113,13 @@ def _end(view: DatasetView, trajectory: Trajectory) -> go.Figure:
     final = trajectory.final_pose
     duration = trajectory.pose_times[-1]
     stamps = np.linspace((1 - _TAIL) * duration, duration, 60)
-    tails = [(look, view.model(matrix).poses([trajectory.log(stamps)])[0]) for look, matrix in _models(view)]
+    tails = [(style, view.model(matrix).poses([trajectory.log(stamps)])[0]) for style, matrix in _models(view)]
     calibrated = tails[1:] or tails  # the design values come first, and are far away
     half = _window([_distance_mm(poses[-1], final) for _, poses in calibrated])
     late = trajectory.poses[trajectory.pose_times >= min(stamps[0], trajectory.pose_times[-2])]
-    traces = _tail_traces(REFERENCE_LOOK, late, final, half, width=2.6)
-    for look, poses in tails:
-        traces += _tail_traces(look, poses, final, half, width=1.6)
+    traces = _tail_traces(REFERENCE_STYLE, late, final, half, width=2.6)
+    for style, poses in tails:
+        traces += _tail_traces(style, poses, final, half, width=1.6)
     figure = plot(*traces, xaxis_title_text="x − x of reference (mm)", yaxis_title_text="y − y of reference (mm)")
     figure.update_xaxes(range=[-half, half])
     figure.update_yaxes(range=[-half, half])
@@ -127,20 +127,20 @@ def _end(view: DatasetView, trajectory: Trajectory) -> go.Figure:
     return figure
 
 
-def _tail_traces(look: Look, poses: Array, final: Array, half: float, width: float) -> list[go.Scatter]:
+def _tail_traces(style: EntryStyle, poses: Array, final: Array, half: float, width: float) -> list[go.Scatter]:
     millimetres = 1e3 * (poses[:, :2] - final[:2])
     end = millimetres[-1]
     stroke = end + 0.28 * half * np.array([[0.0, 0.0], [math.cos(poses[-1, 2]), math.sin(poses[-1, 2])]])
-    words = f"{text(look.label)}: {math.hypot(*end):.1f} mm, {math.degrees(poses[-1, 2] - final[2]):.2f}°"
-    shared = {"legendgroup": look.key, "hovertemplate": f"{words}<extra></extra>"}
-    colour = {"color": look.colour}
+    words = f"{text(style.label)}: {math.hypot(*end):.1f} mm, {math.degrees(poses[-1, 2] - final[2]):.2f}°"
+    shared = {"legendgroup": style.key, "hovertemplate": f"{words}<extra></extra>"}
+    colour = {"color": style.colour}
     return [
         go.Scatter(x=_short(millimetres[:, 0]), y=_short(millimetres[:, 1]), mode="lines", opacity=0.55,
-                   line={**colour, "width": width, "dash": look.dash}, **shared),
+                   line={**colour, "width": width, "dash": style.dash}, **shared),
         go.Scatter(x=_short(stroke[:, 0]), y=_short(stroke[:, 1]), mode="lines",
                    line={**colour, "width": 2.2}, **shared),
         go.Scatter(x=_short(end[:1]), y=_short(end[1:]), mode="markers",
-                   marker={**colour, "symbol": look.symbol, "size": 11, "line": {"width": 2}}, **shared),
+                   marker={**colour, "symbol": style.symbol, "size": 11, "line": {"width": 2}}, **shared),
     ]  # fmt: skip
 
 
@@ -165,24 +165,24 @@ def _distance_mm(pose: Array, reference: Array) -> float:
     return 1e3 * float(math.hypot(pose[0] - reference[0], pose[1] - reference[1]))
 
 
-def _line(look: Look, poses: Array, width: float) -> go.Scatter:
+def _line(style: EntryStyle, poses: Array, width: float) -> go.Scatter:
     return go.Scatter(
         x=_short(poses[:, 0]),
         y=_short(poses[:, 1]),
         mode="lines",
-        line={"color": look.colour, "width": width, "dash": look.dash},
-        legendgroup=look.key,
-        hovertemplate=f"{text(look.label)}<br>x %{{x:.3f}} m, y %{{y:.3f}} m<extra></extra>",
+        line={"color": style.colour, "width": width, "dash": style.dash},
+        legendgroup=style.key,
+        hovertemplate=f"{text(style.label)}<br>x %{{x:.3f}} m, y %{{y:.3f}} m<extra></extra>",
     )
 
 
-def _ends(look: Look, poses: Array, size: int) -> go.Scatter:
+def _ends(style: EntryStyle, poses: Array, size: int) -> go.Scatter:
     return go.Scatter(
         x=_short(poses[:, 0]),
         y=_short(poses[:, 1]),
         mode="markers",
-        marker={"color": look.colour, "size": size, "symbol": look.symbol, "line": {"width": 2}},
-        legendgroup=look.key,
+        marker={"color": style.colour, "size": size, "symbol": style.symbol, "line": {"width": 2}},
+        legendgroup=style.key,
         hoverinfo="skip",
     )
 

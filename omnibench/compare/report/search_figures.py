@@ -1,42 +1,43 @@
-"""How the searches went: best cost, gap above the best known cost, and share of targets reached."""
+"""The section on searches: best cost, gap above the best known cost, and share of targets reached."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.compare.report.view import THEORETICAL_LOOK, DatasetView, Look, is_bounded
+from omnibench.compare.plan import SearchSpace
+from omnibench.compare.report.view import THEORETICAL_STYLE, DatasetView, EntryStyle
 from omnibench.compare.result import ScoredRun
 from omnibench.fit.problem import Improvement
-from omnibench.report.blocks import Block, Figure, FigureGrid, Paragraph
+from omnibench.report.blocks import Figure, FigureGrid, Paragraph, Section
 from omnibench.report.numbers import listing, significant
 from omnibench.report.style import logarithmic, plot, text
 from omnibench.robot.kinematics import Array
 
-TARGETS: Array = np.logspace(0, -8, 81)  # relative gaps above the best known cost
+TARGETS: Array = np.logspace(0, -8, 81)  # relative gaps above the best known cost (chosen)
 Axis = Literal["evaluations", "time"]
 AXES: tuple[Axis, ...] = ("evaluations", "time")
 _TITLES: Mapping[Axis, str] = {"evaluations": "evaluations", "time": "time (s)"}
-_FLOOR = 1e-10  # gaps below it are drawn on it
-_POINTS = 12_000  # of one plot, shared by its runs
+_FLOOR = 1e-10  # relative gap; smaller ones are drawn at this value
+_POINTS = 12_000  # points of one plot, shared by its runs: keeps the file small
 
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """A run's best cost (K,) against evaluations and seconds (K,), with its final answer as the last point.
+    """The course of a search: best cost (K,) against evaluations and seconds (K,), the final answer as last point.
 
     best_known: the exact optimum that the record's gap is measured from; where that is not known, the lowest training
-    cost that any run reached in the same box.
+    cost that any run reached in the same search space.
     """
 
     run: ScoredRun
-    look: Look
+    style: EntryStyle
     evaluations: Array
     seconds: Array
     costs: Array
@@ -44,71 +45,93 @@ class Course:
 
     @property
     def gaps(self) -> Array:
-        """Relative gaps above the best known cost, not below the floor that is drawn."""
+        """Relative gaps (K,) above the best known cost, at least ``_FLOOR``."""
         gaps: Array = np.maximum(self.costs / self.best_known - 1.0, _FLOOR)
         return gaps
 
 
-def search_blocks(view: DatasetView) -> tuple[Block, ...]:
+def search_section(view: DatasetView) -> Section:
     """Cost, gap and targets reached, against evaluations and against time."""
     drawn = courses(view)
     if not drawn:
-        return (Paragraph("There is no course to draw: no entry searched, or none reached a cost above zero.", "note"),)
-    looks = list({course.look.key: course.look for course in drawn}.values())
-    legend = tuple(look.legend for look in looks)
-    limit = max(24, _POINTS // len(drawn))
-    runs = Counter(run.record.label for run in view.runs)
-    theoretical = view.theoretical_cost("train")
-    costs = [
-        Figure(
-            f"Best training cost against {axis}",
-            _cost_plot(drawn, axis, limit, theoretical),
-            f"Best training cost found so far by each run against {axis}, both axes logarithmic",
-            360,
-        )
-        for axis in AXES
-    ]
-    gaps = [
-        Figure(
-            f"Gap above the best known cost against {axis}",
-            _gap_plot(drawn, axis, limit),
-            f"Relative gap above the best known cost in the same box against {axis}, both axes logarithmic",
-            360,
-        )
-        for axis in AXES
-    ]
-    targets = [
-        Figure(
-            f"Targets reached against {axis}",
-            _target_plot(drawn, axis, runs),
-            f"Share of targets that each entry reached, over its seeds, against {axis}",
-            360,
-        )
-        for axis in AXES
-    ]
-    legend = (*legend, THEORETICAL_LOOK.legend)
-    return (FigureGrid((*costs, *gaps, *targets), legend, 2, _caption(drawn)),)
+        words = "There is no course to draw: no entry searched, or none reached a cost above zero."
+        return Section("searches", "Searches", (Paragraph(words, "note"),))
+    searches = _Searches(
+        drawn,
+        points=max(24, _POINTS // len(drawn)),
+        runs=Counter(run.record.label for run in view.runs),
+        theoretical=view.theoretical_cost("train"),
+    )
+    figures = [figure(searches, axis) for figure in (_cost_figure, _gap_figure, _target_figure) for axis in AXES]
+    styles = {course.style.key: course.style for course in drawn}.values()
+    legend = (*(style.legend for style in styles), THEORETICAL_STYLE.legend)
+    return Section("searches", "Searches", (FigureGrid(tuple(figures), legend, 2, _caption(drawn)),))
+
+
+@dataclass(frozen=True, eq=False)
+class _Searches:
+    """What the figures show.
+
+    points: how many a course is drawn with, about. runs: their number by label, those without a course among them.
+    theoretical: the training cost of the design values.
+    """
+
+    courses: Sequence[Course]
+    points: int
+    runs: Mapping[str, int]
+    theoretical: float | None
+
+
+def _cost_figure(searches: _Searches, axis: Axis) -> Figure:
+    return Figure(
+        f"Best training cost against {axis}",
+        _cost_plot(searches.courses, axis, searches.points, searches.theoretical),
+        f"Best training cost found so far by each run against {axis}, both axes logarithmic",
+        360,
+    )
+
+
+def _gap_figure(searches: _Searches, axis: Axis) -> Figure:
+    return Figure(
+        f"Gap above the best known cost against {axis}",
+        _gap_plot(searches.courses, axis, searches.points),
+        f"Relative gap above the best known cost in the same box against {axis}, both axes logarithmic",
+        360,
+    )
+
+
+def _target_figure(searches: _Searches, axis: Axis) -> Figure:
+    return Figure(
+        f"Targets reached against {axis}",
+        _target_plot(searches.courses, axis, searches.runs),
+        f"Share of targets that each entry reached, over its seeds, against {axis}",
+        360,
+    )
 
 
 def courses(view: DatasetView) -> list[Course]:
-    """The runs that searched, in the order of the results; a matrix that is given or kept is no search."""
-    searched = [run for run in view.runs if run.record.evaluations > 1 and is_bounded(run.record.calibrator)]
+    """The courses of the runs that searched, in the order of the results.
+
+    Runs that evaluated one candidate at most, and those whose answer keeps to no box, did not search.
+    """
     lowest = _lowest_costs(view)
-    found = []
-    for run in searched:
-        history, known = _with_answer(run), _best_known(run, lowest[_box_key(view, run)])
-        if history and 0 < known < math.inf:
-            found.append(
+    drawn = []
+    for run in view.runs:
+        if run.record.evaluations <= 1 or not run.search_space.bounded:
+            continue
+        history, best_known = _with_answer(run), _best_known(run, lowest[run.search_space])
+        if history and 0 < best_known < math.inf:
+            drawn.append(
                 Course(
                     run,
-                    view.looks[run.record.label],
+                    view.styles[run.record.label],
                     np.array([step.evaluations for step in history], dtype=float),
                     np.array([step.seconds for step in history]),
                     np.array([step.cost for step in history]),
-                    known,
+                    best_known,
                 )
             )
-    return found
+    return drawn
 
 
 def _best_known(run: ScoredRun, lowest: float) -> float:
@@ -119,18 +142,13 @@ def _best_known(run: ScoredRun, lowest: float) -> float:
     return record.train_cost / (1 + record.gap)
 
 
-def _lowest_costs(view: DatasetView) -> Mapping[Hashable, float]:
-    """The lowest training cost that was reached in each box; infinite where nothing was."""
-    lowest: dict[Hashable, float] = {}
+def _lowest_costs(view: DatasetView) -> Mapping[SearchSpace, float]:
+    """The lowest training cost that was reached in each search space; infinite where nothing was."""
+    lowest: dict[SearchSpace, float] = {}
     for run in view.runs:
-        box, cost = _box_key(view, run), run.record.train_cost
-        lowest[box] = min(lowest.get(box, math.inf), math.inf if cost is None else cost)
+        space, cost = run.search_space, run.record.train_cost
+        lowest[space] = min(lowest.get(space, math.inf), math.inf if cost is None else cost)
     return lowest
-
-
-def _box_key(view: DatasetView, run: ScoredRun) -> Hashable:
-    """What a run searched: runs with equal keys can be measured by each other's costs."""
-    return view.boxes.get(run.record.label, run.record.label), is_bounded(run.record.calibrator)
 
 
 def targets_reached(group: Sequence[Course], runs: int, axis: Axis) -> tuple[Array, Array]:
@@ -144,7 +162,7 @@ def targets_reached(group: Sequence[Course], runs: int, axis: Axis) -> tuple[Arr
 
 
 def thinned(along: Array, gaps: Array, limit: int) -> list[int]:
-    """Indices of about ``limit`` points at most that draw the same steps on logarithmic axes; the ends are kept."""
+    """Indices of at most about ``limit`` points that draw nearly the same steps on logarithmic axes, with both ends."""
     if len(along) <= limit:
         return list(range(len(along)))
     across = np.log(np.maximum(along, 1e-9))
@@ -159,14 +177,14 @@ def _first_times(course: Course, axis: Axis) -> Array:
     """When each target was first reached; infinite where it was not."""
     along: Array = _along(course, axis)
     gaps = course.costs / course.best_known - 1.0
-    # Rounding alone keeps the best known cost itself from a gap of zero.
+    # 1e-12 allows for rounding: the best known cost itself has a gap of zero.
     first = np.searchsorted(-gaps, -TARGETS - 1e-12)
     times: Array = np.where(first < len(gaps), along[np.minimum(first, len(gaps) - 1)], np.inf)
     return times
 
 
 def _with_answer(run: ScoredRun) -> tuple[Improvement, ...]:
-    """The history, ended by the answer at the evaluations and the time that the run took in all."""
+    """The history, followed by the answer at the run's total evaluations and time."""
     record = run.record
     if record.train_cost is None:
         return run.history
@@ -175,14 +193,14 @@ def _with_answer(run: ScoredRun) -> tuple[Improvement, ...]:
     return (*run.history, last)
 
 
-def _groups(drawn: Sequence[Course]) -> Mapping[Look, list[Course]]:
-    groups: dict[Look, list[Course]] = {}
+def _groups(drawn: Sequence[Course]) -> Mapping[EntryStyle, list[Course]]:
+    groups: dict[EntryStyle, list[Course]] = {}
     for course in drawn:
-        groups.setdefault(course.look, []).append(course)
+        groups.setdefault(course.style, []).append(course)
     return groups
 
 
-def _steps(look: Look, group: Sequence[Course], axis: Axis, limit: int, gaps: bool) -> list[go.Scatter]:
+def _steps(style: EntryStyle, group: Sequence[Course], axis: Axis, limit: int, gaps: bool) -> list[go.Scatter]:
     """One trace for all seeds of an entry, with a break between them, and a mark at each end."""
     x: list[float | None] = []
     y: list[float | None] = []
@@ -194,13 +212,13 @@ def _steps(look: Look, group: Sequence[Course], axis: Axis, limit: int, gaps: bo
         y += [*(float(f"{value:.6g}") for value in values[picks]), None]
         seeds += [*([course.run.record.seed] * len(picks)), None]
     ends = [index - 1 for index, value in enumerate(x) if value is None]
-    words = f"{text(look.label)}, seed %{{customdata}}<br>%{{x:.4g}}{' s' if axis == 'time' else ' evaluations'}"
+    words = f"{text(style.label)}, seed %{{customdata}}<br>%{{x:.4g}}{' s' if axis == 'time' else ' evaluations'}"
     shared = {
-        "legendgroup": look.key,
+        "legendgroup": style.key,
         "hovertemplate": f"{words}, {'gap' if gaps else 'cost'} %{{y:.5g}}<extra></extra>",
     }
-    line = {"color": look.colour, "width": 1.8, "dash": look.dash, "shape": "hv"}
-    marker = {"color": look.colour, "symbol": look.symbol, "size": 8, "line": {"width": 1.8}}
+    line = {"color": style.colour, "width": 1.8, "dash": style.dash, "shape": "hv"}
+    marker = {"color": style.colour, "symbol": style.symbol, "size": 8, "line": {"width": 1.8}}
     return [
         go.Scatter(x=x, y=y, customdata=seeds, mode="lines", line=line, opacity=0.8, **shared),
         go.Scatter(
@@ -211,7 +229,7 @@ def _steps(look: Look, group: Sequence[Course], axis: Axis, limit: int, gaps: bo
 
 
 def _cost_plot(drawn: Sequence[Course], axis: Axis, limit: int, theoretical: float | None) -> go.Figure:
-    traces = [trace for look, group in _groups(drawn).items() for trace in _steps(look, group, axis, limit, False)]
+    traces = [trace for style, group in _groups(drawn).items() for trace in _steps(style, group, axis, limit, False)]
     low = min(course.costs.min() for course in drawn)
     high = max(course.costs.max() for course in drawn)
     if theoretical is not None:
@@ -221,8 +239,8 @@ def _cost_plot(drawn: Sequence[Course], axis: Axis, limit: int, theoretical: flo
                 x=list(_extent(drawn, axis)),
                 y=[theoretical, theoretical],
                 mode="lines",
-                line={"color": THEORETICAL_LOOK.colour, "width": 1.8, "dash": THEORETICAL_LOOK.dash},
-                legendgroup=THEORETICAL_LOOK.key,
+                line={"color": THEORETICAL_STYLE.colour, "width": 1.8, "dash": THEORETICAL_STYLE.dash},
+                legendgroup=THEORETICAL_STYLE.key,
                 hovertemplate=f"theoretical, cost {theoretical:.5g}<extra></extra>",
             )
         )
@@ -233,7 +251,7 @@ def _cost_plot(drawn: Sequence[Course], axis: Axis, limit: int, theoretical: flo
 
 
 def _gap_plot(drawn: Sequence[Course], axis: Axis, limit: int) -> go.Figure:
-    traces = [trace for look, group in _groups(drawn).items() for trace in _steps(look, group, axis, limit, True)]
+    traces = [trace for style, group in _groups(drawn).items() for trace in _steps(style, group, axis, limit, True)]
     figure = plot(*traces, xaxis_title_text=_TITLES[axis], yaxis_title_text="relative gap above best known cost")
     logarithmic(figure, "x", *_extent(drawn, axis))
     logarithmic(figure, "y", _FLOOR, float(max(course.gaps.max() for course in drawn)))
@@ -243,8 +261,8 @@ def _gap_plot(drawn: Sequence[Course], axis: Axis, limit: int) -> go.Figure:
 def _target_plot(drawn: Sequence[Course], axis: Axis, runs: Mapping[str, int]) -> go.Figure:
     traces = []
     low, high = _extent(drawn, axis)
-    for look, group in _groups(drawn).items():
-        reached, share = targets_reached(group, runs[look.label], axis)
+    for style, group in _groups(drawn).items():
+        reached, share = targets_reached(group, runs[style.label], axis)
         x = np.concatenate([[low], reached, [high]])
         y = np.concatenate([[0.0], share, [share[-1] if len(share) else 0.0]])
         keep = np.append(np.flatnonzero(np.diff(x) > 0), len(x) - 1)
@@ -253,9 +271,9 @@ def _target_plot(drawn: Sequence[Course], axis: Axis, runs: Mapping[str, int]) -
                 x=[float(f"{value:.5g}") for value in x[keep]],
                 y=np.round(100 * y[keep], 2).tolist(),
                 mode="lines",
-                line={"color": look.colour, "width": 2.2, "dash": look.dash, "shape": "hv"},
-                legendgroup=look.key,
-                hovertemplate=f"{text(look.label)}<br>%{{y:.1f}} % by %{{x:.4g}}<extra></extra>",
+                line={"color": style.colour, "width": 2.2, "dash": style.dash, "shape": "hv"},
+                legendgroup=style.key,
+                hovertemplate=f"{text(style.label)}<br>%{{y:.1f}} % by %{{x:.4g}}<extra></extra>",
             )
         )
     figure = plot(*traces, xaxis_title_text=_TITLES[axis], yaxis_title_text="targets reached (%)")

@@ -1,17 +1,14 @@
-"""What the report shows of one data set, gathered once: entries with their colours, errors of the design values."""
+"""The report's view of one data set: its results, how entries are drawn, errors of the design values."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.plan import PlannedRun, make_plan
-from omnibench.compare.result import ComparisonResult, EntryStatistics, ScoredRun
-from omnibench.compare.statistics import entry_statistics
-from omnibench.data.dataset import Dataset, Split
+from omnibench.compare.result import BoxCertificate, ComparisonResult, EntryStatistics, Interval, ScoredRun
+from omnibench.data.dataset import SPLITS, Dataset, Split
 from omnibench.fit.evaluate import final_errors
-from omnibench.fit.parameterisation import GeometryLimits
 from omnibench.registry import calibrators
 from omnibench.report.blocks import Dash, LegendItem
 from omnibench.report.style import REFERENCE, SYMBOLS, THEORETICAL, colours
@@ -21,7 +18,7 @@ from omnibench.robot.model import OdometryModel
 THEORETICAL_NAME = "theoretical"
 SPLIT_NAMES: Mapping[Split, str] = {"train": "training", "validation": "validation"}
 
-# The paper draws its non-parametric (genetic) result in magenta and the parametric one in brown.
+# Colours by calibrator. The paper draws its non-parametric (genetic) result in magenta, the parametric one in brown.
 _CUSTOMARY = {
     "closed_form": "#0072b2",
     "crs": "#e69f00",
@@ -33,7 +30,7 @@ _CUSTOMARY = {
 
 
 @dataclass(frozen=True)
-class Look:
+class EntryStyle:
     """How an entry is drawn in every plot of the report."""
 
     key: str
@@ -47,17 +44,17 @@ class Look:
         return LegendItem(self.key, self.label, self.colour, self.dash)
 
 
-REFERENCE_LOOK = Look("reference", "reference", REFERENCE, "solid", "circle")
-THEORETICAL_LOOK = Look("theoretical", "theoretical (design values)", THEORETICAL, "dash", "circle")
+REFERENCE_STYLE = EntryStyle("reference", "reference", REFERENCE, "solid", "circle")
+THEORETICAL_STYLE = EntryStyle("theoretical", "theoretical (design values)", THEORETICAL, "dash", "circle")
 
 
 @dataclass(frozen=True, eq=False)
 class DatasetView:
     """One data set of the comparison.
 
-    looks: by label, the same in the whole report. boxes: by label, what the entry searched; equal where two entries
-    searched the same. theoretical: costs of the design values with their intervals. design_errors: final pose errors
-    (Z, 3) in m, m, rad of the design matrix on each split that has trajectories.
+    warnings: those of the whole comparison. styles: by label, the same in the whole report. design_costs: mean cost of
+    the design values on each split that has trajectories. design_errors: final pose errors (Z, 3) of the design matrix
+    on each such split, m, m, rad.
     """
 
     name: str
@@ -65,10 +62,16 @@ class DatasetView:
     dataset: Dataset
     runs: tuple[ScoredRun, ...]
     statistics: tuple[EntryStatistics, ...]
-    looks: Mapping[str, Look]
-    boxes: Mapping[str, Hashable]
-    theoretical: EntryStatistics | None
+    certificates: tuple[BoxCertificate, ...]
+    warnings: tuple[str, ...]
+    styles: Mapping[str, EntryStyle]
+    design_costs: Mapping[Split, Interval]
     design_errors: Mapping[Split, Array]
+
+    @property
+    def splits(self) -> tuple[Split, ...]:
+        """The splits that have trajectories."""
+        return tuple(self.design_errors)
 
     @property
     def scored(self) -> Split:
@@ -102,15 +105,12 @@ class DatasetView:
         return next(iter(exact + best + self.calibrated), None)
 
     def theoretical_cost(self, split: Split) -> float | None:
-        """The cost of the design values, which every run's record holds."""
-        for run in self.runs:
-            record = run.record
-            return record.theoretical_train_cost if split == "train" else record.theoretical_validation_cost
-        return None
+        """The cost of the design values on a split; None where there is no run, or no such split."""
+        return self.runs[0].design[split].cost if self.runs and split in self.runs[0].design else None
 
     def errors(self, run: ScoredRun, split: Split) -> Array | None:
         """Final pose errors (Z, 3) of a run's answer, m, m, rad."""
-        return run.train_errors if split == "train" else run.validation_errors
+        return run.scores[split].errors if split in run.scores else None
 
     def model(self, matrix: Array) -> OdometryModel:
         """The odometry that the comparison used, with another matrix."""
@@ -122,71 +122,37 @@ class DatasetView:
         return self.dataset.robot.inverse_kinematic_matrix
 
 
-def is_bounded(calibrator: str) -> bool:
-    """Whether a calibrator keeps to the box; not so a matrix that is given or kept as it is."""
-    classes = {entry.name: entry.cls for entry in calibrators.entries()}
-    return bool(getattr(classes.get(calibrator), "bounded", True))
-
-
 def views(result: ComparisonResult) -> list[DatasetView]:
     """The data sets of a comparison, in the config's order."""
-    looks = _looks(result)
-    plan = make_plan(result.config, result.datasets)
-    return [_view(result, name, looks, plan) for name in result.datasets]
+    styles = _styles(result)
+    return [_view(result, name, styles) for name in result.datasets]
 
 
-def _view(result: ComparisonResult, name: str, looks: Mapping[str, Look], plan: Sequence[PlannedRun]) -> DatasetView:
+def _view(result: ComparisonResult, name: str, styles: Mapping[str, EntryStyle]) -> DatasetView:
     dataset = result.datasets[name]
-    splits: tuple[Split, ...] = ("train", "validation")
-    present = [split for split in splits if dataset.split(split)]
     design = OdometryModel.of_design(dataset.robot, result.config.integration)
-    runs = tuple(run for run in result.runs if run.record.dataset == name)
     return DatasetView(
         name=name,
         config=result.config,
         dataset=dataset,
-        runs=runs,
+        runs=tuple(run for run in result.runs if run.record.dataset == name),
         statistics=tuple(entry for entry in result.statistics if entry.dataset == name),
-        looks=looks,
-        boxes={run.label: _searched(run) for run in plan if run.dataset_name == name},
-        theoretical=_theoretical(result, runs[0]) if runs else None,
-        design_errors={split: final_errors(design, dataset.split(split)) for split in present},
+        certificates=tuple(certificate for certificate in result.certificates if certificate.dataset == name),
+        warnings=result.warnings,
+        styles=styles,
+        design_costs=result.design_costs.get(name, {}),
+        design_errors={split: final_errors(design, dataset.split(split)) for split in SPLITS if dataset.split(split)},
     )
 
 
-def _searched(run: PlannedRun) -> Hashable:
-    """The content of a run's box: a name like ``custom`` may stand for several."""
-    if run.parameterisation == "geometry":
-        return run.parameterisation, run.entry.limits or GeometryLimits()
-    return run.parameterisation, run.entry.box or run.config.box
-
-
-def _theoretical(result: ComparisonResult, run: ScoredRun) -> EntryStatistics:
-    """Statistics of the design values, which every run holds the costs of, as if they were its answer."""
-    record = run.record.model_copy(
-        update={
-            "label": THEORETICAL_NAME,
-            "train_cost": run.record.theoretical_train_cost,
-            "validation_cost": run.record.theoretical_validation_cost,
-        }
-    )
-    design = replace(
-        run,
-        record=record,
-        train_costs=run.theoretical_train_costs,
-        validation_costs=run.theoretical_validation_costs,
-    )
-    (statistics,) = entry_statistics([design], result.config.bootstrap)
-    return statistics
-
-
-def _looks(result: ComparisonResult) -> dict[str, Look]:
+def _styles(result: ComparisonResult) -> dict[str, EntryStyle]:
+    """A style for each label; the design values have theirs."""
     names = {entry.label: entry.calibrator for entry in result.statistics}
     names |= {run.record.label: run.record.calibrator for run in result.runs}
     searches = {label: name for label, name in names.items() if name != THEORETICAL_NAME}
-    styles = colours({label: _CUSTOMARY.get(name) for label, name in searches.items()})
-    looks = {
-        label: Look(f"entry-{index}", label, colour, dash, SYMBOLS[index % len(SYMBOLS)])
-        for index, (label, (colour, dash)) in enumerate(styles.items())
+    drawn = colours({label: _CUSTOMARY.get(name) for label, name in searches.items()})
+    styles = {
+        label: EntryStyle(f"entry-{index}", label, colour, dash, SYMBOLS[index % len(SYMBOLS)])
+        for index, (label, (colour, dash)) in enumerate(drawn.items())
     }
-    return {label: looks.get(label, THEORETICAL_LOOK) for label in names}
+    return {label: styles.get(label, THEORETICAL_STYLE) for label in names}

@@ -1,44 +1,60 @@
-"""Statistics as the report words them: which figure of an entry counts on a split, intervals, units."""
+"""Wording that the report's parts share: entries, costs, improvements, differences, units."""
 
 from __future__ import annotations
 
-from omnibench.compare.report.view import DatasetView
-from omnibench.compare.result import EntryStatistics, Interval
+from omnibench.compare.plan import UNBOUNDED
+from omnibench.compare.report.view import THEORETICAL_NAME, THEORETICAL_STYLE, DatasetView
+from omnibench.compare.result import EntryStatistics, Interval, RunRecord
 from omnibench.data.dataset import Split
+from omnibench.registry import costs
+from omnibench.report.blocks import Cell
 from omnibench.report.numbers import NOTHING, decimals_for, fixed, percent, significant, span
 
 
-def improvement(entry: EntryStatistics, split: Split) -> Interval | None:
-    """The share by which an entry's cost lies below that of the design values."""
-    return entry.train_improvement if split == "train" else entry.validation_improvement
-
-
 def improvement_in_words(entry: EntryStatistics, split: Split, decimals: int) -> tuple[str, str]:
-    """An improvement and its interval, in per cent."""
-    found = improvement(entry, split)
-    if found is None:
+    """An entry's improvement on a split and its interval, in per cent."""
+    share = entry.improvement(split)
+    if share is None:
         return NOTHING, ""
-    return percent(found.value, decimals), f"{span(100 * found.low, 100 * found.high, 1)} %"
+    return percent(share.value, decimals), f"{span(100 * share.low, 100 * share.high, 1)} %"
 
 
 def level_in_words(view: DatasetView) -> str:
-    """That others are practically equal to the best, if so."""
+    """How many entries are practically equal to the best; empty where it is alone."""
     return f"of {len(view.level)} that are level" if len(view.level) > 1 else ""
 
 
-def cost(entry: EntryStatistics, split: Split) -> Interval | None:
-    """An entry's cost on a split."""
-    return entry.train if split == "train" else entry.validation
+def entry_cell(view: DatasetView, entry: EntryStatistics | None) -> Cell:
+    """An entry's name with its colour; None stands for the design values."""
+    if entry is None:
+        return Cell(THEORETICAL_NAME, "design values", THEORETICAL_STYLE.colour)
+    if entry.calibrator == THEORETICAL_NAME:
+        note = "design values"
+    elif entry.box == UNBOUNDED:
+        note = f"{entry.parameterisation}, as given"
+    else:
+        note = "geometry within limits" if entry.parameterisation == "geometry" else f"matrix, box {entry.box}"
+    return Cell(entry.label, note, view.styles[entry.label].colour)
+
+
+def on_bounds(record: RunRecord) -> list[str]:
+    """Elements that the search moved to a bound; not those that the box holds at their start value."""
+    return [name for name in record.at_bounds if name not in record.held]
+
+
+def cost_in_words(view: DatasetView) -> str:
+    """The cost's name and what it is."""
+    return f"{view.config.cost.name}: {costs.entry(view.config.cost.name).summary.rstrip('.')}."
 
 
 def cost_decimals(view: DatasetView) -> int:
     """Decimals of a data set's costs: four as in the paper, more where that leaves the lowest too few digits."""
-    costs = [interval.value for entry in view.statistics for interval in (entry.train, entry.validation) if interval]
-    return min(7, max(4, decimals_for(min(costs, default=None), 3)))
+    values = [of_split.cost.value for entry in view.statistics for of_split in entry.splits.values()]
+    return min(7, max(4, decimals_for(min(values, default=None), 3)))
 
 
 def position_unit(*errors: float) -> tuple[float, str, int]:
-    """Factor, unit and decimals in which these lengths (m) are best read: mm below a metre."""
+    """Factor from m, unit and decimals in which these errors (m) are shown: mm below a metre."""
     return (1e3, "mm", 1) if max(errors, default=0.0) < 1.0 else (1.0, "m", 3)
 
 

@@ -11,12 +11,12 @@ from report_page import Page
 
 from omnibench.compare.certificates import certify
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
+from omnibench.compare.data_sources import load_datasets
+from omnibench.compare.plan import PlannedRun, make_plan
 from omnibench.compare.report.comparison_report import write_report
 from omnibench.compare.result import ComparisonResult, EntryStatistics
-from omnibench.compare.run_problem import make_problem
 from omnibench.compare.scoring import score
-from omnibench.compare.statistics import entry_statistics
+from omnibench.compare.statistics import design_costs, entry_statistics
 from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
 from omnibench.fit.calibrator import RunResult, run_calibrator
@@ -73,6 +73,7 @@ def run(chosen: CompareConfig, datasets: Mapping[str, Dataset] | None = None) ->
         datasets=loaded,
         runs=scored,
         statistics=entry_statistics(scored, chosen.bootstrap),
+        design_costs=design_costs(scored, chosen.bootstrap),
         certificates=certificates,
         uncertainties={},
         environment=environment(),
@@ -82,11 +83,7 @@ def run(chosen: CompareConfig, datasets: Mapping[str, Dataset] | None = None) ->
 
 def solve(planned: PlannedRun) -> RunResult:
     """One planned run, in this process."""
-    dataset = planned.dataset
-    problem = make_problem(
-        planned.config, planned.entry, dataset.robot, dataset.split("train"), planned.parameterisation, planned.seed
-    )
-    return run_calibrator(calibrators.create(planned.entry.name, planned.entry.options), problem)
+    return run_calibrator(calibrators.create(planned.entry.name, planned.entry.options), planned.task.problem())
 
 
 def page(result: ComparisonResult, folder: Path) -> Page:

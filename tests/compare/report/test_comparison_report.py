@@ -62,7 +62,7 @@ def test_recorded_data_wear_no_badge(result: ComparisonResult, tmp_path: Path) -
 def test_costs_stand_in_tables_like_the_papers(result: ComparisonResult, report: Page, split: str, number: int) -> None:
     caption = f"Cost of 16 trajectories, {split}"
     entry = statistics(result, "closed_form")
-    interval = entry.train if split == "training" else entry.validation
+    interval = entry.cost("train" if split == "training" else "validation")
     cells = report.row(caption, "closed_form")
     assert report.tables[caption][0] == ["M⁻¹", "CF theoretical", f"CF {split}", "Improvement"]
     assert cells[2] == f"{fixed(interval.value, 4)} | {fixed(interval.low, 4)} to {fixed(interval.high, 4)}"
@@ -96,7 +96,7 @@ def test_entries_are_compared_with_the_best(result: ComparisonResult, report: Pa
 
 
 def test_final_errors_are_in_millimetres_and_degrees(result: ComparisonResult, report: Page) -> None:
-    errors = statistics(result, "closed_form").typical.validation_errors
+    errors = statistics(result, "closed_form").typical.scores["validation"].errors
     cells = report.row("Error of the final pose, validation", "closed_form")
     assert cells[1] == f"{1e3 * np.hypot(errors[:, 0], errors[:, 1]).mean():.1f}"
     assert cells[3] == f"{np.degrees(np.abs(errors[:, 2]).mean()):.2f}"
@@ -146,7 +146,7 @@ def test_the_design_values_lead_the_tables_even_if_no_entry_asks_for_them(tmp_pa
     result = run(config(calibrators=["closed_form"]))
     told = page(result, tmp_path)
     theoretical = fixed(result.runs[0].record.theoretical_validation_cost, 4)
-    listed = run(config(calibrators=["theoretical", "closed_form"])).statistics[0].validation
+    listed = run(config(calibrators=["theoretical", "closed_form"])).statistics[0].cost("validation")
     assert told.row("Cost of 16 trajectories, validation", "theoretical")[1].split(" | ")[0] == theoretical
     assert told.row("Cost of 16 trajectories, validation", "closed_form")[1] == theoretical
     interval = f"{fixed(listed.low, 4)} to {fixed(listed.high, 4)}"

@@ -29,7 +29,7 @@ def test_the_headline_names_the_best_and_the_improvement_with_its_interval(
     result: ComparisonResult, report: Page
 ) -> None:
     best = next(entry for entry in result.statistics if entry.is_best)
-    fell = best.validation_improvement
+    fell = best.improvement("validation")
     assert f"{best.label} is best." in report.text
     assert f"the error fell by {100 * fell.value:.1f} %" in report.text
     assert f"(95 % interval {100 * fell.low:.1f} to {100 * fell.high:.1f} %)" in report.text
@@ -89,12 +89,14 @@ def test_commands_that_the_best_makes_worse_are_listed_with_both_costs(
     commands = [trajectory.command for trajectory in dataset.split("validation")]
     typical = statistics(result, "closed_form").typical
     spoilt = np.array([command == commands[0] for command in commands])
-    costs = np.where(spoilt, typical.theoretical_validation_costs + 0.01, typical.validation_costs)
+    score, design = typical.scores["validation"], typical.design["validation"]
+    costs = np.where(spoilt, design.costs + 0.01, score.costs)
+    scores = {**typical.scores, "validation": replace(score, costs=costs)}
     changed = [
-        replace(e, typical=replace(typical, validation_costs=costs)) if e.label == "closed_form" else e
+        replace(e, typical=replace(typical, scores=scores)) if e.label == "closed_form" else e
         for e in result.statistics
     ]
-    was = typical.theoretical_validation_costs[spoilt].mean()
+    was = design.costs[spoilt].mean()
     told = page(replace(result, statistics=tuple(changed)), tmp_path).text
     assert f"worse than the design values on 1 of {len(set(commands))} commands of the validation data" in told
     assert f"{commands[0]} {was:.4f} → {was + 0.01:.4f}." in told

@@ -34,9 +34,9 @@ def scaled(result: ComparisonResult, before: float, after: float) -> dict[str, f
     entry = statistics(result, "closed_form")
     return {
         "theoretical_train_cost": before * record.theoretical_train_cost,
-        "train_cost": after * entry.train.value,
+        "train_cost": after * entry.cost("train").value,
         "theoretical_validation_cost": before * record.theoretical_validation_cost,
-        "validation_cost": after * entry.validation.value,
+        "validation_cost": after * entry.cost("validation").value,
     }
 
 

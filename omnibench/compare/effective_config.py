@@ -1,0 +1,60 @@
+"""A config's names resolved: plug-ins loaded, unknown names refused, every option with its default."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from omnibench.compare.config import CalibratorEntry, CompareConfig
+from omnibench.config import validate
+from omnibench.errors import ConfigError, OmnibenchError, PluginError
+from omnibench.fit.calibrator import unloadable
+from omnibench.registry import PluginFailure, calibrators, costs, load_plugins
+
+
+def load_calibrators(config: CompareConfig) -> list[PluginFailure]:
+    """Load the config's plug-ins. The runs of one that cannot be imported fail with its error, the others run."""
+    failures = load_plugins(config.plugins)
+    missing = {entry.name for entry in config.calibrators} - {entry.name for entry in calibrators.entries()}
+    for failure in failures:
+        for name in missing & _names_in(Path(failure.origin)):
+            calibrators.register(name)(unloadable(failure))
+            missing.remove(name)
+    return failures
+
+
+def _names_in(plugin: Path) -> set[str]:
+    """Calibrators that a plug-in file would register: the file's name, and names in its text."""
+    text = plugin.read_text(encoding="utf-8", errors="replace") if plugin.is_file() else ""
+    return {plugin.stem, *re.findall(r"""calibrators\s*\.\s*register\(\s*["']([^"']+)["']""", text)}
+
+
+def effective_config(config: CompareConfig) -> CompareConfig:
+    """The config with every default of every option written out. Refuses unknown names and options."""
+    cost = config.cost
+    cost_options = costs.create(cost.name, cost.options, f"config {config.name}").options
+    entries = []
+    for index, entry in enumerate(config.calibrators):
+        place = f"config {config.name}: calibrators.{index}"
+        options = _effective_options(entry, place)
+        entries.append(entry.model_copy(update={"options": options.model_dump(mode="json")}))
+    return config.model_copy(
+        update={
+            "calibrators": tuple(entries),
+            "cost": cost.model_copy(update={"options": cost_options.model_dump(mode="json")}),
+        }
+    )
+
+
+def _effective_options(entry: CalibratorEntry, place: str) -> BaseModel:
+    calibrator = calibrators.entry(entry.name, place)
+    options = validate(calibrator.options, entry.options, f"{place}: calibrator {entry.name!r}")
+    try:
+        calibrators.create(entry.name, entry.options)  # a constructor may check its options further
+    except PluginError:
+        pass  # reported as the outcome of its run
+    except OmnibenchError as error:
+        raise ConfigError(f"{place}: {error}") from None
+    return options

@@ -1,0 +1,80 @@
+"""The section on costs: Tables 2 and 3 of the paper with intervals, and published results beside them."""
+
+from __future__ import annotations
+
+from omnibench.compare.report.published_tables import published_blocks
+from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_NAME, DatasetView
+from omnibench.compare.report.wording import cost_decimals, cost_in_words, entry_cell, improvement_in_words
+from omnibench.compare.result import EntryStatistics, Interval
+from omnibench.data.dataset import Split
+from omnibench.report.blocks import Cell, Column, Row, Section, Table
+from omnibench.report.numbers import NOTHING, fixed, percent, plural, span
+
+
+def cost_section(view: DatasetView) -> Section:
+    """A table of costs for each split, then what is like the published results and what is not."""
+    tables = (cost_table(view, split) for split in view.splits)
+    return Section("costs", "Costs", (*tables, *published_blocks(view)))
+
+
+def cost_table(view: DatasetView, split: Split) -> Table:
+    """Table 2 (training) or 3 (validation) of the paper, with intervals."""
+    theoretical = view.theoretical_cost(split)
+    decimals = cost_decimals(view)
+    before = fixed(theoretical, decimals)
+    design = Cell(before, _span(view.design_costs.get(split), decimals))
+    rows = [Row((entry_cell(view, None), design, Cell(NOTHING), Cell(NOTHING)))]
+    searched = [entry for entry in view.statistics if entry.calibrator != THEORETICAL_NAME]
+    rows += [_cost_row(view, entry, split, before) for entry in searched]
+    rows += _published_rows(view, split)
+    number = len(view.dataset.split(split))
+    return Table(
+        caption=f"Cost of {plural(number, 'trajectory')}, {SPLIT_NAMES[split]}",
+        columns=(
+            Column("M⁻¹", numeric=False),
+            Column("CF theoretical"),
+            Column(f"CF {SPLIT_NAMES[split]}"),
+            Column("Improvement"),
+        ),
+        rows=tuple(rows),
+        note=f"As Table {2 if split == 'train' else 3} of the paper. CF is the cost {cost_in_words(view)} "
+        "Small print: 95 % bootstrap intervals over trajectories, of the run with the median training cost.",
+    )
+
+
+def _cost_row(view: DatasetView, entry: EntryStatistics, split: Split, before: str) -> Row:
+    reached = entry.cost(split)
+    if reached is None:
+        failed = [run.record for run in view.runs if run.record.label == entry.label]
+        outcome = failed[0].outcome.value if failed else "no run"
+        return Row((entry_cell(view, entry), Cell(before), Cell("no answer", outcome), Cell(NOTHING)), "failed")
+    cells = (
+        entry_cell(view, entry),
+        Cell(before),
+        Cell(fixed(reached.value, cost_decimals(view)), _span(reached, cost_decimals(view))),
+        Cell(*improvement_in_words(entry, split, 2)),
+    )
+    return Row(cells, "best" if entry.is_best else "plain")
+
+
+def _published_rows(view: DatasetView, split: Split) -> list[Row]:
+    rows = []
+    for result in view.config.published_results:
+        published = result.costs(split)
+        if published is None:
+            continue
+        before, after = published
+        cells = (
+            Cell(result.label, result.source),
+            Cell(fixed(before, 4)),
+            Cell(fixed(after, 4)),
+            Cell(percent(1 - after / before, 2)),
+        )
+        rows.append(Row(cells, "muted"))
+    if rows:
+        rows.insert(0, Row((Cell("Published, on other data: not comparable row by row"),), "group"))
+    return rows
+
+
+def _span(interval: Interval | None, decimals: int) -> str:
+    return "" if interval is None else span(interval.low, interval.high, decimals)

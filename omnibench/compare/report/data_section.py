@@ -1,0 +1,56 @@
+"""The section on the data."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omnibench.compare.report.view import SPLIT_NAMES, DatasetView
+from omnibench.data.dataset import SPLITS
+from omnibench.report.blocks import Callout, Fact, Facts, Section
+from omnibench.report.numbers import count, fixed, listing, significant
+from omnibench.robot.kinematics import Array
+
+
+def data_section(view: DatasetView) -> Section:
+    """Where the data come from, how much there is, the robot, and warnings on reading them."""
+    dataset = view.dataset
+    trajectories = dataset.trajectories
+    durations = np.array([trajectory.pose_times[-1] for trajectory in trajectories])
+    commands = {trajectory.command for trajectory in trajectories} - {None}
+    sessions = {trajectory.session for trajectory in trajectories} - {None}
+    split_sizes = [f"{count(len(dataset.split(split)))} for {SPLIT_NAMES[split]}" for split in SPLITS]
+    wheels = [
+        f"{wheel.name}: radius {wheel.radius:g} m, distance {wheel.distance:g} m, "
+        f"angle {fixed(np.degrees(wheel.angle), 1)}°"
+        + (f", rollers {fixed(np.degrees(wheel.roller_angle), 1)}°" if wheel.roller_angle else "")
+        for wheel in dataset.robot.wheels
+    ]
+    facts = [
+        Fact("Data set", dataset.name, "simulated" if dataset.simulated else ""),
+        Fact("Description", dataset.description),
+        Fact("Source", dataset.source),
+        Fact("Licence", dataset.licence),
+        Fact("Trajectories", f"{count(len(trajectories))}: {listing(split_sizes)}"),
+        Fact("Commands", count(len(commands)) if commands else "not known"),
+        Fact("Sessions", listing(sorted(map(str, sessions))) if sessions else "not known"),
+        Fact(
+            "Duration",
+            f"{_range(durations)} s a run",
+            f"wheel samples every {significant(1e3 * dataset.sample_period, 3)} ms",
+        ),
+        Fact("Robot", dataset.robot.name, "; ".join(wheels)),
+        Fact("Odometry", "exact arcs" if view.config.integration == "arc" else "Euler steps, Eq. (1)"),
+        Fact("Content (SHA-256)", dataset.hash[:16]),
+    ]
+    shown_above = " ".join(view.warnings)
+    warnings = tuple(warning for warning in dataset.warnings if warning not in shown_above)
+    blocks = (
+        Facts(tuple(fact for fact in facts if fact.value)),
+        Callout("Warnings on reading the data", warnings, "warning"),
+    )
+    return Section("data", "Data", blocks)
+
+
+def _range(values: Array) -> str:
+    low, high = (significant(float(value), 3) for value in (values.min(), values.max()))
+    return low if low == high else f"{low} to {high}"

@@ -1,0 +1,181 @@
+"""The section on outcomes: entries over their seeds, proven bounds, every run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from omnibench.compare.report.view import SPLIT_NAMES, DatasetView
+from omnibench.compare.report.wording import difference_in_words, entry_cell, level_in_words, on_bounds
+from omnibench.compare.result import BoxCertificate, EntryStatistics, RunRecord
+from omnibench.report.blocks import Block, Cell, Column, Details, Row, Section, Table
+from omnibench.report.numbers import (
+    NOTHING,
+    count,
+    decimals_for,
+    fixed,
+    listing,
+    percent,
+    seconds,
+    significant,
+)
+
+_FOLDED_ABOVE = 20  # runs: a longer table of runs is folded away (chosen)
+
+
+def outcome_section(view: DatasetView) -> Section:
+    """How each entry did over its seeds, what is proven, and every run."""
+    proofs = (certificate_table(view.certificates),) if view.certificates else ()
+    runs: Block = run_table(view)
+    if len(view.runs) > _FOLDED_ABOVE:
+        runs = Details(f"Every run ({len(view.runs)})", (runs,))
+    return Section("outcomes", "Outcomes", (entry_table(view), *proofs, runs))
+
+
+def entry_table(view: DatasetView) -> Table:
+    """How each entry did over its seeds and against the best."""
+    rows = []
+    for entry in view.statistics:
+        digits = decimals_for(entry.train_median, 5)
+        rows.append(
+            Row(
+                (
+                    entry_cell(view, entry),
+                    Cell(f"{entry.answers} of {entry.runs}"),
+                    Cell(fixed(entry.train_median, digits), _spread(entry)),
+                    Cell(gap(entry.gap_median), proven(entry.proven_gap_median)),
+                    Cell(count(entry.evaluations_median), seconds(entry.seconds_median)),
+                    _difference(entry),
+                    _verdict(view, entry),
+                ),
+                "best" if entry.is_best else "plain" if entry.answers else "failed",
+            )
+        )
+    return Table(
+        caption="Entries over their seeds",
+        columns=(
+            Column("Entry", numeric=False),
+            Column("Answers of runs"),
+            Column("CF training, median"),
+            Column("Gap above exact optimum", "relative"),
+            Column("Evaluations and time, median"),
+            Column(f"Difference from the best in CF {SPLIT_NAMES[view.scored]}"),
+            Column("Verdict", numeric=False),
+        ),
+        rows=tuple(rows),
+        note="Spread: interquartile range over seeds. Gap: training cost relative to the exact optimum in the same box "
+        f"(closed_form), minus one; {NOTHING} where that is not known. Proven: what share of the "
+        "cost any optimiser could still save in that box, at most. Difference: paired over trajectories, with its "
+        "95 % bootstrap interval. Practically equal: that interval contains zero, or the difference is below a tenth "
+        "of the standard error of the best entry's cost. Best: the lowest training cost of the entries that are "
+        f"practically equal to the one of lowest {SPLIT_NAMES[view.scored]} cost.{_held_in_words(view)}",
+    )
+
+
+def run_table(view: DatasetView) -> Table:
+    """Every run, those without an answer too."""
+    return Table(
+        caption="Every run",
+        columns=(
+            Column("Entry", numeric=False),
+            Column("Seed"),
+            Column("Outcome", numeric=False),
+            Column("CF training"),
+            Column("CF validation"),
+            Column("Gap"),
+            Column("Evaluations and time"),
+            Column("On a bound", numeric=False),
+        ),
+        rows=tuple(_run_row(view, run.record) for run in view.runs),
+    )
+
+
+def certificate_table(certificates: Sequence[BoxCertificate]) -> Table:
+    """Lower bounds on the training cost, one for each box for which one is proven."""
+    rows = [
+        Row(
+            (
+                Cell(certificate.box),
+                Cell(significant(certificate.best_cost, 6)),
+                Cell(significant(certificate.lower_bound, 6)),
+                Cell(percent(certificate.gap, 2), "" if certificate.finished else "time was up"),
+                Cell(count(certificate.parts), seconds(certificate.seconds)),
+            )
+        )
+        for certificate in certificates
+    ]
+    return Table(
+        caption="What no optimiser can beat",
+        columns=(
+            Column("Box", numeric=False),
+            Column("Lowest CF training found"),
+            Column("No matrix of the box is below"),
+            Column("Left to gain, at most"),
+            Column("Parts of the box, time"),
+        ),
+        rows=tuple(rows),
+        note="Proven by branch and bound on row 3 of the matrix, with rounding counted in: whichever search is used, "
+        "and however long it runs, the training cost cannot fall below the bound while the matrix stays in the box.",
+    )
+
+
+def gap(value: float | None) -> str:
+    """A relative gap; below what arithmetic can tell it is zero."""
+    if value is not None and abs(value) < 5e-13:
+        return "0"
+    return significant(value, 2)
+
+
+def proven(value: float | None) -> str:
+    """What share of a cost could be saved at most, as a note; nothing where nothing is proven."""
+    return "" if value is None else f"proven: ≤ {percent(max(value, 0.0), 2)}"
+
+
+def _spread(entry: EntryStatistics) -> str:
+    if entry.train_spread is None or entry.answers < 2:
+        return "one seed" if entry.answers == 1 else ""
+    return f"spread {significant(entry.train_spread, 2)}"
+
+
+def _difference(entry: EntryStatistics) -> Cell:
+    if entry.difference is None or entry.is_best:
+        return Cell(NOTHING)
+    return Cell(*difference_in_words(entry.difference))
+
+
+def _verdict(view: DatasetView, entry: EntryStatistics) -> Cell:
+    if entry.typical is None:
+        return Cell("no answer")
+    if entry.is_best:
+        return Cell("best", level_in_words(view))
+    if entry.practically_equal is None or entry.difference is None:
+        return Cell(NOTHING)
+    if entry.practically_equal:
+        return Cell("practically equal")
+    if entry.difference.value > 0:
+        return Cell("worse")
+    return Cell("lower cost here", "higher training cost")
+
+
+def _held_in_words(view: DatasetView) -> str:
+    """Elements without width, and the entries whose box holds them."""
+    held: dict[tuple[str, ...], list[str]] = {}
+    for entry, run in view.calibrated:
+        if run.record.held:
+            held.setdefault(run.record.held, []).append(entry.label)
+    parts = [f"{listing(list(names), 12)} ({listing(labels, 20)})" for names, labels in held.items()]
+    return f" Held at the design value by a box without width there: {'; '.join(parts)}." if parts else ""
+
+
+def _run_row(view: DatasetView, record: RunRecord) -> Row:
+    answered = record.matrix is not None
+    cells = (
+        Cell(record.label, colour=view.styles[record.label].colour),
+        Cell(str(record.seed)),
+        Cell(record.outcome.value, record.reason),
+        Cell(fixed(record.train_cost, 6)),
+        Cell(fixed(record.validation_cost, 6)),
+        Cell(gap(record.gap), proven(record.proven_gap)),
+        Cell(count(record.evaluations), seconds(record.seconds)),
+        Cell(", ".join(on_bounds(record)) if answered and on_bounds(record) else NOTHING),
+    )
+    return Row(cells, "plain" if answered else "failed")

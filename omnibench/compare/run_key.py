@@ -1,0 +1,65 @@
+"""The key of a run's stored result: it changes with everything that the result depends on, the code included.
+
+The code behind a run is what all runs share (``robot/``, ``fit/``, trajectories, the problem that a run is given) and
+the files of the calibrators and the cost that it names. Files in ``fit/calibrators/`` that it does not name are left
+out, so that a new calibrator does not discard the stored runs of the others; none of them imports another.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from functools import cache
+from pathlib import Path
+
+from omnibench.compare.config import CalibratorEntry, CompareConfig
+from omnibench.data.dataset import Dataset
+from omnibench.registry import calibrators, costs
+
+_PACKAGE = Path(__file__).parents[1]
+# Files that every run depends on; ** takes in subfolders.
+_SHARED = ("robot/**/*.py", "fit/**/*.py", "data/dataset.py", "compare/plan.py")
+_CALIBRATORS = "fit/calibrators/*.py"
+
+
+def run_key(config: CompareConfig, dataset: Dataset, entry: CalibratorEntry, seed: int) -> str:
+    """The key (20 hexadecimal digits) of one entry's run on one data set with one seed."""
+    facts = {
+        "data": dataset.hash,
+        "cost": config.cost.model_dump(mode="json"),
+        "integration": config.integration,
+        "unidentified": config.unidentified,
+        "calibrator": entry.model_dump(mode="json", exclude={"label"}),
+        "box": config.box if isinstance(config.box, str) else config.box.model_dump(mode="json"),
+        "budget": config.budget.model_dump(mode="json"),
+        "seed": seed,
+        "code": named_code(entry, config.cost.name) + _shared_code(),
+    }
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:20]
+
+
+def shared_code(package: Path) -> str:
+    """Hash of the code that every run uses: paths and contents of the files in ``package``, an omnibench folder."""
+    files = {file for pattern in _SHARED for file in package.glob(pattern)} - {*package.glob(_CALIBRATORS)}
+    digest = hashlib.sha256()
+    for file in sorted(files):
+        digest.update(file.relative_to(package).as_posix().encode())
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+@cache
+def _shared_code() -> str:
+    return shared_code(_PACKAGE)
+
+
+def named_code(entry: CalibratorEntry, cost: str) -> str:
+    """Hash of the code of the calibrator, of the calibrators that its options name, of the cost, and of their bases."""
+    named = {entry.name, *(value for value in entry.options.values() if isinstance(value, str))}
+    classes = [known.cls for known in calibrators.entries() if known.name in named] + [costs.entry(cost).cls]
+    modules = {sys.modules.get(base.__module__) for cls in classes for base in cls.__mro__}
+    digest = hashlib.sha256()
+    for file in sorted({file for module in modules if (file := getattr(module, "__file__", None))}):
+        digest.update(hashlib.sha256(Path(file).read_bytes()).digest())
+    return digest.hexdigest()
