@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit, paths_of, split_runs
 from omnibench.discover.held_out.gaps import confirmation, folds_of
-from omnibench.discover.regressors.encoder_quantisation import Rounding
+from omnibench.discover.selection.encoder_quantisation import Rounding
 from omnibench.discover.regressors.significance import Gains, gains_of
 from omnibench.discover.regressors.whitened import Whitened, given
 from omnibench.discover.selection.candidate_groups import Groups, make_groups
