@@ -9,7 +9,7 @@ import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.fitting.extend import Extended
-from omnibench.discover.selection.extrapolation import driven_motions
+from omnibench.discover.selection.extrapolation import training_domain
 from omnibench.environment import package_versions
 from omnibench.errors import DataError
 from omnibench.robot.calibration import Calibration, EffectTerm, Provenance, covariance_rows, matrix_rows
@@ -18,7 +18,7 @@ from omnibench.robot.kinematics import Array
 
 @dataclass(frozen=True)
 class Request:
-    """What was asked for."""
+    """The options of a discovery, as discover_effects was called with them."""
 
     without: tuple[str, ...]
     unknown_term: bool
@@ -32,7 +32,7 @@ def calibration_of(
     request: Request,
     reason: str,
 ) -> Calibration:
-    """The calibration of a fit, with its noise, its covariance (zero for shapes) and where it comes from."""
+    """The calibration of a fit with its noise, covariance and provenance. reason: why the fit ended, in words."""
     terms = tuple(
         EffectTerm(name=term.name, parameters={key: float(value) for key, value in term.values.items()})
         for term in extended.fit.model.terms
@@ -47,7 +47,7 @@ def calibration_of(
         noise=extended.fit.noise.noise,
         covariance=covariance_rows(_with_shapes(extended)),
         session=extended.fit.runs[0].session,
-        driven=tuple(tuple(float(value) for value in motion) for motion in driven_motions(extended)),
+        driven=tuple(tuple(float(value) for value in motion) for motion in training_domain(extended)),
         provenance=Provenance(
             dataset=dataset.name,
             dataset_hash=dataset.hash,
@@ -67,25 +67,25 @@ def calibration_of(
 
 
 def _cost(extended: Extended, runs: Sequence[Trajectory]) -> float | None:
-    """Eq. (6) of runs as they were recorded; None without runs, or where they lack what an effect needs."""
+    """Eq. (6), m and rad, of runs as recorded; None without runs, or where they lack what an effect needs."""
     if not runs:
         return None
     try:
         poses = extended.fit.model.reported([run.final_log for run in runs])
     except DataError:
         return None
-    errors = [np.linalg.norm(run.final_pose - own[-1]) for run, own in zip(runs, poses, strict=True)]
+    errors = [np.linalg.norm(run.final_pose - modelled[-1]) for run, modelled in zip(runs, poses, strict=True)]
     return float(np.mean(errors))
 
 
 def _with_shapes(extended: Extended) -> Array:
-    """The covariance with rows of zeros for parameters that shape an effect and were chosen, not fitted."""
+    """The covariance, with rows and columns of zeros for shape parameters: these were chosen, not fitted."""
     elements = extended.fit.model.matrix.size
-    places = list(range(elements))
+    fitted = list(range(elements))
     count = elements
     for group in extended.groups:
-        places += range(count, count + len(group.parameters))
+        fitted += range(count, count + len(group.parameters))
         count += len(group.parameters) + len(group.shapes)
     covariance = np.zeros((count, count))
-    covariance[np.ix_(places, places)] = (extended.covariance + extended.covariance.T) / 2
+    covariance[np.ix_(fitted, fitted)] = (extended.covariance + extended.covariance.T) / 2
     return covariance

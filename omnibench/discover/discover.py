@@ -1,39 +1,55 @@
-"""Discovering what a model lacks: fit, look, name, extend, compare. The whole way on one page."""
+"""Discovering what a model lacks. The whole way on one page.
+
+Fit the plain matrix; screen its residuals for all that could explain them; select the effects of the catalogue that do;
+extend the model by these; confirm them once the noise is known better; compare plain and extended model on runs that
+were held out; conclude.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from omnibench.data.dataset import Dataset
 from omnibench.discover.calibrations import Request
-from omnibench.discover.conclude import told
-from omnibench.discover.fitting.extend import Extended, extend
+from omnibench.discover.conclude import Findings, conclude
+from omnibench.discover.covariate_dependence import covariate_dependences
+from omnibench.discover.fitting.extend import Extended, extend, without_effects
 from omnibench.discover.fitting.model_fit import Fit, fit_matrix
 from omnibench.discover.fitting.usable_runs import usable_runs
+from omnibench.discover.held_out.gaps import compare_held_out
+from omnibench.discover.held_out.validation_runs import validation_runs
+from omnibench.discover.held_out.waterfall import waterfall_steps
 from omnibench.discover.result import Discovery
 from omnibench.discover.selection.candidate_groups import check_names
-from omnibench.discover.selection.competing_models import rivals_of
-from omnibench.discover.selection.motor_effects import look_at_actuators
-from omnibench.discover.selection.screening import Look, look_at
+from omnibench.discover.selection.competing_models import competing_models
+from omnibench.discover.selection.detectability import detectability_of
+from omnibench.discover.selection.extrapolation import extrapolations_of
+from omnibench.discover.selection.model_selection import Selection, select_effects
+from omnibench.discover.selection.motor_effects import select_motor_effects
+from omnibench.discover.selection.named_effects import named_effects
+from omnibench.discover.selection.screening import Screening, screen_again, screen_extended, screen_plain
+from omnibench.discover.selection.unknown_term import add_smooth_term
+from omnibench.discover.verdict import lacks_a_name, verdict_of
 from omnibench.errors import DataError
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 
-_EXPLAINED = 0.5  # of what slopes left: when more is left by the effects themselves, they are wrong
+_EXPLAINED = 0.5  # share of what names left that may remain once they are fitted in full; otherwise they are wrong
 
 
 class Watch(Protocol):
-    """Who wants to know how far it is."""
+    """Progress of a discovery."""
 
     def stage(self, text: str) -> None:
-        """What is being done now."""
+        """The step that begins now, in words."""
 
 
-class _Nobody:
+class _Unwatched:
     def stage(self, text: str) -> None:
         pass
 
@@ -47,62 +63,109 @@ def discover_effects(
     watch: Watch | None = None,
     calibration: Calibration | None = None,
 ) -> Discovery:
-    """Find where the odometry of a data set's training split disagrees with its reference, and name what is missing.
+    """Find where the odometry of a data set's training split disagrees with its reference, and which effect is missing.
 
-    without: effects that are not to be tried. unknown_term: where nothing has a name, add a smooth term over what was
-    located. calibration: whose matrix to begin at. The validation split is looked at when all is decided, and only to
-    say how well that predicts it.
+    without: effects that are not to be tried. unknown_term: where no effect explains what is missing, add a smooth term
+    over the covariate that the residuals depend on. calibration: whose matrix to begin at. The validation split is used
+    when all is decided, and only to say how well the models predict it.
 
     Raises UnknownNameError for a name in ``without`` that is no effect's, DataError for a training split without
     reference poses or another robot's calibration.
     """
-    began, tell = time.monotonic(), watch or _Nobody()
+    began, progress = time.monotonic(), watch or _Unwatched()
     check_names(without)
     rng = np.random.default_rng(seed)
     runs = usable_runs(dataset.split("train"))
     start = _start(dataset, calibration)
-    tell.stage("fitting the plain matrix")
+
+    progress.stage("fitting the plain matrix")
     plain = fit_matrix(runs, dataset.robot, dataset.sample_period, start)
-    tell.stage("looking where it fails, and at the catalogue")
-    look = look_at(plain, None, None, without, rng)
-    extended = extend(plain, look.named.chosen)
-    if look.named.tentative:
-        look, extended = _beyond_slopes(plain, look, extended, without, rng)
-    if look.named.chosen:
-        tell.stage("looking again, now that the noise is known better")
-        again = look_at(extended.fit, extended, look.groups, without, rng)
-        if not again.named.is_same_as(look.named):
-            extended = extend(plain, again.named.chosen)
-        look = again
-    rivals = rivals_of(plain, look, extended)
-    tell.stage("looking at the motors")
-    motors = look_at_actuators(runs, dataset.robot, without, rng)
-    tell.stage("comparing on runs that were held out")
-    return told(dataset, plain, look, rivals, motors, Request(tuple(without), unknown_term, seed), began)
+
+    progress.stage("looking where it fails, and at the catalogue")
+    screening = screen_plain(plain, without)
+    selection = select_effects(screening, rng)
+    model = _Model(screening, selection, extend(plain, selection.chosen))
+    if selection.tentative:
+        model = _extend_by_tentative(plain, model, without, rng)
+    if model.selection.chosen:
+        progress.stage("looking again, now that the noise is known better")
+        model = _confirm(plain, model, without, rng)
+    screening, selection = model.screening, model.selection
+    models = competing_models(plain, selection, model.extended)
+
+    progress.stage("looking at the motors")
+    motors = select_motor_effects(runs, dataset.robot, without, rng)
+
+    dependences = covariate_dependences(screening, selection, motors)
+    effects = named_effects(models, motors)
+    verdict = verdict_of(effects, dependences.where, dependences.left)
+    term_notes: tuple[str, ...] = ()
+    if unknown_term and lacks_a_name(verdict):
+        smooth = add_smooth_term(plain, screening, selection, models)
+        models, term_notes = smooth.models, (smooth.note,)
+        effects = named_effects(models, motors)
+
+    progress.stage("comparing on runs that were held out")
+    extended = models.used
+    baseline = without_effects(plain, extended)
+    validation = validation_runs(dataset, extended.fit)
+    findings = Findings(
+        screening=screening,
+        selection=selection,
+        effects=effects,
+        dependences=dependences,
+        verdict=verdict,
+        term_notes=term_notes,
+        baseline=baseline,
+        extended=extended,
+        validation=validation,
+        held_out=compare_held_out(baseline, extended, validation),
+        steps=waterfall_steps(plain, baseline, extended, validation.kept),
+        extrapolations=extrapolations_of(validation.kept, baseline, models.models),
+        detectability=detectability_of(screening, models.selection),
+    )
+    request = Request(tuple(without), unknown_term, seed)
+    return conclude(dataset, request, findings, time.monotonic() - began)
 
 
-def _beyond_slopes(
-    plain: Fit, look: Look, extended: Extended, without: Sequence[str], rng: np.random.Generator
-) -> tuple[Look, Extended]:
-    """A second look with the names that were given up fitted in full, which stands if that explains what was left.
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """An extended model with the selection of its effects, and the screening that these were selected from."""
 
-    Where an effect is many times as large as the noise, its slopes alone leave what another effect would.
+    screening: Screening
+    selection: Selection
+    extended: Extended
+
+
+def _extend_by_tentative(plain: Fit, model: _Model, without: Sequence[str], rng: np.random.Generator) -> _Model:
+    """Try the effects that were given up, fitted in full, and keep them if most of what they left is then explained.
+
+    To first order, an effect many times as large as the noise leaves residuals that look like another effect.
     """
-    tried = extend(plain, look.named.tentative)
-    again = look_at(tried.fit, tried, None, without, rng)
-    if again.named.chosen and again.named.left_share < _EXPLAINED * look.named.left_share:
-        return again, tried
-    return look, extended
+    extended = extend(plain, model.selection.tentative)
+    screening = screen_extended(extended, without)
+    selection = select_effects(screening, rng)
+    if selection.chosen and selection.left_share < _EXPLAINED * model.selection.left_share:
+        return _Model(screening, selection, extended)
+    return model
+
+
+def _confirm(plain: Fit, model: _Model, without: Sequence[str], rng: np.random.Generator) -> _Model:
+    """Screen and select once more with the noise of the extended model; extend anew if other effects are selected."""
+    screening = screen_again(model.extended, model.screening, without)
+    selection = select_effects(screening, rng)
+    same = selection.is_same_as(model.selection)
+    return _Model(screening, selection, model.extended if same else extend(plain, selection.chosen))
 
 
 def _start(dataset: Dataset, calibration: Calibration | None) -> Array:
-    """The matrix (3, N) to begin at."""
+    """The matrix (3, N) to begin at. Raises DataError for a calibration that has effects or other wheels."""
     if calibration is None:
         return dataset.robot.inverse_kinematic_matrix
     if calibration.effects:
-        held = ", ".join(term.name for term in calibration.effects)
+        names = ", ".join(term.name for term in calibration.effects)
         raise DataError(
-            f"the calibration {calibration.name!r} holds effects already ({held}), and discover begins at a plain "
+            f"the calibration {calibration.name!r} holds effects already ({names}), and discover begins at a plain "
             "matrix; give one without effects, such as the plain.yaml beside it, or none"
         )
     if calibration.robot.wheel_names != dataset.robot.wheel_names:

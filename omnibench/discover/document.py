@@ -9,14 +9,14 @@ from omnibench.config import Model
 from omnibench.discover.result import (
     Absorbed,
     Candidate,
+    CovariateDependence,
     Discovery,
     Experiment,
+    Extrapolation,
     Gap,
     HeldOut,
     Hidden,
     NamedEffect,
-    Novelty,
-    Place,
     Step,
     Verdict,
 )
@@ -25,7 +25,7 @@ from omnibench.robot.effects.effect import Stage
 
 
 class ParameterEntry(Model):
-    """A parameter with its 95 % interval; shape: chosen among a few values, without an interval."""
+    """A parameter with its 95 % interval. shape: True if it was chosen among a few values, without an interval."""
 
     value: float
     unit: str
@@ -35,7 +35,7 @@ class ParameterEntry(Model):
 
 
 class EffectEntry(Model):
-    """An effect that was found, as result.NamedEffect, its parameters by name."""
+    """An effect that was found, as result.NamedEffect. gain: its whitened chi-square difference."""
 
     name: str
     stage: Stage
@@ -47,6 +47,15 @@ class EffectEntry(Model):
     gain: float
     degrees_of_freedom: int
     in_doubt: str
+
+
+class CandidateEntry(Model):
+    """An effect that was tried at one step, as result.Candidate. gain: its whitened chi-square difference."""
+
+    name: str
+    gain: float
+    degrees_of_freedom: int
+    weight: float
 
 
 class BeforeAfter(Model):
@@ -74,7 +83,7 @@ class NotLookedFor(Model):
 
 
 class NoiseEntry(Model):
-    """The noise that everything is measured against, as fit.noise.NoiseEstimate."""
+    """The noise by which all residuals are whitened, as fit.least_squares.noise.NoiseEstimate."""
 
     components: Noise
     source: str
@@ -83,11 +92,11 @@ class NoiseEntry(Model):
 
 
 class DiscoveryDocument(Model):
-    """The content of discovery.json; what result.py defines is there as it is."""
+    """The content of discovery.json; classes of result.py are written as they stand there."""
 
     verdict: Verdict
     effects: tuple[EffectEntry, ...]
-    where: tuple[Place, ...]
+    where: tuple[CovariateDependence, ...]
     absorbed: tuple[str, ...]
     gap: Gap
     held_out: dict[Literal["repetitions", "session"], HeldOutEntry]
@@ -97,15 +106,15 @@ class DiscoveryDocument(Model):
     dataset: str
     dataset_hash: str
     simulated: bool
-    left: tuple[Place, ...]
-    candidates: tuple[tuple[Candidate, ...], ...]
+    left: tuple[CovariateDependence, ...]
+    candidates: tuple[tuple[CandidateEntry, ...], ...]
     classes: tuple[tuple[str, ...], ...]
-    experiments: tuple[Experiment, ...]  # their configs are files of their own, too
-    measurements: tuple[Absorbed, ...]  # that would tell the absorbed effects
+    experiments: tuple[Experiment, ...]  # their configs are files beside this one, too
+    measurements: tuple[Absorbed, ...]  # those that would tell the absorbed effects
     not_looked_for: tuple[NotLookedFor, ...]
     hidden: tuple[Hidden, ...]
     steps: tuple[Step, ...]
-    novelties: tuple[Novelty, ...]
+    novelties: tuple[Extrapolation, ...]
     notes: tuple[str, ...]
     noise: NoiseEntry
     runs: int
@@ -120,7 +129,7 @@ def experiment_file(number: int) -> str:
 
 
 def discovery_document(discovery: Discovery, folder: Path) -> DiscoveryDocument:
-    """A discovery as the document; ``folder``: where its calibrations are, or will be."""
+    """The document of a discovery. folder: where its calibrations are, or will be."""
     noise = discovery.noise
     return DiscoveryDocument(
         verdict=discovery.verdict,
@@ -136,14 +145,14 @@ def discovery_document(discovery: Discovery, folder: Path) -> DiscoveryDocument:
         dataset_hash=discovery.dataset.hash,
         simulated=discovery.dataset.simulated,
         left=discovery.left,
-        candidates=discovery.candidates,
+        candidates=tuple(tuple(map(_candidate, step)) for step in discovery.candidates),
         classes=discovery.classes,
         experiments=discovery.experiments,
         measurements=discovery.absorbed,
         not_looked_for=tuple(NotLookedFor(name=name, reason=reason) for name, reason in discovery.not_looked_for),
         hidden=discovery.hidden,
         steps=discovery.steps,
-        novelties=discovery.novelties,
+        novelties=discovery.extrapolations,
         notes=discovery.notes,
         noise=NoiseEntry(
             components=noise.noise,
@@ -176,9 +185,18 @@ def _effect(effect: NamedEffect) -> EffectEntry:
         confusable_with=effect.confusable_with,
         physics=effect.physics,
         source=effect.source,
-        gain=effect.gain,
+        gain=effect.chi_square,
         degrees_of_freedom=effect.degrees_of_freedom,
         in_doubt=effect.in_doubt,
+    )
+
+
+def _candidate(candidate: Candidate) -> CandidateEntry:
+    return CandidateEntry(
+        name=candidate.name,
+        gain=candidate.chi_square,
+        degrees_of_freedom=candidate.degrees_of_freedom,
+        weight=candidate.weight,
     )
 
 

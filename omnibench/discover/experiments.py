@@ -1,4 +1,4 @@
-"""Experiments that tell look-alikes apart, as configs for ``omnibench simulate`` or for the robot."""
+"""Experiments that tell the members of a class of effects apart, as configs for ``omnibench simulate``."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from omnibench.simulate.config import FlowerConfig
 
 def experiments_for(dataset: Dataset, effects: Sequence[NamedEffect], fit: Fit) -> tuple[Experiment, ...]:
     """One experiment for each effect that is confusable with others."""
-    found = []
-    for effect in effects:
-        if effect.confusable_with:
-            members = (effect.name, *effect.confusable_with)
-            found.append(Experiment(members, _WORDS, _config(dataset, effect, fit)))
-    return tuple(found)
+    return tuple(
+        Experiment((effect.name, *effect.confusable_with), _WORDS, _config(dataset, effect, fit))
+        for effect in effects
+        if effect.confusable_with
+    )
 
 
 _WORDS = (

@@ -1,4 +1,4 @@
-"""What a discovery says: where, what, how sure, how much better."""
+"""The result of a discovery: where odometry and reference disagree, what is missing, how sure, how much better."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Verdict = Literal["none", "named", "class", "incomplete", "unknown"]
 
 @dataclass(frozen=True)
 class EstimatedParameter:
-    """A value with its 95 % interval. shape: it was chosen among a few, and has no interval."""
+    """A value with its 95 % interval. shape: True if it was chosen among a few values; then it has no interval."""
 
     name: str
     value: float
@@ -30,8 +30,9 @@ class EstimatedParameter:
 class NamedEffect:
     """An effect that was found.
 
-    weight: the probability that this name is right. confusable_with: names that these data cannot tell from it.
-    gain: by how much it lowers the whitened chi2, of degrees_of_freedom parameters; in doubt: why it is not sure.
+    weight: probability that this name is right. confusable_with: names that these data cannot tell from it.
+    class_weight: probability that this or one of these is right. chi_square: whitened chi-square difference, of
+    degrees_of_freedom parameters. in_doubt: why the name is not sure, or nothing.
     """
 
     name: str
@@ -41,28 +42,29 @@ class NamedEffect:
     confusable_with: tuple[str, ...]
     physics: str
     source: str
-    gain: float
+    chi_square: float
     degrees_of_freedom: int
-    in_doubt: str = ""
+    in_doubt: str
+    class_weight: float
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect that was tried at one step. weight: among those tried; gain: in whitened chi2."""
+    """An effect that was tried at one step. chi_square: whitened difference. weight: probability of its name."""
 
     name: str
-    gain: float
+    chi_square: float
     degrees_of_freedom: int
     weight: float
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where the residual depends on something, before any effect is added or after all are.
+class CovariateDependence:
+    """A covariate that the residuals depend on, before any effect is added or after all are.
 
     covariate: command, elapsed time, heading, place, order of runs, wheel rate, wheel angle, acceleration or stamps.
-    p_value: with all that was looked at counted. excess: whitened chi2 beyond chance. description: in words.
-    within_ticks: rounding to encoder ticks can make as much.
+    p_value: corrected for all covariates that were tried. excess: whitened chi-square beyond chance. description: in
+    words. within_ticks: True if rounding to encoder ticks can make as much.
     """
 
     covariate: str
@@ -76,7 +78,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Absorbed:
-    """An effect that any matrix reproduces here, and the measurement that would tell it."""
+    """An effect that the matrix reproduces in these recordings, and the measurement that would tell it."""
 
     name: str
     stage: Stage
@@ -85,8 +87,11 @@ class Absorbed:
 
 @dataclass(frozen=True)
 class Hidden:
-    """How large an effect could still hide: its parameter lies within +-limit with 95 %. detectable: found nearly
-    always from this size on."""
+    """How large an effect could still be without having been found.
+
+    limit: its parameter lies within +-limit with 95 %. detectable: size from which on it is found nearly always.
+    plausible: the largest size that its catalogue entry expects.
+    """
 
     name: str
     parameter: str
@@ -98,10 +103,11 @@ class Hidden:
 
 @dataclass(frozen=True)
 class Gap:
-    """The error of the plain matrix (before), of the extended model (after), and what repetitions allow (floor).
+    """Errors of the plain matrix (before) and of the extended model (after), and what repetitions allow (floor).
 
-    metric: "eq6" (m and rad, final poses) or "chi2" (whitened, all poses, per degree of freedom). closed: the share of
-    the gap that is gone; None where the gap is not larger than two standard errors. standard_error: of before - floor.
+    metric: "eq6" (m and rad, final poses) or "chi2" (whitened, all poses, per number). closed: the share of before -
+    floor that is gone; None where that is not larger than two standard errors, or no command is repeated.
+    standard_error: that of before - floor.
     """
 
     metric: Literal["eq6", "chi2"]
@@ -114,7 +120,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """The same on runs that no fit has seen.
+    """Errors of both models on runs that no fit has seen.
 
     data: "repetitions" (of the training runs, each fold predicted from the others) or "session" (the validation split).
     """
@@ -129,28 +135,34 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class Step:
-    """One step of the waterfall: the model after an effect was added. name: "plain matrix" for the first."""
+    """A step of the waterfall: the model after one more effect. name: "plain matrix" for the first.
+
+    train, held_out: whitened chi-square per number. eq6_train, eq6_held_out: Eq. (6), m and rad.
+    """
 
     name: str
-    train: float  # whitened chi2 per degree of freedom
+    train: float
     held_out: float | None
     eq6_train: float
     eq6_held_out: float | None
 
 
 @dataclass(frozen=True)
-class Novelty:
-    """A motion of the held-out runs that the training runs never drove, and what it does to the intervals."""
+class Extrapolation:
+    """A command of the held-out runs that leaves the training domain.
+
+    before_m, after_m: 95 % bound on the final position's error, by the plain matrix and by the extended model.
+    """
 
     command: str
     description: str
-    before_m: float  # predicted 95 % bound of the final position error, plain matrix
-    after_m: float  # and extended model
+    before_m: float
+    after_m: float
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """What would tell the members of a class apart: a config for ``omnibench simulate``, in YAML, and words."""
+    """An experiment that tells the members of a class apart. config: for ``omnibench simulate``, in YAML."""
 
     separates: tuple[str, ...]
     description: str
@@ -159,13 +171,13 @@ class Experiment:
 
 @dataclass(frozen=True, eq=False)
 class Discovery:
-    """All that is said.
+    """The result of a discovery.
 
-    plain, extended: calibrations without and with the effects that were found. dataset: outliers taken out;
-    dataset_hash: of all of it.
-    outliers: reference poses that were left out of the fits. before, after: residuals of the training runs, each
-    (K, 3), reference minus odometry in m, m, rad, at pose_times[1:]; whitened_before, whitened_after: the same,
-    independent and of unit variance under the noise.
+    plain, extended: calibrations without and with the effects that were found. where, left: what the residuals depend
+    on before and after these. dataset: the data set without outliers; dataset_hash: that of the whole data set.
+    outliers: number of reference poses that were left out of the fits. before, after: residuals (K, 3) of each training
+    run, reference minus odometry in m, m, rad, at pose_times[1:]. whitened_before, whitened_after: these, independent
+    and of unit variance under the noise.
     """
 
     dataset: Dataset
@@ -174,8 +186,8 @@ class Discovery:
     headline: str
     effects: tuple[NamedEffect, ...]
     candidates: tuple[tuple[Candidate, ...], ...]
-    where: tuple[Place, ...]
-    left: tuple[Place, ...]
+    where: tuple[CovariateDependence, ...]
+    left: tuple[CovariateDependence, ...]
     absorbed: tuple[Absorbed, ...]
     not_looked_for: tuple[tuple[str, str], ...]  # name and why
     classes: tuple[tuple[str, ...], ...]
@@ -183,7 +195,7 @@ class Discovery:
     gap: Gap
     held_out: tuple[HeldOut, ...]
     steps: tuple[Step, ...]
-    novelties: tuple[Novelty, ...]
+    extrapolations: tuple[Extrapolation, ...]
     experiments: tuple[Experiment, ...]
     notes: tuple[str, ...]
     noise: NoiseEstimate

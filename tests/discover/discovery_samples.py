@@ -9,7 +9,7 @@ from typing import Any
 
 from omnibench.data.dataset import Dataset
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.result import Discovery, Experiment, HeldOut, Novelty, Place
+from omnibench.discover.result import CovariateDependence, Discovery, Experiment, Extrapolation, HeldOut
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
@@ -72,12 +72,13 @@ def nameless() -> Discovery:
 def incomplete() -> Discovery:
     """Named, with more of whatever a discovery may hold than these data give rise to."""
     found = named()
-    place = Place("wheel rate", "wheel", 2e-11, 90.0, 24, "what is left depends on how fast the wheels turn")
+    description = "what is left depends on how fast the wheels turn"
+    dependence = CovariateDependence("wheel rate", "wheel", 2e-11, 90.0, 24, description)
     return replace(
         found,
         verdict="incomplete",
-        left=(place,),
-        novelties=(NOVELTY,),
+        left=(dependence,),
+        extrapolations=(EXTRAPOLATION,),
         experiments=(EXPERIMENT,),
         classes=(("acceleration_slip", "reference_time_offset"),),
         outliers=12,
@@ -98,7 +99,7 @@ def held_out(found: Discovery, data: str) -> HeldOut:
     return next(each for each in found.held_out if each.data == data)
 
 
-NOVELTY = Novelty("v0.4_a90_w1", "turns at 1.0 rad/s, where training had at most 0.35 rad/s", 0.041, 0.152)
+EXTRAPOLATION = Extrapolation("v0.4_a90_w1", "turns at 1.0 rad/s, where training had at most 0.35 rad/s", 0.041, 0.152)
 EXPERIMENT = Experiment(
     ("acceleration_slip", "reference_time_offset"),
     "Turn on the spot at two rates: only a time offset shows there.",

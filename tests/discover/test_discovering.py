@@ -119,9 +119,9 @@ def test_what_a_real_robot_lacks_is_found_on_circles_and_holds_on_squares(omni3:
 
 
 def test_squares_are_told_to_hold_motions_that_circles_had_not(omni3: Discovery) -> None:
-    assert omni3.novelties
-    assert all(each.after_m > omni3.held_out[-1].position_m[1] for each in omni3.novelties)
-    assert any("turning on the spot" in each.description for each in omni3.novelties)
+    assert omni3.extrapolations
+    assert all(each.after_m > omni3.held_out[-1].position_m[1] for each in omni3.extrapolations)
+    assert any("turning on the spot" in each.description for each in omni3.extrapolations)
 
 
 def test_the_experiment_that_tells_a_class_apart_does_so_when_it_is_simulated(omni3: Discovery, tmp_path: Path) -> None:

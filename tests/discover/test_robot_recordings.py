@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.selection.encoder_quantisation import ticks_of
+from omnibench.discover.selection.encoder_quantisation import quantisation_steps
 from omnibench.simulate.simulate import simulate_dataset
 
 FEW: dict[str, Any] = {
@@ -56,13 +56,13 @@ def trajectory(steps: np.ndarray) -> Trajectory:
 def test_the_size_of_a_tick_is_found(tick: float, seed: int, most: int) -> None:
     counts = np.random.default_rng(seed).integers(-most, most + 1, size=(400, 3))
     counts[:2] = [[most] * 3, [most - 1] * 3]
-    np.testing.assert_allclose(ticks_of([trajectory(tick * counts)]), tick, rtol=1e-9)
+    np.testing.assert_allclose(quantisation_steps([trajectory(tick * counts)]), tick, rtol=1e-9)
 
 
 @given(seed=st.integers(0, 2**32 - 1))
 def test_rates_that_are_no_whole_ticks_have_none(seed: int) -> None:
     steps = np.random.default_rng(seed).normal(size=(400, 3))
-    assert not ticks_of([trajectory(steps)]).any()
+    assert not quantisation_steps([trajectory(steps)]).any()
 
 
 def test_rounding_to_ticks_is_told_apart_from_an_effect_many_times_as_large() -> None:

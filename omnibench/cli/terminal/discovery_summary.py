@@ -16,9 +16,9 @@ from omnibench.discover.report.wording import (
     chance,
     closed_in_words,
     data_in_words,
+    extrapolations_in_words,
     gap_decimals,
     held_out_in_words,
-    novelties_in_words,
     reading,
     value_and_interval,
     weight_in_words,
@@ -134,7 +134,9 @@ def _remarks(discovery: Discovery) -> Iterator[str]:
     if discovery.absorbed:
         absorbed = listing([each.name for each in discovery.absorbed], 12)
         yield f"Absorbed by any matrix, and so never named: {absorbed}."
-    yield from _first(novelties_in_words(discovery.novelties), "warning: not driven in training: ", "such warning")
+    yield from _first(
+        extrapolations_in_words(discovery.extrapolations), "warning: not driven in training: ", "such warning"
+    )
     yield from _first(discovery.notes, "- ", "note")
 
 

@@ -1,4 +1,4 @@
-"""Adding effects to the model: matrix and parameters fitted together, without shortcuts, noise and nuisances anew."""
+"""The model extended by effects: matrix and parameters fitted together, noise and nuisances estimated anew."""
 
 from __future__ import annotations
 
@@ -17,24 +17,25 @@ from omnibench.discover.fitting.model_fit import (
     split_runs,
     with_noise,
 )
+from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.paths import Paths, make_paths
 from omnibench.discover.regressors.whitened import Whitened, given
-from omnibench.discover.selection.candidate_groups import Group
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
 
-_STEPS = 4
-_STILL = 0.05  # standard errors
+_STEPS = 4  # of Gauss-Newton, at most
+_STILL = 0.05  # standard errors: smaller steps end the fit; chosen
 
 
 @dataclass(frozen=True, eq=False)
 class Extended:
-    """A fit with effects. data: whitened columns of matrix elements, then of the effects' linear parameters.
+    """A fit with effects.
 
-    values (n,): of these parameters. covariance: of matrix elements and parameters, by the scatter of the runs'
-    scores where that is wider than the noise model says.
+    data: whitened columns of the matrix elements, then of the effects' linear parameters. columns (K, 3, p): of each
+    run, before whitening. values (n,): the effects' linear parameters. covariance (p, p): of matrix elements and
+    parameters, by the scatter of the runs' scores where that is wider than the noise model says.
     """
 
     fit: Fit
@@ -44,9 +45,18 @@ class Extended:
     values: Array
     covariance: Array
 
+    @property
+    def residuals_without_effects(self) -> list[Array]:
+        """Nuisance-free residuals (K, 3) of each run with the effects' share put back, to first order."""
+        elements = self.fit.model.matrix.size
+        return [
+            residuals + columns[..., elements:] @ self.values
+            for residuals, columns in zip(self.fit.nuisance_free_residuals, self.columns, strict=True)
+        ]
+
 
 def extend(plain: Fit, groups: Sequence[Group]) -> Extended:
-    """Fit matrix and effects together, beginning at the plain matrix."""
+    """Fit matrix and effects together, from the plain matrix and effects of 0."""
     fit = plain
     values: Array = np.zeros(sum(len(group.parameters) for group in groups))
     for round_ in range(2):
@@ -58,14 +68,19 @@ def extend(plain: Fit, groups: Sequence[Group]) -> Extended:
     return Extended(fit, tuple(groups), data, columns, values, _covariance(data))
 
 
+def without_effects(plain: Fit, extended: Extended) -> Extended:
+    """The plain matrix fitted to the runs, noise and nuisances of an extended model, to be compared with it."""
+    return extend(at_model(extended.fit, plain.model), ()) if extended.groups else extended
+
+
 def terms_of(groups: Sequence[Group], values: Array) -> list[Term]:
-    """The effects as terms of a model; values: of all their linear parameters in turn."""
+    """The effects as terms of a model. values: all their linear parameters in turn."""
     terms, first = [], 0
     for group in groups:
-        own = {each.name: float(value) for each, value in zip(group.parameters, values[first:], strict=False)}
+        linear = {each.name: float(value) for each, value in zip(group.parameters, values[first:], strict=False)}
         first += len(group.parameters)
         assert group.effect is not None
-        terms.append(Term(group.effect, own | dict(group.shapes)))
+        terms.append(Term(group.effect, linear | dict(group.shapes)))
     return terms
 
 
@@ -78,7 +93,7 @@ def columns_of(fit: Fit, groups: Sequence[Group]) -> tuple[Array, ...]:
 
 
 def columns_at(extended: Extended, runs: Sequence[Trajectory]) -> list[Array]:
-    """The same slopes (K, 3, n) for other runs."""
+    """Slopes (K, 3, n) of other runs' poses by matrix elements and by the effects' parameters."""
     model = extended.fit.model
     assert model.sample_period is not None
     ordered = sorted(range(len(runs)), key=lambda index: str(runs[index].session))
@@ -119,10 +134,9 @@ def _size(step: Array, covariance: Array) -> float:
 
 
 def _covariance(data: Whitened) -> Array:
-    """Of the fitted numbers: by the noise model, or wider where the runs' scores scatter more."""
+    """Covariance (p, p) of the fitted numbers: by the noise model, or wider where the runs' scores scatter more."""
     now = given(data, [])
-    everything = list(range(data.information.shape[0]))
-    roots = now.roots(everything)
+    roots = now.roots(list(range(data.information.shape[0])))
     runs = len(data.scores)
     centred = data.scores @ roots
     scatter = centred.T @ centred * runs / max(runs - roots.shape[1], 1)

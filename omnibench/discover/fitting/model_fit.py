@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.fitting.usable_runs import Nuisances, deviations_of, in_start_frames, log_of, without_jumps
+from omnibench.discover.fitting.nuisances import Nuisances, deviations_of, log_of, nuisance_slopes
+from omnibench.discover.fitting.outliers import without_jumps
+from omnibench.discover.fitting.start_frames import in_start_frames
 from omnibench.discover.regressors.paths import Paths, make_paths
 from omnibench.discover.regressors.whitened import Whitened, given, whitened
 from omnibench.fit.least_squares.noise import NoiseEstimate, Whitener, estimate_noise
@@ -18,19 +20,20 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import OdometryBatch, WheelLog
 
-# Before anything is known of the noise: 1 cm or 0.01 rad, and as much again in a second.
-_NOTHING_KNOWN = NoiseEstimate(
+# Noise that the first fit assumes: 1 cm or 0.01 rad, and as much again in a second; chosen.
+_UNKNOWN_NOISE = NoiseEstimate(
     Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.01, walk_heading=0.01), "within runs", 1, ""
 )
-_ROUNDS = 4
+_ROUNDS = 4  # of noise and matrix by turns, at most; fewer where the noise stays within 2 %
+_NEAR = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A fitted model and what it leaves.
+    """A fitted model and its residuals.
 
-    runs: without poses that jump; jumps: how many these were. residuals: of each run (K, 3), reference minus model, m,
-    m, rad, at pose_times[1:]. slopes: derivatives (K, 3, 3) of the model's poses by the run's nuisances.
+    runs: without poses that jump; jumps: the number of these. residuals: (K, 3) of each run, reference minus model, m,
+    m, rad, at pose_times[1:]. slopes: derivatives (K, 3, 3) of the model's poses by each run's nuisances.
     """
 
     model: OdometryModel
@@ -43,34 +46,34 @@ class Fit:
 
     @property
     def nuisance_free_residuals(self) -> list[Array]:
-        """Residuals as they would be without any of the nuisances' present values, to first order."""
+        """Residuals (K, 3) of each run if all nuisances were 0, to first order."""
         return [
-            own + slopes @ values
-            for own, slopes, values in zip(self.residuals, self.slopes, self.nuisances.values, strict=True)
+            residuals + slopes @ values
+            for residuals, slopes, values in zip(self.residuals, self.slopes, self.nuisances.values, strict=True)
         ]
 
     @property
     def stamps(self) -> list[Array]:
-        """Of each run's residuals, s."""
+        """Times (K,) of each run's residuals, s."""
         return [run.pose_times[1:] for run in self.runs]
 
     def whitened(self, columns: Sequence[Array], residuals: Sequence[Array] | None = None) -> Whitened:
-        """Columns (K, 3, p) of every run, independent and of unit variance, nuisances eliminated, with the residuals.
+        """Columns (K, 3, p) and residuals (K, 3) of every run, whitened under the noise, nuisances eliminated.
 
-        residuals (K, 3): others than the fit's own free ones.
+        residuals: the fit's nuisance-free ones where none are given.
         """
-        own = self.nuisance_free_residuals if residuals is None else residuals
-        return whitened(own, columns, self.stamps, self.noise.noise, self.slopes, self.nuisances.deviations)
+        values = self.nuisance_free_residuals if residuals is None else residuals
+        return whitened(values, columns, self.stamps, self.noise.noise, self.slopes, self.nuisances.deviations)
 
 
 def fit_matrix(runs: Sequence[Trajectory], robot: Robot, sample_period: float, start: Array) -> Fit:
-    """The plain matrix from a start (3, N), with noise, nuisances and jumping poses found on the way.
+    """Fit the plain matrix from a start (3, N), and with it noise, nuisances and the poses that jump.
 
-    Exact arcs: Euler steps would leave what looks like centripetal slip.
+    The model drives exact arcs: Euler steps would leave what looks like centripetal slip.
     """
     model = OdometryModel(robot, start, "arc", (), sample_period)
     nuisances = Nuisances(np.zeros((len(runs), 3)), np.zeros(3))
-    fit = _at(model, tuple(runs), nuisances, _NOTHING_KNOWN, 0)
+    fit = _at(model, tuple(runs), nuisances, _UNKNOWN_NOISE, 0)
     for _ in range(3):
         fit = _matrix_step(fit)
     for _ in range(_ROUNDS):
@@ -84,18 +87,18 @@ def fit_matrix(runs: Sequence[Trajectory], robot: Robot, sample_period: float, s
 
 
 def with_noise(fit: Fit) -> Fit:
-    """The same with noise, nuisances and jumping poses estimated anew from its residuals."""
-    near = fit.noise.noise if fit.noise is not _NOTHING_KNOWN else None
-    seen = in_start_frames(fit.runs, fit.residuals)
-    found = estimate_noise(fit.runs, seen, near)
-    runs, jumps = without_jumps(fit.runs, seen, found.noise)
+    """The fit with noise, nuisances and jumping poses estimated anew from its residuals."""
+    near = fit.noise.noise if fit.noise is not _UNKNOWN_NOISE else None
+    turned = in_start_frames(fit.runs, fit.residuals)
+    noise = estimate_noise(fit.runs, turned, near)
+    runs, jumps = without_jumps(fit.runs, turned, noise.noise)
     if jumps:
-        fit = _at(fit.model, runs, fit.nuisances, found, fit.jumps + jumps)
-        found = estimate_noise(fit.runs, in_start_frames(fit.runs, fit.residuals), found.noise)
-    own, slopes = (in_start_frames(fit.runs, each) for each in (fit.nuisance_free_residuals, fit.slopes))
-    deviations = deviations_of(fit.runs, own, slopes, found.noise)
+        fit = _at(fit.model, runs, fit.nuisances, noise, fit.jumps + jumps)
+        noise = estimate_noise(fit.runs, in_start_frames(fit.runs, fit.residuals), noise.noise)
+    residuals, slopes = (in_start_frames(fit.runs, values) for values in (fit.nuisance_free_residuals, fit.slopes))
+    deviations = deviations_of(fit.runs, residuals, slopes, noise.noise)
     values = np.where(deviations > 0, fit.nuisances.values, 0.0)
-    return _at(fit.model, fit.runs, Nuisances(values, deviations), found, fit.jumps)
+    return _at(fit.model, fit.runs, Nuisances(values, deviations), noise, fit.jumps)
 
 
 def matrix_jacobian(fit: Fit) -> Array:
@@ -106,7 +109,7 @@ def matrix_jacobian(fit: Fit) -> Array:
 
 
 def paths_of(fit: Fit, coarse: float = 0.0) -> Paths:
-    """The paths of a fit's runs by its matrix alone, samples put together up to ``coarse`` s."""
+    """The paths of the fit's runs by its matrix alone; samples are merged into ones of up to ``coarse`` s."""
     assert fit.model.sample_period is not None
     together = max(1, int(coarse / fit.model.sample_period))
     logs = [_coarser(log, together) for log in _logs(fit.runs, fit.nuisances.values)]
@@ -114,7 +117,7 @@ def paths_of(fit: Fit, coarse: float = 0.0) -> Paths:
 
 
 def _coarser(log: WheelLog, together: int) -> WheelLog:
-    """A log with the mean rates of so many samples each."""
+    """The log with so many samples merged into one, of their mean rates."""
     if together == 1:
         return log
     ends = np.unique(np.append(np.arange(together - 1, len(log.times), together), len(log.times) - 1))
@@ -126,12 +129,12 @@ def _coarser(log: WheelLog, together: int) -> WheelLog:
 
 
 def at_model(fit: Fit, model: OdometryModel) -> Fit:
-    """The fit with another model; the nuisances follow: the most likely ones given the residuals that are left."""
+    """Another model at the fit's runs, with the most likely nuisances given the residuals that it leaves."""
     return _with_nuisances(_at(model, fit.runs, fit.nuisances, fit.noise, fit.jumps))
 
 
 def at_runs(fit: Fit, runs: Sequence[Trajectory]) -> Fit:
-    """The fit's model at other runs, of whose nuisances nothing is known but their size."""
+    """The fit's model at other runs, their nuisances 0: only the sizes of these are known."""
     nothing_known = Nuisances(np.zeros((len(runs), 3)), fit.nuisances.deviations)
     return _at(fit.model, tuple(runs), nothing_known, fit.noise, 0)
 
@@ -143,9 +146,9 @@ def _with_nuisances(fit: Fit) -> Fit:
     if not known.any():
         return fit
     values = np.zeros_like(fit.nuisances.values)
-    for row, (run, own, slopes) in enumerate(zip(fit.runs, fit.nuisance_free_residuals, fit.slopes, strict=True)):
-        white = Whitener(fit.noise.noise, run.pose_times[1:])(np.concatenate([own[..., None], slopes[..., known]], -1))
-        flat = white.reshape(3 * len(own), -1)
+    for row, (run, residuals, slopes) in enumerate(zip(fit.runs, fit.nuisance_free_residuals, fit.slopes, strict=True)):
+        both = np.concatenate([residuals[..., None], slopes[..., known]], -1)
+        flat = Whitener(fit.noise.noise, run.pose_times[1:])(both).reshape(3 * len(residuals), -1)
         columns = flat[:, 1:]
         prior = np.diag(deviations[known] ** -2.0)
         values[row, known] = np.linalg.solve(columns.T @ columns + prior, columns.T @ flat[:, 0])
@@ -153,7 +156,7 @@ def _with_nuisances(fit: Fit) -> Fit:
 
 
 def _matrix_step(fit: Fit) -> Fit:
-    """One Gauss-Newton step of the matrix, and the nuisances that go with it."""
+    """One Gauss-Newton step of the matrix, nuisances refitted after it."""
     jacobian = matrix_jacobian(fit)
     data = fit.whitened(split_runs(jacobian, fit.runs))
     everything = list(range(jacobian.shape[2]))
@@ -167,34 +170,24 @@ def _at(
 ) -> Fit:
     logs = _logs(runs, nuisances.values)
     poses = model.reported(logs)
-    residuals = tuple(run.poses[1:] - own for run, own in zip(runs, poses, strict=True))
-    slopes = tuple(_nuisance_slopes(log, own) for log, own in zip(logs, poses, strict=True))
+    residuals = tuple(run.poses[1:] - modelled for run, modelled in zip(runs, poses, strict=True))
+    slopes = tuple(nuisance_slopes(log, modelled) for log, modelled in zip(logs, poses, strict=True))
     return Fit(model, runs, nuisances, noise, residuals, slopes, jumps)
 
 
 def _logs(runs: Sequence[Trajectory], nuisances: Array) -> list[WheelLog]:
-    return [log_of(run, own) for run, own in zip(runs, nuisances, strict=True)]
-
-
-def _nuisance_slopes(log: WheelLog, poses: Array) -> Array:
-    """Derivatives (K, 3, 3) of poses (K, 3) by start heading, clock offset and clock slope."""
-    lever = poses - log.start
-    turning = np.stack([-lever[:, 1], lever[:, 0], np.ones(len(poses))], axis=1)
-    velocity = np.gradient(
-        np.vstack([log.start, poses]), np.concatenate([[min(0.0, log.stamps[0] - 1e-3)], log.stamps]), axis=0
-    )[1:]
-    return np.stack([turning, -velocity, -velocity * log.stamps[:, None]], axis=2)
+    return [log_of(run, values) for run, values in zip(runs, nuisances, strict=True)]
 
 
 def split_runs(columns: Array, runs: Sequence[Trajectory]) -> list[Array]:
-    """What belongs to each run (K, ...), of all poses (S, ...)."""
+    """Values of all poses (S, ...), cut into those of each run (K, ...)."""
     ends = np.cumsum([len(run.pose_times) - 1 for run in runs])[:-1]
     return np.split(columns, ends)
 
 
 def _is_near(first: Noise, second: Noise) -> bool:
     ours, theirs = (np.array(list(each.model_dump().values())) for each in (first, second))
-    return bool((np.abs(ours - theirs) <= 0.02 * np.maximum(ours, theirs).max()).all())
+    return bool((np.abs(ours - theirs) <= _NEAR * np.maximum(ours, theirs).max()).all())
 
 
 def model_with(model: OdometryModel, matrix: Array, terms: Sequence[Term]) -> OdometryModel:

@@ -1,9 +1,9 @@
-"""How surprising the gains of groups of columns are, all that was looked at counted.
+"""Significance of chi-square differences by groups of columns, corrected for the number of groups that were tried.
 
 Where nothing is missing, the residuals of a run are as likely as their opposites, whatever their distribution and
-however they are correlated within the run. Signs of whole runs, turned at random, therefore show what chance makes of
-the largest gain of all (Westfall and Young 1993). What is plainly there is taken out of the residuals before, so that
-it does not pass for noise.
+however they are correlated within the run. Flipping the signs of whole runs at random therefore gives the distribution
+of the largest chi-square difference by chance (Westfall and Young 1993). Groups that are plainly significant are taken
+out of the residuals before, so that they do not count as noise.
 """
 
 from __future__ import annotations
@@ -14,27 +14,28 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
+from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.whitened import Given, Whitened, given
-from omnibench.discover.selection.candidate_groups import Group
 from omnibench.robot.kinematics import Array
 
-_FLIPS = 499
-_TAIL = 0.1  # share of the flips whose maxima say how fast chance falls off
-_PLAIN = 3.0  # evidence from which on something is plainly there
-_MOST_TAKEN = 3  # groups that are taken out of what stands for noise
+_FLIPS = 499  # random sign flips; chosen
+_TAIL = 0.1  # share of the flips, the largest, to which an exponential tail is fitted
+_PLAIN = 3.0  # -log10 of the chance from which on a group is plainly significant
+_MOST_TAKEN = 3  # groups, at most, that are taken out of the residuals that stand for noise
 
 
 @dataclass(frozen=True, eq=False)
-class Gains:
-    """Gains of groups: gain (G,), rank (G,), spread (G,): the mean gain of chance per degree of freedom.
+class Significance:
+    """Chi-square differences of G groups and how significant they are.
 
-    evidence (G,): -log10 of the chance of such a gain of one group by itself. chance: largest evidence of all groups
-    in each flip, sorted. surplus: largest gain beyond chance of all groups in units of its own scatter, less what
-    chance makes of that; surplus_of: the group that has it.
+    chi_square (G,): the differences. rank (G,): degrees of freedom. spread (G,): mean difference by chance per degree
+    of freedom. evidence (G,): -log10 of the chance of the difference for that group alone. chance: the largest evidence
+    of all groups in each random flip, sorted. surplus: the largest difference beyond chance in units of its standard
+    deviation, less what chance makes of that maximum. surplus_of: the group that has it.
     """
 
     groups: tuple[Group, ...]
-    gain: Array
+    chi_square: Array
     rank: Array
     spread: Array
     evidence: Array
@@ -44,71 +45,81 @@ class Gains:
 
     @property
     def excess(self) -> Array:
-        """Gains beyond chance (G,)."""
-        return np.maximum(self.gain - self.rank * self.spread, 0.0)
+        """Chi-square differences (G,) less what chance makes of them, at least 0."""
+        return np.maximum(self.chi_square - self.rank * self.spread, 0.0)
 
     def p_value(self, index: int) -> float:
-        """The chance that any of all groups gains as surprisingly as this one."""
-        own, chance = float(self.evidence[index]), self.chance
-        exceeded = int((chance >= own).sum())
+        """The chance that any of the groups is as significant as the one at ``index`` where nothing is missing."""
+        evidence, chance = float(self.evidence[index]), self.chance
+        exceeded = int((chance >= evidence).sum())
         tail = max(int(_TAIL * len(chance)), 1)
         if exceeded >= tail // 4:
             return (exceeded + 1) / (len(chance) + 1)
         edge = float(chance[-tail])
         scale = max(float((chance[-tail:] - edge).mean()), 1e-3)
-        return float(max(tail / len(chance) * np.exp(-(own - edge) / scale), 1e-300))
+        return float(max(tail / len(chance) * np.exp(-(evidence - edge) / scale), 1e-300))
 
     @property
     def best(self) -> int:
-        """Index of the most surprising group."""
+        """Index of the most significant group."""
         return int(self.evidence.argmax())
 
     @property
-    def surplus_gain(self) -> tuple[float, float]:
-        """The gain that goes with the surplus, and its scatter by chance."""
+    def surplus_chi_square(self) -> tuple[float, float]:
+        """The chi-square difference that the surplus stands for, and its standard deviation by chance."""
         scatter = float(np.sqrt(2 * self.rank[self.surplus_of]) * self.spread[self.surplus_of])
         return max(self.surplus, 0.0) * scatter, scatter
 
 
-def gains_of(data: Whitened, fitted: Sequence[int], groups: Sequence[Group], rng: np.random.Generator) -> Gains:
-    """Gains of groups beyond the columns ``fitted``, and what chance makes of them."""
+def significance_of(
+    data: Whitened, fitted: Sequence[int], groups: Sequence[Group], rng: np.random.Generator
+) -> Significance:
+    """Chi-square differences of groups beyond the columns ``fitted``, and their significance."""
     now = given(data, fitted)
     roots = [now.roots(group.index) for group in groups]
-    rank = np.array([each.shape[1] for each in roots], dtype=float)
+    rank = np.array([root.shape[1] for root in roots], dtype=float)
     tries = np.array([group.tries for group in groups], dtype=float)
-    own = [now.scores[:, list(group.index)] @ each for group, each in zip(groups, roots, strict=True)]
-    gain = np.array([float(np.square(each.sum(axis=0)).sum()) for each in own])
-    steady = np.array([_without_any_one(each) for each in own])
+    scores = [now.scores[:, list(group.index)] @ root for group, root in zip(groups, roots, strict=True)]
+    chi_square = np.array([float(np.square(of_runs.sum(axis=0)).sum()) for of_runs in scores])
+    steady = np.array([_without_any_one(of_runs) for of_runs in scores])
     noise = _noise_scores(data, list(fitted), groups)
-    left = [noise.scores[:, list(group.index)] @ each for group, each in zip(groups, roots, strict=True)]
-    spread = np.maximum([float(np.square(each).sum()) / max(each.shape[1], 1) for each in left], 1.0)
+    by_chance = [noise.scores[:, list(group.index)] @ root for group, root in zip(groups, roots, strict=True)]
+    spread = np.maximum([float(np.square(of_runs).sum()) / max(of_runs.shape[1], 1) for of_runs in by_chance], 1.0)
     signs = rng.choice([-1.0, 1.0], size=(_FLIPS, len(now.scores)))
-    flipped = np.array([np.square(signs @ each).sum(axis=1) for each in left]).T
+    flipped = np.array([np.square(signs @ of_runs).sum(axis=1) for of_runs in by_chance]).T
     chance = _evidence(flipped, rank, spread, tries)
     evidence = _evidence(steady[None], rank, spread, tries)[0]
     scatter = np.sqrt(2 * np.maximum(rank, 1.0)) * spread
-    beyond = (gain - rank * spread) / scatter
+    beyond = (chi_square - rank * spread) / scatter
     usual = float(np.mean(((flipped - rank * spread) / scatter).max(axis=1)))
     best = int(beyond.argmax())
-    return Gains(
-        tuple(groups), gain, rank, spread, evidence, np.sort(chance.max(axis=1)), float(beyond[best]) - usual, best
+    return Significance(
+        groups=tuple(groups),
+        chi_square=chi_square,
+        rank=rank,
+        spread=spread,
+        evidence=evidence,
+        chance=np.sort(chance.max(axis=1)),
+        surplus=float(beyond[best]) - usual,
+        surplus_of=best,
     )
 
 
 def _without_any_one(scores: Array) -> float:
-    """The gain that is left without the run that it owes most to: one run that went wrong is no effect."""
+    """The chi-square difference without the run that adds most to it: one run that went wrong is no effect."""
     total = scores.sum(axis=0)
     return float(np.square(total - scores).sum(axis=1).min(initial=np.inf)) if scores.size else 0.0
 
 
 def _noise_scores(data: Whitened, fitted: list[int], groups: Sequence[Group]) -> Given:
-    """Scores (Z, p) of residuals without what is plainly there."""
+    """Scores (Z, p) that stand for noise: of the residuals without up to three groups that are plainly significant."""
     taken = list(fitted)
     now = given(data, taken)
     for _ in range(_MOST_TAKEN if groups else 0):
-        gain = np.array([now.gain(group.index) for group in groups])
+        chi_square = np.array([now.chi_square(group.index) for group in groups])
         rank = np.array([now.rank(group.index) for group in groups], dtype=float)
-        evidence = _evidence(gain[None], rank, np.ones(len(groups)), np.array([each.tries for each in groups]))[0]
+        tries = np.array([group.tries for group in groups])
+        evidence = _evidence(chi_square[None], rank, np.ones(len(groups)), tries)[0]
         best = int(evidence.argmax())
         if evidence[best] < _PLAIN:
             break
@@ -117,13 +128,15 @@ def _noise_scores(data: Whitened, fitted: list[int], groups: Sequence[Group]) ->
     if len(taken) == len(fitted):
         return now
     values, _ = given(data, []).estimate(taken)
-    residuals = [own - columns[:, taken] @ values for own, columns in zip(data.residuals, data.columns, strict=True)]
+    residuals = [
+        of_run - columns[:, taken] @ values for of_run, columns in zip(data.residuals, data.columns, strict=True)
+    ]
     return given(data.with_residuals(residuals), fitted)
 
 
-def _evidence(gain: Array, rank: Array, spread: Array, tries: Array) -> Array:
-    """-log10 of the chance of gains (B, G), and of being the best of so many tries."""
-    scaled, freedom = gain / spread, np.maximum(rank, 1.0)
-    found = -chi2.logsf(scaled, freedom) / np.log(10)
-    evidence: Array = np.where(rank > 0, np.maximum(found - np.log10(tries), 0.0), 0.0)
+def _evidence(chi_square: Array, rank: Array, spread: Array, tries: Array) -> Array:
+    """-log10 of the chance of chi-square differences (B, G), the best of so many tries (Bonferroni); at least 0."""
+    scaled, freedom = chi_square / spread, np.maximum(rank, 1.0)
+    single = -chi2.logsf(scaled, freedom) / np.log(10)
+    evidence: Array = np.where(rank > 0, np.maximum(single - np.log10(tries), 0.0), 0.0)
     return evidence

@@ -1,4 +1,4 @@
-"""Many columns against the residuals of many runs, whitened, nuisances of each run eliminated; sums of runs thereof."""
+"""Columns and residuals of many runs, whitened under the noise, with the nuisances of each run eliminated."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from omnibench.fit.least_squares.noise import Whitener
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
-_DETERMINED = 1e-6  # share of a direction that must be left for it to count as one
+_DETERMINED = 1e-6  # share of a direction that must be left beyond other columns for it to count; chosen
 
 
 @dataclass(frozen=True, eq=False)
 class Whitened:
     """Residuals and columns of Z runs, independent and of unit variance under the noise.
 
-    residuals: of each run (k,). columns: of each run (k, p). information (p, p): their products over all runs. scores
-    (Z, p): of each run, columns times residuals.
+    residuals: (k,) for each run. columns: (k, p) for each run. information (p, p): products of the columns, summed over
+    all runs. scores (Z, p): columns times residuals of each run.
     """
 
     residuals: tuple[Array, ...]
@@ -28,7 +28,7 @@ class Whitened:
     scores: Array
 
     def with_residuals(self, residuals: Sequence[Array]) -> Whitened:
-        """The same columns against other whitened residuals."""
+        """These columns with other whitened residuals."""
         return Whitened(tuple(residuals), self.columns, self.information, _scores(self.columns, residuals))
 
 
@@ -40,20 +40,20 @@ def whitened(
     nuisances: Sequence[Array],
     deviations: Array,
 ) -> Whitened:
-    """Whiten residuals (K, 3) and columns (K, 3, p) of every run.
+    """Whiten residuals ``runs`` (K, 3) and columns (K, 3, p) of every run, at its stamps (K,).
 
-    nuisances: derivatives (K, 3, m) of each run's poses by what is its own, of the expected sizes deviations (m,), 0
-    for one that is none: what these could explain counts for little.
+    nuisances: derivatives (K, 3, m) of each run's poses by its nuisances. deviations (m,): their standard deviations,
+    0 for one that is left at 0; they count as noise that all poses of a run share.
     """
     whiteners: dict[bytes, Whitener] = {}
     known = deviations > 0
     residuals, whites = [], []
-    for own, slopes, times, extra in zip(runs, columns, stamps, nuisances, strict=True):
+    for values, slopes, times, extra in zip(runs, columns, stamps, nuisances, strict=True):
         key = times.tobytes()
         if key not in whiteners:
             whiteners[key] = Whitener(noise, times)
-        everything = np.concatenate([own[..., None], slopes, extra[..., known]], axis=-1)
-        white = whiteners[key](everything).reshape(3 * len(own), -1)
+        everything = np.concatenate([values[..., None], slopes, extra[..., known]], axis=-1)
+        white = whiteners[key](everything).reshape(3 * len(values), -1)
         count = 1 + slopes.shape[2]
         free = _without(white[:, :count], white[:, count:] * deviations[known]) if known.any() else white
         residuals.append(np.ascontiguousarray(free[:, 0]))
@@ -77,60 +77,60 @@ def _products(columns: Sequence[Array]) -> Array:
 
 
 def _scores(columns: Sequence[Array], residuals: Sequence[Array]) -> Array:
-    return np.array([slopes.T @ own for slopes, own in zip(columns, residuals, strict=True)])
+    return np.array([slopes.T @ values for slopes, values in zip(columns, residuals, strict=True)])
 
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """What columns say beyond others that are fitted already.
+    """Schur complement of the information matrix: what columns add once others are fitted.
 
-    information (p, p): what is left of it. scores (Z, p): likewise, of each run. total (p,): information's diagonal
-    before, against which a direction counts as determined.
+    information (p, p), scores (Z, p): of the columns' parts beyond those others. total (p,): diagonal of the
+    information before, against which a direction counts as determined.
     """
 
     information: Array
     scores: Array
     total: Array
 
-    def gain(self, index: Sequence[int]) -> float:
-        """By how much fitting some columns lowers chi2."""
+    def chi_square(self, index: Sequence[int]) -> float:
+        """Chi-square difference: by how much fitting some columns lowers it."""
         roots = self.roots(index)
         return float(np.square(roots.T @ self.scores[:, list(index)].sum(axis=0)).sum())
 
     def rank(self, index: Sequence[int]) -> int:
-        """How many independent directions they have left."""
+        """Degrees of freedom: independent directions that some columns have left."""
         return self.roots(index).shape[1]
 
     def roots(self, index: Sequence[int]) -> Array:
-        """(n, d): turns the scores of n columns into d independent ones of unit variance."""
+        """Matrix (n, d) that turns the scores of n columns into d independent ones of unit variance."""
         index = list(index)
         scale = 1 / np.sqrt(np.maximum(self.total[index], 1e-300))
         inner = self.information[np.ix_(index, index)] * np.outer(scale, scale)
         values, vectors = np.linalg.eigh(inner)
         known = values > _DETERMINED
-        found: Array = scale[:, None] * vectors[:, known] / np.sqrt(values[known])
-        return found
+        roots: Array = scale[:, None] * vectors[:, known] / np.sqrt(values[known])
+        return roots
 
     def share_left(self, index: Sequence[int]) -> float:
-        """The largest share of itself that any direction of some columns keeps beyond those that are fitted."""
+        """The largest share of itself that any direction of some columns keeps beyond those that are fitted, 0 to 1."""
         index = list(index)
         scale = 1 / np.sqrt(np.maximum(self.total[index], 1e-300))
         return float(np.linalg.eigvalsh(self.information[np.ix_(index, index)] * np.outer(scale, scale))[-1])
 
     def estimate(self, index: Sequence[int]) -> tuple[Array, Array]:
-        """Values (n,) of some columns and their covariance (n, n), by the noise model."""
+        """Least-squares values (n,) of some columns, and their covariance (n, n) by the noise model."""
         roots = self.roots(index)
         covariance = roots @ roots.T
         values: Array = covariance @ self.scores[:, list(index)].sum(axis=0)
         return values, covariance
 
     def given(self, index: Sequence[int]) -> Given:
-        """The same beyond further columns."""
+        """The Schur complement beyond further columns."""
         return _beyond(self.information, self.scores, self.total, index)
 
 
 def given(data: Whitened, index: Sequence[int]) -> Given:
-    """What all columns say beyond the columns ``index``."""
+    """What all columns add once the columns ``index`` are fitted."""
     return _beyond(data.information, data.scores, np.diag(data.information).copy(), index)
 
 

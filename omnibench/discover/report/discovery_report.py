@@ -10,11 +10,11 @@ from omnibench.discover.document import experiment_file
 from omnibench.discover.report.evidence_figures import candidate_grid, gap_grid, hidden_grid, waterfall_grid
 from omnibench.discover.report.tables import (
     absorbed_table,
+    extrapolation_table,
     gap_table,
     held_out_table,
     hidden_table,
     not_looked_for_table,
-    novelty_table,
     parameter_table,
     place_table,
     step_table,
@@ -27,12 +27,12 @@ from omnibench.discover.report.wording import (
     closed_in_words,
     decisive,
     effect_in_words,
+    extrapolations_in_words,
     final_errors_in_words,
     gap_decimals,
     gap_in_words,
     held_out_in_words,
     noise_in_words,
-    novelties_in_words,
     parameter_in_words,
     weight_in_words,
 )
@@ -80,7 +80,9 @@ def answer_section(discovery: Discovery) -> Section:
 def _answer(discovery: Discovery) -> Iterator[Block]:
     yield Paragraph(discovery.headline, "lead")
     yield Facts(tuple(_tiles(discovery)), "tiles")
-    yield Callout("Motions that the training runs never had", novelties_in_words(discovery.novelties), "warning")
+    yield Callout(
+        "Motions that the training runs never had", extrapolations_in_words(discovery.extrapolations), "warning"
+    )
     yield Callout("Before you read on", discovery.notes)
 
 
@@ -153,7 +155,7 @@ def _how_sure(discovery: Discovery) -> Iterator[Block]:
                 Fact(
                     effect_in_words(effect).replace("_", " "),
                     weight_in_words(effect.weight),
-                    f"weight of the name; χ² falls by {count(effect.gain)} "
+                    f"weight of the name; χ² falls by {count(effect.chi_square)} "
                     f"for {plural(effect.degrees_of_freedom, 'parameter')}",
                 )
                 for effect in discovery.effects
@@ -211,13 +213,13 @@ def _how_much_better(discovery: Discovery) -> Iterator[Block]:
     yield held_out_table(discovery) if discovery.held_out else gap_table(discovery)
     if len(discovery.steps) > 1:
         yield Details("Every step in numbers", (step_table(discovery),))
-    if discovery.novelties:
+    if discovery.extrapolations:
         words = (
             "The held-out runs drive motions that no training run had. There the extended model extrapolates, and its "
             "bound may be wider than the plain matrix's.",
         )
         yield Callout("Warning: new motions", words, "warning")
-        yield novelty_table(discovery.novelties)
+        yield extrapolation_table(discovery.extrapolations)
 
 
 def _better_in_words(discovery: Discovery) -> str:

@@ -37,7 +37,7 @@ def candidate_grid(discovery: Discovery) -> FigureGrid | None:
     found = {effect.name for effect in discovery.effects}
     figures = []
     for number, tried in enumerate(discovery.candidates, 1):
-        shown = sorted((each for each in tried if each.gain > 0), key=lambda each: -each.gain)[:_CANDIDATES]
+        shown = sorted((each for each in tried if each.chi_square > 0), key=lambda each: -each.chi_square)[:_CANDIDATES]
         if not shown:
             continue
         chosen = next((each.name for each in shown if each.name in found and _is_step(discovery, number, each)), None)
@@ -47,7 +47,9 @@ def candidate_grid(discovery: Discovery) -> FigureGrid | None:
                 title,
                 _candidate_bars(shown, chosen),
                 "Gain in whitened chi2 of each candidate: "
-                + ", ".join(f"{each.name} {each.gain:.3g}, weight {weight_in_words(each.weight)}" for each in shown),
+                + ", ".join(
+                    f"{each.name} {each.chi_square:.3g}, weight {weight_in_words(each.weight)}" for each in shown
+                ),
                 80 + 34 * len(shown),
             )
         )
@@ -74,7 +76,7 @@ def _candidate_bars(shown: Sequence[Candidate], chosen: str | None) -> go.Figure
         _Bar(
             _folded(each.name),
             0.0,
-            each.gain,
+            each.chi_square,
             f"{weight_in_words(each.weight)}, {each.degrees_of_freedom} df",
             *(("chosen", AFTER) if each.name == chosen else ("other", _UNCHOSEN)),
         )

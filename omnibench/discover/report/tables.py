@@ -20,14 +20,14 @@ from omnibench.discover.report.wording import (
     value_and_interval,
     weight_in_words,
 )
-from omnibench.discover.result import Discovery, Gap, Hidden, NamedEffect, Novelty, Place
+from omnibench.discover.result import CovariateDependence, Discovery, Extrapolation, Gap, Hidden, NamedEffect
 from omnibench.registry import effects
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.numbers import NOTHING, count, fixed, percent, plural, significant
 from omnibench.robot.effects.effect import Effect
 
 
-def place_table(places: Sequence[Place], caption: str) -> Table:
+def place_table(places: Sequence[CovariateDependence], caption: str) -> Table:
     """What the residual depends on, with its significance."""
     rows = tuple(
         Row(
@@ -217,7 +217,7 @@ def not_looked_for_table(discovery: Discovery) -> Table:
     return Table("Not looked for", columns, rows)
 
 
-def novelty_table(novelties: Sequence[Novelty]) -> Table:
+def extrapolation_table(extrapolations: Sequence[Extrapolation]) -> Table:
     """Motions that the training runs never had, with the bounds that widen."""
     rows = tuple(
         Row(
@@ -228,7 +228,7 @@ def novelty_table(novelties: Sequence[Novelty]) -> Table:
                 Cell(significant(1e3 * each.after_m, 3)),
             )
         )
-        for each in novelties
+        for each in extrapolations
     )
     return Table(
         "Motions of the held-out runs that no training run drives",

@@ -10,11 +10,11 @@ from typing import Literal
 from omnibench.discover.result import (
     Discovery,
     EstimatedParameter,
+    Extrapolation,
     Gap,
     HeldOut,
     Hidden,
     NamedEffect,
-    Novelty,
     Step,
     Verdict,
 )
@@ -193,12 +193,12 @@ def decisive(discovery: Discovery) -> HeldOut | None:
     return max(discovery.held_out, key=lambda held: held.data == "session", default=None)
 
 
-def novelties_in_words(novelties: tuple[Novelty, ...]) -> tuple[str, ...]:
+def extrapolations_in_words(extrapolations: tuple[Extrapolation, ...]) -> tuple[str, ...]:
     """Where the extended model leaves the motions that it was fitted to."""
     return tuple(
         f"{each.command}: {each.description}. Final position within {_millimetres(each.before_m)} by the plain matrix, "
         f"within {_millimetres(each.after_m)} by the extended model (95 %)."
-        for each in novelties
+        for each in extrapolations
     )
 
 

@@ -1,62 +1,52 @@
-"""All that is looked at: the matrix, every effect of the catalogue in its shapes and forms, and the generic bases."""
+"""Groups of columns that are tried on the residuals: the matrix, the catalogue's effects, the generic bases."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from enum import Enum
 from itertools import product
-from typing import Literal
 
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.regressors.covariate_bases import Basis, generic_bases
+from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.covariate_bases import generic_bases
 from omnibench.discover.regressors.paths import Paths
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import Effect, MotionEffect, Parameter, ReferenceEffect
+from omnibench.robot.effects.effect import Effect, MotionEffect, ReferenceEffect
 from omnibench.robot.kinematics import Array
 
-_FEW = 6  # shapes; more of them make up for other forms
-Kind = Literal["matrix", "effect", "place"]
+_FEW = 6  # shapes of an effect: with more of them, one comes near enough to any other form
 
 
-@dataclass(frozen=True, eq=False)
-class Group:
-    """Columns that belong together. index: where they stand.
+class Missing(Enum):
+    """What recordings lack, so that an effect cannot be looked for; the value is the reason in words."""
 
-    Of an effect: its parameters in the columns' order, the values of its shapes, how many shapes were tried, and
-    ``forms``, columns by which its form could differ from the catalogue's. Of a generic basis: ``basis``.
-    """
-
-    kind: Kind
-    name: str
-    index: tuple[int, ...]
-    effect: Effect | None = None
-    parameters: tuple[Parameter, ...] = ()
-    shapes: Mapping[str, float] = field(default_factory=dict)
-    tries: int = 1
-    forms: tuple[int, ...] = ()
-    basis: Basis | None = None
+    WHEEL_ANGLES = "the wheels' absolute angles were not recorded (columns phi_*)"
+    START_TIMES = "when the runs were driven was not recorded (column started_at)"
+    SESSIONS = "the session of some runs was not recorded (column session)"
+    SECOND_SESSION = "all runs are of one session"
 
 
 @dataclass(frozen=True, eq=False)
 class Groups:
-    """Groups with their columns (S, 3, p), and the effects that these recordings cannot show, with the reason."""
+    """All groups with their columns (S, 3, p), and the effects that cannot be looked for in these recordings."""
 
     matrix: Group
     effects: tuple[Group, ...]
-    places: tuple[Group, ...]
+    bases: tuple[Group, ...]
     columns: Array
-    not_looked_for: tuple[tuple[str, str], ...]
+    not_looked_for: tuple[tuple[str, Missing], ...]
 
 
 def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Sequence[str]) -> Groups:
-    """Groups and columns. without: names that are not to be tried."""
+    """Groups and columns along paths. without: names of effects that are not to be tried."""
     columns: list[Array] = [_of_matrix(paths)]
     count = columns[0].shape[2]
     matrix = Group("matrix", "matrix", tuple(range(count)))
     named: list[Group] = []
-    missing: list[tuple[str, str]] = []
+    not_looked_for: list[tuple[str, Missing]] = []
 
     def add(new: Array) -> tuple[int, ...]:
         nonlocal count
@@ -66,8 +56,8 @@ def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Seque
 
     sessions = tuple(dict.fromkeys(run.session for run in trajectories if run.session is not None))
     for effect in _candidates(without):
-        if reason := _lacks(effect, paths, sessions):
-            missing.append((effect.name, reason))
+        if missing := _lacks(effect, paths, sessions):
+            not_looked_for.append((effect.name, missing))
             continue
         parameters = effect.parameters(paths.robot, sessions)
         linear = tuple(each for each in parameters if not each.choices)
@@ -78,17 +68,17 @@ def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Seque
             base = {each.name: 0.0 for each in linear} | shape
             index = add(np.concatenate([paths.of_effect(effect, each.name, base) for each in linear], axis=2))
             forms = None if len(shapes) > _FEW else _forms(paths, effect, [each.name for each in linear], base)
-            own = add(forms) if forms is not None else ()
-            named.append(Group("effect", effect.name, index, effect, linear, shape, len(shapes), own))
-    places = [
-        Group("place", basis.covariate, add(basis.columns), tries=basis.tries, basis=basis)
+            form_index = add(forms) if forms is not None else ()
+            named.append(Group("effect", effect.name, index, effect, linear, shape, len(shapes), form_index))
+    bases = [
+        Group("covariate", basis.covariate, add(basis.columns), tries=basis.tries, basis=basis)
         for basis in generic_bases(paths, trajectories)
     ]
-    return Groups(matrix, tuple(named), tuple(places), np.concatenate(columns, axis=2), tuple(missing))
+    return Groups(matrix, tuple(named), tuple(bases), np.concatenate(columns, axis=2), tuple(not_looked_for))
 
 
 def _of_matrix(paths: Paths) -> Array:
-    """Slopes (S, 3, 3N) by the elements of the matrix, of the same samples as all other columns."""
+    """Slopes (S, 3, 3N) by the elements of the matrix, of the samples of the other columns."""
     rates = paths.signals.rates
     return np.concatenate([paths.of_twist(np.tile(row, (len(rates), 1)), rates) for row in np.eye(3)], axis=2)
 
@@ -102,44 +92,47 @@ def _candidates(without: Sequence[str]) -> Iterator[MotionEffect | ReferenceEffe
             yield effect
 
 
-def _lacks(effect: Effect, paths: Paths, sessions: tuple[str, ...]) -> str:
-    """Why an effect cannot be looked for, or nothing."""
+def _lacks(effect: Effect, paths: Paths, sessions: tuple[str, ...]) -> Missing | None:
+    """Why an effect cannot be looked for; None if it can."""
     if "wheel_angles" in effect.needs and paths.signals.wheel_angles is None:
-        return "the wheels' absolute angles were not recorded (columns phi_*)"
+        return Missing.WHEEL_ANGLES
     if "session_time" in effect.needs and paths.signals.session_time is None:
-        return "when the runs were driven was not recorded (column started_at)"
+        return Missing.START_TIMES
     if "session" in effect.needs and any(log.session is None for log in paths.logs):
-        return "the session of some runs was not recorded (column session)"
+        return Missing.SESSIONS
     if not effect.parameters(paths.robot, sessions):
-        return "all runs are of one session"
-    return ""
+        return Missing.SECOND_SESSION
+    return None
 
 
 def _forms(
     paths: Paths, effect: MotionEffect | ReferenceEffect, names: Sequence[str], values: Mapping[str, float]
 ) -> Array | None:
-    """Slopes by what may make the true form differ from the catalogue's: it varies with its own covariate."""
+    """Slopes (S, 3, n) by other forms of an effect: its size varies linearly and quadratically with its covariate.
+
+    None for an effect that has no such covariate.
+    """
     if isinstance(effect, ReferenceEffect):
         return None
     share = _covariate(paths, effect)
     if share is None:
         return None
-    found = []
+    slopes = []
     for name in names:
         change = paths.correction(effect, {**values, name: 1.0})
         for power in (share, share**2):
             varied = change * (power if power.ndim == 2 else power[:, None])
             if effect.stage == "body":
-                found.append(paths.of_twist(varied, np.ones((len(varied), 1))))
+                slopes.append(paths.of_twist(varied, np.ones((len(varied), 1))))
             elif effect.stage == "world":
-                found.append(paths.of_velocity(varied))
+                slopes.append(paths.of_velocity(varied))
             else:
-                found.append(paths.of_rates(varied))
-    return np.concatenate(found, axis=2)
+                slopes.append(paths.of_rates(varied))
+    return np.concatenate(slopes, axis=2)
 
 
 def _covariate(paths: Paths, effect: MotionEffect) -> Array | None:
-    """What the effect shows in, (F,) or of each wheel (F, N), from -1 to 1."""
+    """The covariate that the effect shows in, (F,) or of each wheel (F, N), from -1 to 1."""
     signals = paths.signals
     if effect.shows_in == "wheel rate" or (effect.stage == "wheel" and effect.shows_in == "command"):
         return _unit(np.abs(signals.rates))
@@ -162,6 +155,6 @@ def _unit(values: Array) -> Array:
 
 
 def check_names(names: Sequence[str]) -> None:
-    """UnknownNameError for a name that is no effect's."""
+    """Raises UnknownNameError for a name that is no effect's."""
     for name in names:
         effects.entry(name, "without")

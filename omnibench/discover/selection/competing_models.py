@@ -1,94 +1,76 @@
-"""Models that the recordings cannot tell apart, and which of them to use.
+"""Competing models: those that the recordings cannot tell apart, and which of them is used.
 
-Where several effects explain the same, each in its place makes a model of its own. The one that predicts commands
-that its fit did not see best, in the paper's cost, is used; what they disagree on is not known.
+Where several effects explain the same residuals, each in its place makes a model of its own. The one that best predicts
+commands that its fit did not see, in the paper's cost, is used; what the models disagree on is not known.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.extend import Extended, extend
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.held_out.gaps import held_out_residuals
-from omnibench.discover.selection.candidate_groups import Group
-from omnibench.discover.selection.model_selection import Named
-from omnibench.discover.selection.screening import Look
-from omnibench.fit.least_squares.repetitions import grouped
+from omnibench.discover.held_out.cross_validation import folds_of_commands, held_out_residuals
+from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.selection.model_selection import Selection
 from omnibench.robot.kinematics import Array
 
-_CLEARLY = 2.0  # standard errors of the difference in cost
+_CLEARLY = 2.0  # standard errors of the difference in cost from which on a model predicts better; chosen
 
 
 @dataclass(frozen=True, eq=False)
-class Rivals:
-    """The model that is used, its names, and all models with their weights, the used one first.
+class CompetingModels:
+    """The model that is used, its effects, and all models with their weights, the used one first.
 
-    preferred: of each chosen effect, why it is used where another is as likely, or nothing.
+    preferred: for each chosen effect, why it is used where another is as likely, or nothing.
     """
 
     used: Extended
-    named: Named
+    selection: Selection
     models: tuple[tuple[float, Extended], ...]
     preferred: tuple[str, ...]
 
 
-def rivals_of(plain: Fit, look: Look, extended: Extended) -> Rivals:
-    """All models that the data cannot tell apart, and the best of them on commands that are held out."""
-    named, used = look.named, extended
-    preferred = ["" for _ in named.chosen]
+def competing_models(plain: Fit, selection: Selection, extended: Extended) -> CompetingModels:
+    """Fit all models that the data cannot tell apart, and use the best of them on commands that are held out."""
+    used = extended
+    preferred = ["" for _ in selection.chosen]
     others: list[tuple[float, Extended]] = []
-    for place, stand_ins in enumerate(named.stand_ins):
-        for other in stand_ins:
-            groups = [*named.chosen[:place], other, *named.chosen[place + 1 :]]
-            model = extend(plain, groups)
-            weight = named.weights.get(other.name, 0.0)
+    for position, stand_ins in enumerate(selection.stand_ins):
+        for stand_in in stand_ins:
+            chosen = selection.chosen
+            model = extend(plain, [*chosen[:position], stand_in, *chosen[position + 1 :]])
+            weight = selection.weights.get(stand_in.name, 0.0)
             difference = _costs(used) - _costs(model)
             if difference.mean() > 0:
-                others.append((named.weights.get(named.chosen[place].name, 0.0), used))
-                preferred[place] = _reason(other, difference)
-                named, used = _exchanged(named, place, other), model
+                others.append((selection.weights.get(chosen[position].name, 0.0), used))
+                preferred[position] = _reason(stand_in, difference)
+                selection, used = _exchanged(selection, position, stand_in), model
             else:
                 others.append((weight, model))
-                preferred[place] = preferred[place] or _reason(named.chosen[place], -difference)
-    first = min((named.weights.get(group.name, 0.0) for group in named.chosen), default=1.0)
-    return Rivals(used, named, ((first, used), *others), tuple(preferred))
+                preferred[position] = preferred[position] or _reason(chosen[position], -difference)
+    weight = min((selection.weights.get(group.name, 0.0) for group in selection.chosen), default=1.0)
+    return CompetingModels(used, selection, ((weight, used), *others), tuple(preferred))
 
 
-def _exchanged(named: Named, place: int, other: Group) -> Named:
-    """The names with another effect in one place."""
-    before = named.chosen[place]
-    chosen = (*named.chosen[:place], other, *named.chosen[place + 1 :])
-    own = tuple(before if each is other else each for each in named.stand_ins[place])
-    stand_ins = (*named.stand_ins[:place], own, *named.stand_ins[place + 1 :])
-    return replace(
-        named, chosen=chosen, stand_ins=stand_ins,
-        confusable=tuple(tuple(each.name for each in members) for members in stand_ins),
-    )  # fmt: skip
+def _exchanged(selection: Selection, position: int, stand_in: Group) -> Selection:
+    """The selection with a stand-in at one position, and the effect that stood there among the stand-ins."""
+    before = selection.chosen[position]
+    chosen = (*selection.chosen[:position], stand_in, *selection.chosen[position + 1 :])
+    exchanged = tuple(before if group is stand_in else group for group in selection.stand_ins[position])
+    stand_ins = (*selection.stand_ins[:position], exchanged, *selection.stand_ins[position + 1 :])
+    return replace(selection, chosen=chosen, stand_ins=stand_ins)
 
 
 def _reason(group: Group, difference: Array) -> str:
-    sure = difference.mean() > _CLEARLY * difference.std() / np.sqrt(max(len(difference), 1))
-    return (
-        f"{group.name} is used: it predicts commands that were held out {'better' if sure else 'no worse'} in the cost "
-        "of Eq. (6)"
-    )
+    clear = difference.mean() > _CLEARLY * difference.std() / np.sqrt(max(len(difference), 1))
+    how = "better" if clear else "no worse"
+    return f"{group.name} is used: it predicts commands that were held out {how} in the cost of Eq. (6)"
 
 
 def _costs(extended: Extended) -> Array:
     """Eq. (6) of every run (Z,), its command held out of the fit."""
-    left = held_out_residuals(extended, folds_of_commands(extended.fit.runs))
-    return np.array([float(np.linalg.norm(own[-1])) for own in left])
-
-
-def folds_of_commands(runs: Sequence[Trajectory]) -> NDArray[np.intp]:
-    """A fold (Z,) of each run: whole commands, in five folds."""
-    folds = np.zeros(len(runs), dtype=np.intp)
-    for number, members in enumerate(grouped([run.command or run.id for run in runs])):
-        folds[list(members)] = number % 5
-    return folds
+    residuals = held_out_residuals(extended, folds_of_commands(extended.fit.runs))
+    return np.array([float(np.linalg.norm(of_run[-1])) for of_run in residuals])

@@ -1,4 +1,7 @@
-"""Encoder ticks: what a wheel turns between the last tick and standstill is not seen, and no effect explains it."""
+"""Encoder quantisation: what a wheel turns between the last tick and standstill is not measured.
+
+No effect explains it, and it may look like one where a controller stops the wheels at the same place each time.
+"""
 
 from __future__ import annotations
 
@@ -12,23 +15,23 @@ from omnibench.discover.regressors.whitened import given
 from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.robot.kinematics import Array
 
-_FEWEST = 50  # samples in which a wheel turns, to tell ticks from chance
-_MOST = 10_000  # ticks in a sample; finer ones are no matter
-_MEAN = 0.25  # of a tick
-_WHOLE = 1e-3  # of a tick: by so much multiples may differ from whole ones
+_FEWEST = 50  # samples in which a wheel turns: with fewer, multiples may be chance
+_FINEST = 10_000  # ticks in the largest sample: finer ones do no harm
+_MEAN = 0.25  # ticks: mean size of an error that is uniform within half a tick
+_WHOLE = 1e-3  # ticks: by so much multiples may differ from whole ones; chosen
 
 
-def ticks_of(runs: Sequence[Trajectory]) -> Array:
+def quantisation_steps(runs: Sequence[Trajectory]) -> Array:
     """The angle (N,) of a tick of each wheel's encoder, rad; 0 where measured angles are no multiples of one."""
-    steps = np.concatenate([run.rates * np.diff(run.times, prepend=0.0)[:, None] for run in runs])
-    return np.array([_tick(np.abs(own)) for own in steps.T])
+    turned = np.concatenate([run.rates * np.diff(run.times, prepend=0.0)[:, None] for run in runs])
+    return np.array([_tick(np.abs(of_wheel)) for of_wheel in turned.T])
 
 
 def _tick(steps: Array) -> float:
     turning = steps[steps > 0]
     if len(turning) < _FEWEST:
         return 0.0
-    floor = turning.max() / _MOST
+    floor = turning.max() / _FINEST
     ordered = np.sort(np.append(turning, 0.0))
     gaps = np.diff(ordered)
     gaps = gaps[gaps > floor]
@@ -38,47 +41,49 @@ def _tick(steps: Array) -> float:
     near = np.round(turning / tick)
     if not near.any():
         return 0.0
-    tick = float(turning @ near / (near @ near))  # of all, which the smallest gap alone says less exactly
+    tick = float(turning @ near / (near @ near))  # least squares over all samples: more exact than the smallest gap
     return tick if (np.abs(turning / tick - np.round(turning / tick)) < _WHOLE * np.maximum(near, 1)).all() else 0.0
 
 
-class Rounding:
-    """How much of chi2 columns could explain of what rounding to ticks does, if every command conspired.
+class EncoderQuantisation:
+    """Upper bounds on the chi-square that encoder quantisation lets columns explain, if every command conspired.
 
-    A controller stops a wheel at the same place within a tick each time that a command is repeated; so the wheel's true
-    angle is off the measured one by up to half a tick, a quarter in the mean, for a whole command, where it begins to
-    turn and where it rests.
+    A controller stops a wheel at the same place within a tick each time that a command is repeated. The wheel's true
+    angle is then off the measured one by up to half a tick, a quarter in the mean, for a whole command: where it begins
+    to turn and where it rests.
     """
 
     def __init__(self, fit: Fit, columns: Sequence[Array]) -> None:
-        """columns (K, 3, p): of every run of the fit, not whitened."""
-        self.ticks = ticks_of(fit.runs)
+        """columns (K, 3, p): of every run of the fit, before whitening."""
+        self.steps = quantisation_steps(fit.runs)
         self._count = columns[0].shape[2]
-        if not self.ticks.any():
+        if not self.steps.any():
             return
-        hidden = [
-            _quarter_ticks(run, run.poses[1:] - own, fit.model.matrix, self.ticks)
-            for run, own in zip(fit.runs, fit.residuals, strict=True)
+        errors = [
+            _quarter_ticks(run, run.poses[1:] - residuals, fit.model.matrix, self.steps)
+            for run, residuals in zip(fit.runs, fit.residuals, strict=True)
         ]
-        data = fit.whitened([np.concatenate(each, axis=2) for each in zip(columns, hidden, strict=True)])
+        data = fit.whitened([np.concatenate(both, axis=2) for both in zip(columns, errors, strict=True)])
         members = grouped([run.command or run.id for run in fit.runs])
-        products = [each[:, : self._count].T @ each[:, self._count :] for each in data.columns]
+        products = [both[:, : self._count].T @ both[:, self._count :] for both in data.columns]
         self._products = np.concatenate([sum(products[run] for run in runs) for runs in members], axis=1)
         self._data = data
 
-    def gain(self, index: Sequence[int], beyond: Sequence[int]) -> float:
-        """An upper bound on what the columns ``index`` could gain beyond others that are fitted."""
-        if not self.ticks.any():
+    def chi_square(self, index: Sequence[int], beyond: Sequence[int]) -> float:
+        """The largest chi-square difference (0 without ticks) by the columns ``index`` beyond others."""
+        if not self.steps.any():
             return 0.0
         left = given(self._data, beyond)
         taken = given(self._data, []).roots(beyond)
-        own = self._products[list(index)]
-        own = own - (self._data.information[np.ix_(index, beyond)] @ taken) @ (taken.T @ self._products[list(beyond)])
-        return float(np.linalg.norm(left.roots(index).T @ own, axis=0).sum() ** 2)
+        products = self._products[list(index)]
+        products = products - (self._data.information[np.ix_(index, beyond)] @ taken) @ (
+            taken.T @ self._products[list(beyond)]
+        )
+        return float(np.linalg.norm(left.roots(index).T @ products, axis=0).sum() ** 2)
 
 
 def _quarter_ticks(run: Trajectory, poses: Array, matrix: Array, ticks: Array) -> Array:
-    """Changes (K, 3, 2N) of a run's poses (K, 3) by a quarter of a tick of each wheel, at both ends of its turn."""
+    """Changes (K, 3, 2N) of a run's poses (K, 3) by a quarter of a tick of each wheel: at its start, and its rest."""
     turning = run.rates != 0
     columns = np.zeros((len(poses), 3, 2 * len(ticks)))
     stamps, known = run.pose_times[1:], np.vstack([run.start, poses])

@@ -1,74 +1,83 @@
-"""One look at what a model leaves: everything that could explain it, what does, and what that leaves."""
+"""Screening: all that could explain what the plain matrix leaves, as whitened columns against its residuals."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit, paths_of, split_runs
-from omnibench.discover.held_out.gaps import confirmation, folds_of
-from omnibench.discover.selection.encoder_quantisation import Rounding
-from omnibench.discover.regressors.significance import Gains, gains_of
-from omnibench.discover.regressors.whitened import Whitened, given
+from omnibench.discover.held_out.cross_validation import folds_of_repetitions, is_confirmed
+from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.whitened import Given, Whitened, given
 from omnibench.discover.selection.candidate_groups import Groups, make_groups
-from omnibench.discover.selection.model_selection import Named, name_effects
+from omnibench.discover.selection.encoder_quantisation import EncoderQuantisation
 from omnibench.robot.kinematics import Array
 
-_COARSE = 0.03  # s; what is looked for varies more slowly, and the fit itself takes every sample
+_COARSE = 0.03  # s: samples are merged into longer ones, since all that is screened varies more slowly
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """What was looked at and found. data: all columns against what the plain matrix leaves; places: before any effect.
+class Screening:
+    """Columns of all candidates against the residuals of the plain matrix.
 
-    columns (K, 3, p): of every run, not whitened. folds (Z,): by which runs are held out. rounding: what the encoders'
-    ticks may have to do with it.
+    folds (Z,): by which runs are held out. quantisation: the encoders', None where it does not matter.
     """
 
     groups: Groups
-    columns: tuple[Array, ...]
     data: Whitened
     folds: NDArray[np.intp]
-    named: Named
-    places: Gains
-    rounding: Rounding
+    quantisation: EncoderQuantisation | None = None
+
+    def beyond_matrix(self) -> Given:
+        """What all columns add once the matrix is fitted."""
+        return given(self.data, self.groups.matrix.index)
+
+    def index_with(self, chosen: Sequence[Group]) -> list[int]:
+        """The columns of the matrix and of some groups."""
+        return [*self.groups.matrix.index, *(index for group in chosen for index in group.index)]
+
+    def confirms(self, others: Sequence[Group], group: Group) -> bool:
+        """True if held-out runs gain significantly by a group beyond the matrix and others."""
+        return is_confirmed(self.data, self.index_with(others), group.index, self.folds)
+
+    def quantisation_chi_square(self, group: Group, beyond: Sequence[Group] = ()) -> float:
+        """The chi-square difference that encoder quantisation could make for a group, beyond the matrix and others."""
+        if self.quantisation is None:
+            return 0.0
+        return self.quantisation.chi_square(group.index, self.index_with(beyond))
 
 
-def look_at(
-    fit: Fit, extended: Extended | None, groups: Groups | None, without: Sequence[str], rng: np.random.Generator
-) -> Look:
-    """Look at what the plain matrix leaves, with the noise, nuisances and poses of a fit.
-
-    extended: the fit with effects, whose noise is better known; their share is put back into the residuals. groups:
-    of an earlier look at the same poses.
-    """
-    if groups is None or len(groups.columns) != sum(len(own) for own in fit.residuals):
-        groups = make_groups(paths_of(fit, _COARSE), fit.runs, without)
-    residuals = fit.nuisance_free_residuals
-    if extended is not None:
-        elements = fit.model.matrix.size
-        residuals = [
-            own + columns[..., elements:] @ extended.values
-            for own, columns in zip(residuals, extended.columns, strict=True)
-        ]
-    columns = tuple(split_runs(groups.columns, fit.runs))
-    data, folds = fit.whitened(columns, residuals), folds_of(fit.runs)
-    rounding = Rounding(fit, columns)
-    named = name_effects(data, groups, confirmation(data, folds), rng)
-    if doubtful := _within_ticks(data, groups, named, rounding):
-        others = tuple(group for group in groups.effects if group.name not in doubtful)
-        named = name_effects(data, replace(groups, effects=others), confirmation(data, folds), rng)
-    places = gains_of(data, groups.matrix.index, groups.places, rng)
-    return Look(groups, columns, data, folds, named, places, rounding)
+def screen_plain(plain: Fit, without: Sequence[str]) -> Screening:
+    """Screen the residuals of the plain matrix. without: names of effects that are not to be tried."""
+    return _screened(plain, plain.nuisance_free_residuals, _groups_at(plain, without))
 
 
-def _within_ticks(data: Whitened, groups: Groups, named: Named, rounding: Rounding) -> set[str]:
-    """Names that explain no more than rounding to encoder ticks can make."""
-    beyond = groups.matrix.index
-    start = given(data, beyond)
-    chosen = (*named.chosen, *named.tentative)
-    return {group.name for group in chosen if start.gain(group.index) <= rounding.gain(group.index, beyond)}
+def screen_extended(extended: Extended, without: Sequence[str]) -> Screening:
+    """Screen with the noise, nuisances and poses of an extended model, its effects put back into the residuals."""
+    return _screened(extended.fit, extended.residuals_without_effects, _groups_at(extended.fit, without))
+
+
+def screen_again(extended: Extended, earlier: Screening, without: Sequence[str]) -> Screening:
+    """Screen as ``screen_extended``, with the columns of an earlier screening unless further poses were left out."""
+    fit = extended.fit
+    same_poses = len(earlier.groups.columns) == sum(len(residuals) for residuals in fit.residuals)
+    groups = earlier.groups if same_poses else _groups_at(fit, without)
+    return _screened(fit, extended.residuals_without_effects, groups)
+
+
+def _groups_at(fit: Fit, without: Sequence[str]) -> Groups:
+    return make_groups(paths_of(fit, _COARSE), fit.runs, without)
+
+
+def _screened(fit: Fit, residuals: Sequence[Array], groups: Groups) -> Screening:
+    columns = split_runs(groups.columns, fit.runs)
+    return Screening(
+        groups,
+        fit.whitened(columns, residuals),
+        folds_of_repetitions(fit.runs),
+        EncoderQuantisation(fit, columns),
+    )

@@ -1,4 +1,7 @@
-"""Where nothing has a name: smooth functions of what was located, kept if runs that were held out gain by them."""
+"""A smooth term where no effect has a name: functions of the covariate that the residuals depend on most surely.
+
+They are kept if held-out runs gain by them.
+"""
 
 from __future__ import annotations
 
@@ -10,122 +13,120 @@ import numpy as np
 
 from omnibench.discover.fitting.extend import Extended, columns_of, extend
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.held_out.gaps import HELD_OUT, folds_by_lot, gains_on_held_out
+from omnibench.discover.held_out.cross_validation import (
+    STANDARD_ERRORS,
+    held_out_chi_square,
+    random_folds_of_repetitions,
+)
+from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.covariate_bases import Basis
-from omnibench.discover.regressors.significance import Gains
-from omnibench.discover.regressors.whitened import given
-from omnibench.discover.selection.candidate_groups import Group
-from omnibench.discover.selection.competing_models import Rivals
-from omnibench.discover.selection.model_selection import CHANCE
-from omnibench.discover.selection.screening import Look
+from omnibench.discover.regressors.significance import Significance
+from omnibench.discover.regressors.whitened import Whitened, given
+from omnibench.discover.selection.competing_models import CompetingModels
+from omnibench.discover.selection.model_selection import CHANCE, Selection
+from omnibench.discover.selection.screening import Screening
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Array, Robot
 
-_GRID = 6  # patches of the map along each side of the area
-_MOST = 5  # bases that are put together
-_PRICE = 2.0  # chi2 that a direction of a further basis must gain; single functions are chosen more strictly
+_GRID = 6  # patches of the map along each side of the area; chosen
+_MOST = 5  # bases that are put together, at most; chosen
+_PRICE = 2.0  # chi-square difference per degree of freedom that a further basis must make, as in Akaike's criterion
 _DETERMINED = 0.01  # share of a function that must be left beyond the others, so that coefficients stay small
-_LARGEST = 3.0  # times the plausible range: a value beyond stands for something else
+_LARGEST = 3.0  # times the plausible range: a larger coefficient stands for something else; chosen
 
 
 @dataclass(frozen=True, eq=False)
-class Closed:
-    """The models with the term, or as they were, and what is to be told of it."""
+class SmoothTerm:
+    """The competing models with a smooth term, or as they were where it is left out, and a note on it."""
 
-    rivals: Rivals
+    models: CompetingModels
     note: str
 
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A model with functions, and by how much these lower the chi2 of each run (Z,) when it is held out."""
+    """A model with functions, and the chi-square difference (Z,) that they make for each run when it is held out."""
 
     terms: tuple[Group, ...]
     used: Extended
     gains: Array
 
 
-def close_without_name(plain: Fit, look: Look, rivals: Rivals) -> Closed:
-    """Add smooth functions of the surest place's covariate to all models: of what effects leave, if there are any.
+def add_smooth_term(plain: Fit, screening: Screening, selection: Selection, models: CompetingModels) -> SmoothTerm:
+    """Add smooth functions of the covariate that the residuals depend on most surely to all competing models.
 
-    Matrix, named effects and functions are fitted together. They stay only if runs that are held out gain. All are of
-    one stage, of several the one that gains most: what happens at one can be imitated at another, badly.
+    The residuals are those after the selected effects, if there are any. Matrix, named effects and functions are fitted
+    together. They stay only if held-out runs gain. All are of one stage, of several stages the one that gains most:
+    what happens at one stage can be imitated at another, badly.
     """
-    found = surest_bases(look)
-    if not found:
-        return Closed(rivals, "No smooth term was tried: nothing that is left depends on what a model could use.")
-    covariate = found[0][0].covariate
-    trials = [trial for bases in found for trial in _tried(plain, rivals.used, bases)]
+    stages = surest_bases(screening, selection)
+    if not stages:
+        return SmoothTerm(models, "No smooth term was tried: nothing that is left depends on what a model could use.")
+    covariate = stages[0][0].covariate
+    trials = [trial for bases in stages for trial in _tried(plain, models.used, bases)]
     if not trials:
-        return Closed(rivals, f"No smooth term was added: no function of the {covariate} is plainly there by itself.")
+        return SmoothTerm(
+            models, f"No smooth term was added: no function of the {covariate} is plainly there by itself."
+        )
     best = max(trials, key=lambda trial: float(trial.gains.mean()))
     details = dict.fromkeys(term.basis.detail for term in best.terms if term.basis is not None)
     what = f"a smooth term over {covariate} ({'; '.join(details)})"
     mean, error = float(best.gains.mean()), float(best.gains.std()) / np.sqrt(len(best.gains))
     gained = f"{mean:.2g} +- {error:.1g} of whitened chi2 a run"
-    if not mean > HELD_OUT * error:
-        return Closed(rivals, f"{_capital(what)} was tried and left out: on runs held out it gains {gained}.")
-    others = tuple((weight, extend(plain, [*each.groups, *best.terms])) for weight, each in rivals.models[1:])
+    if not mean > STANDARD_ERRORS * error:
+        return SmoothTerm(models, f"{_capital(what)} was tried and left out: on runs held out it gains {gained}.")
+    others = tuple((weight, extend(plain, [*model.groups, *best.terms])) for weight, model in models.models[1:])
     note = f"The extended model holds {what}, which is no name: on runs held out it gains {gained}."
-    return Closed(replace(rivals, used=best.used, models=((rivals.models[0][0], best.used), *others)), note)
+    return SmoothTerm(replace(models, used=best.used, models=((models.models[0][0], best.used), *others)), note)
 
 
 def _tried(plain: Fit, base: Extended, bases: Sequence[Basis]) -> Iterator[_Trial]:
-    """The model with functions of some bases, if any of them is plainly there."""
+    """The model with functions of some bases, if any of them gains more than its price."""
     terms = chosen_functions(base, list(_groups_of(bases, plain.model.robot)))
     if terms:
         used = extend(plain, [*base.groups, *terms])
-        yield _Trial(tuple(terms), used, _gains(used, len(base.groups)))
+        yield _Trial(tuple(terms), used, _held_out_gain(used, len(base.groups)))
 
 
-def step_name(group: Group) -> str:
-    """What a step of the waterfall is called that adds a group."""
-    return group.name if group.basis is None else f"smooth term over {group.basis.covariate} (no name)"
-
-
-def steps_of(groups: Sequence[Group]) -> list[int]:
-    """How many groups there are after each step: named effects come one by one, what has no name at once."""
-    named = sum(group.basis is None for group in groups)
-    return [*range(1, named + 1), *([len(groups)] if len(groups) > named else [])]
-
-
-def surest_bases(look: Look) -> list[list[Basis]]:
-    """Bases of the surest place's covariate that a model can use, those of each stage apart.
+def surest_bases(screening: Screening, selection: Selection) -> list[list[Basis]]:
+    """Bases of the most significant covariate that a model can use, those of each stage apart.
 
     Each gains beyond those before it.
     """
-    gains = look.named.left if look.named.chosen else look.places
-    groups = _of_surest_covariate(gains)
-    before = [*look.groups.matrix.index, *(index for group in look.named.chosen for index in group.index)]
-    price = _PRICE * max(float(np.median(gains.spread)), 1.0)
+    significance = selection.left if selection.chosen else selection.where
+    groups = _of_surest_covariate(significance)
+    before = screening.index_with(selection.chosen)
+    price = _PRICE * max(float(np.median(significance.spread)), 1.0)
     stages = dict.fromkeys(group.basis.stage for group in groups if group.basis is not None)
-    of_stages = [[each for each in groups if each.basis and each.basis.stage == stage] for stage in stages]
+    of_stages = [[group for group in groups if group.basis and group.basis.stage == stage] for stage in stages]
     return [
-        [group.basis for group in _together(look, own, before, price) if group.basis is not None] for own in of_stages
+        [group.basis for group in _together(screening.data, of_stage, before, price) if group.basis is not None]
+        for of_stage in of_stages
     ]
 
 
-def _together(look: Look, groups: Sequence[Group], before: Sequence[int], price: float) -> list[Group]:
-    """Groups that gain more than a price for each direction, one beyond the other; at least the best one."""
-    groups, fitted, found = list(groups), list(before), list[Group]()
-    while groups and len(found) < _MOST:
-        now = given(look.data, fitted)
-        beyond = [now.gain(group.index) - price * now.rank(group.index) for group in groups]
+def _together(data: Whitened, groups: Sequence[Group], before: Sequence[int], price: float) -> list[Group]:
+    """Groups that gain more than a price per degree of freedom, each beyond those before it; at least the best one."""
+    groups, fitted, chosen = list(groups), list(before), list[Group]()
+    while groups and len(chosen) < _MOST:
+        now = given(data, fitted)
+        beyond = [now.chi_square(group.index) - price * now.rank(group.index) for group in groups]
         best = groups.pop(int(np.argmax(beyond)))
-        if found and max(beyond) <= 0:
+        if chosen and max(beyond) <= 0:
             break
-        found.append(best)
+        chosen.append(best)
         fitted += best.index
-    return found
+    return chosen
 
 
-def _of_surest_covariate(gains: Gains) -> list[Group]:
-    beyond = (gains.gain - gains.rank * gains.spread) / np.sqrt(2 * np.maximum(gains.rank, 1.0)) / gains.spread
-    surest = int(np.lexsort((-beyond, -gains.evidence))[0])
-    if gains.p_value(surest) >= CHANCE:
+def _of_surest_covariate(bases: Significance) -> list[Group]:
+    """All bases of the most significant covariate that have a term; none where it may be chance."""
+    beyond = (bases.chi_square - bases.rank * bases.spread) / np.sqrt(2 * np.maximum(bases.rank, 1.0)) / bases.spread
+    surest = int(np.lexsort((-beyond, -bases.evidence))[0])
+    if bases.p_value(surest) >= CHANCE:
         return []
-    name = gains.groups[surest].name
-    return [group for group in gains.groups if group.name == name and group.basis is not None and group.basis.term]
+    name = bases.groups[surest].name
+    return [group for group in bases.groups if group.name == name and group.basis is not None and group.basis.term]
 
 
 def _groups_of(bases: Sequence[Basis], robot: Robot) -> Iterator[Group]:
@@ -140,7 +141,7 @@ def _groups_of(bases: Sequence[Basis], robot: Robot) -> Iterator[Group]:
 
 
 def _terms_of(basis: Basis) -> Iterator[tuple[str, Mapping[str, float]]]:
-    """The basis's own term, and finer ones to choose functions from as well."""
+    """The terms whose functions are candidates: the basis's own, and finer ones."""
     yield basis.term, basis.shapes
     if basis.term == "smooth_wheel_rate":
         yield "smooth_common_rate", basis.shapes
@@ -160,16 +161,16 @@ def _terms_of(basis: Basis) -> Iterator[tuple[str, Mapping[str, float]]]:
 
 
 def chosen_functions(base: Extended, groups: Sequence[Group]) -> list[Group]:
-    """Groups with those parameters alone that gain more than ln(runs) beyond matrix, effects and the others; 0 for all
-    others, and no group that has none.
+    """Groups with only those functions that gain more than ln(runs) beyond matrix, effects and each other (BIC).
 
-    One after another, those that gain most first. What the data hardly determine beyond these is no choice, nor is what
-    would need a coefficient far outside of its plausible range.
+    All other parameters are 0; groups without any function are left out. Functions are chosen one after another, the
+    largest gain first. Those that the data hardly determine beyond the chosen ones are passed over, and those that
+    would need a coefficient far outside its plausible range.
     """
     data = base.fit.whitened(columns_of(base.fit, [*base.groups, *groups]))
     owner = np.repeat(np.arange(len(groups)), [len(group.parameters) for group in groups])
-    names = [each.name for group in groups for each in group.parameters]
-    limits = _LARGEST * np.array([each.high for group in groups for each in group.parameters])
+    names = [parameter.name for group in groups for parameter in group.parameters]
+    limits = _LARGEST * np.array([parameter.high for group in groups for parameter in group.parameters])
     first = data.information.shape[0] - len(owner)
     left = given(data, range(first))
     scale = 1 / np.sqrt(np.maximum(left.total[first:], 1e-300))
@@ -187,26 +188,23 @@ def chosen_functions(base: Extended, groups: Sequence[Group]) -> list[Group]:
         column = information[:, best] / information[best, best]
         score = score - column * score[best]
         information = information - np.outer(column, information[best])
-    found = []
+    chosen = []
     for number, group in enumerate(groups):
-        own = {names[row] for row in kept if owner[row] == number}
-        parameters = tuple(each for each in group.parameters if each.name in own)
-        fixed = {each.name: 0.0 for each in group.parameters if each.name not in own}
+        names_kept = {names[row] for row in kept if owner[row] == number}
+        parameters = tuple(each for each in group.parameters if each.name in names_kept)
+        fixed = {each.name: 0.0 for each in group.parameters if each.name not in names_kept}
         if parameters:
-            found.append(replace(group, parameters=parameters, shapes=fixed | dict(group.shapes)))
-    return found
+            chosen.append(replace(group, parameters=parameters, shapes=fixed | dict(group.shapes)))
+    return chosen
 
 
-def _gains(extended: Extended, named: int) -> Array:
-    """By how much all groups after the first ``named`` lower each run's chi2 (Z,), predicted from the other folds."""
-    fit, elements = extended.fit, extended.fit.model.matrix.size
-    residuals = [
-        own + columns[..., elements:] @ extended.values
-        for own, columns in zip(fit.nuisance_free_residuals, extended.columns, strict=True)
-    ]
+def _held_out_gain(extended: Extended, named: int) -> Array:
+    """Chi-square difference (Z,) of each held-out run by all groups after the first ``named``."""
+    elements = extended.fit.model.matrix.size
     before = range(elements + sum(len(group.parameters) for group in extended.groups[:named]))
-    data = fit.whitened(extended.columns, residuals)
-    return gains_on_held_out(data, before, range(elements + len(extended.values)), folds_by_lot(fit.runs))
+    after = range(elements + len(extended.values))
+    data = extended.fit.whitened(extended.columns, extended.residuals_without_effects)
+    return held_out_chi_square(data, before, after, random_folds_of_repetitions(extended.fit.runs))
 
 
 def _capital(text: str) -> str:

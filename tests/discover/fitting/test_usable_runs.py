@@ -9,7 +9,8 @@ import pytest
 from discovery_samples import simulated
 
 from omnibench.discover.fitting.model_fit import fit_matrix
-from omnibench.discover.fitting.usable_runs import log_of, usable_runs
+from omnibench.discover.fitting.nuisances import log_of
+from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.errors import DataError
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import binomtest
 
-from omnibench.discover.regressors.significance import gains_of
+from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.significance import significance_of
 from omnibench.discover.regressors.whitened import Whitened
-from omnibench.discover.selection.candidate_groups import Group
 
-GROUPS = tuple(Group("place", f"group {start}", tuple(range(start, start + 2))) for start in range(2, 22, 2))
+GROUPS = tuple(Group("covariate", f"group {start}", tuple(range(start, start + 2))) for start in range(2, 22, 2))
 
 
 def data_of(residuals: list[np.ndarray], columns: list[np.ndarray]) -> Whitened:
@@ -32,7 +32,7 @@ def test_noise_of_any_kind_is_surprising_as_often_as_its_p_value_says() -> None:
     seen = []
     for seed in range(200):
         residuals, columns, rng = noise(seed)
-        found = gains_of(data_of(residuals, columns), [0, 1], GROUPS, rng)
+        found = significance_of(data_of(residuals, columns), [0, 1], GROUPS, rng)
         seen.append(found.p_value(found.best) < 0.1)
     assert binomtest(sum(seen), len(seen), 0.1, alternative="greater").pvalue > 1e-3
 
@@ -40,7 +40,7 @@ def test_noise_of_any_kind_is_surprising_as_often_as_its_p_value_says() -> None:
 def test_an_effect_in_every_run_is_found_in_its_group() -> None:
     residuals, columns, rng = noise(1)
     residuals = [own + each[:, 6] for own, each in zip(residuals, columns, strict=True)]
-    found = gains_of(data_of(residuals, columns), [0, 1], GROUPS, rng)
+    found = significance_of(data_of(residuals, columns), [0, 1], GROUPS, rng)
     assert found.groups[found.best].name == "group 6"
     assert found.p_value(found.best) < 1e-6
 
@@ -48,8 +48,8 @@ def test_an_effect_in_every_run_is_found_in_its_group() -> None:
 def test_one_run_that_went_wrong_is_no_effect() -> None:
     residuals, columns, rng = noise(2)
     residuals[7] = residuals[7] + 40 * columns[7][:, 6]
-    found = gains_of(data_of(residuals, columns), [0, 1], GROUPS, rng)
-    assert found.gain.max() > 100
+    found = significance_of(data_of(residuals, columns), [0, 1], GROUPS, rng)
+    assert found.chi_square.max() > 100
     assert found.p_value(found.best) > 0.01
 
 
@@ -59,6 +59,6 @@ def test_what_depends_on_few_runs_is_found_where_these_agree() -> None:
         residuals[run] = residuals[run] + 8 * columns[run][:, 6]
     for each in columns[5:]:
         each[:, 6:8] = 0.0
-    found = gains_of(data_of(residuals, columns), [0, 1], GROUPS, rng)
+    found = significance_of(data_of(residuals, columns), [0, 1], GROUPS, rng)
     assert found.groups[found.best].name == "group 6"
     assert found.p_value(found.best) < 1e-3

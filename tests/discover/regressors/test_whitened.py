@@ -30,7 +30,7 @@ def test_a_gain_is_what_least_squares_lowers_chi2_by(seed: int, count: int) -> N
         answer, *_ = np.linalg.lstsq(columns[:, index], residuals, rcond=None)
         return float(np.square(residuals - columns[:, index] @ answer).sum())
 
-    assert np.isclose(given(data, [0, 1]).gain([2, 3]), left([0, 1]) - left([0, 1, 2, 3]), rtol=1e-6, atol=1e-8)
+    assert np.isclose(given(data, [0, 1]).chi_square([2, 3]), left([0, 1]) - left([0, 1, 2, 3]), rtol=1e-6, atol=1e-8)
 
 
 @cases(seed=st.integers(0, 10**6))
@@ -69,4 +69,4 @@ def test_a_direction_that_others_make_is_no_direction() -> None:
         np.array([each.T @ own for each, own in zip(columns, data.residuals, strict=True)]),
     )
     assert given(twice, [0, 1]).rank([6]) == 0
-    assert given(twice, [0, 1]).gain([6]) == 0.0
+    assert given(twice, [0, 1]).chi_square([6]) == 0.0

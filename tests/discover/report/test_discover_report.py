@@ -13,7 +13,7 @@ import pytest
 from discovery_samples import (
     COUPLING,
     EXPERIMENT,
-    NOVELTY,
+    EXTRAPOLATION,
     held_out,
     incomplete,
     named,
@@ -178,7 +178,7 @@ def test_absorbed_effects_come_with_the_measurement_that_would_tell(report: Page
 
 def test_new_motions_are_a_warning_with_both_bounds() -> None:
     told = whole(incomplete)
-    assert f"{NOVELTY.command}: {NOVELTY.description}." in told.text
+    assert f"{EXTRAPOLATION.command}: {EXTRAPOLATION.description}." in told.text
     assert "within 41.0 mm by the plain matrix, within 152 mm by the extended model" in told.text
     assert "callout warning" in told.html
 

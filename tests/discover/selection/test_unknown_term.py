@@ -14,11 +14,13 @@ from omnibench.discover.discover import discover_effects
 from omnibench.discover.fitting.extend import Extended, extend
 from omnibench.discover.fitting.model_fit import fit_matrix
 from omnibench.discover.fitting.usable_runs import usable_runs
+from omnibench.discover.held_out.waterfall import group_counts, step_name
+from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.covariate_bases import Basis
-from omnibench.discover.selection.candidate_groups import Group
-from omnibench.discover.selection.competing_models import Rivals
-from omnibench.discover.selection.screening import Look, look_at
-from omnibench.discover.selection.unknown_term import chosen_functions, close_without_name, step_name, steps_of
+from omnibench.discover.selection.competing_models import CompetingModels
+from omnibench.discover.selection.model_selection import Selection, select_effects
+from omnibench.discover.selection.screening import Screening, screen_plain
+from omnibench.discover.selection.unknown_term import add_smooth_term, chosen_functions
 from omnibench.fit.least_squares.noise import Whitener
 from omnibench.registry import effects
 from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
@@ -138,32 +140,33 @@ def test_a_function_that_the_matrix_explains_is_not_chosen(grooved: tuple[Datase
 def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
     grooved: tuple[Dataset, Truth, Discovery],
 ) -> None:
-    bare, look = looked_at(grooved[0])
-    closed = close_without_name(bare.fit, look, with_names(bare, look, group("heading_drift")))
-    used = closed.rivals.used
+    bare, screening, selection = screened(grooved[0])
+    models = with_names(bare, selection, group("heading_drift"))
+    smooth = add_smooth_term(bare.fit, screening, selection, models)
+    used = smooth.models.used
     assert used.groups[0].name == "heading_drift"
     assert {each.name for each in used.groups[1:]} <= {"smooth_heading", "smooth_course"}
-    assert closed.rivals.models[0][1] is used
-    assert "no name" in closed.note
+    assert smooth.models.models[0][1] is used
+    assert "no name" in smooth.note
     calibrated = calibration_terms(used)
     assert calibrated["heading_drift"]["b"] == used.values[0]
 
 
 def test_nothing_is_added_to_a_model_that_leaves_nothing_of_it(grooved: tuple[Dataset, Truth, Discovery]) -> None:
-    bare, look = looked_at(grooved[0])
-    rivals = with_names(bare, look, group("smooth_heading"), group("smooth_course"))
-    closed = close_without_name(bare.fit, look, rivals)
-    assert closed.rivals is rivals
-    assert "smooth term" in closed.note
-    assert "was added" in closed.note or "left out" in closed.note
+    bare, screening, selection = screened(grooved[0])
+    models = with_names(bare, selection, group("smooth_heading"), group("smooth_course"))
+    smooth = add_smooth_term(bare.fit, screening, selection, models)
+    assert smooth.models is models
+    assert "smooth term" in smooth.note
+    assert "was added" in smooth.note or "left out" in smooth.note
 
 
 def test_named_effects_come_one_by_one_and_what_has_no_name_at_once() -> None:
     basis = Basis("place", "body", "where on the floor the robot is", np.zeros((0, 3, 0)))
     named, nameless = group("heading_drift"), replace(group("smooth_place"), basis=basis)
-    assert steps_of([named, named, nameless, nameless]) == [1, 2, 4]
-    assert steps_of([named]) == [1]
-    assert steps_of([]) == []
+    assert group_counts([named, named, nameless, nameless]) == [1, 2, 4]
+    assert group_counts([named]) == [1]
+    assert group_counts([]) == []
     assert step_name(nameless) == "smooth term over place (no name)"
 
 
@@ -173,15 +176,16 @@ def plain(dataset: Dataset) -> Extended:
     return extend(fit_matrix(runs, dataset.robot, dataset.sample_period, start), ())
 
 
-def looked_at(dataset: Dataset) -> tuple[Extended, Look]:
+def screened(dataset: Dataset) -> tuple[Extended, Screening, Selection]:
     bare = plain(dataset)
-    return bare, look_at(bare.fit, None, None, (), np.random.default_rng(0))
+    screening = screen_plain(bare.fit, ())
+    return bare, screening, select_effects(screening, np.random.default_rng(0))
 
 
-def with_names(bare: Extended, look: Look, *groups: Group) -> Rivals:
-    """A model with these effects, whatever was found."""
+def with_names(bare: Extended, selection: Selection, *groups: Group) -> CompetingModels:
+    """A model with these effects, whatever was selected."""
     used = extend(bare.fit, groups)
-    return Rivals(used, look.named, ((1.0, used),), ())
+    return CompetingModels(used, selection, ((1.0, used),), ())
 
 
 def calibration_terms(extended: Extended) -> dict[str, dict[str, float]]:

@@ -1,0 +1,121 @@
+"""Cross-validation: runs of a fit predicted from the runs of the other folds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.data.dataset import Trajectory
+from omnibench.discover.fitting.extend import Extended
+from omnibench.discover.regressors.whitened import Whitened
+from omnibench.fit.least_squares.repetitions import grouped
+from omnibench.robot.kinematics import Array
+
+_FOLDS = 5
+STANDARD_ERRORS = 2.0  # by which runs that are held out must gain; chosen
+
+
+def folds_of_repetitions(runs: Sequence[Trajectory]) -> NDArray[np.intp]:
+    """A fold (Z,) for each run: repetitions of a command go to different folds."""
+    folds = np.zeros(len(runs), dtype=np.intp)
+    for number, members in enumerate(grouped([(run.session, run.command) for run in runs])):
+        for rank, index in enumerate(members):
+            folds[index] = (rank + (number if len(members) < _FOLDS else 0)) % _FOLDS
+    return folds
+
+
+def random_folds_of_repetitions(runs: Sequence[Trajectory]) -> NDArray[np.intp]:
+    """A fold (Z,) for each run: repetitions of a command go to different folds, at random which to which.
+
+    In their order, all runs from early in a session would be held out together, and a function of the session's time
+    would be extrapolated.
+    """
+    folds, rng = folds_of_repetitions(runs), np.random.default_rng(0)
+    for members in grouped([(run.session, run.command) for run in runs]):
+        rows = list(members)
+        if len(rows) >= _FOLDS:
+            folds[rows] = rng.permutation(folds[rows])
+        else:
+            folds[rows] = (folds[rows] + rng.integers(_FOLDS)) % _FOLDS
+    return folds
+
+
+def folds_of_commands(runs: Sequence[Trajectory]) -> NDArray[np.intp]:
+    """A fold (Z,) for each run: all runs of a command go to the same one."""
+    folds = np.zeros(len(runs), dtype=np.intp)
+    for number, members in enumerate(grouped([run.command or run.id for run in runs])):
+        folds[list(members)] = number % _FOLDS
+    return folds
+
+
+def values_of_other_folds(data: Whitened, index: Sequence[int], folds: NDArray[np.intp]) -> Array:
+    """Values (Z, n) of the columns ``index``: for each run, those fitted to the runs of all folds but its own."""
+    index = list(index)
+    values = np.zeros((len(folds), len(index)))
+    of_runs = [columns[:, index] for columns in data.columns]
+    for fold in np.unique(folds):
+        train = [columns for columns, other in zip(of_runs, folds, strict=True) if other != fold]
+        stacked = np.concatenate(train) if train else np.zeros((0, len(index)))
+        target = [residuals for residuals, other in zip(data.residuals, folds, strict=True) if other != fold]
+        values[folds == fold] = _solved(stacked, target)
+    return values
+
+
+def _solved(columns: Array, residuals: Sequence[Array]) -> Array:
+    if not len(columns):
+        return np.zeros(columns.shape[1])
+    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    information = (columns / size).T @ (columns / size)
+    score = (columns / size).T @ np.concatenate(list(residuals))
+    values: Array = np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ score / size
+    return values
+
+
+def held_out_residuals(extended: Extended, folds: NDArray[np.intp]) -> list[Array]:
+    """Residuals (K, 3) of each run, to first order, by the model fitted to all folds but the run's own.
+
+    Nothing is fitted to the run itself, nor are its nuisances.
+    """
+    values = _values_of_others(extended, folds)
+    return [
+        residuals - columns @ value
+        for residuals, columns, value in zip(
+            extended.fit.nuisance_free_residuals, extended.columns, values, strict=True
+        )
+    ]
+
+
+def held_out_whitened(extended: Extended, folds: NDArray[np.intp]) -> list[Array]:
+    """Whitened residuals (k,) of each run by the model fitted to all folds but the run's own."""
+    values = _values_of_others(extended, folds)
+    return [
+        residuals - columns @ value
+        for residuals, columns, value in zip(extended.data.residuals, extended.data.columns, values, strict=True)
+    ]
+
+
+def _values_of_others(extended: Extended, folds: NDArray[np.intp]) -> Array:
+    return values_of_other_folds(extended.data, range(extended.data.information.shape[0]), folds)
+
+
+def held_out_chi_square(data: Whitened, before: Sequence[int], after: Sequence[int], folds: NDArray[np.intp]) -> Array:
+    """Chi-square difference (Z,) of each run between the columns ``before`` and ``after``, its fold held out."""
+    return _chi_square(data, before, folds) - _chi_square(data, after, folds)
+
+
+def is_confirmed(data: Whitened, before: Sequence[int], new: Sequence[int], folds: NDArray[np.intp]) -> bool:
+    """True if the columns ``new`` lower the chi-square of held-out runs beyond ``before``, by two standard errors."""
+    gains = held_out_chi_square(data, before, [*before, *new], folds)
+    return float(gains.mean()) > STANDARD_ERRORS * float(gains.std()) / np.sqrt(len(gains))
+
+
+def _chi_square(data: Whitened, index: Sequence[int], folds: NDArray[np.intp]) -> Array:
+    values = values_of_other_folds(data, index, folds)
+    return np.array(
+        [
+            float(np.square(residuals - columns[:, list(index)] @ value).sum())
+            for residuals, columns, value in zip(data.residuals, data.columns, values, strict=True)
+        ]
+    )

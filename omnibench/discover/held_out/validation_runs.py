@@ -1,0 +1,68 @@
+"""The runs of the validation split that a model can predict, and warnings about them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.discover.fitting.model_fit import Fit, at_runs
+from omnibench.discover.fitting.outliers import without_jumps
+from omnibench.discover.fitting.start_frames import in_start_frames
+from omnibench.discover.fitting.usable_runs import usable_runs
+from omnibench.robot.model import OdometryModel
+
+_LATER, _LATER_S = 1.1, 60  # times, and s more than, the latest training run: beyond it a session's time is new
+
+
+@dataclass(frozen=True, eq=False)
+class ValidationRuns:
+    """Runs of the validation split: all that the model can predict, these without poses that jump, and warnings."""
+
+    runs: tuple[Trajectory, ...]
+    kept: tuple[Trajectory, ...]
+    warnings: tuple[str, ...]
+
+
+def validation_runs(dataset: Dataset, fit: Fit) -> ValidationRuns:
+    """Runs of the validation split that hold all that the effects of a fit need; jumps are told by its residuals."""
+    recorded = [run for run in dataset.split("validation") if len(run.pose_times) > 1]
+    able = [run for run in recorded if not _lacks_inputs(fit.model, run)]
+    warnings = list(_beyond_training(fit, able))
+    if len(able) < len(recorded):
+        warnings.append(
+            f"{len(recorded) - len(able)} validation runs lack what an effect of the model needs: left out."
+        )
+    if not able:
+        return ValidationRuns((), (), tuple(warnings))
+    runs = usable_runs(able)
+    kept, jumps = without_jumps(runs, in_start_frames(runs, at_runs(fit, runs).residuals), fit.noise.noise)
+    if jumps:
+        warnings.append(f"{jumps} validation poses contradict their neighbours; chi2 is without them.")
+    return ValidationRuns(runs, kept, tuple(warnings))
+
+
+def _lacks_inputs(model: OdometryModel, run: Trajectory) -> bool:
+    """True if an effect of the model needs what was not recorded in the run."""
+    needs = {need for term in model.terms for need in term.effect.needs}
+    missing = {
+        "wheel_angles": run.angles is None,
+        "session_time": run.started_at is None,
+        "session": run.session is None,
+    }
+    return any(missing.get(need, False) for need in needs)
+
+
+def _beyond_training(fit: Fit, runs: Sequence[Trajectory]) -> Iterator[str]:
+    """Warnings of sessions, and times in a session, that effects need and that no training run covers."""
+    needs = {need: term.name for term in fit.model.terms for need in term.effect.needs}
+    known = {run.session for run in fit.runs}
+    if "session" in needs and (new := sorted({str(run.session) for run in runs} - {str(name) for name in known})):
+        yield f"{needs['session']} says nothing of sessions that were not trained on: {', '.join(new[:3])}."
+    latest = max((run.started_at or 0.0 for run in fit.runs), default=0.0)
+    late = [run.id for run in runs if (run.started_at or 0.0) > _LATER * latest + _LATER_S]
+    if "session_time" in needs and late:
+        yield (
+            f"{needs['session_time']} was fitted to the first {latest:.0f} s of a session; {len(late)} validation runs "
+            "are later, where it is not known to hold."
+        )

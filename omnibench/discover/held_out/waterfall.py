@@ -1,0 +1,61 @@
+"""The waterfall: errors on training and held-out runs, step by step as effects are added."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from omnibench.data.dataset import Trajectory
+from omnibench.discover.fitting.extend import Extended, extend
+from omnibench.discover.fitting.model_fit import Fit, at_runs
+from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.result import Step
+from omnibench.fit.least_squares.noise import Whitener
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Array
+
+
+def waterfall_steps(
+    plain: Fit, baseline: Extended, extended: Extended, validation: Sequence[Trajectory]
+) -> tuple[Step, ...]:
+    """The plain matrix (baseline), then the models with one effect more each; all under the extended model's noise.
+
+    plain: the fit that models between the first and the last are extended from.
+    """
+    models = [("plain matrix", baseline)]
+    for count in group_counts(extended.groups):
+        model = extended if count == len(extended.groups) else extend(plain, extended.groups[:count])
+        models.append((f"+ {step_name(extended.groups[count - 1])}", model))
+    return tuple(_step(name, model.fit, extended.fit.noise.noise, validation) for name, model in models)
+
+
+def group_counts(groups: Sequence[Group]) -> list[int]:
+    """The number of groups after each step: named effects come one by one, smooth terms without a name all at once."""
+    named = sum(group.basis is None for group in groups)
+    return [*range(1, named + 1), *([len(groups)] if len(groups) > named else [])]
+
+
+def step_name(group: Group) -> str:
+    """The name of the step that adds a group."""
+    return group.name if group.basis is None else f"smooth term over {group.basis.covariate} (no name)"
+
+
+def _step(name: str, fit: Fit, noise: Noise, validation: Sequence[Trajectory]) -> Step:
+    held_out = at_runs(fit, validation).residuals if validation else ()
+    return Step(
+        name,
+        _chi2(noise, fit.runs, fit.residuals),
+        _chi2(noise, validation, held_out) if held_out else None,
+        _eq6(fit.nuisance_free_residuals),
+        _eq6(held_out) if held_out else None,
+    )
+
+
+def _chi2(noise: Noise, runs: Sequence[Trajectory], residuals: Sequence[Array]) -> float:
+    white = [Whitener(noise, run.pose_times[1:])(values) for run, values in zip(runs, residuals, strict=True)]
+    return float(sum(np.square(values).sum() for values in white) / sum(values.size for values in white))
+
+
+def _eq6(residuals: Sequence[Array]) -> float:
+    return float(np.mean([np.linalg.norm(values[-1]) for values in residuals]))

@@ -1,0 +1,32 @@
+"""Groups of columns: the slopes of the poses by all parameters of an effect, or by all functions of a basis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from omnibench.discover.regressors.covariate_bases import Basis
+from omnibench.robot.effects.effect import Effect, Parameter
+
+Kind = Literal["matrix", "effect", "covariate"]
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Columns that belong together; ``index`` says which of all columns they are.
+
+    A group of an effect has its linear parameters in the columns' order, the values of its shapes, the number of shapes
+    that are tried, and ``forms``: columns by which its form could differ from the catalogue's. A group of a generic
+    basis has ``basis``.
+    """
+
+    kind: Kind
+    name: str
+    index: tuple[int, ...]
+    effect: Effect | None = None
+    parameters: tuple[Parameter, ...] = ()
+    shapes: Mapping[str, float] = field(default_factory=dict)
+    tries: int = 1
+    forms: tuple[int, ...] = ()
+    basis: Basis | None = None

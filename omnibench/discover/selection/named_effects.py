@@ -1,0 +1,100 @@
+"""Named effects: those that were selected, with 95 % intervals, probabilities and doubts; and all that were tried."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import stats
+
+from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.significance import Significance
+from omnibench.discover.result import Candidate, EstimatedParameter, NamedEffect
+from omnibench.discover.selection.competing_models import CompetingModels
+from omnibench.discover.selection.model_selection import SURE, Selection
+from omnibench.discover.selection.motor_effects import MotorEffects
+from omnibench.robot.kinematics import Array, Robot
+
+
+def named_effects(models: CompetingModels, motors: MotorEffects | None) -> tuple[NamedEffect, ...]:
+    """The effects of the model that is used, then those of the motors."""
+    used, model, runs = models.used, models.used.fit.model, len(models.used.fit.runs)
+    effects = _effects(models.selection, model.robot, used.values, used.covariance, model.matrix.size, runs)
+    effects = tuple(
+        replace(effect, in_doubt="; ".join(filter(None, (effect.in_doubt, reason))))
+        if effect.confusable_with
+        else effect
+        for effect, reason in zip(effects, models.preferred, strict=True)
+    )
+    if motors is None:
+        return effects
+    return effects + _effects(motors.selection, model.robot, motors.values, motors.covariance, 0, runs)
+
+
+def candidates_of(selection: Selection) -> tuple[tuple[Candidate, ...], ...]:
+    """The effects that were tried at each step, each in its best shape, the largest chi-square difference first."""
+    return tuple(_candidates(step, selection) for step in selection.steps)
+
+
+def _effects(
+    selection: Selection, robot: Robot, values: Array, covariance: Array, first: int, runs: int
+) -> tuple[NamedEffect, ...]:
+    """The chosen effects. first: the row of the covariance at which their parameters begin."""
+    deviations = np.sqrt(np.diag(covariance))[first:]
+    quantile = float(stats.t.ppf(0.975, max(runs - len(deviations) - first, 1)))
+    tried = {
+        group.name: (chi_square, rank)
+        for step in selection.steps[::-1]
+        for group, chi_square, rank in zip(step.groups, step.chi_square, step.rank, strict=True)
+        if group in selection.chosen
+    }
+    doubt = ""
+    if not selection.known > SURE:
+        doubt = (
+            f"generic bases still find {selection.left_share:.0%} of what was there, which a right name seldom leaves"
+        )
+    effects, row = [], 0
+    for group, confusable in zip(selection.chosen, selection.confusable, strict=True):
+        assert group.effect is not None
+        rows = slice(row, row + len(group.parameters))
+        row = rows.stop
+        weight = selection.weights.get(group.name, 0.0)
+        chi_square, rank = tried.get(group.name, (0.0, 0.0))
+        effects.append(
+            NamedEffect(
+                name=group.name,
+                stage=group.effect.stage,
+                weight=weight,
+                parameters=(*_estimates(group, values[rows], quantile * deviations[rows]), *_shapes(group, robot)),
+                confusable_with=confusable,
+                physics=group.effect.physics,
+                source=group.effect.source,
+                chi_square=float(chi_square),
+                degrees_of_freedom=int(rank),
+                in_doubt=doubt,
+                class_weight=weight + sum(selection.weights.get(name, 0.0) for name in confusable),
+            )
+        )
+    return tuple(effects)
+
+
+def _estimates(group: Group, values: Array, margins: Array) -> list[EstimatedParameter]:
+    return [
+        EstimatedParameter(parameter.name, float(value), parameter.unit, float(value - margin), float(value + margin))
+        for parameter, value, margin in zip(group.parameters, values, margins, strict=True)
+    ]
+
+
+def _shapes(group: Group, robot: Robot) -> list[EstimatedParameter]:
+    assert group.effect is not None
+    shapes = [(each, group.shapes[each.name]) for each in group.effect.parameters(robot) if each.name in group.shapes]
+    return [EstimatedParameter(each.name, value, each.unit, value, value, shape=True) for each, value in shapes]
+
+
+def _candidates(step: Significance, selection: Selection) -> tuple[Candidate, ...]:
+    best: dict[str, Candidate] = {}
+    for group, chi_square, rank in zip(step.groups, step.chi_square, step.rank, strict=True):
+        if rank and (group.name not in best or chi_square > best[group.name].chi_square):
+            weight = selection.weights.get(group.name, 0.0)
+            best[group.name] = Candidate(group.name, float(chi_square), int(rank), weight)
+    return tuple(sorted(best.values(), key=lambda candidate: -candidate.chi_square))
