@@ -4,9 +4,7 @@
 without ``from __future__ import annotations``: Typer evaluates such annotations from their text, twice.
 """
 
-from __future__ import annotations
-
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -44,15 +42,38 @@ class CommandsByFamily(TyperGroup):
                 formatter.write_dl(rows)
 
 
+def _print_version(asked: bool) -> None:
+    if not asked:
+        return
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        typer.echo(f"omnibench {version('omnibench')}")
+    except PackageNotFoundError:  # run from a folder of source files
+        typer.echo("omnibench, version unknown: it is not installed")
+    raise typer.Exit
+
+
 app = typer.Typer(
     name="omnibench",
     cls=CommandsByFamily,
-    help="Calibrate the odometry of robots on omnidirectional wheels, compare calibrators, run the result.",
+    help="Calibrate the odometry of wheeled robots, compare calibrators, find missing physics, run the result live.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     add_completion=False,
 )
+
+
+@app.callback()
+def options_of_all(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Options of omnibench itself, before any command."""
+
+
 for heading, families in FAMILIES:
     for family in families:
         for command in family.registered_commands:

@@ -1,46 +1,65 @@
-"""``calibrate``, ``evaluate``, ``certify`` and ``export``: one calibration, from the fit to other software."""
+"""``calibrate``, ``evaluate``, ``certify`` and ``export``: one calibration, from its fit to its use elsewhere."""
 
 import sys
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
-from omnibench.cli.options import Json, Plugins, Settings, load_given_plugins
+from omnibench.cli.options import (
+    CalibrationFile,
+    DatasetFolder,
+    Json,
+    Plugins,
+    Settings,
+    load_given_plugins,
+    output_option,
+)
 from omnibench.cli.terminal.console import make_console, print_json, warn
 from omnibench.errors import ConfigError
-
-if TYPE_CHECKING:
-    pass
 
 calibration_app = typer.Typer()
 
 
 @calibration_app.command()
 def calibrate(
-    dataset: Annotated[Path, typer.Argument(help="A data set folder.")],
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="The calibration file to write.")] = None,
-    calibrator: Annotated[str, typer.Option(help="See omnibench list.")] = "closed_form",
-    cost: Annotated[str, typer.Option(help="See omnibench list.")] = "final_pose",
-    parameterisation: Annotated[
-        Literal["matrix", "geometry"] | None, typer.Option(help="What is searched. Default: the calibrator's own.")
+    dataset: DatasetFolder,
+    output: Annotated[
+        Path | None, output_option("Calibration file to write; may be left out with --json.", metavar="FILE.yaml")
     ] = None,
-    box: Annotated[Literal["paper", "row"], typer.Option(help="paper: +-10 % of each element; row: wider.")] = "row",
-    integration: Annotated[Literal["euler", "arc"], typer.Option(help="Euler: the paper's step.")] = "arc",
-    seed: Annotated[int, typer.Option(min=0)] = 1,
-    evaluations: Annotated[int, typer.Option(min=1, help="Budget.")] = 60_000,
-    seconds: Annotated[float, typer.Option(min=0.001, help="Budget.")] = 600.0,
-    intervals: Annotated[bool, typer.Option("--intervals", help="Also bootstrap intervals (closed_form).")] = False,
+    calibrator: Annotated[str, typer.Option(help="How to search; omnibench list names all.")] = "closed_form",
+    cost: Annotated[str, typer.Option(help="What to minimise; omnibench list names all.")] = "final_pose",
+    parameterisation: Annotated[
+        Literal["matrix", "geometry"] | None,
+        typer.Option(help="Search the matrix elements, or the wheels' geometry. Default: the calibrator's own."),
+    ] = None,
+    box: Annotated[
+        Literal["paper", "row"],
+        typer.Option(help="Search range. paper: +-10 % of each element; row: +-25 % of the row's largest element."),
+    ] = "row",
+    integration: Annotated[
+        Literal["euler", "arc"],
+        typer.Option(help="Path within a sample. arc: exact for constant rates; euler: the paper's straight step."),
+    ] = "arc",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 1,
+    evaluations: Annotated[int, typer.Option(min=1, help="Budget: most evaluations of the cost.")] = 60_000,
+    seconds: Annotated[float, typer.Option(min=0.001, help="Budget: longest time, in s.")] = 600.0,
+    intervals: Annotated[
+        bool, typer.Option("--intervals", help="Also bootstrap 95 % intervals of the matrix (closed_form only).")
+    ] = False,
     unidentified: Annotated[
         Literal["keep", "fit"],
-        typer.Option(help="Motions that the data hardly drive: keep the design values, or fit them to slip and noise."),
+        typer.Option(help="Motions hardly driven in the data: keep their design values, or fit them all the same."),
     ] = "keep",
     settings: Settings = None,
     plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
-    """Fit the odometry model of a data set's training split and write the calibration file."""
+    """Fit a robot's odometry model and write the calibration file.
+
+    The fit uses the training split of the data set, and never its validation split.
+    """
     from omnibench.cli.terminal.calibration_tables import print_calibration
     from omnibench.cli.terminal.progress import EvaluationsBar
     from omnibench.config import parse_settings
@@ -76,9 +95,9 @@ def calibrate(
         write_calibration(calibration, output)
     warn([*recordings.warnings, *run.warnings])
     if result.at_bounds:
-        warn([f"{', '.join(result.at_bounds)} lie on a bound of the box {box!r}; a wider box may fit better"])
+        warn([f"on a bound of the box {box!r}: {', '.join(result.at_bounds)}; a wider box may fit better"])
     if result.held:
-        warn([f"{', '.join(result.held)} keep their start values (box {box!r}, cost {cost!r})"])
+        warn([f"not fitted, kept at the start value (box {box!r}, cost {cost!r}): {', '.join(result.held)}"])
     if as_json:
         return print_json(calibration)
     print_calibration(make_console(), run)
@@ -88,20 +107,23 @@ def calibrate(
 
 @calibration_app.command()
 def evaluate(
-    calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
-    dataset: Annotated[Path, typer.Argument(help="A data set folder.")],
+    calibration: CalibrationFile,
+    dataset: DatasetFolder,
     plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
-    """Cost and final errors of a calibration on a data set."""
+    """Show the cost and the errors of a calibration on a data set.
+
+    On each split: the cost, and the errors of the final pose, beside those of the robot's design values.
+    """
     from omnibench.cli.terminal.calibration_tables import print_evaluation
     from omnibench.data.storage import load_dataset
-    from omnibench.fit.evaluate import evaluate as judge
+    from omnibench.fit.evaluate import evaluate as evaluate_calibration
     from omnibench.robot.calibration import read_calibration
 
     load_given_plugins(plugins)
     recordings = load_dataset(dataset)
-    evaluation = judge(read_calibration(calibration), recordings)
+    evaluation = evaluate_calibration(read_calibration(calibration), recordings)
     warnings = [*recordings.warnings, *evaluation.warnings]
     warn(warnings)
     if as_json:
@@ -115,18 +137,25 @@ def evaluate(
 
 @calibration_app.command()
 def certify(
-    calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
-    dataset: Annotated[Path, typer.Argument(help="A data set folder.")],
+    calibration: CalibrationFile,
+    dataset: DatasetFolder,
     box: Annotated[
         Literal["paper", "row"] | None,
-        typer.Option(help="paper: +-10 % of each element; row: wider. Default: the box it was searched in, or row."),
+        typer.Option(help="Matrices to compare with; see calibrate. Default: the box of the calibration's search."),
     ] = None,
-    gap: Annotated[float, typer.Option(min=1e-9, max=0.999, help="Stop when this share of the cost is left.")] = 1e-3,
-    seconds: Annotated[float, typer.Option(min=0.0, help="Or after this time; what is proven by then holds.")] = 60.0,
+    gap: Annotated[
+        float, typer.Option(min=1e-9, max=0.999, help="Stop once at most this share of the cost could be saved.")
+    ] = 1e-3,
+    seconds: Annotated[
+        float, typer.Option(min=0.0, help="Stop after this time, in s; the bound proven by then holds.")
+    ] = 60.0,
     plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
-    """Prove how much better than a calibration any matrix of the box could be, on the training split."""
+    """Prove how far a calibration's cost is from the lowest possible.
+
+    Gives a lower bound on the cost of every matrix in the box, on the training split, whatever the optimiser.
+    """
     from omnibench.cli.terminal.calibration_tables import print_certificate
     from omnibench.cli.terminal.progress import ProofLine
     from omnibench.data.storage import load_dataset
@@ -141,7 +170,7 @@ def certify(
         )
     warn(recordings.warnings)
     if not certified.inside:
-        warn([f"the calibration is outside the box {certified.certificate.box!r}, of which the bound speaks"])
+        warn([f"the calibration is outside the box {certified.certificate.box!r}; the bound is for matrices inside it"])
     if as_json:
         return print_json(certified.certificate)
     return print_certificate(make_console(), certified)
@@ -149,14 +178,12 @@ def certify(
 
 @calibration_app.command()
 def export(
-    calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
-    to: Annotated[str, typer.Option("--to", help="ros2_controllers or c_header.")],
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="File to write; default: standard output.")
-    ] = None,
+    calibration: CalibrationFile,
+    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="ros2_controllers or c_header.")],
+    output: Annotated[Path | None, output_option("File or folder to write to. Default: standard output.")] = None,
     plugins: Plugins = None,
 ) -> None:
-    """Write a calibration for other software."""
+    """Convert a calibration for ROS 2 controllers or C programs."""
     from omnibench.files import write_text
     from omnibench.robot.calibration import read_calibration
     from omnibench.robot.export.formats import export_calibration

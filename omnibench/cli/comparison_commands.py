@@ -1,55 +1,61 @@
 """``compare``: several calibrators on equal terms."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from omnibench.cli.options import output_option
 from omnibench.cli.terminal.console import make_console, warn
 from omnibench.errors import ConfigError
-
-if TYPE_CHECKING:
-    pass
 
 comparison_app = typer.Typer()
 
 
 @comparison_app.command()
 def compare(
-    config: Annotated[Path, typer.Argument(help="A comparison in YAML.")],
+    config: Annotated[Path, typer.Argument(help="Comparison config (YAML).")],
     output: Annotated[
-        Path | None, typer.Option("--output", help="Folder for results; runs that are there are kept.")
+        Path | None,
+        output_option("Folder for the results; finished runs in it are kept. Default: results/NAME/TIME."),
     ] = None,
     data: Annotated[
-        list[str] | None, typer.Option("--data", metavar="[NAME=]PATH", help="Where the data (set NAME) is.")
+        list[str] | None,
+        typer.Option(
+            "--data", metavar="[NAME=]PATH", help="Where the recordings of the config's data set NAME are on this disk."
+        ),
     ] = None,
     plugins: Annotated[
-        list[Path] | None, typer.Option("--plugins", help="Folder of plug-ins besides the config's; may be repeated.")
+        list[Path] | None,
+        typer.Option("--plugins", metavar="DIR", help="Folder of plug-ins besides the config's; may be repeated."),
     ] = None,
 ) -> None:
-    """Run every calibrator of a config on the same data and budget; score them and write a report."""
+    """Run calibrators on equal terms, score them, write a report.
+
+    All calibrators of the config get the same data and the same budget. Run again with the same --output, it goes on
+    where it was stopped.
+    """
     from omnibench.cli.terminal.comparison_tables import print_result
     from omnibench.cli.terminal.progress import Bars, Lines
     from omnibench.compare.read_config import read_compare_config
     from omnibench.compare.run import run_comparison
 
-    chosen = read_compare_config(config, _named_paths(data))
-    folders = [*chosen.plugins, *(folder.resolve() for folder in plugins or [])]
-    chosen = chosen.model_copy(update={"plugins": tuple(dict.fromkeys(folders))})
+    comparison = read_compare_config(config, _named_paths(data))
+    folders = [*comparison.plugins, *(folder.resolve() for folder in plugins or [])]
+    comparison = comparison.model_copy(update={"plugins": tuple(dict.fromkeys(folders))})
     console = make_console(error=True)
     watch: Bars | Lines = Bars(console) if console.is_terminal else Lines(console)
     with watch:
-        result = run_comparison(chosen, output, watch)
+        result = run_comparison(comparison, output, watch)
     warn(result.warnings)
-    out = make_console()
-    print_result(out, result)
-    out.print(f"report: {result.output / 'report.html'}", highlight=False, soft_wrap=True)
+    print_result(make_console(), result)
+    typer.echo(f"report: {result.output / 'report.html'}")
     if all(run.matrix is None for run in result.runs):
         raise typer.Exit(1)
 
 
 def _named_paths(data: list[str] | None) -> dict[str, Path]:
-    """``[NAME=]PATH`` pairs; a path that exists as it stands needs no name."""
+    """Paths by the names of data sets, from ``[NAME=]PATH``; a path without a name stands under an empty one."""
     paths = {}
     for item in data or []:
         name, equals, location = item.partition("=")

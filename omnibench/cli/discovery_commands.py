@@ -1,43 +1,42 @@
-"""``discover``: what the model lacks."""
+"""``discover``: what the odometry model lacks."""
 
 import sys
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from omnibench.cli.options import Json, Plugins, load_given_plugins
+from omnibench.cli.options import DatasetFolder, Json, Plugins, load_given_plugins, output_option
 from omnibench.cli.terminal.console import make_console, print_json, warn
-
-if TYPE_CHECKING:
-    pass
 
 discovery_app = typer.Typer()
 
 
 @discovery_app.command()
 def discover(
-    dataset: Annotated[Path, typer.Argument(help="A data set folder.")],
+    dataset: DatasetFolder,
     model: Annotated[
         Path | None,
         typer.Option("--model", metavar="CALIBRATION", help="Start from this calibration. Default: fit a matrix."),
     ] = None,
-    output: Annotated[
-        Path | None, typer.Option("--output", help="Folder for results. Default: results/NAME/TIME, and a link latest.")
-    ] = None,
+    output: Annotated[Path | None, output_option("Folder for the results. Default: results/NAME/TIME.")] = None,
     without: Annotated[
-        list[str] | None, typer.Option("--without", metavar="NAME", help="An effect not to try; may be repeated.")
+        list[str] | None, typer.Option("--without", metavar="NAME", help="Effect not to try; may be repeated.")
     ] = None,
     unknown_term: Annotated[
         bool,
-        typer.Option("--unknown-term", help="Where nothing in the catalogue fits: close the gap by a smooth function."),
+        typer.Option("--unknown-term", help="If no known effect fits, close the gap with a smooth function instead."),
     ] = False,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,
     plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
-    """Find where odometry and reference disagree, name the missing effect, add it, show how much better that is."""
+    """Find and name the physics that a robot's model lacks.
+
+    Shows where odometry and reference disagree, names the effect that explains it, adds it to the calibration, and
+    tells how much smaller the error becomes on runs that were held out.
+    """
     from omnibench.cli.terminal.discovery_summary import print_discovery
     from omnibench.cli.terminal.progress import Stages
     from omnibench.data.storage import load_dataset
@@ -54,7 +53,7 @@ def discover(
     start = None if model is None else read_calibration(model)
     recordings = load_dataset(dataset)
     with redirect_stdout(sys.stderr), Stages(make_console(error=True)) as watch:
-        found = discover_effects(
+        discovery = discover_effects(
             recordings,
             without=tuple(without or ()),
             unknown_term=unknown_term,
@@ -71,8 +70,8 @@ def discover(
             seed=seed,
             plugins=tuple(map(str, plugins or ())),
         )
-        folder = write_discovery(found, options, output)
+        folder = write_discovery(discovery, options, output)
     warn(recordings.warnings)
     if as_json:
-        return print_json(discovery_document(found, folder))
-    return print_discovery(make_console(), found, folder)
+        return print_json(discovery_document(discovery, folder))
+    return print_discovery(make_console(), discovery, folder)

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from omnibench.cli.options import output_option
 from omnibench.errors import ConfigError
 
 guide_app = typer.Typer()
@@ -32,9 +33,12 @@ def guide(
 @guide_app.command()
 def example(
     name: Annotated[str | None, typer.Argument(help="One of the list that is shown without it.")] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder to write to.")] = None,
+    output: Annotated[Path | None, output_option("Folder to write to.", metavar="DIR")] = None,
 ) -> None:
-    """Write a config, with what it needs, or a small recording to begin with; or list the examples."""
+    """Write an example to begin with, or list the examples.
+
+    An example is a config with all that it needs, or a small recording.
+    """
     from omnibench.cli.examples import find_example, write_example
 
     if name is None:

@@ -1,4 +1,4 @@
-"""The commands of the live runtime: parse, call, print."""
+"""The commands of the live runtime: the node, and the programs that work with a running one."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from omnibench.cli.options import Plugins, load_given_plugins, plugin_folders
+from omnibench.cli.options import Plugins, load_given_plugins, output_option, plugin_folders
 from omnibench.cli.terminal.console import make_console
 from omnibench.errors import ConfigError
 
@@ -15,30 +15,41 @@ if TYPE_CHECKING:
     from omnibench.live.config import LiveConfig
 
 live_app = typer.Typer()
-_LISTENING = 0.2  # s
+_LISTENING = 0.2  # s between two looks at whether a signal came; chosen
 
 ConfigOption = Annotated[
-    Path | None, typer.Option("--config", help="YAML with zenoh, profile and domain; or the node's own config.")
+    Path | None,
+    typer.Option("--config", help="How to reach the node: YAML with zenoh, profile, domain; or the node's own config."),
 ]
-Connect = Annotated[str | None, typer.Option("--connect", help="Endpoint of a node, as tcp/127.0.0.1:7447.")]
-ProfileOption = Annotated[Literal["plain", "rmw", "humble"] | None, typer.Option(help="How topics are keys.")]
-Seconds = Annotated[float | None, typer.Option(min=0.0, help="Stop after so long. Default: on Ctrl-C.")]
+Connect = Annotated[str | None, typer.Option("--connect", help="Endpoint of the node, for example tcp/127.0.0.1:7447.")]
+ProfileOption = Annotated[
+    Literal["plain", "rmw", "humble"] | None,
+    typer.Option(help="How topics are named: plain Zenoh, ROS 2's rmw_zenoh, or that of Humble. Default: plain."),
+]
+Seconds = Annotated[float | None, typer.Option(min=0.0, help="Stop after this time, in s. Default: on Ctrl-C.")]
 
 
 @live_app.command()
 def live(
-    config: Annotated[Path, typer.Argument(help="A node in YAML.")],
+    config: Annotated[Path, typer.Argument(help="Config of the node (YAML).")],
     dataset: Annotated[
         Path | None,
-        typer.Argument(help="With --replay: a data set, or a config with a simulated one. Default: the config's."),
+        typer.Argument(help="With --replay: data set folder, or config with a simulated one. Default: as in CONFIG."),
     ] = None,
-    replay: Annotated[bool, typer.Option("--replay", help="Play a recording to the node; then judge and end.")] = False,
-    speed: Annotated[str | None, typer.Option(help="Of the replay: 1, 10, max. Default: the config's.")] = None,
-    foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve Foxglove's WebSocket on loopback.")] = False,
+    replay: Annotated[
+        bool, typer.Option("--replay", help="Play a recording to the node, show its errors, and end.")
+    ] = False,
+    speed: Annotated[
+        str | None, typer.Option(help="Speed of the replay: 1, 10, ... or max. Default: as in CONFIG.")
+    ] = None,
+    foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve Foxglove's WebSocket on this computer.")] = False,
     seconds: Seconds = None,
     plugins: Plugins = None,
 ) -> None:
-    """Run the node: wheel samples in, calibrated odometry out, over Zenoh."""
+    """Run the node: wheel samples in, odometry out, over Zenoh.
+
+    With --replay it needs no robot: a recording is played to the node.
+    """
     from omnibench.live.config import read_live_config
 
     if replay and config.is_dir() and dataset is not None:  # --replay DATASET before CONFIG
@@ -49,21 +60,24 @@ def live(
         chosen = chosen.model_copy(update={"foxglove": True})
     if not replay:
         if dataset is not None or speed is not None:
-            raise ConfigError(f"{dataset or '--speed'}: is for a replay; say --replay, too")
+            raise ConfigError(f"{dataset or '--speed'}: is for a replay only; add --replay")
         return _run(chosen, seconds)
     return _replay_to_node(chosen, dataset, speed, config)
 
 
 @live_app.command()
 def replay(
-    dataset: Annotated[Path, typer.Argument(help="A data set, or a config with a simulated one.")],
-    robot: Annotated[str, typer.Option(help="As whom it is played.")] = "robot",
-    speed: Annotated[str, typer.Option(help="1: as it was; 10: ten times as fast; max.")] = "1",
+    dataset: Annotated[Path, typer.Argument(help="Data set folder, or config with a simulated one.")],
+    robot: Annotated[str, typer.Option(help="Name of the robot that is played.")] = "robot",
+    speed: Annotated[str, typer.Option(help="1: as recorded; 10: ten times as fast; max: as fast as can be.")] = "1",
     settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="As under replay in a node's config.")
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="Set what a node's config holds under replay; may be repeated."
+        ),
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="Whose noise model says how sure the SLAM poses are.")
+        Path | None, typer.Option(help="Calibration whose noise model gives the covariance of the SLAM poses.")
     ] = None,
     config: ConfigOption = None,
     connect: Connect = None,
@@ -101,12 +115,12 @@ def replay(
 
 @live_app.command()
 def listen(
-    robot: Annotated[str | None, typer.Argument(help="Default: all that are there.")] = None,
+    robot: Annotated[str | None, typer.Argument(help="Name of the robot. Default: all that are heard.")] = None,
     config: ConfigOption = None,
     connect: Connect = None,
     profile: ProfileOption = None,
     seconds: Seconds = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document a line, once a second.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document a line, once a second.")] = False,
 ) -> None:
     """Show a robot's odometry live: pose, rate, age, health."""
     from omnibench.cli.terminal.robot_table import listen as show
@@ -118,13 +132,16 @@ def listen(
 
 @live_app.command()
 def swap(
-    robot: Annotated[str, typer.Argument(help="Whose calibration.")],
-    calibration: Annotated[Path, typer.Argument(help="The calibration file that is to run.")],
+    robot: Annotated[str, typer.Argument(help="Name of the robot.")],
+    calibration: Annotated[Path, typer.Argument(help="Calibration file to run from now on.")],
     config: ConfigOption = None,
     connect: Connect = None,
     plugins: Plugins = None,
 ) -> None:
-    """Give a running node another calibration: it runs from the next sample on, and odom does not jump."""
+    """Give a running node another calibration, without a jump.
+
+    It holds from the next wheel sample on; the odometry goes on from where it is.
+    """
     from omnibench.live.control.swap import swap_calibration
 
     load_given_plugins(plugins)
@@ -132,20 +149,25 @@ def swap(
         swapped = swap_calibration(session, robot, calibration)
     typer.echo(f"{robot}: {swapped.calibration} runs")
     if not swapped.kept:
-        typer.echo(f"warning: a node that starts again begins with the old one: {swapped.reason}", err=True)
+        typer.echo(f"warning: after a restart the node begins with the old calibration: {swapped.reason}", err=True)
 
 
 @live_app.command()
 def record(
-    robots: Annotated[list[str], typer.Argument(metavar="ROBOT...|CONFIG", help="Whose topics.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="The MCAP file to write.")],
+    robots: Annotated[
+        list[str],
+        typer.Argument(metavar="ROBOT...|CONFIG", help="Names of robots, or a node's config: all of its robots."),
+    ],
+    output: Annotated[Path, output_option("MCAP file to write.", metavar="FILE.mcap")],
     config: ConfigOption = None,
     connect: Connect = None,
     profile: ProfileOption = None,
     seconds: Seconds = None,
-    topics: Annotated[list[str] | None, typer.Option("--topic", help="Only this; may be repeated.")] = None,
+    topics: Annotated[
+        list[str] | None, typer.Option("--topic", help="Record only this topic; may be repeated. Default: all.")
+    ] = None,
 ) -> None:
-    """Record live topics into MCAP, which Foxglove and rosbags open."""
+    """Record live topics into MCAP, for Foxglove and rosbags."""
     from omnibench.cli.terminal.recording_status import record as write
     from omnibench.live.config import read_live_config
     from omnibench.live.stopping import stop_on_signals
@@ -160,14 +182,19 @@ def record(
 
 @live_app.command()
 def keys(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where they go.")],
-    names: Annotated[list[str] | None, typer.Argument(help="One certificate each. Default: node, client.")] = None,
-    hosts: Annotated[list[str] | None, typer.Option("--host", help="Where the node runs; may be repeated.")] = None,
-    days: Annotated[int, typer.Option(min=1, help="How long they are valid.")] = 365,
-    users: Annotated[bool, typer.Option("--users", help="Passwords, too, and users.txt for the node.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there, the CA too.")] = False,
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write to.")],
+    names: Annotated[list[str] | None, typer.Argument(help="Who gets a certificate. Default: node and client.")] = None,
+    hosts: Annotated[
+        list[str] | None,
+        typer.Option("--host", help="Name or address of the computer that the node runs on; may be repeated."),
+    ] = None,
+    days: Annotated[int, typer.Option(min=1, help="Validity, in days.")] = 365,
+    users: Annotated[bool, typer.Option("--users", help="Also make passwords, and a users.txt for the node.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace files that exist, the authority (CA) too.")
+    ] = False,
 ) -> None:
-    """Make a test CA and certificates for mTLS."""
+    """Make a test authority (CA) and certificates for mutual TLS."""
     from omnibench.live.network.keys import make_keys
 
     chosen = names or ["node", "client"]

@@ -1,4 +1,4 @@
-"""Options that several commands share."""
+"""Options and arguments that several commands share, and the plug-ins that ``--plugins`` names."""
 
 from __future__ import annotations
 
@@ -14,34 +14,41 @@ if TYPE_CHECKING:
     from omnibench.registry import PluginFailure
 
 
-def output_option(text: str) -> Any:
-    """``-o`` and ``--output``, which mean the same on every command that writes something."""
-    return typer.Option("-o", "--output", help=text)
+def output_option(text: str, **settings: Any) -> Any:
+    """``-o`` and ``--output``: the same two spellings for every command that writes files."""
+    return typer.Option("-o", "--output", help=text, **settings)
 
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+DatasetFolder = Annotated[Path, typer.Argument(help="Data set folder.")]
+CalibrationFile = Annotated[Path, typer.Argument(help="Calibration file.")]
+WhichDataset = Annotated[str | None, typer.Option(help="Name of the data set, if the config has several.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output, and nothing else.")]
 Settings = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="An option, value in YAML; may be repeated.")
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Set an option, its value in YAML; may be repeated."),
 ]
-TableFormat = Annotated[Literal["parquet", "csv"], typer.Option("--format", help="Format of the tables.")]
+TableFormat = Annotated[Literal["parquet", "csv"], typer.Option("--format", help="Format of the data set's tables.")]
 Plugins = Annotated[
     list[Path] | None,
-    typer.Option("--plugins", help="Folder of plug-ins; may be repeated. Default: ./plugins, if it is there."),
+    typer.Option("--plugins", metavar="DIR", help="Folder of plug-ins; may be repeated. Default: ./plugins, if any."),
 ]
 
 
 def plugin_folders(given: Sequence[Path] | None) -> list[Path]:
-    """The folders that were given, or else the default, if it is there."""
+    """The folders that were given; by default ./plugins, if it exists."""
     if given:
         return list(given)
     return [Path("plugins")] if given is None and Path("plugins").is_dir() else []
 
 
 def load_given_plugins(given: Sequence[Path] | None) -> list[PluginFailure]:
-    """Load their plug-ins; one that cannot be imported is a warning on standard error. PluginError: no such folder."""
+    """Load the plug-ins of the given folders, or of the default one, and warn on standard error of those that fail.
+
+    PluginError: a folder does not exist.
+    """
     from omnibench.registry import load_plugins
 
-    with redirect_stdout(sys.stderr):  # what a plug-in prints is not our output
+    with redirect_stdout(sys.stderr):  # a plug-in that prints must not spoil our output
         failures = load_plugins(plugin_folders(given))
     for failure in failures:
         typer.echo(f"warning: plug-in {failure.origin} cannot be imported: {failure.error}", err=True)

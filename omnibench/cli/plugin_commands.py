@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 plugin_app = typer.Typer()
-_plugin = typer.Typer(help="Write a plug-in, or check one.", no_args_is_help=True, rich_markup_mode=None)
+_plugin = typer.Typer(help="Write a new plug-in, or check one.", no_args_is_help=True, rich_markup_mode=None)
 plugin_app.add_typer(_plugin, name="plugin")
 
 # Where the config of each command is: module and class.
@@ -29,7 +29,10 @@ _CONFIGS = {
 
 @plugin_app.command("list")
 def list_(plugins: Plugins = None, as_json: Json = False) -> None:
-    """Calibrators, effects, costs and importers, and where each comes from."""
+    """List calibrators, costs, effects and importers.
+
+    Each with where it comes from: built in, a plug-in's file, or an installed package.
+    """
     from omnibench.cli.terminal.registry_tables import print_registries, registry_document
 
     failures = load_given_plugins(plugins)
@@ -41,10 +44,10 @@ def list_(plugins: Plugins = None, as_json: Json = False) -> None:
 @plugin_app.command()
 def schema(
     kind: Annotated[
-        Literal["compare", "design", "live", "simulate"], typer.Argument(help="Configs of which command.")
+        Literal["compare", "design", "live", "simulate"], typer.Argument(help="Which command's config.")
     ] = "compare",
 ) -> None:
-    """JSON schema of the configs, for editors."""
+    """Print the JSON schema of a config, for editors."""
     module, name = _CONFIGS[kind]
     config: type[BaseModel] = getattr(import_module(module), name)
     print_json(config.model_json_schema(by_alias=True))
@@ -52,10 +55,14 @@ def schema(
 
 @_plugin.command("new")
 def plugin_new(
-    name: Annotated[str, typer.Argument(help="Its name in configs.")],
-    kind: Annotated[str | None, typer.Option(help="calibrator (the default), importer, cost or effect.")] = None,
-    effect: Annotated[bool, typer.Option("--effect", help="The same as --kind effect.")] = False,
-    folder: Annotated[Path, typer.Option(help="Where it goes.")] = Path("plugins"),
+    name: Annotated[str, typer.Argument(help="Name of the plug-in in configs.")],
+    kind: Annotated[
+        str | None, typer.Option(metavar="KIND", help="calibrator, importer, cost or effect. Default: calibrator.")
+    ] = None,
+    effect: Annotated[bool, typer.Option("--effect", help="Short for --kind effect.")] = False,
+    folder: Annotated[
+        Path, typer.Option("--folder", "-o", "--output", metavar="DIR", help="Folder to write to.")
+    ] = Path("plugins"),
 ) -> None:
     """Write a working plug-in and its test."""
     from omnibench.testing.plugin_files import new_plugin
@@ -69,10 +76,13 @@ def plugin_new(
 
 @_plugin.command("check")
 def plugin_check(
-    file: Annotated[Path, typer.Argument(help="A plug-in file.")],
-    sample: Annotated[Path | None, typer.Option(help="Recordings for an importer to read.")] = None,
+    file: Annotated[Path, typer.Argument(help="Plug-in file.")],
+    sample: Annotated[Path | None, typer.Option(help="Sample recordings for an importer to read.")] = None,
 ) -> None:
-    """Run the conformance tests on a plug-in; exit code 1 when one fails."""
+    """Run the conformance tests on a plug-in.
+
+    The exit code is 1 if a test fails.
+    """
     from omnibench.testing.plugin_files import check_plugin
 
     report = check_plugin(file, sample)

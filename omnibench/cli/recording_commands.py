@@ -1,30 +1,42 @@
 """``import``, ``inspect``, ``design``, ``simulate`` and ``slam``: recordings, and what to record."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
-from omnibench.cli.options import Json, Plugins, Settings, TableFormat, load_given_plugins
+from omnibench.cli.options import (
+    DatasetFolder,
+    Json,
+    Plugins,
+    Settings,
+    TableFormat,
+    WhichDataset,
+    load_given_plugins,
+    output_option,
+)
 from omnibench.cli.terminal.console import make_console, print_json, warn
 from omnibench.errors import ConfigError
-
-if TYPE_CHECKING:
-    pass
+from omnibench.report.numbers import plural
 
 recording_app = typer.Typer()
 
 
 @recording_app.command("import")
 def import_(
-    importer: Annotated[str, typer.Argument(metavar="FORMAT", help="See omnibench list.")],
-    source: Annotated[Path, typer.Argument(help="File or folder of recordings.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="The data set folder to write.")],
+    importer: Annotated[
+        str, typer.Argument(metavar="FORMAT", help="Format of the recordings; omnibench list names all.")
+    ],
+    source: Annotated[Path, typer.Argument(help="File or folder with the recordings.")],
+    output: Annotated[Path, output_option("Data set folder to write.")],
     settings: Settings = None,
     table_format: TableFormat = "parquet",
     plugins: Plugins = None,
 ) -> None:
-    """Turn recordings into a data set."""
+    """Convert recordings into a data set.
+
+    Recordings with laser scans but without reference poses get these by SLAM.
+    """
     from omnibench.config import parse_settings
     from omnibench.data.storage import save_dataset
     from omnibench.registry import importers
@@ -35,43 +47,54 @@ def import_(
     dataset = import_dataset(importer, source, parse_settings(settings))
     save_dataset(dataset, output, table_format)
     warn(dataset.warnings)
-    typer.echo(f"{len(dataset.trajectories)} trajectories: {output}")
+    typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {output}")
 
 
 @recording_app.command()
-def inspect(dataset: Annotated[Path, typer.Argument(help="A data set folder.")], as_json: Json = False) -> None:
-    """What is in a data set, and what can be identified from it."""
+def inspect(dataset: DatasetFolder, as_json: Json = False) -> None:
+    """Show what a data set holds, and what can be identified from it."""
     from omnibench.cli.terminal.inspection_tables import print_inspection
     from omnibench.data.storage import load_dataset
     from omnibench.fit.inspect import inspect_dataset
 
-    found = inspect_dataset(load_dataset(dataset))
+    inspection = inspect_dataset(load_dataset(dataset))
     if as_json:
-        return print_json(found)
-    print_inspection(make_console(), found)
-    return warn(found.warnings)
+        return print_json(inspection)
+    print_inspection(make_console(), inspection)
+    return warn(inspection.warnings)
 
 
 @recording_app.command()
 def design(
     source: Annotated[
-        Path, typer.Argument(metavar="DATASET|CONFIG", help="A data set folder, or a comparison's or design's YAML.")
+        Path, typer.Argument(metavar="DATASET|CONFIG", help="Data set folder, or config of a comparison or a design.")
     ],
     use: Annotated[
-        Literal["trajectory", "final"], typer.Option(help="Reference poses that a calibration is made from.")
+        Literal["trajectory", "final"],
+        typer.Option(help="Reference poses to calibrate from: all of a run's, or only its final one."),
     ] = "trajectory",
-    per: Annotated[Literal["run", "second", "metre"], typer.Option(help="What is to be spared.")] = "run",
-    runs: Annotated[int | None, typer.Option(min=1, help="Choose so many. Default: within 1 % of the optimum.")] = None,
-    repetitions: Annotated[int | None, typer.Option(min=1, help="How often a command may be chosen.")] = None,
-    dataset: Annotated[str | None, typer.Option(help="Which data set, if the config has several.")] = None,
-    integration: Annotated[
-        Literal["euler", "arc"] | None, typer.Option(help="Default: the config's, or arc for a data set.")
+    per: Annotated[
+        Literal["run", "second", "metre"], typer.Option(help="Effort to keep small: runs, time or distance.")
+    ] = "run",
+    runs: Annotated[
+        int | None, typer.Option(min=1, help="Runs to choose. Default: the fewest within 1 % of the optimum.")
     ] = None,
-    output: Annotated[Path | None, typer.Option("--output", help="Folder for report.html and design.json.")] = None,
+    repetitions: Annotated[int | None, typer.Option(min=1, help="How often a command may be chosen at most.")] = None,
+    dataset: WhichDataset = None,
+    integration: Annotated[
+        Literal["euler", "arc"] | None,
+        typer.Option(help="Path within a sample; see calibrate. Default: the config's, or arc for a data set."),
+    ] = None,
+    output: Annotated[
+        Path | None, output_option("Folder for report.html and design.json. Default: nothing is written.")
+    ] = None,
     plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
-    """Which commands are worth driving: the runs that shrink the covariance of the matrix most."""
+    """Choose the motion commands that are most worth driving.
+
+    These are the runs from which the matrix would be calibrated most precisely (D-optimal design).
+    """
     from omnibench.cli.terminal.design_summary import print_design
     from omnibench.config import to_json
     from omnibench.design.design import design_experiment
@@ -79,15 +102,15 @@ def design(
     from omnibench.files import write_text
 
     load_given_plugins(plugins)
-    found = design_experiment(
+    chosen = design_experiment(
         source, use=use, per=per, runs=runs, repetitions=repetitions, dataset=dataset, integration=integration
     )
     if output is not None:
-        write_text(output / "design.json", to_json(found) + "\n")
-        write_design_report(found, output / "report.html")
+        write_text(output / "design.json", to_json(chosen) + "\n")
+        write_design_report(chosen, output / "report.html")
     if as_json:
-        return print_json(found)
-    print_design(make_console(), found)
+        return print_json(chosen)
+    print_design(make_console(), chosen)
     if output is not None:
         typer.echo(f"report: {output / 'report.html'}")
     return None
@@ -95,31 +118,35 @@ def design(
 
 @recording_app.command()
 def slam(
-    dataset: Annotated[Path, typer.Argument(help="A data set folder with scans.")],
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="The data set folder to write, with the new poses.")
-    ] = None,
+    dataset: Annotated[Path, typer.Argument(help="Data set folder with laser scans.")],
+    output: Annotated[Path | None, output_option("Data set folder to write, with the new poses.")] = None,
     start: Annotated[
-        Literal["odometry", "last_pose"] | None, typer.Option(help="Where the search begins. Default: odometry.")
+        Literal["odometry", "last_pose"] | None,
+        typer.Option(help="First guess of each scan's pose. Default: odometry."),
     ] = None,
     no_deskew: Annotated[
-        bool, typer.Option("--no-deskew", help="Take each scan as seen from one pose, as if the robot stood.")
+        bool, typer.Option("--no-deskew", help="Leave out the correction for the robot's motion during a scan.")
     ] = False,
     model: Annotated[
-        Path | None, typer.Option(metavar="CALIBRATION", help="Odometry to start from. Default: the design values.")
+        Path | None,
+        typer.Option(metavar="CALIBRATION", help="Calibration for that odometry. Default: the design values."),
     ] = None,
     truth: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="What simulate --truth wrote: judge the poses by it.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder that simulate --truth wrote: show the errors against it."),
     ] = None,
     report: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="Pictures of the scans, the paths and the wheels.")
+        Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of scans, paths and wheels.")
     ] = None,
     settings: Settings = None,
     table_format: TableFormat = "parquet",
     plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
-    """Reference poses from the recorded scans of a data set, by scan matching against a growing map."""
+    """Compute reference poses from the laser scans of a data set.
+
+    Each scan is matched against a map that grows from scan to scan.
+    """
     from omnibench.cli.terminal.progress import Steps
     from omnibench.cli.terminal.slam_summary import print_slam
     from omnibench.config import parse_settings, validate
@@ -136,16 +163,16 @@ def slam(
     if output is None and report is None and not as_json:
         raise ConfigError("say where the poses go: -o DATASET; or ask for figures alone: --json, --report FILE.html")
     with Steps(make_console(error=True)) as watch:
-        found = request.run(watch, table_format)
+        result = request.run(watch, table_format)
         if report is not None:
             watch("writing the report", 0, 1)
-            write_recording_report(found.dataset, report, truth=found.truth, accuracy=found.accuracy)
+            write_recording_report(result.dataset, report, truth=result.truth, accuracy=result.accuracy)
             watch("writing the report", 1, 1)
-    warn(found.summary.warnings)
+    warn(result.summary.warnings)
     if as_json:
-        return print_json(found.summary)
-    print_slam(make_console(), found.summary)
-    for what, file in (("report", report), (f"{found.summary.runs} trajectories", output)):
+        return print_json(result.summary)
+    print_slam(make_console(), result.summary)
+    for what, file in (("report", report), (plural(result.summary.runs, "trajectory"), output)):
         if file is not None:
             typer.echo(f"{what}: {file}")
     return None
@@ -153,29 +180,38 @@ def slam(
 
 @recording_app.command()
 def simulate(
-    output: Annotated[Path, typer.Option("-o", "--output", help="The data set folder to write.")],
-    config: Annotated[Path | None, typer.Argument(help="A config with a simulated data set.")] = None,
-    truth: Annotated[Path | None, typer.Option(help="Folder for what is hidden: the true matrix, effects.")] = None,
-    dataset: Annotated[str | None, typer.Option(help="Which data set, if the config has several.")] = None,
+    output: Annotated[Path, output_option("Data set folder to write.")],
+    config: Annotated[Path | None, typer.Argument(help="Config with a simulated data set.")] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder for the truth: matrix, effects, true poses. Default: not written."),
+    ] = None,
+    dataset: WhichDataset = None,
     effects: Annotated[
         list[str] | None,
-        typer.Option("--effect", metavar="YAML", help="Hide it, too: 'name: {parameter: value}'; may be repeated."),
+        typer.Option("--effect", metavar="YAML", help="Add an effect, 'name: {parameter: value}'; may be repeated."),
     ] = None,
     like: Annotated[
-        Path | None, typer.Option(metavar="DATASET", help="In place of CONFIG: drive its recorded wheels again.")
+        Path | None,
+        typer.Option(metavar="DATASET", help="Instead of CONFIG: drive this data set's recorded wheel rates."),
     ] = None,
     model: Annotated[
-        Path | None, typer.Option(metavar="CALIBRATION", help="With --like: by the model of this calibration.")
+        Path | None, typer.Option(metavar="CALIBRATION", help="With --like: the true model, a calibration file.")
     ] = None,
-    noise: Annotated[bool, typer.Option("--noise", help="With --like: add the calibration's noise.")] = False,
-    seed: Annotated[int | None, typer.Option(min=0, help="With --noise. Default: 0.")] = None,
+    noise: Annotated[
+        bool, typer.Option("--noise", help="With --like: add the noise that the calibration states.")
+    ] = False,
+    seed: Annotated[int | None, typer.Option(min=0, help="With --noise: its seed. Default: 0.")] = None,
     table_format: TableFormat = "parquet",
     report: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="Pictures of the recording and of what is hidden in it.")
+        Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of the recording and the truth.")
     ] = None,
     plugins: Plugins = None,
 ) -> None:
-    """Simulate the data set of a config, or a recording's own wheels; the truth goes to another folder, or nowhere."""
+    """Simulate recordings of a robot whose true model is known.
+
+    The truth stays out of the data set: it is written to another folder with --truth, or else nowhere.
+    """
     from omnibench.cli.terminal.progress import Steps
     from omnibench.cli.terminal.slam_summary import print_slam_accuracy
     from omnibench.report.recording.section import write_recording_report
@@ -204,4 +240,4 @@ def simulate(
         typer.echo(f"truth: {truth / 'truth.yaml'}")
     if report is not None:
         typer.echo(f"report: {report}")
-    typer.echo(f"{len(made.dataset.trajectories)} simulated trajectories: {output}")
+    typer.echo(f"{plural(len(made.dataset.trajectories), 'simulated trajectory')}: {output}")
