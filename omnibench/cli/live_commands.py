@@ -24,7 +24,9 @@ ConfigOption = Annotated[
 Connect = Annotated[str | None, typer.Option("--connect", help="Endpoint of the node, for example tcp/127.0.0.1:7447.")]
 ProfileOption = Annotated[
     Literal["plain", "rmw", "humble"] | None,
-    typer.Option(help="How topics are named: plain Zenoh, ROS 2's rmw_zenoh, or that of Humble. Default: plain."),
+    typer.Option(
+        help="Naming of topics: plain Zenoh, rmw_zenoh, or that of ROS 2 Humble. Default: as in --config, or plain."
+    ),
 ]
 Seconds = Annotated[float | None, typer.Option(min=0.0, help="Stop after this time, in s. Default: on Ctrl-C.")]
 
@@ -34,13 +36,13 @@ def live(
     config: Annotated[Path, typer.Argument(help="Config of the node (YAML).")],
     dataset: Annotated[
         Path | None,
-        typer.Argument(help="With --replay: data set folder, or config with a simulated one. Default: as in CONFIG."),
+        typer.Argument(help="With --replay: data set folder, or config with a simulated one. Default: the config's."),
     ] = None,
     replay: Annotated[
         bool, typer.Option("--replay", help="Play a recording to the node, show its errors, and end.")
     ] = False,
     speed: Annotated[
-        str | None, typer.Option(help="Speed of the replay: 1, 10, ... or max. Default: as in CONFIG.")
+        str | None, typer.Option(help="Speed of the replay: 1, 10, ... or max. Default: the config's.")
     ] = None,
     foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve Foxglove's WebSocket on this computer.")] = False,
     seconds: Seconds = None,
@@ -156,7 +158,7 @@ def swap(
 def record(
     robots: Annotated[
         list[str],
-        typer.Argument(metavar="ROBOT...|CONFIG", help="Names of robots, or a node's config: all of its robots."),
+        typer.Argument(metavar="ROBOT...|CONFIG", help="Names of robots, or the config of a node with them."),
     ],
     output: Annotated[Path, output_option("MCAP file to write.", metavar="FILE.mcap")],
     config: ConfigOption = None,

@@ -79,5 +79,5 @@ def listing(names: list[str], limit: int = 8) -> str:
 
 def plural(number: int, noun: str) -> str:
     """A number with its noun: ``1 run``, ``2 runs``."""
-    irregular = {"entry": "entries", "trajectory": "trajectories"}
-    return f"{count(number)} {noun if number == 1 else irregular.get(noun, noun + 's')}"
+    several = f"{noun[:-1]}ies" if noun[-1] == "y" and noun[-2] not in "aeo" else f"{noun}s"
+    return f"{count(number)} {noun if number == 1 else several}"

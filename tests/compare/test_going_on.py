@@ -106,7 +106,7 @@ def test_going_on_keeps_what_had_ended_and_gives_what_an_uninterrupted_compariso
 ) -> None:
     run = compared(stopped.config, stopped.output)
     (line,) = (line for line in run.stderr.splitlines() if "kept from an earlier run" in line)
-    assert "theoretical seed 1: converged, cost 0.138732, 1 evaluations, " in line
+    assert "theoretical seed 1: converged, cost 0.138732, 1 evaluation, " in line
     after = files_of(stopped.output)
     kept = {name: content for name, content in stopped.files.items() if name.startswith("runs/")}
     assert kept == {name: after[name] for name in kept}

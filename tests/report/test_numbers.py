@@ -85,6 +85,7 @@ def test_a_listing_ends_with_and_and_counts_what_it_leaves_out() -> None:
 
 def test_plurals_are_english() -> None:
     assert [plural(1, "run"), plural(2, "run"), plural(180, "trajectory")] == ["1 run", "2 runs", "180 trajectories"]
+    assert [plural(1, "simulated trajectory"), plural(0, "ray")] == ["1 simulated trajectory", "0 rays"]
 
 
 def test_powers_of_ten_are_set_as_such() -> None:

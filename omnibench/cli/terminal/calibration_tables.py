@@ -14,6 +14,7 @@ from omnibench.fit.evaluate import Evaluation
 from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals
 from omnibench.fit.uncertainty.physical import ParameterEstimate
+from omnibench.report.numbers import plural
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 
@@ -35,7 +36,9 @@ def print_certificate(console: Console, certified: CertifiedCalibration) -> None
     if certified.held:
         console.print(f"The box holds {', '.join(certified.held)} at the design value.", soft_wrap=True)
     ended = "" if proof.finished else "; the time was up: with more (--seconds) the bound may rise"
-    console.print(f"{proof.boxes} parts of the box looked at in {certificate.seconds:.1f} s{ended}", soft_wrap=True)
+    console.print(
+        f"{plural(proof.boxes, 'part')} of the box examined in {certificate.seconds:.1f} s{ended}", soft_wrap=True
+    )
 
 
 def print_calibration(console: Console, run: CalibrationRun) -> None:
@@ -62,7 +65,7 @@ def print_calibration(console: Console, run: CalibrationRun) -> None:
         console.print(f"95 % intervals: {run.uncertainty.source}", soft_wrap=True)
         console.print(f"noise of the reference: {_noise_in_words(run.uncertainty.noise)}", soft_wrap=True)
     console.print(
-        f"{result.outcome}: {result.reason}; {result.evaluations} evaluations, {result.seconds:.2f} s",
+        f"{result.outcome}: {result.reason}; {plural(result.evaluations, 'evaluation')}, {result.seconds:.2f} s",
         soft_wrap=True,
     )
 

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from omnibench.compare.result import ComparisonResult, EntryStatistics, Interval
 from omnibench.data.dataset import SPLITS, Split
+from omnibench.report.numbers import plural
 
 
 def print_result(console: Console, result: ComparisonResult) -> None:
@@ -20,7 +21,7 @@ def print_result(console: Console, result: ComparisonResult) -> None:
         where = f"{name}{' (simulated data)' if dataset.simulated else ''}"
         for split in SPLITS:
             if count := len(dataset.split(split)):
-                title = f"{_TITLES[split]}: {where}, {count} trajectories, cost {result.config.cost.name}"
+                title = f"{_TITLES[split]}: {where}, {plural(count, 'trajectory')}, cost {result.config.cost.name}"
                 console.print(_cost_table(title, entries, split), "")
         console.print(_error_table(f"Final errors: {where}", entries), "")
     console.print(_search_table(result), "")

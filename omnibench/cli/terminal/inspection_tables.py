@@ -9,6 +9,7 @@ from rich.table import Table
 
 from omnibench.fit.inspect import Inspection, ScansContent
 from omnibench.fit.uncertainty.identifiability import ROWS, Identifiability
+from omnibench.report.numbers import plural
 
 
 def print_inspection(console: Console, found: Inspection) -> None:
@@ -21,9 +22,9 @@ def print_inspection(console: Console, found: Inspection) -> None:
             console.print(f"{label}: {text}", soft_wrap=True)
     shortest, longest = (1000 * period for period in found.sample_period_range_s)
     console.print(
-        f"robot {found.robot}, wheels {', '.join(found.wheels)}; {found.wheel_samples} wheel samples every "
-        f"{1000 * found.sample_period_s:g} ms ({shortest:.3g} to {longest:.3g} ms), {found.reference_poses} reference "
-        f"poses every {1000 * found.pose_period_s:.3g} ms",
+        f"robot {found.robot}, wheels {', '.join(found.wheels)}; {plural(found.wheel_samples, 'wheel sample')} every "
+        f"{1000 * found.sample_period_s:g} ms ({shortest:.3g} to {longest:.3g} ms), "
+        f"{plural(found.reference_poses, 'reference pose')} every {1000 * found.pose_period_s:.3g} ms",
         soft_wrap=True,
     )
     if found.scans is not None:
@@ -56,9 +57,9 @@ def print_inspection(console: Console, found: Inspection) -> None:
 def _print_scans(console: Console, scans: ScansContent) -> None:
     every = "" if scans.scan_period_s is None else f" every {1000 * scans.scan_period_s:.3g} ms"
     console.print(
-        f"{scans.scans} scans{every} in {scans.trajectories} runs; {scans.rays} rays over "
-        f"{math.degrees(scans.field_of_view_rad):.0f} deg up to {scans.range_max_m:g} m, of which "
-        f"{scans.seen_share:.0%} measured something",
+        f"{plural(scans.scans, 'scan')}{every} in {plural(scans.trajectories, 'run')}; "
+        f"{plural(scans.rays, 'ray')} over {math.degrees(scans.field_of_view_rad):.0f} deg up to "
+        f"{scans.range_max_m:g} m, of which {scans.seen_share:.0%} measured something",
         soft_wrap=True,
     )
 

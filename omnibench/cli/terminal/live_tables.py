@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
+from omnibench.report.numbers import plural
+
 if TYPE_CHECKING:
     from omnibench.live.replay.demonstration import Demonstration, Deviation
     from omnibench.live.replay.replay_player import PlayReport
@@ -48,12 +50,13 @@ def print_played(console: Console, report: PlayReport, simulated: bool) -> None:
     """What was played."""
     kind = "simulated" if simulated else "recorded"
     console.print(
-        f"{report.sent['joint_states']} wheel samples and {report.sent['slam_pose']} SLAM poses ({kind}), "
+        f"{plural(report.sent['joint_states'], 'wheel sample')} and "
+        f"{plural(report.sent['slam_pose'], 'SLAM pose')} ({kind}), "
         f"{report.data_seconds:.1f} s of the drive in {report.wall_seconds:.1f} s",
         soft_wrap=True,
     )
     if not report.complete:
-        console.print(f"stopped after {sum(report.sent.values())} of {report.total} messages", soft_wrap=True)
+        console.print(f"stopped after {sum(report.sent.values())} of {plural(report.total, 'message')}", soft_wrap=True)
 
 
 def print_demonstration(console: Console, shown: Demonstration) -> None:
@@ -78,7 +81,7 @@ def print_demonstration(console: Console, shown: Demonstration) -> None:
     console.print(table)
     console.print(
         f"odom against the batch odometry: {shown.batch_difference:.1e} (m, rad) at most; "
-        f"{shown.lost} messages of odom lost",
+        f"{plural(shown.lost, 'message')} of odom lost",
         soft_wrap=True,
     )
     counts = {name: value for name, value in shown.health.counts.items() if value}

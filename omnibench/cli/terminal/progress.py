@@ -16,6 +16,7 @@ from rich.progress import (
 )
 
 from omnibench.cli.terminal.console import make_console
+from omnibench.report.numbers import plural
 
 if TYPE_CHECKING:
     from omnibench.compare.plan import PlannedRun
@@ -49,7 +50,9 @@ class EvaluationsBar:
         self._progress.stop()
 
     def __call__(self, evaluations: int, best: float) -> None:
-        self._progress.update(self._task, completed=evaluations, note=f"{evaluations} evaluations, best {best:.6f}")
+        self._progress.update(
+            self._task, completed=evaluations, note=f"{plural(evaluations, 'evaluation')}, best {best:.6f}"
+        )
 
 
 class ProofLine:
@@ -75,7 +78,7 @@ class ProofLine:
         self._progress.stop()
 
     def __call__(self, proof: Proof) -> None:
-        note = f"{proof.boxes} parts of the box, bound {proof.lower_bound:.6f}, best {proof.best_cost:.6f}"
+        note = f"{plural(proof.boxes, 'part')} of the box, bound {proof.lower_bound:.6f}, best {proof.best_cost:.6f}"
         self._progress.update(self._task, note=note)
 
 
@@ -233,7 +236,7 @@ def run_line(run: PlannedRun, result: RunResult, reused: bool) -> str:
     """How a run ended, in one line."""
     cost = "no answer" if result.cost is None else f"cost {result.cost:.6f}"
     kept = ", kept from an earlier run" if reused else ""
-    figures = f"{cost}, {result.evaluations} evaluations, {result.seconds:.1f} s{kept}"
+    figures = f"{cost}, {plural(result.evaluations, 'evaluation')}, {result.seconds:.1f} s{kept}"
     return f"{run_title(run)}: {result.outcome}, {figures} ({result.reason})"
 
 
@@ -267,8 +270,8 @@ class ReplayBar:
     def __call__(self, played: Played, health: Health | None = None) -> None:
         note = f"{played.data_seconds:.0f} s of the drive"
         if health is not None:
-            note += f", {health.rate_hz:.0f} samples/s, {health.counts['poses']} poses fused"
+            note += f", {health.rate_hz:.0f} samples/s, {plural(health.counts['poses'], 'pose')} fused"
         self._progress.update(self._task, total=played.total, completed=played.done, note=note)
         if not self.console.is_terminal and played.wall_seconds - self._told >= self._PERIOD:
             self._told = played.wall_seconds
-            self.console.print(f"{self._title}: {played.done} of {played.total} messages, {note}")
+            self.console.print(f"{self._title}: {played.done} of {plural(played.total, 'message')}, {note}")

@@ -9,6 +9,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from omnibench.report.numbers import plural
 from omnibench.slam.accuracy import SlamAccuracy
 from omnibench.slam.summary import SlamSummary
 
@@ -17,7 +18,10 @@ def print_slam(console: Console, found: SlamSummary) -> None:
     """The runs, what SLAM states of its poses, how far they are from those before and, if it is known, the truth."""
     kind = "simulated data" if found.simulated else "recorded data"
     matched = f"{found.matched_mean:.1%} of the points matched (worst scan {found.matched_min:.0%})"
-    console.print(f"{found.dataset}: {kind}; {found.runs} runs, {found.scans} scans, {matched}", soft_wrap=True)
+    console.print(
+        f"{found.dataset}: {kind}; {plural(found.runs, 'run')}, {plural(found.scans, 'scan')}, {matched}",
+        soft_wrap=True,
+    )
     table = _table("reference poses from the scans")
     deviations = (
         (found.position_deviation_mean_m, None, found.position_deviation_max_m),
@@ -30,7 +34,7 @@ def print_slam(console: Console, found: SlamSummary) -> None:
             (apart.position_mean_m, apart.position_p95_m, None),
             (apart.heading_mean_rad, apart.heading_p95_rad, None),
         )
-        table.add_row(f"from the recorded reference ({apart.poses} poses)", *_cells(*distances))
+        table.add_row(f"from the recorded reference ({plural(apart.poses, 'pose')})", *_cells(*distances))
     console.print(table)
     if found.accuracy is not None:
         print_slam_accuracy(console, found.accuracy)
@@ -44,14 +48,14 @@ def print_slam_accuracy(console: Console, found: SlamAccuracy) -> None:
         positions = (errors.position_mean_m, errors.position_p95_m, errors.position_max_m)
         headings = (errors.heading_mean_rad, errors.heading_p95_rad, errors.heading_max_rad)
         nees = "" if errors.nees_mean is None else f"{errors.nees_mean:.1f}"
-        table.add_row(f"{what} ({errors.poses} poses)", *_cells(positions, headings), nees)
+        table.add_row(f"{what} ({plural(errors.poses, 'pose')})", *_cells(positions, headings), nees)
     console.print(table)
     bias = found.final
     console.print(
         f"bias at the end, along the robot's axes: {1000 * bias.bias_forward_m:+.2f} mm forward, "
         f"{1000 * bias.bias_left_m:+.2f} mm left, {math.degrees(bias.bias_heading_rad):+.3f} deg; drift "
         f"{1000 * found.drift_position:.2g} mm and {math.degrees(found.drift_heading):.2g} deg a metre, over "
-        f"{found.distance_m:.0f} m in {found.runs} runs",
+        f"{found.distance_m:.0f} m in {plural(found.runs, 'run')}",
         soft_wrap=True,
     )
 
