@@ -65,6 +65,12 @@ def test_a_topic_is_set_for_reading_on_a_terminal(command: Command, monkeypatch:
     assert all(len(line) <= 80 for line in re.sub(r"\x1b[^m]*m", "", printed).splitlines())
 
 
+@pytest.mark.parametrize("name", BY_NAME)
+def test_no_line_of_code_is_broken_on_a_narrow_terminal(name: str) -> None:
+    long = [line for block in blocks(BY_NAME[name].file) for line in block.splitlines() if len(line) > 76]
+    assert long == []
+
+
 def test_an_unknown_topic_is_answered_with_the_nearest(command: Command) -> None:
     assert_refused(command("guide", "calibrator"), "unknown topic 'calibrator'; did you mean 'calibrators'?")
 
@@ -78,8 +84,8 @@ def test_a_command_that_does_not_exist_would_be_noticed() -> None:
     for typed in ("omnibench compar x", "omnibench compare x --out y", "omnibench calibrate", "omnibench plugin neu x"):
         with pytest.raises(Exception, match=r"No such|Missing"):
             parse(typed)
-    assert commands_in("    omnibench a  # b\n`omnibench c && d`\n    cd x && omnibench d\n") == [
-        "omnibench a  # b",
+    assert commands_in("    omnibench a \\\n        -b  # c\n`omnibench c && d`\n    cd x && omnibench d\n") == [
+        "omnibench a -b  # c",
         "omnibench d",
         "omnibench c",
     ]

@@ -16,7 +16,8 @@ _INLINE = re.compile(r"`(omnibench [^`]+)`")
 
 def commands_in(markdown: str) -> list[str]:
     """Every ``omnibench ...`` of the code blocks and of the code within lines."""
-    blocks = [line.strip() for line in markdown.splitlines() if line.startswith("    ")]
+    joined = re.sub(r"\\\n +", "", markdown)  # a backslash goes on in the next line
+    blocks = [line.strip() for line in joined.splitlines() if line.startswith("    ")]
     typed = [part.strip() for line in [*blocks, *_INLINE.findall(markdown)] for part in line.split("&&")]
     return [line for line in typed if line.startswith("omnibench ")]
 
