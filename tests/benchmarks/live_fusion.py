@@ -40,9 +40,9 @@ def fused(
         if isinstance(message, JointState):
             newest = message.stamp
             poses += [
-                update.filtered.pose
+                update.in_map[0]
                 for update in tracker.take_wheels(JOINT_STATE.encode(message), event.arrival)
-                if update.filtered is not None
+                if update.in_map is not None
             ]
         else:
             stamp = newest if as_new else message.stamp

@@ -104,6 +104,9 @@ class Fusion:
 
     def set_pose(self, pose: Array, covariance: Array) -> None:
         """The robot is here, now; what was measured before counts no more."""
+        if not self._timeline.entries:
+            self.begin(pose, covariance)
+            return
         self._since = self._timeline.newest + 1
         self._waiting.clear()
         self._rejections.clear()
@@ -112,6 +115,9 @@ class Fusion:
 
     def reset(self) -> None:
         """Forget where the robot is; the next pose of SLAM says it anew."""
+        if not self._timeline.entries:
+            self.begin(np.zeros(3), None)
+            return
         self.set_pose(self.pose, _NOWHERE)
         self.located, self.outcome, self.fused_at = False, None, None
 

@@ -17,28 +17,20 @@ import xxhash
 import zenoh
 from zenoh.handlers import Callback
 
-from omnibench.live.wire.messages import (
-    DIAGNOSTICS,
-    JOINT_STATE,
-    ODOMETRY,
-    POSE_ESTIMATE,
-    TRANSFORMS,
-    MessageType,
-)
+from omnibench.live.wire.messages import DIAGNOSTICS, JOINT_STATE, POSE_ESTIMATE, MessageType
+from omnibench.live.wire.outputs import OUTPUTS
 
 Profile = Literal["plain", "rmw", "humble"]
 M = TypeVar("M")
 
-# A robot's topics, below its name; tf is everybody's.
+INPUTS: Final = ("joint_states", "slam_pose")
+# A robot's topics, below its name, and their message types; all robots share tf.
 TOPICS: Final[dict[str, MessageType[Any]]] = {
     "joint_states": JOINT_STATE,
     "slam_pose": POSE_ESTIMATE,
-    "odom": ODOMETRY,
-    "odometry/filtered": ODOMETRY,
+    **{output.topic: output.message_type for output in OUTPUTS},
     "diagnostics": DIAGNOSTICS,
-    "tf": TRANSFORMS,
 }
-INPUTS: Final = ("joint_states", "slam_pose")
 
 _QOS = "::,10:,:,:,,"  # reliable, volatile, depth 10
 _HASH_OF_HUMBLE = "TypeHashNotSupported"

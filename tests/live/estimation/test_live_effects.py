@@ -22,7 +22,8 @@ from sessions import free_port
 
 from omnibench.config import to_yaml
 from omnibench.live.estimation.live_odometry import LiveOdometry
-from omnibench.live.estimation.tracker import RobotTracker, Update
+from omnibench.live.estimation.tracker import RobotTracker
+from omnibench.live.estimation.update import Update
 from omnibench.live.estimation.wheel_input import WheelStep
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.live.node import LiveNode
@@ -77,7 +78,7 @@ def fed(robot: RobotTracker, payloads: list[bytes]) -> list[Update]:
 
 
 def odometry(updates: list[Update]) -> Array:
-    return np.array([update.odometry.pose for update in updates])
+    return np.array([update.pose for update in updates])
 
 
 class TestAgreesWithTheBatch:
@@ -120,16 +121,16 @@ class TestAgreesWithTheBatch:
         robot.take_pose(slam(ORIGIN, [0.0, 0.0, 0.0]), 0.0)
         updates = fed(robot, path.payloads()[1:])
         for update in updates:
-            assert update.filtered is not None
-            np.testing.assert_allclose(update.filtered.pose, update.odometry.pose, atol=1e-9)
+            assert update.in_map is not None
+            np.testing.assert_allclose(update.in_map[0], update.pose, atol=1e-9)
 
     def test_the_covariance_of_the_matrix_is_used_though_that_of_effects_follows_it(self) -> None:
         plain, nothing = calibration(), term("heading_drift", b=0.0)
         spread = np.diag([1e-8] * 9 + [1e-4])
         using = with_effects(nothing, plain=plain, covariance=covariance_rows(spread))
         path = drive(1.0)
-        covariances = [fed(RobotTracker("apr", each), path.payloads())[-1].odometry for each in (plain, using)]
-        np.testing.assert_allclose(covariances[1].pose_covariance, covariances[0].pose_covariance, rtol=1e-9)
+        last, last_with_effect = (fed(RobotTracker("apr", each), path.payloads())[-1] for each in (plain, using))
+        np.testing.assert_allclose(last_with_effect.covariance, last.covariance, rtol=1e-9)
 
 
 class TestSwaps:

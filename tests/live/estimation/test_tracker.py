@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.estimation.saved_state import RobotMemory
-from omnibench.live.estimation.tracker import Frames, RobotTracker, Update
+from omnibench.live.estimation.tracker import RobotTracker
+from omnibench.live.estimation.update import Update
 from omnibench.live.fusion.pose_fusion import FusionSettings
-from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY, JointState
+from omnibench.live.wire.messages import JOINT_STATE, JointState
 from omnibench.robot.calibration import EffectTerm, matrix_rows
-from omnibench.robot.odometry import Integration, advance
+from omnibench.robot.odometry import Integration
 
 
 def tracker(**options: object) -> RobotTracker:
@@ -32,7 +33,7 @@ def fed(robot: RobotTracker, payloads: list[bytes], begin: float = 0.0) -> list[
 
 
 def poses(updates: list[Update]) -> np.ndarray:
-    return np.array([update.odometry.pose for update in updates])
+    return np.array([update.pose for update in updates])
 
 
 @pytest.mark.parametrize("integration", ["euler", "arc"])
@@ -43,35 +44,28 @@ def test_odom_is_the_batch_odometry(integration: Integration, wheels: int) -> No
     np.testing.assert_allclose(poses(fed(robot, path.payloads())), path.poses, atol=1e-9)
 
 
-def test_stamps_are_those_of_the_wheel_samples_and_frames_are_of_rep_105() -> None:
+def test_stamps_are_those_of_the_wheel_samples() -> None:
     path = drive(0.2)
-    updates = fed(tracker(), path.payloads())
-    assert [update.odometry.stamp for update in updates] == path.stamps
-    first = updates[0]
-    assert first.filtered is not None
-    assert (first.odometry.frame, first.odometry.child_frame) == ("odom", "base_link")
-    assert (first.filtered.frame, first.filtered.child_frame) == ("map", "base_link")
-    assert [(each.frame, each.child_frame) for each in first.transforms] == [("map", "odom"), ("odom", "base_link")]
+    assert [update.stamp for update in fed(tracker(), path.payloads())] == path.stamps
 
 
-def test_the_two_transforms_together_are_the_filtered_pose() -> None:
-    path = drive(1.0)
-    robot = tracker()
-    fed(robot, path.payloads()[:50])
-    robot.take_pose(slam(path.stamps[40], [4.0, 5.0, 2.0]), 0.5)
-    (update,) = fed(robot, path.payloads()[50:51], 0.5)
-    to_odom, to_base = (each.pose for each in update.transforms)
-    assert update.filtered is not None
-    np.testing.assert_allclose(advance(to_odom, to_base, "euler"), update.filtered.pose, atol=1e-12)
+def test_updates_are_published_in_order_and_none_after_closing() -> None:
+    path = drive(0.2)
+    robot, published = tracker(), list[Update]()
+    updates = [
+        update for payload in path.payloads()[:10] for update in robot.take_wheels(payload, 0.0, published.append)
+    ]
+    assert published == updates
+    robot.close()
+    assert robot.take_wheels(path.payloads()[10], 0.1, published.append) == []
+    assert (len(published), robot.counts.samples) == (10, 10)
 
 
 def test_covariances_come_from_the_calibration() -> None:
     path = drive(1.0, using=calibration(deviation=None))
-    last = fed(RobotTracker("apr", path.calibration), path.payloads())[-1].odometry
-    assert last.pose_covariance[2, 2] == pytest.approx(NOISE.walk_heading**2 * 1.0, rel=1e-6)
+    last = fed(RobotTracker("apr", path.calibration), path.payloads())[-1]
+    assert last.covariance[2, 2] == pytest.approx(NOISE.walk_heading**2 * 1.0, rel=1e-6)
     assert last.twist_covariance[2, 2] == pytest.approx(NOISE.walk_heading**2 / 0.01, rel=1e-6)
-    decoded = ODOMETRY.decode(ODOMETRY.encode(last))
-    np.testing.assert_array_equal(decoded.pose_covariance, last.pose_covariance)
 
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow])
@@ -104,7 +98,7 @@ def test_odom_never_jumps_and_no_stamp_comes_twice_whatever_happens(data: st.Dat
         for each in sent:
             chosen = replace(each, stamp=each.stamp + shift, positions=None if rates else each.positions)
             updates += robot.take_wheels(JOINT_STATE.encode(chosen), arrival)
-    stamps = [update.odometry.stamp for update in updates]
+    stamps = [update.stamp for update in updates]
     assert len(set(stamps)) == len(stamps)
     # no wheel turns faster than 3 rad/s, so that 0.3 m/s and 1.6 rad/s bound what the robot does in the time that
     # passes from one message to the next (samples that wait for a clock's confirmation included)
@@ -119,10 +113,10 @@ def test_a_correction_of_slam_moves_the_filtered_pose_and_leaves_odom_alone() ->
     before = fed(robot, path.payloads()[:60])[-1]
     robot.take_pose(slam(path.stamps[50], [4.0, 5.0, 2.0]), 0.6)
     (after,) = fed(robot, path.payloads()[60:61], 0.6)
-    np.testing.assert_allclose(after.odometry.pose, path.poses[60], atol=1e-9)
-    assert before.filtered is not None
-    assert after.filtered is not None
-    assert np.linalg.norm(after.filtered.pose[:2] - before.filtered.pose[:2]) > 1
+    np.testing.assert_allclose(after.pose, path.poses[60], atol=1e-9)
+    assert before.in_map is not None
+    assert after.in_map is not None
+    assert np.linalg.norm(after.in_map[0][:2] - before.in_map[0][:2]) > 1
 
 
 def test_time_backwards_is_counted_and_the_stream_goes_on() -> None:
@@ -132,7 +126,7 @@ def test_time_backwards_is_counted_and_the_stream_goes_on() -> None:
     back = [JOINT_STATE.encode(replace(each, stamp=each.stamp - 100 * SECOND)) for each in path.samples()[50:]]
     updates = fed(robot, back, 0.5)
     assert robot.counts.clock_jumps == 1
-    np.testing.assert_allclose(updates[-1].odometry.pose, path.poses[-1], atol=1e-9)
+    np.testing.assert_allclose(updates[-1].pose, path.poses[-1], atol=1e-9)
     assert robot.take_pose(slam(path.stamps[-1] - 100 * SECOND, path.poses[-1]), 1.0) == "located"
 
 
@@ -220,8 +214,8 @@ def test_after_a_silence_of_a_sender_of_rates_the_twist_is_true_and_the_pose_unc
         updates += robot.take_wheels(payload, float(time))
     twist = calibration().matrix_array @ rates
     for update in updates[1:]:
-        np.testing.assert_allclose(update.odometry.twist, twist, atol=1e-9)
-    before, after = updates[99].odometry.pose_covariance, updates[100].odometry.pose_covariance
+        np.testing.assert_allclose(update.twist, twist, atol=1e-9)
+    before, after = updates[99].covariance, updates[100].covariance
     driven = float(np.hypot(*twist[:2])) * 19
     assert np.sqrt(after[0, 0] - before[0, 0]) > 0.25 * driven
 
@@ -330,10 +324,10 @@ def test_a_robot_goes_on_where_it_was_after_its_node_was_killed(tmp_path: Path) 
     again.resume(saved, now=1.3, wall=saved.wall + 0.2)
     updates = fed(again, path.payloads()[130:], 1.3)
     # the wheels' angles bridge what nobody saw, as one arc
-    np.testing.assert_allclose(updates[-1].odometry.pose, path.poses[-1], atol=0.01)
-    assert updates[-1].filtered is not None
-    np.testing.assert_allclose(updates[-1].filtered.pose, path.poses[-1] + [3, 0, 0], atol=0.02)
-    assert updates[0].odometry.stamp == path.stamps[130]
+    np.testing.assert_allclose(updates[-1].pose, path.poses[-1], atol=0.01)
+    assert updates[-1].in_map is not None
+    np.testing.assert_allclose(updates[-1].in_map[0], path.poses[-1] + [3, 0, 0], atol=0.02)
+    assert updates[0].stamp == path.stamps[130]
     memory.close()
 
 
@@ -359,13 +353,6 @@ def test_two_nodes_cannot_share_a_robots_memory(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"apr\.state\.json: another node is using it for robot 'apr'"):
         RobotMemory(tmp_path, "apr")
     memory.close()
-
-
-def test_frames_can_carry_a_robots_name() -> None:
-    path = drive(0.05)
-    robot = tracker(frames=Frames(odom="apr/odom", base="apr/base_link"))
-    update = fed(robot, path.payloads())[-1]
-    assert update.transforms[1].child_frame == "apr/base_link"
 
 
 def test_a_message_with_rates_alone_is_enough() -> None:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from drives import EXACT, ORIGIN, PERIOD, calibration, drive, slam
 
-from omnibench.live.estimation.tracker import RobotTracker, Update
+from omnibench.live.estimation.tracker import RobotTracker
+from omnibench.live.estimation.update import Update
 from omnibench.live.fusion.pose_fusion import FusionSettings
 from omnibench.robot.calibration import Calibration, EffectTerm
 from omnibench.robot.kinematics import Array
@@ -28,7 +29,7 @@ def fed(robot: RobotTracker, payloads: list[bytes]) -> list[Update]:
 
 
 def odometry(updates: list[Update]) -> Array:
-    return np.array([update.odometry.pose for update in updates])
+    return np.array([update.pose for update in updates])
 
 
 def seen(using: Calibration, tau: tuple[float, float], arm: Array | None = None) -> tuple[Array, int]:
@@ -50,8 +51,8 @@ def seen(using: Calibration, tau: tuple[float, float], arm: Array | None = None)
                 for sign, angle in ((1, pose[2]), (-1, start[2])):
                     pose[:2] += sign * compose(np.array([0, 0, angle]), np.append(arm, 0.0))[:2]
             robot.take_pose(slam(path.stamps[index], pose, 1e-2 * EXACT), 0.01 * index)
-        if updates and updates[0].filtered is not None and index > 300:
-            errors.append(updates[0].filtered.pose - truth[index])
+        if updates and updates[0].in_map is not None and index > 300:
+            errors.append(updates[0].in_map[0] - truth[index])
     return np.abs(errors).max(axis=0), robot.health(6.0).counts["poses"]
 
 

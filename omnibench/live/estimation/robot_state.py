@@ -1,0 +1,67 @@
+"""State of one robot: its estimators, what came last, and what was refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from omnibench.live.estimation.counts import Counts
+from omnibench.live.estimation.extrapolation_monitor import ExtrapolationMonitor
+from omnibench.live.estimation.health import SwapRecord
+from omnibench.live.estimation.live_odometry import LiveOdometry
+from omnibench.live.estimation.published_stamps import PublishedStamps
+from omnibench.live.estimation.wheel_input import WheelInput, WheelSettings
+from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings
+from omnibench.live.fusion.reference_correction import ReferenceCorrection
+from omnibench.live.fusion.timeline import Timeline
+from omnibench.robot.calibration import Calibration
+
+_HISTORY = 5.0  # s of odometry that are remembered without fusion; chosen, as FusionSettings.history
+
+
+@dataclass(slots=True, eq=False)
+class RobotState:
+    """Everything that samples, poses and orders change.
+
+    fusion: None for odometry alone. guessed_angles: names of the calibration's effects that need wheel angles, while
+    nobody has been warned that there are none. arrival: of the last wheel sample, s, monotonic. last_refusal: why the
+    last message was refused that was. last_swap: None before the first calibration is sent.
+    """
+
+    name: str
+    calibration: Calibration
+    counts: Counts
+    wheel_input: WheelInput
+    odometry: LiveOdometry
+    timeline: Timeline
+    fusion: Fusion | None
+    reference: ReferenceCorrection
+    monitor: ExtrapolationMonitor
+    guessed_angles: str
+    stamps: PublishedStamps = field(default_factory=PublishedStamps)
+    arrival: float | None = None
+    last_refusal: str = ""
+    last_swap: SwapRecord | None = None
+
+
+def new_state(name: str, calibration: Calibration, wheels: WheelSettings, fusion: FusionSettings | None) -> RobotState:
+    """The state before the first message: odometry at the origin, nobody knows where in the map."""
+    counts = Counts()
+    timeline = Timeline(fusion.history if fusion else _HISTORY)
+    return RobotState(
+        name=name,
+        calibration=calibration,
+        counts=counts,
+        wheel_input=WheelInput(calibration.robot.wheel_names, wheels, calibration.sample_period, counts),
+        odometry=LiveOdometry(calibration, (fusion or FusionSettings()).standstill),
+        timeline=timeline,
+        fusion=Fusion(fusion, timeline, counts) if fusion else None,
+        reference=ReferenceCorrection(calibration.model),
+        monitor=ExtrapolationMonitor(name, calibration),
+        guessed_angles=wheel_angle_effects(calibration),
+    )
+
+
+def wheel_angle_effects(calibration: Calibration) -> str:
+    """Names of the calibration's effects that depend on the absolute angles of the wheels."""
+    terms = calibration.model.motion_terms
+    return ", ".join(term.name for term in terms if "wheel_angles" in term.effect.needs)

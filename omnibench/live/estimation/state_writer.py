@@ -1,0 +1,72 @@
+"""Saving a robot's state now and then, and resuming from a state that was saved."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+
+from omnibench.errors import DataError
+from omnibench.live.estimation.live_odometry import Motion
+from omnibench.live.estimation.robot_state import RobotState
+from omnibench.live.estimation.saved_state import RobotMemory, SavedState
+
+_PERIOD = 0.1  # s between two states; chosen: a node that is killed loses no more
+_RETRY = 10.0  # s until a state that could not be written is tried again; chosen
+
+
+class StateWriter:
+    """Writes a robot's state to its memory; does nothing without one."""
+
+    def __init__(self, memory: RobotMemory | None) -> None:
+        self._memory = memory
+        self._due = -math.inf  # arrival of a wheel sample, s, monotonic
+
+    def save_if_due(self, state: RobotState) -> None:
+        """Write the state unless that was done less than 0.1 s ago."""
+        if state.arrival is not None and state.arrival >= self._due:
+            self.save(state)
+
+    def save(self, state: RobotState) -> None:
+        """Write the state after the last wheel sample; a disk that refuses is counted and told in health."""
+        last = state.wheel_input.last_sample
+        if self._memory is None or last is None or state.arrival is None:
+            return
+        self._due = state.arrival + _PERIOD
+        stamp, positions = last
+        fused = None
+        if state.fusion is not None and state.fusion.located:
+            fused = state.fusion.pose, state.fusion.covariance
+        wall = time.time() - (time.monotonic() - state.arrival)
+        odometry = state.odometry.pose, state.odometry.covariance
+        try:
+            self._memory.save(stamp, wall, positions, odometry, fused, state.odometry.session_time)
+        except OSError as error:  # a full disk must not stop the odometry
+            state.counts.failures += 1
+            state.last_refusal = f"the state could not be written: {error.strerror}"
+            self._due += _RETRY
+
+    def close(self, state: RobotState) -> None:
+        """Write the last state and let another node use the memory."""
+        self.save(state)
+        if self._memory is not None:
+            self._memory.close()
+            self._memory = None
+
+
+def resume_state(state: RobotState, saved: SavedState, now: float, wall: float) -> Motion:
+    """Bring a new state to where another node stopped; the motion that begins the timeline there.
+
+    now, wall: monotonic and unix time, s. DataError: the saved state is of a robot with other wheels.
+    """
+    wheels = len(state.calibration.robot.wheels)
+    positions = None if saved.positions is None else np.array(saved.positions)
+    if positions is not None and len(positions) != wheels:
+        raise DataError(f"the state of robot {state.name!r} is of a robot with {len(positions)} wheels; remove it")
+    state.wheel_input.resume(saved.stamp, positions, now - (wall - saved.wall))
+    state.odometry.resume(np.array(saved.pose), np.reshape(saved.covariance, (3, 3)), saved.session_time)
+    if state.fusion is not None and saved.map_pose is not None and saved.map_covariance is not None:
+        state.fusion.begin(np.array(saved.map_pose), np.reshape(saved.map_covariance, (3, 3)))
+    state.stamps.unique(saved.stamp)
+    return Motion(saved.stamp, 0.0, np.zeros(3), state.calibration.integration, 0.0, 0.0)
