@@ -1,76 +1,75 @@
-"""omnibench: compare, run and extend odometry calibrations of robots on omnidirectional wheels."""
+"""Calibrate the odometry of wheeled robots, compare calibrators, find missing physics, run the result live."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from omnibench.compare.read_config import read_compare_config
-    from omnibench.compare.run import run_comparison
-    from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-    from omnibench.data.storage import load_dataset, save_dataset
-    from omnibench.design.design import design_experiment
-    from omnibench.discover.discover import discover_effects
-    from omnibench.errors import OmnibenchError
-    from omnibench.fit.calibrate import calibrate
-    from omnibench.fit.certify import certify_optimum
-    from omnibench.fit.evaluate import evaluate
-    from omnibench.fit.inspect import inspect_dataset
-    from omnibench.live.wire.subscriber import subscribe
-    from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
-    from omnibench.robot.export.formats import export_calibration
-    from omnibench.simulate.simulate import simulate_dataset
-    from omnibench.slam.import_dataset import import_dataset
-
-__all__ = [
-    "Calibration",
-    "Dataset",
-    "OmnibenchError",
-    "Trajectory",
-    "calibrate",
-    "certify_optimum",
-    "design_experiment",
-    "discover_effects",
-    "evaluate",
-    "export_calibration",
-    "import_dataset",
-    "inspect_dataset",
-    "load_dataset",
-    "make_dataset",
-    "read_calibration",
-    "read_compare_config",
-    "run_comparison",
-    "save_dataset",
-    "simulate_dataset",
-    "subscribe",
-    "write_calibration",
-]
-
-# Imported when first asked for: the command line starts at once, and Ctrl-C finds it listening.
-_HOMES = {
-    "design.design": ("design_experiment",),
-    "compare.read_config": ("read_compare_config",),
-    "compare.run": ("run_comparison",),
-    "data.dataset": ("Dataset", "Trajectory", "make_dataset"),
-    "simulate.simulate": ("simulate_dataset",),
-    "slam.import_dataset": ("import_dataset",),
-    "data.storage": ("load_dataset", "save_dataset"),
-    "discover.discover": ("discover_effects",),
-    "errors": ("OmnibenchError",),
-    "fit.calibrate": ("calibrate",),
-    "fit.certify": ("certify_optimum",),
-    "fit.evaluate": ("evaluate",),
-    "fit.inspect": ("inspect_dataset",),
-    "live.wire.subscriber": ("subscribe",),
-    "robot.calibration": ("Calibration", "read_calibration", "write_calibration"),
-    "robot.export.formats": ("export_calibration",),
+# The public names and their modules. A name is imported when it is first asked for, so that the command line starts at
+# once.
+_PUBLIC = {
+    "Budget": "fit.problem",
+    "Calibration": "robot.calibration",
+    "Dataset": "data.dataset",
+    "LiveNode": "live.node",
+    "OmnibenchError": "errors",
+    "Robot": "robot.kinematics",
+    "Trajectory": "data.dataset",
+    "calibrate": "fit.calibrate",
+    "certify_optimum": "fit.certify",
+    "design_experiment": "design.design",
+    "discover_effects": "discover.discover",
+    "evaluate": "fit.evaluate",
+    "export_calibration": "robot.export.formats",
+    "import_dataset": "slam.import_dataset",
+    "inspect_dataset": "fit.inspect",
+    "load_dataset": "data.storage",
+    "load_plugins": "registry",
+    "make_dataset": "data.dataset",
+    "read_calibration": "robot.calibration",
+    "read_compare_config": "compare.read_config",
+    "read_live_config": "live.config",
+    "read_simulation": "simulate.source",
+    "run_comparison": "compare.run",
+    "save_dataset": "data.storage",
+    "simulate_dataset": "simulate.simulate",
+    "subscribe": "live.wire.subscriber",
+    "write_calibration": "robot.calibration",
 }
+__all__ = list(_PUBLIC)
+
+if TYPE_CHECKING:  # the same names for type checkers; tests/ground/test_package.py holds the two lists equal
+    from omnibench.compare.read_config import read_compare_config as read_compare_config
+    from omnibench.compare.run import run_comparison as run_comparison
+    from omnibench.data.dataset import Dataset as Dataset
+    from omnibench.data.dataset import Trajectory as Trajectory
+    from omnibench.data.dataset import make_dataset as make_dataset
+    from omnibench.data.storage import load_dataset as load_dataset
+    from omnibench.data.storage import save_dataset as save_dataset
+    from omnibench.design.design import design_experiment as design_experiment
+    from omnibench.discover.discover import discover_effects as discover_effects
+    from omnibench.errors import OmnibenchError as OmnibenchError
+    from omnibench.fit.calibrate import calibrate as calibrate
+    from omnibench.fit.certify import certify_optimum as certify_optimum
+    from omnibench.fit.evaluate import evaluate as evaluate
+    from omnibench.fit.inspect import inspect_dataset as inspect_dataset
+    from omnibench.fit.problem import Budget as Budget
+    from omnibench.live.config import read_live_config as read_live_config
+    from omnibench.live.node import LiveNode as LiveNode
+    from omnibench.live.wire.subscriber import subscribe as subscribe
+    from omnibench.registry import load_plugins as load_plugins
+    from omnibench.robot.calibration import Calibration as Calibration
+    from omnibench.robot.calibration import read_calibration as read_calibration
+    from omnibench.robot.calibration import write_calibration as write_calibration
+    from omnibench.robot.export.formats import export_calibration as export_calibration
+    from omnibench.robot.kinematics import Robot as Robot
+    from omnibench.simulate.simulate import simulate_dataset as simulate_dataset
+    from omnibench.simulate.source import read_simulation as read_simulation
+    from omnibench.slam.import_dataset import import_dataset as import_dataset
 
 
 def __getattr__(name: str) -> Any:
-    for module, names in _HOMES.items():
-        if name in names:
-            return getattr(import_module(f"omnibench.{module}"), name)
-    raise AttributeError(f"module 'omnibench' has no attribute {name!r}")
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'omnibench' has no attribute {name!r}")
+    return getattr(import_module(f"omnibench.{_PUBLIC[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -15,6 +17,14 @@ def test_a_public_name_is_found_in_its_module(name: str) -> None:
     found = getattr(omnibench, name)
     assert found.__name__ == name
     assert found.__module__.startswith("omnibench.")
+
+
+def test_type_checkers_see_the_public_names_in_the_modules_that_they_are_taken_from() -> None:
+    statements = ast.walk(ast.parse(Path(omnibench.__file__).read_text(encoding="utf-8")))
+    imported = [statement for statement in statements if isinstance(statement, ast.ImportFrom)]
+    ours = [statement for statement in imported if (statement.module or "").startswith("omnibench.")]
+    seen = {alias.asname: statement.module for statement in ours for alias in statement.names}
+    assert seen == {name: getattr(omnibench, name).__module__ for name in omnibench.__all__}
 
 
 def test_a_name_that_is_not_public_is_missed_by_its_name() -> None:
