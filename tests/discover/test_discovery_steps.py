@@ -1,0 +1,52 @@
+"""The steps of a discovery: their order, and that what concludes fits nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from discovery_samples import simulated
+
+from omnibench.discover import discover
+from omnibench.discover.regressors.whitened import Given
+from omnibench.discover.result import Discovery
+from omnibench.robot.odometry import OdometryBatch
+
+
+class Recorder:
+    def __init__(self) -> None:
+        self.stages: list[str] = []
+
+    def stage(self, text: str) -> None:
+        self.stages.append(text)
+
+
+def test_steps_are_announced_in_order_and_confirming_comes_only_with_an_effect() -> None:
+    with_effect, without_effect = Recorder(), Recorder()
+    discover.discover_effects(simulated(validation=None), watch=with_effect)
+    discover.discover_effects(simulated((), validation=None), watch=without_effect)
+    confirming = "looking again, now that the noise is known better"
+    assert with_effect.stages == [
+        "fitting the plain matrix",
+        "looking where it fails, and at the catalogue",
+        confirming,
+        "looking at the motors",
+        "comparing on runs that were held out",
+    ]
+    assert without_effect.stages == [stage for stage in with_effect.stages if stage != confirming]
+
+
+def test_what_concludes_fits_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    conclude = discover.conclude
+
+    def refuse(*_: Any) -> None:
+        raise AssertionError("fitted while concluding")
+
+    def conclude_without_fits(*args: Any) -> Discovery:
+        with monkeypatch.context() as patch:
+            patch.setattr(Given, "estimate", refuse)
+            patch.setattr(OdometryBatch, "jacobian", refuse)
+            return conclude(*args)
+
+    monkeypatch.setattr(discover, "conclude", conclude_without_fits)
+    assert discover.discover_effects(simulated()).verdict == "named"
