@@ -121,7 +121,7 @@ def discover_effects(
         validation=validation,
         held_out=compare_held_out(baseline, extended, validation),
         steps=waterfall_steps(plain, baseline, extended, validation.kept),
-        extrapolations=extrapolations_of(validation.kept, baseline, models.models),
+        extrapolations=extrapolations_of(validation.kept, baseline, models.weighted),
         detectability=detectability_of(screening, models.selection),
     )
     request = Request(tuple(without), unknown_term, seed)

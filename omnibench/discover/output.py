@@ -1,4 +1,4 @@
-"""The folder of a discovery: discovery.json, report, calibrations, experiments, tables. Whole or not at all."""
+"""The folder of a discovery: discovery.json, report, calibrations, experiments, tables; written as a whole."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from omnibench.files import (
 from omnibench.report.render import render
 from omnibench.robot.kinematics import Array
 
-# The first line of config.yaml tells a folder of results from a folder that happens to hold such a file.
+# First line of config.yaml: it tells a folder of results from one that happens to hold a file of that name.
 _MARK = "# The effective options of a discovery; the results beside it were made with them."
 
 
 class DiscoverOptions(Model):
-    """What a discovery was asked for: the content of its config.yaml."""
+    """The options of a discovery: the content of its config.yaml."""
 
     dataset: str
     model: str | None = None
@@ -41,16 +41,16 @@ class DiscoverOptions(Model):
 
 
 def check_output(folder: Path | None) -> None:
-    """DataError when ``folder`` is a file, or holds something else than an earlier discovery; asked before the work."""
+    """Raises DataError if ``folder`` is a file, or holds anything but an earlier discovery. For use before the work."""
     if folder is not None:
         check_results_folder(folder, _MARK, "discovery")
 
 
 def write_discovery(discovery: Discovery, options: DiscoverOptions, folder: Path | None = None) -> Path:
-    """Write everything that a discovery says; the folder.
+    """Write all files of a discovery and return their folder.
 
-    Default: ``results/<data set name>/<time>``, with a link ``latest``. DataError when it cannot be written to, or
-    holds other files; then all is as it was.
+    Default: ``results/<data set name>/<time>``, with a link ``latest``. Raises DataError if the folder cannot be
+    written to or holds other files; it is then left as it was.
     """
     check_output(folder)
     chosen = folder or new_results_folder(RESULTS / _plain(discovery.dataset.name))
@@ -84,7 +84,7 @@ def _contents(discovery: Discovery, options: DiscoverOptions, folder: Path) -> d
 
 
 def residual_table(discovery: Discovery) -> pl.DataFrame:
-    """Every reference pose of the training runs after their starts, with its residuals before and after.
+    """Table of the reference poses of the training runs after their starts, with residuals before and after.
 
     Residuals are reference minus odometry, by the plain matrix (before) and by the extended model (after), in m and
     rad; whitened ones are independent and of unit variance under the noise.
@@ -109,5 +109,5 @@ def residual_table(discovery: Discovery) -> pl.DataFrame:
 
 
 def _plain(name: str) -> str:
-    """A name as a folder's."""
+    """A name as one that a folder can have."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("_.") or "dataset"

@@ -1,1 +1,1 @@
-"""Regressors that say where the residual depends on something, and how surprising that is."""
+"""Regressors: columns by which the residuals may depend on something, and their significance."""

@@ -1,8 +1,8 @@
-"""Generic bases that say where the residual depends on something, with no physics in them.
+"""Generic bases: columns by which the residuals may depend on a covariate, with no physics in them.
 
-Each is a set of small changes of the motion (or of the reported pose) that varies with one covariate: along the way,
-across it and in turning, times smooth functions of the covariate. A change in turning is counted per way of the
-wheels, so that a robot that stands is never changed.
+A basis is a set of small changes of the motion, or of the reported pose, that vary with one covariate: changes along
+the direction of travel, across it and in turning, each times smooth functions of the covariate. A change in turning is
+proportional to the way of the wheels, so that a robot that stands is never changed.
 """
 
 from __future__ import annotations
@@ -20,32 +20,33 @@ from omnibench.robot.effects.smooth import lever, surfaces, waves
 from omnibench.robot.effects.smooth_wheels import HARMONICS, tents
 from omnibench.robot.kinematics import Array
 
-_ORDERS = 6  # of smooth functions of time
-_FREQUENCIES = 32  # of a clock's errors
-_GRID = 5  # places along each side of the area
-_NARROW = 0.02  # of the largest motion: how far from a motion another still counts as the same, at least
-_SMALL = 1e-9
+_ORDERS = 6  # smooth functions of time; chosen
+_FREQUENCIES = 32  # at which errors of a clock are tried; chosen
+_GRID = 5  # patches along each side of the area; chosen
+_NARROW = 0.02  # of the largest motion: width, at least, within which another motion counts as the same; chosen
+_SMALL = 1e-9  # below it a covariate does not vary
 
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """Slopes (S, 3, n) of the poses by n generic changes that vary with a covariate.
+    """Columns (S, 3, n): slopes of the poses by n generic changes that vary with a covariate.
 
-    detail: which of several bases of the covariate it is, in words that complete "the residual depends on ...". term:
-    the effect without a name that adds the same to a model, or nothing; shapes: the values that shape it.
+    detail: words that complete "the residual depends on ...", and tell several bases of a covariate apart. tries: bases
+    of this kind, of which the best is taken. term: the smooth effect that adds these changes to a model, or nothing.
+    shapes: the values that shape it.
     """
 
     covariate: str
     stage: Stage
     detail: str
     columns: Array
-    tries: int = 1  # bases of this kind, of which the best is taken
+    tries: int = 1
     term: str = ""
     shapes: Mapping[str, float] = field(default_factory=dict)
 
 
 def generic_bases(paths: Paths, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:
-    """All that these recordings allow."""
+    """All bases that these recordings allow: of each covariate that varies and was recorded."""
     modes = _Modes(paths)
     yield from _elapsed(paths, modes)
     yield from _heading(paths, modes)
@@ -59,7 +60,7 @@ def generic_bases(paths: Paths, trajectories: Sequence[Trajectory]) -> Iterator[
 
 
 class _Modes:
-    """Directions (F, 3) in which the twist may be changed."""
+    """Changes (F, 3) of the twist: along the direction of travel, across it, in turning, and of the rotation alone."""
 
     def __init__(self, paths: Paths) -> None:
         twists = paths.signals.twists
@@ -73,14 +74,14 @@ class _Modes:
         self._changes = [paths.changes(mode) for mode in (self.along, self.across, self.turn)]
 
     def all_of(self, paths: Paths, shares: Array) -> Array:
-        """Slopes (S, 3, 3 J) by changes along, across and in turning that go with shares (F, J)."""
+        """Slopes (S, 3, 3 J) by changes along, across and in turning, times shares (F, J)."""
         return np.concatenate([paths.respond(changes, shares) for changes in self._changes], axis=2)
 
     def each_of(self, paths: Paths, shares: Array) -> list[Array]:
-        """The same apart for every share: J of (S, 3, 3)."""
+        """J slopes (S, 3, 3) by changes along, across and in turning, one for each column of shares (F, J)."""
         count = shares.shape[1]
         columns = self.all_of(paths, shares)
-        return [columns[..., own::count] for own in range(count)]
+        return [columns[..., column::count] for column in range(count)]
 
 
 def _elapsed(paths: Paths, modes: _Modes) -> Iterator[Basis]:
@@ -144,7 +145,7 @@ def _order(paths: Paths, modes: _Modes, trajectories: Sequence[Trajectory]) -> I
                     shapes={"duration": longest})  # fmt: skip
     sessions = list(dict.fromkeys(run.session for run in trajectories))
     if len(sessions) > 1:
-        belongs = np.array([[run.session == each for each in sessions[1:]] for run in trajectories], dtype=float)
+        belongs = np.array([[run.session == name for name in sessions[1:]] for run in trajectories], dtype=float)
         columns = [paths.of_twist(mode, belongs[paths.owner]) for mode in (modes.along, modes.rotation)]
         yield Basis("order of runs", "wheel", "the session", np.concatenate(columns, axis=2))
 
@@ -155,10 +156,10 @@ def _wheel_rate(paths: Paths) -> Iterator[Basis]:
     if top < _SMALL:
         return
     changes, shapes = tents(rates, top), {"top": top}
-    each = [paths.of_wheel(wheel, changes[:, wheel]) for wheel in range(rates.shape[1])]
-    yield Basis("wheel rate", "wheel", "how fast the wheels turn", np.sum(each, axis=0), term="smooth_wheel_rate",
+    of_wheels = [paths.of_wheel(wheel, changes[:, wheel]) for wheel in range(rates.shape[1])]
+    yield Basis("wheel rate", "wheel", "how fast the wheels turn", np.sum(of_wheels, axis=0), term="smooth_wheel_rate",
                 shapes=shapes)  # fmt: skip
-    yield Basis("wheel rate", "wheel", "how fast each wheel turns", np.concatenate(each, axis=2),
+    yield Basis("wheel rate", "wheel", "how fast each wheel turns", np.concatenate(of_wheels, axis=2),
                 term="smooth_wheel_rate", shapes=shapes)  # fmt: skip
 
 
@@ -208,7 +209,7 @@ def _stamps(paths: Paths) -> Iterator[Basis]:
     number = np.concatenate([np.arange(part.stop - part.start) for part in paths.parts])
     shares = np.column_stack([np.ones(len(stamps)), stamps / stamps.max(), (-1.0) ** number])
     position, heading = velocity * [1.0, 1.0, 0.0], velocity * [0.0, 0.0, 1.0]
-    columns = [each[:, :, None] * shares[:, None, :] for each in (position, heading)]
+    columns = [moving[:, :, None] * shares[:, None, :] for moving in (position, heading)]
     steps = [np.diff(log.stamps) for log in paths.logs if len(log.stamps) > 1]
     finest = float(np.median(np.concatenate(steps)) if steps else stamps.max())
     yield Basis("stamps", "reference", "when the reference's poses are stamped", np.concatenate(columns, axis=2),
@@ -229,14 +230,14 @@ def _command(paths: Paths, modes: _Modes, trajectories: Sequence[Trajectory]) ->
         return
     belongs = np.array([[run.command == command for command in commands] for run in trajectories], dtype=float)
     twists, of_samples = paths.signals.twists, belongs[paths.owner] > 0
-    motions = np.array([np.median(twists[own], axis=0) for own in of_samples.T])
-    columns = modes.each_of(paths, belongs[paths.owner])
-    for command, own, shapes in zip(commands, columns, _near_motions(paths, motions), strict=True):
-        yield Basis("command", "body", f"the command {command}", own, len(commands), "smooth_command", shapes)
+    motions = np.array([np.median(twists[samples], axis=0) for samples in of_samples.T])
+    of_commands = modes.each_of(paths, belongs[paths.owner])
+    for command, columns, shapes in zip(commands, of_commands, _near_motions(paths, motions), strict=True):
+        yield Basis("command", "body", f"the command {command}", columns, len(commands), "smooth_command", shapes)
 
 
 def _near_motions(paths: Paths, motions: Array) -> Iterator[dict[str, float]]:
-    """For each of several motions (n, 3) where a bump lies that ends before the next of them."""
+    """For each of several motions (n, 3): centre and width of a bump that ends before the nearest other motion."""
     at_wheels = motions * [1.0, 1.0, lever(paths.robot)]
     away = np.linalg.norm(at_wheels[:, None] - at_wheels, axis=2) + np.diag(np.full(len(motions), np.inf))
     least = _SMALL + _NARROW * float(np.linalg.norm(at_wheels, axis=1).max())
@@ -245,13 +246,13 @@ def _near_motions(paths: Paths, motions: Array) -> Iterator[dict[str, float]]:
 
 
 def _pose_velocity(paths: Paths) -> Array:
-    """Velocities (S, 3) of the poses in the world, m/s, m/s, rad/s, over 100 ms."""
-    found = []
+    """Velocities (S, 3) of the poses in the world, m/s, m/s, rad/s, means over 100 ms."""
+    velocities = []
     for log, path in zip(paths.logs, paths.ends, strict=True):
         times = np.concatenate([[0.0], log.times])
         after, before = (
             np.column_stack([np.interp(log.stamps + shift, times, path[:, axis]) for axis in range(3)])
             for shift in (0.05, -0.05)
         )
-        found.append((after - before) / 0.1)
-    return np.concatenate(found)
+        velocities.append((after - before) / 0.1)
+    return np.concatenate(velocities)

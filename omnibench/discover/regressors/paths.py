@@ -1,11 +1,11 @@
-"""The paths of many runs under one model, and how their poses respond to small changes of the motion.
+"""The paths of many runs by one matrix, and the slopes of their poses by small changes of the motion.
 
 With z = x + iy and theta along a path, a change (dv, dw) of the twist, dv = dvx + i dvy in the robot's frame, moves the
 pose at time t, to first order, by
 
     d theta(t) = int dw dt',    d z(t) = int (exp(i theta) dv - i z dw) dt' + i z(t) d theta(t),
 
-so that any number of changes costs one sum over the samples each.
+One sum over the samples is enough for each change.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.signals import Signals, signals_of
 
-_STEP = 0.1  # of the plausible range: by so much a reference effect's parameter is moved to see its slope
-_BLOCK = 8_000_000  # numbers that are summed at once
+_STEP = 0.1  # of the plausible range: by so much a reference effect's parameter is moved to see its slope; chosen
+_BLOCK = 8_000_000  # numbers that are summed at once: 64 MB
 
 
 @dataclass(frozen=True, eq=False)
 class Paths:
-    """Runs end to end: F samples, S stamps.
+    """Paths of runs one after another: F samples, S stamps.
 
-    signals: of each session's samples, in the order of ``owner`` (F,), the run of each sample. middle (F, 3): pose in
-    the middle of each sample; poses (S, 3): at the stamps. run (S,): the run of each stamp. parts: the stamps of each
-    run.
+    signals: of all samples. sessions: the samples of each session. owner (F,): the run of each sample. middle (F, 3):
+    pose in the middle of each sample. poses (S, 3): at the stamps. run (S,): the run of each stamp. parts: the stamps
+    of each run. ends: of each run, poses at the start and at the end of each sample.
     """
 
     robot: Robot
@@ -55,7 +55,7 @@ class Paths:
 
     @property
     def stamps(self) -> Array:
-        """(S,): s."""
+        """Times (S,) of the stamps, s."""
         return np.concatenate([log.stamps for log in self.logs])
 
     def of_twist(self, direction: Array, shares: Array) -> Array:
@@ -77,14 +77,14 @@ class Paths:
         return self.respond(column, None)
 
     def correction(self, effect: MotionEffect, values: Mapping[str, float]) -> Array:
-        """What an effect adds at its stage, of every sample."""
+        """Correction of every sample by an effect: of wheel rates (F, N), twists (F, 3) or velocities (F, 2)."""
         parts = []
         for session, part in self.sessions:
             parts.append(_corrected(effect, _part(self.signals, part, session), values))
         return np.concatenate(parts)
 
     def of_effect(self, effect: MotionEffect | ReferenceEffect, unit: str, values: Mapping[str, float]) -> Array:
-        """Slopes (S, 3, 1) by the parameter ``unit`` of an effect, where all but the shapes among ``values`` are 0."""
+        """Slopes (S, 3, 1) by the parameter called ``unit`` of an effect. values: its shapes, and 0 for all else."""
         if isinstance(effect, ReferenceEffect):
             return self._of_reference(effect, unit, values)
         change = self.correction(effect, {**values, unit: 1.0})
@@ -98,8 +98,8 @@ class Paths:
         return ((after - before) / (2 * step))[..., None]
 
     def reported(self, effect: ReferenceEffect, values: Mapping[str, float]) -> Array:
-        """What the reference would report (S, 3) with an effect."""
-        found = []
+        """Poses (S, 3) that the reference would report with an effect."""
+        reported = []
         for log, path in zip(self.logs, self.ends, strict=True):
             position, heading = effect.delays(log.stamps, values)
             times = np.concatenate([[0.0], log.times])
@@ -109,8 +109,8 @@ class Paths:
                     _along(log.stamps - heading, times, path[:, 2]),
                 ]
             )
-            found.append(effect.reported(poses, log.start, values))
-        return np.concatenate(found)
+            reported.append(effect.reported(poses, log.start, values))
+        return np.concatenate(reported)
 
     def respond(self, column: Array, shares: Array | None) -> Array:
         """Slopes (S, 3, J) by column (F, 3), changes of (z, theta) in each sample, times shares (F, J)."""
@@ -121,7 +121,7 @@ class Paths:
         return np.concatenate(blocks, axis=2)
 
     def changes(self, twist: Array) -> Array:
-        """What a change (3,) or (F, 3) of the twist adds in each sample to z - i z dw and to theta, (F, 3)."""
+        """Integrals (F, 3) of exp(i theta) dv - i z dw and of dw over each sample. twist: changes (3,) or (F, 3)."""
         cosine, sine, east, north = self._turns.T
         forward, left, turn = twist.T
         changes = np.empty((len(cosine), 3))
@@ -147,14 +147,14 @@ def make_paths(robot: Robot, matrix: Array, logs: Sequence[WheelLog], sample_per
     """The paths of runs by a matrix alone, with exact arcs."""
     order = sorted(range(len(logs)), key=lambda index: str(logs[index].session))
     assert order == list(range(len(logs))), "runs come by session"
-    found = [signals_of(log, robot, matrix, sample_period) for log in logs]
-    ends, middles = zip(*(_path(log, signals) for log, signals in zip(logs, found, strict=True)), strict=True)
+    of_runs = [signals_of(log, robot, matrix, sample_period) for log in logs]
+    ends, middles = zip(*(_path(log, signals) for log, signals in zip(logs, of_runs, strict=True)), strict=True)
     counts = [len(log.times) for log in logs]
     owner = np.repeat(np.arange(len(logs)), counts)
     edges = np.cumsum([0, *(len(log.stamps) for log in logs)])
     parts = tuple(slice(int(low), int(high)) for low, high in pairwise(edges))
     middle = np.concatenate(middles)
-    signals = replace(_joined(found), poses=middle)
+    signals = replace(_joined(of_runs), poses=middle)
     sums, poses = _sums(logs, ends)
     run = np.repeat(np.arange(len(logs)), np.diff(edges))
     starts = np.array([log.start for log in logs])
@@ -179,7 +179,7 @@ def make_paths(robot: Robot, matrix: Array, logs: Sequence[WheelLog], sample_per
 
 
 def _path(log: WheelLog, signals: Signals) -> tuple[Array, Array]:
-    """Poses at the ends of the samples, the start before them (F + 1, 3), and in their middles (F, 3)."""
+    """Poses of the start and of the ends of the samples (F + 1, 3), and of their middles (F, 3)."""
     moved = signals.twists * signals.durations[:, None]
     heading = log.start[2] + np.concatenate([[0.0], np.cumsum(moved[:, 2])])
     middle = (heading[1:] + heading[:-1]) / 2
@@ -191,13 +191,13 @@ def _path(log: WheelLog, signals: Signals) -> tuple[Array, Array]:
 
 def _along(times: Array, ends: Array, values: Array) -> Array:
     """A coordinate of a path at any times: at rest before the start, straight on after the last sample."""
-    found: Array = np.interp(times, ends, values)
+    along: Array = np.interp(times, ends, values)
     late = times > ends[-1]
     if late.any():
         back = max(len(ends) - 6, 0)
         slope = (values[-1] - values[back]) / (ends[-1] - ends[back])
-        found[late] = values[-1] + slope * (times[late] - ends[-1])
-    return found
+        along[late] = values[-1] + slope * (times[late] - ends[-1])
+    return along
 
 
 def _sums(logs: Sequence[WheelLog], ends: Sequence[Array]) -> tuple[csr_array, Array]:
@@ -222,35 +222,35 @@ def _sums(logs: Sequence[WheelLog], ends: Sequence[Array]) -> tuple[csr_array, A
 
 
 def _sessions(logs: Sequence[WheelLog], counts: Sequence[int]) -> tuple[tuple[str | None, slice], ...]:
-    """The samples of each session, whose runs come one after another."""
-    found: list[tuple[str | None, slice]] = []
+    """The samples of each session; its runs come one after another."""
+    sessions: list[tuple[str | None, slice]] = []
     first = 0
     for log, count in zip(logs, counts, strict=True):
-        if found and found[-1][0] == log.session:
-            found[-1] = (log.session, slice(found[-1][1].start, first + count))
+        if sessions and sessions[-1][0] == log.session:
+            sessions[-1] = (log.session, slice(sessions[-1][1].start, first + count))
         else:
-            found.append((log.session, slice(first, first + count)))
+            sessions.append((log.session, slice(first, first + count)))
         first += count
-    return tuple(found)
+    return tuple(sessions)
 
 
 def _corrected(effect: MotionEffect, signals: Signals, values: Mapping[str, float]) -> Array:
-    """An effect's correction. PluginError: it cannot be had, or is no such thing."""
+    """Correction by an effect. Raises PluginError where it fails, has another shape, or is not finite."""
     width = {"body": 3, "world": 2}.get(effect.stage, signals.rates.shape[1])
     way_out = f"try omnibench plugin check, or leave it out: --without {effect.name}"
     try:
-        found = np.asarray(effect.correction(signals, values), dtype=float)
+        correction = np.asarray(effect.correction(signals, values), dtype=float)
     except Exception as error:  # a plug-in may raise anything
         said = f"{type(error).__name__}: {error}"
         raise PluginError(f"effect {effect.name!r}: its correction ended in {said}; {way_out}") from error
-    if found.shape != (len(signals.rates), width) or not np.isfinite(found).all():
+    if correction.shape != (len(signals.rates), width) or not np.isfinite(correction).all():
         expected = f"{(len(signals.rates), width)} finite values"
-        raise PluginError(f"effect {effect.name!r}: its correction is not {expected} but {found.shape}; {way_out}")
-    return found
+        raise PluginError(f"effect {effect.name!r}: its correction is not {expected} but {correction.shape}; {way_out}")
+    return correction
 
 
 def _part(signals: Signals, part: slice, session: str | None) -> Signals:
-    """Some of the samples, of one session."""
+    """The signals of some samples, which are of one session."""
     values = {item.name: getattr(signals, item.name) for item in fields(signals)}
     chosen: dict[str, Any] = {name: value[part] for name, value in values.items() if isinstance(value, np.ndarray)}
     chosen["session"] = session
@@ -258,7 +258,7 @@ def _part(signals: Signals, part: slice, session: str | None) -> Signals:
 
 
 def _joined(signals: Sequence[Signals]) -> Signals:
-    """Samples of all runs one after another; what one run lacks, all lack."""
+    """The signals of all runs one after another; a signal that one run lacks is left out for all."""
     joined: dict[str, Any] = {}
     for item in fields(Signals):
         values = [getattr(each, item.name) for each in signals]

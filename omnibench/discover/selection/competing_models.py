@@ -22,14 +22,15 @@ _CLEARLY = 2.0  # standard errors of the difference in cost from which on a mode
 
 @dataclass(frozen=True, eq=False)
 class CompetingModels:
-    """The model that is used, its effects, and all models with their weights, the used one first.
+    """The model that is used, the selection of its effects, and all competing models.
 
-    preferred: for each chosen effect, why it is used where another is as likely, or nothing.
+    weighted: all models with the weights of their names, the used one first. preferred: for each chosen effect, why it
+    is used where another is as likely, or nothing.
     """
 
     used: Extended
     selection: Selection
-    models: tuple[tuple[float, Extended], ...]
+    weighted: tuple[tuple[float, Extended], ...]
     preferred: tuple[str, ...]
 
 

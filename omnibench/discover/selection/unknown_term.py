@@ -75,13 +75,13 @@ def add_smooth_term(plain: Fit, screening: Screening, selection: Selection, mode
     gained = f"{mean:.2g} +- {error:.1g} of whitened chi2 a run"
     if not mean > STANDARD_ERRORS * error:
         return SmoothTerm(models, f"{_capital(what)} was tried and left out: on runs held out it gains {gained}.")
-    others = tuple((weight, extend(plain, [*model.groups, *best.terms])) for weight, model in models.models[1:])
+    others = tuple((weight, extend(plain, [*model.groups, *best.terms])) for weight, model in models.weighted[1:])
     note = f"The extended model holds {what}, which is no name: on runs held out it gains {gained}."
-    return SmoothTerm(replace(models, used=best.used, models=((models.models[0][0], best.used), *others)), note)
+    return SmoothTerm(replace(models, used=best.used, weighted=((models.weighted[0][0], best.used), *others)), note)
 
 
 def _tried(plain: Fit, base: Extended, bases: Sequence[Basis]) -> Iterator[_Trial]:
-    """The model with functions of some bases, if any of them gains more than its price."""
+    """The model with functions of some bases; none where no function gains enough."""
     terms = chosen_functions(base, list(_groups_of(bases, plain.model.robot)))
     if terms:
         used = extend(plain, [*base.groups, *terms])

@@ -146,7 +146,7 @@ def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
     used = smooth.models.used
     assert used.groups[0].name == "heading_drift"
     assert {each.name for each in used.groups[1:]} <= {"smooth_heading", "smooth_course"}
-    assert smooth.models.models[0][1] is used
+    assert smooth.models.weighted[0][1] is used
     assert "no name" in smooth.note
     calibrated = calibration_terms(used)
     assert calibrated["heading_drift"]["b"] == used.values[0]
