@@ -1,4 +1,4 @@
-"""How good reference poses are, judged by a simulation's hidden truth."""
+"""Accuracy of reference poses against the hidden truth of a simulation."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import moved_to
 
-_SINGULAR = 1e-14  # of the largest variance
+_SINGULAR = 1e-14  # share of the largest variance below which a covariance counts as singular
 
 
 class ErrorSummary(Model):
-    """Errors of poses. The bias is the mean error in the robot's frame, and what repeats in it is systematic."""
+    """Errors of poses. The bias is the mean error along the robot's axes, the systematic part of the error."""
 
     poses: int
     position_mean_m: float
@@ -38,7 +38,7 @@ class ErrorSummary(Model):
 
 
 class SlamAccuracy(Model):
-    """Errors of the last pose of every run, and of all poses after the first, which is where the run starts."""
+    """Errors of the last pose of every run, and of all poses but the start poses."""
 
     runs: int
     distance_m: float = Field(description="driven in all")
@@ -56,7 +56,9 @@ def slam_accuracy(poses: Dataset, truth: Mapping[str, TruePath]) -> SlamAccuracy
     runs = []
     for trajectory in poses.trajectories:
         if trajectory.id not in truth:
-            raise DataError(f"data set {poses.name}: trajectory {trajectory.id} is not in the truth; is it of others?")
+            raise DataError(
+                f"data set {poses.name}: trajectory {trajectory.id} is not in the truth; name that of this data set"
+            )
         if len(trajectory.pose_times) < 2:
             raise DataError(f"data set {poses.name}: trajectory {trajectory.id} has no pose after its start")
         runs.append(run_errors(trajectory, truth[trajectory.id]))
@@ -74,8 +76,9 @@ def slam_accuracy(poses: Dataset, truth: Mapping[str, TruePath]) -> SlamAccuracy
 class RunErrors:
     """Errors of a run's reference poses after the first.
 
-    times (K,): of the poses, s. driven (K,): true way until then, m. in_robot (K, 3): along the robot's axes, m, m,
-    rad. nees (K,): error' covariance^-1 error, NaN where the covariance is singular; None without covariances.
+    times (K,): of the poses, s. driven (K,): true distance driven until then, m. in_robot (K, 3): errors along the
+    robot's axes, m, m, rad. nees (K,): error' covariance^-1 error, NaN where the covariance is singular; None without
+    covariances.
     """
 
     times: Array
@@ -85,16 +88,16 @@ class RunErrors:
 
     @property
     def position(self) -> Array:
-        """Magnitudes (K,), m."""
+        """Magnitudes (K,) of the position's errors, m."""
         return np.hypot(self.in_robot[:, 0], self.in_robot[:, 1])
 
     @property
     def heading(self) -> Array:
-        """Magnitudes (K,), rad."""
+        """Magnitudes (K,) of the heading's errors, rad."""
         return np.abs(self.in_robot[:, 2])
 
     def of(self, poses: slice | NDArray[np.bool_]) -> RunErrors:
-        """Of some of the poses."""
+        """The errors of some of the poses."""
         nees = None if self.nees is None else self.nees[poses]
         return RunErrors(self.times[poses], self.driven[poses], self.in_robot[poses], nees)
 
@@ -114,7 +117,7 @@ def run_errors(trajectory: Trajectory, truth: TruePath) -> RunErrors:
 
 
 def _nees(errors: Array, covariances: Array) -> Array:
-    """error' covariance^-1 error (K,); NaN where the covariance, as in a foreign data set, is singular."""
+    """Normalised squared errors e' C^-1 e (K,); NaN where the covariance C is singular."""
     values, directions = np.linalg.eigh(covariances)
     regular = values[:, 0] > _SINGULAR * values[:, -1]
     along = np.einsum("kij,ki->kj", directions[regular], errors[regular])
@@ -145,7 +148,7 @@ def _summary(runs: list[RunErrors]) -> ErrorSummary:
 
 
 def _growth(runs: list[RunErrors], sizes: list[Array]) -> float:
-    """The slope k of size^2 = noise^2 + (k way)^2, by least squares; 0 where errors do not grow."""
+    """Slope k of error^2 = noise^2 + (k distance)^2 by least squares; 0 where errors do not grow."""
     squares = np.concatenate(sizes) ** 2
     ways = np.concatenate([run.driven for run in runs]) ** 2
     ways -= ways.mean()

@@ -1,6 +1,6 @@
-"""What is known of the robot's motion besides the scan in question: odometry, or only how it moved before.
+"""Motion priors: the next scan's pose and the motion within it, predicted from odometry or from the last poses.
 
-A motion is written as the constant twist that makes it in unit time: (3,), m, m, rad.
+A motion (3,) is written as the constant twist that makes it in unit time, m, m, rad.
 """
 
 from __future__ import annotations
@@ -16,16 +16,18 @@ from omnibench.robot.planar import compose, relative, unit_twist
 from omnibench.slam.motion_within_scan import MotionWithinScan, smoothed
 from omnibench.slam.slam_options import SlamOptions
 
-_ARM = 0.3  # m; a turn counts as what it moves there
-_EACH: Array = np.array([1.0, 1.0, 1 / _ARM])
-_UNSTEADY = 0.5  # 1/s; in a second a twist changes by this share of what the robot may drive
-_FOUND: Array = np.array([1e-3, 1e-3, 5e-4])  # m, m, rad; standard deviations of a motion between poses found
+_ARM = 0.3  # m; lever arm that turns a rotation into a distance (chosen)
+_PER_LENGTH: Array = np.array([1.0, 1.0, 1 / _ARM])
+_UNSTEADY = 0.5  # 1/s; change of a twist in a second, as a share of the robot's greatest twist (chosen)
+_MATCH_NOISE: Array = np.array([1e-3, 1e-3, 5e-4])  # m, m, rad; standard deviations of a motion between matched poses
 
 
 @dataclass(frozen=True, eq=False)
 class MotionPrediction:
-    """Of a scan before it is matched. start (3,): where the robot may be. deviations (3,): standard deviations of its
-    motion since the last scan, in the robot's frame, m, m, rad. within: its motion during the scan.
+    """Prediction for a scan before it is matched.
+
+    start (3,): predicted pose. deviations (3,): standard deviations of the motion since the last scan, in the robot's
+    frame, m, m, rad. within: motion during the scan.
     """
 
     start: Array
@@ -34,37 +36,34 @@ class MotionPrediction:
 
 
 class MotionPrior(ABC):
-    """Of one run, scan by scan. The first scan is number 0."""
+    """Prior of the motion of one run. times (S,): of its scans, s; scan 0 is the first. duration: of a scan, s."""
 
     def __init__(self, times: Array, duration: float) -> None:
         self._periods, self._duration = np.diff(times, prepend=times[0]), duration
 
     @abstractmethod
     def first(self) -> tuple[MotionWithinScan, Array]:
-        """The motion during the first scan, and the standard deviations (3,) of its twist."""
+        """The motion during the first scan, and standard deviations (3,) of its twist, m/s, m/s, rad/s."""
 
     @abstractmethod
     def predict(self, scan: int, last: Array) -> MotionPrediction:
-        """What to expect of a scan after the first, the robot's last pose (3,) known."""
+        """The prediction for a scan after the first. last (3,): pose of the scan before it."""
 
     @abstractmethod
-    def correct(self, scan: int, last: Array, found: Array, before: Array) -> tuple[Array, Array]:
-        """What a scan whose pose is roughly known tells of the motion during it.
+    def correct(self, scan: int, last: Array, pose: Array, before: Array) -> tuple[Array, Array]:
+        """Correct the motion during a scan by the scan's roughly known ``pose`` (3,).
 
-        The twist (3,) that is to be added to what was expected, and the standard deviations (3,) of what is then left.
-        before (3,): the twist that had been added when the pose was found.
+        Returns the twist (3,) to add to the predicted one, and standard deviations (3,) of the corrected twist. last
+        (3,): pose of the scan before. before (3,): twist that had been added when the pose was estimated.
         """
 
-    def _unseen(self, scan: int, change: Array) -> Array:
-        """Of a change (3,) of the twist within a scan that its own pose told: what that pose, skewed by it, hides."""
+    def _skew_error(self, scan: int, change: Array) -> Array:
+        """Standard deviations (3,) of the twist after a change (3,) by a pose that this change itself had skewed."""
         return self._duration / (2 * self._periods[scan]) * np.abs(change)
 
 
 class OdometryPrior(MotionPrior):
-    """Odometry, which may be uncalibrated (wrong in scale and direction by a few per cent) and coarse.
-
-    times (S,): of the scans, each of which takes ``duration``, s.
-    """
+    """Prior from odometry, which may be uncalibrated (wrong in scale and direction by a few per cent) and coarse."""
 
     def __init__(self, odometry: Callable[[Array], Array], times: Array, duration: float, options: SlamOptions) -> None:
         stamps, place = np.unique(times, return_inverse=True)
@@ -74,39 +73,43 @@ class OdometryPrior(MotionPrior):
         super().__init__(times, duration)
 
     def first(self) -> tuple[MotionWithinScan, Array]:
-        return self._within[0], self._doubt(0, self._within[0].mean)
+        return self._within[0], self._deviations(0, self._within[0].mean)
 
     def predict(self, scan: int, last: Array) -> MotionPrediction:
         driven = relative(self._poses[scan - 1], self._poses[scan])
         return MotionPrediction(compose(last, driven), odometry_deviations(driven, self._error), self._within[scan])
 
-    def correct(self, scan: int, last: Array, found: Array, before: Array) -> tuple[Array, Array]:
-        """As wrong as the odometry was since the last scan, in proportion to the motion.
+    def correct(self, scan: int, last: Array, pose: Array, before: Array) -> tuple[Array, Array]:
+        """Scale the odometry's error since the last scan to the motion within this scan.
 
-        The less the robot has moved since, or the less its odometry's error exceeds that of the pose found, the less is
-        known of it.
+        The correction gets a smaller share the less the robot has moved, and the less the odometry's error exceeds that
+        of the matched pose.
         """
         if not self._duration:
             return np.zeros(3), np.zeros(3)
         twist = self._within[scan].mean
         driven = unit_twist(relative(self._poses[scan - 1], self._poses[scan]))
-        noise = np.hypot(np.sqrt(2) * self._coarse, _FOUND)
+        noise = np.hypot(np.sqrt(2) * self._coarse, _MATCH_NOISE)
         share = length(driven) * length(twist) / (length(driven) ** 2 + (length(noise) / self._error) ** 2)
-        correction = share * (unit_twist(relative(last, found)) - driven)
-        doubts = self._doubt(scan, twist - share * driven), share * noise, self._unseen(scan, correction - before)
-        return correction, np.sqrt(np.square(doubts).sum(axis=0))
+        correction = share * (unit_twist(relative(last, pose)) - driven)
+        errors = (
+            self._deviations(scan, twist - share * driven),
+            share * noise,
+            self._skew_error(scan, correction - before),
+        )
+        return correction, np.sqrt(np.square(errors).sum(axis=0))
 
-    def _doubt(self, scan: int, unknown: Array) -> Array:
-        """Standard deviations (3,) of the twist within a scan, a part (3,) of which is as wrong as odometry may be."""
-        return np.hypot(odometry_deviations(unknown, self._error), self._within[scan].deviations)
+    def _deviations(self, scan: int, uncorrected: Array) -> Array:
+        """Standard deviations (3,) of the twist within a scan. uncorrected (3,): its part with the odometry's error."""
+        return np.hypot(odometry_deviations(uncorrected, self._error), self._within[scan].deviations)
 
 
 class LastPosePrior(MotionPrior):
-    """Only the poses so far are known; the last one is where the search starts. At the first scan the robot stands."""
+    """Prior from the last poses alone: the search starts from the last one. At the first scan the robot stands."""
 
     def __init__(self, times: Array, duration: float, options: SlamOptions) -> None:
         super().__init__(times, duration)
-        self._deviations = np.array([options.speed, options.speed, options.turn_rate])
+        self._greatest = np.array([options.speed, options.speed, options.turn_rate])
         self._mean: Array = np.zeros(3)  # twist between the last two scans
         self._before: Array | None = None  # the pose of the first of them
 
@@ -118,23 +121,23 @@ class LastPosePrior(MotionPrior):
             self._mean = unit_twist(relative(self._before, last)) / self._periods[scan - 1]
         self._before = last
         within = MotionWithinScan.steady(self._mean, self._duration)
-        return MotionPrediction(last, self._deviations * self._periods[scan], within)
+        return MotionPrediction(last, self._greatest * self._periods[scan], within)
 
-    def correct(self, scan: int, last: Array, found: Array, before: Array) -> tuple[Array, Array]:
-        """The mean twist since the last scan, carried on as it changes; it may as well have changed otherwise."""
+    def correct(self, scan: int, last: Array, pose: Array, before: Array) -> tuple[Array, Array]:
+        """Extrapolate the mean twist since the last scan linearly; deviations cover any other change."""
         period = self._periods[scan]
-        mean = unit_twist(relative(last, found)) / period
+        mean = unit_twist(relative(last, pose)) / period
         change = (mean - self._mean) * (period + self._duration) / (period + self._periods[scan - 1]) / 2
         correction = mean + change - self._mean
-        doubts = change, _UNSTEADY * self._deviations * self._duration / 2, self._unseen(scan, correction - before)
-        return correction, np.sqrt(np.square(doubts).sum(axis=0))
+        errors = change, _UNSTEADY * self._greatest * self._duration / 2, self._skew_error(scan, correction - before)
+        return correction, np.sqrt(np.square(errors).sum(axis=0))
 
 
 def odometry_deviations(driven: Array, error: float) -> Array:
-    """Standard deviations (3,) of a motion (3,) of the robot that its odometry tells but for an ``error``, a share."""
-    return error * length(driven) * _EACH
+    """Standard deviations (3,) of a motion (3,) measured by odometry. error: relative, as a share of the length."""
+    return error * length(driven) * _PER_LENGTH
 
 
 def length(moved: Array) -> float:
-    """Of a motion (3,) or twist: m or m/s, its turn included."""
+    """Length of a motion (3,), m, or a twist (3,), m/s; the turn counts at the lever arm."""
     return float(np.hypot(np.hypot(moved[0], moved[1]), _ARM * moved[2]))

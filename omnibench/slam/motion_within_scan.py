@@ -1,4 +1,4 @@
-"""How the robot moves within a scan, smoothly, as a function of time: taken from its odometry, ticks smoothed out."""
+"""Motion of the robot within a scan as a smooth function of time, fitted to its odometry."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import unit_twist
 
-_AROUND = 0.25  # s; so much of the odometry besides the scan's own time tells the motion within it
-_INSTANT = 0.02  # s between instants at which it is asked
-_DEGREE = 3
-_ALIKE = 4.0  # instants one after another whose errors are the same, as those of ticks are
+_AROUND = 0.25  # s of odometry besides the scan's own time that the fit takes in (chosen)
+_INSTANT = 0.02  # s between the odometry poses of the fit (chosen)
+_DEGREE = 3  # of the polynomial in time
+_ALIKE = 4.0  # successive poses with one error, as encoder ticks give (chosen)
 
 
 @dataclass(frozen=True, eq=False)
 class MotionWithinScan:
-    """The motion since a scan's stamp: until a delay t the one that the twist c_1 t + c_2 t^2 + ... makes in unit time.
+    """Motion from a scan's stamp to a delay t: the one that the twist c_1 t + c_2 t^2 + ... makes in unit time.
 
     coefficients (k, 3): m/s^k, m/s^k, rad/s^k, in the robot's frame at the stamp. duration: of the scan, s. deviations
-    (3,): standard deviations of twists until some delay that come from how coarse the odometry is.
+    (3,): standard deviations of mean twists since the stamp due to coarse odometry, m/s, m/s, rad/s.
     """
 
     coefficients: Array
@@ -30,7 +30,7 @@ class MotionWithinScan:
 
     @classmethod
     def steady(cls, twist: Array, duration: float) -> MotionWithinScan:
-        """With a constant twist (3,), m/s, m/s, rad/s."""
+        """The motion with a constant twist (3,), m/s, m/s, rad/s."""
         return cls(twist[None], duration, np.zeros(3))
 
     def at(self, delays: Array) -> Array:
@@ -46,10 +46,10 @@ class MotionWithinScan:
 
 
 def smoothed(odometry: Callable[[Array], Array], times: Array, duration: float) -> tuple[list[MotionWithinScan], Array]:
-    """The motion within each scan, and standard deviations (3,) of the odometry's poses, which tell how coarse it is.
+    """The motion within each scan, and standard deviations (3,) of the odometry's poses about the fit, m, m, rad.
 
-    A motion is the cubic through the odometry about a scan, by least squares; what is left over is coarse.
-    times (S,): of the scans, s. duration: of each, s. There is no odometry before t = 0.
+    A motion is the cubic through the odometry about a scan, by least squares. times (S,): of the scans, s. duration: of
+    each, s. There is no odometry before t = 0.
     """
     if not duration:
         return [MotionWithinScan.steady(np.zeros(3), 0.0)] * len(times), np.zeros(3)
@@ -62,14 +62,17 @@ def smoothed(odometry: Callable[[Array], Array], times: Array, duration: float) 
     basis = np.concatenate([np.ones((*delays.shape, 1)), _powers(delays, _DEGREE)], axis=2)
     inverse = np.linalg.pinv(basis)
     fitted = inverse @ motions
-    left = motions - basis @ fitted
-    squares = (left**2).sum(axis=1) / (count - _DEGREE - 1)
+    residuals = motions - basis @ fitted
+    squares = (residuals**2).sum(axis=1) / (count - _DEGREE - 1)
     coarse = squares.mean(axis=0)
-    squares = np.maximum(squares, coarse)  # where no tick falls, there may have been one
+    squares = np.maximum(squares, coarse)  # a scan without encoder ticks looks smoother than its odometry is
     parts = duration * np.linspace(0.2, 1.0, 5)
     means = parts[:, None] ** np.arange(_DEGREE) @ inverse[:, 1:]  # twists of parts of the scan: (S, 5, count)
     deviations = np.sqrt(_ALIKE * (means**2).sum(axis=2).mean(axis=1)[:, None] * squares)
-    motions_within = [MotionWithinScan(each[1:], duration, of) for each, of in zip(fitted, deviations, strict=True)]
+    motions_within = [
+        MotionWithinScan(coefficients[1:], duration, scan_deviations)
+        for coefficients, scan_deviations in zip(fitted, deviations, strict=True)
+    ]
     return motions_within, np.sqrt(coarse)
 
 

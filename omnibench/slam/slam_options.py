@@ -1,4 +1,4 @@
-"""What can be chosen of SLAM."""
+"""Options of SLAM."""
 
 from __future__ import annotations
 
@@ -15,31 +15,48 @@ class SlamOptions(Model):
     """How scans become poses. The defaults suit a robot indoors, up to 0.5 m/s and 1 rad/s with four scans a second."""
 
     start: Literal["odometry", "last_pose"] = Field(
-        "odometry", description="where the search for a scan's pose begins, and what is kept where scans tell nothing"
+        "odometry",
+        description="where the search for a scan's pose starts; kept along directions that the scans do not measure",
     )
     deskew: bool = Field(True, description="undo the robot's motion within a scan")
     search_distance: float = Field(
-        1.0, gt=0, le=10, allow_inf_nan=False, description="m; farther from the map no point is matched, at first"
+        1.0,
+        gt=0,
+        le=10,
+        allow_inf_nan=False,
+        description="m; points farther from the map are not matched in the first search",
     )
     match_distance: float = Field(
-        0.15, gt=0, le=10, allow_inf_nan=False, description="m; the same once the pose is roughly known"
+        0.15,
+        gt=0,
+        le=10,
+        allow_inf_nan=False,
+        description="m; points farther from the map are not matched once the pose is roughly known",
     )
     spacing: float = Field(0.1, gt=0.005, le=1, allow_inf_nan=False, description="m between points of the map")
     keyframe_distance: float = Field(
-        0.25, gt=0, allow_inf_nan=False, description="m; after it a scan adds to the map what is not there yet"
+        0.25, gt=0, allow_inf_nan=False, description="m; distance after which a scan adds new surfaces to the map"
     )
-    keyframe_angle: float = Field(0.2, gt=0, allow_inf_nan=False, description="rad; the same")
+    keyframe_angle: float = Field(0.2, gt=0, allow_inf_nan=False, description="rad; turn after which a scan does so")
     constrained_position: float = Field(
-        0.02, gt=0, allow_inf_nan=False, description="m; along a direction told less well than this the start is kept"
+        0.02,
+        gt=0,
+        allow_inf_nan=False,
+        description="m; along directions that a scan measures less precisely, the start is kept",
     )
-    constrained_heading: float = Field(0.01, gt=0, allow_inf_nan=False, description="rad; the same for headings")
+    constrained_heading: float = Field(
+        0.01, gt=0, allow_inf_nan=False, description="rad; as constrained_position, for the heading"
+    )
     odometry_error: float = Field(
-        0.1, gt=0, allow_inf_nan=False, description="standard deviation of the odometry's error, share of the distance"
+        0.1,
+        gt=0,
+        allow_inf_nan=False,
+        description="standard deviation of the odometry's error, as a share of the distance",
     )
-    speed: float = Field(
-        0.5, gt=0, allow_inf_nan=False, description="m/s; what the robot may drive where scans and start tell nothing"
+    speed: float = Field(0.5, gt=0, allow_inf_nan=False, description="m/s; greatest speed, for start last_pose")
+    turn_rate: float = Field(
+        1.0, gt=0, allow_inf_nan=False, description="rad/s; greatest rate of turn, for start last_pose"
     )
-    turn_rate: float = Field(1.0, gt=0, allow_inf_nan=False, description="rad/s; the same")
 
     @model_validator(mode="after")
     def _narrows(self) -> SlamOptions:
@@ -51,5 +68,5 @@ class SlamOptions(Model):
 
     @property
     def limits(self) -> Array:
-        """How well (3,) a scan must tell x, y (m) and heading (rad), or the start is kept."""
+        """Least precision (3,) of a scan along x, y (m) and in heading (rad) at which the start is not kept."""
         return np.array([self.constrained_position, self.constrained_position, self.constrained_heading])

@@ -1,4 +1,4 @@
-"""What ``omnibench slam`` is asked for: reference poses of a recording from its scans, and how good they are."""
+"""The job of ``omnibench slam``: reference poses of a recording from its scans, and how good they are."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from omnibench.slam.slam_dataset import slam_paths, with_paths
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.summary import SlamSummary, summarise
 
-_WORKERS = 2
+_WORKERS = 2  # processes
 
 
 @dataclass(frozen=True, eq=False)
 class SlamResult:
-    """The data set with its new poses, what is said of them, and the true paths, if they are known."""
+    """The data set with its new poses, their summary, and the true paths, if they are known."""
 
     dataset: Dataset
     summary: SlamSummary
@@ -37,10 +37,11 @@ class SlamResult:
 
 @dataclass(frozen=True)
 class SlamRequest:
-    """A recording, and where it goes with its new poses (None: nowhere).
+    """Arguments of ``omnibench slam``.
 
-    model: a calibration file, whose odometry the search starts from; None: the design values. truth: the folder that
-    ``simulate --truth`` wrote. ConfigError in one line: the recording would be written over.
+    dataset: folder of the recording. output: folder to write with the new poses; None: none. model: a calibration file,
+    whose odometry the search starts from; None: the design values. truth: the folder that ``simulate --truth`` wrote.
+    ConfigError in one line: the recording would be written over.
     """
 
     dataset: Path

@@ -1,4 +1,4 @@
-"""What SLAM of a data set came to, in numbers."""
+"""Summary of SLAM of a data set in numbers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SAME_TIME = 1e-6  # s
 
 
 class Distances(Model):
-    """How far poses are from others of the same runs and times, the start poses left out."""
+    """Distances between two sets of poses of the same runs and times, without the start poses."""
 
     poses: int
     position_mean_m: float
@@ -27,19 +27,21 @@ class Distances(Model):
 
 
 class SlamSummary(Model):
-    """SLAM of a data set. Deviations are standard deviations that SLAM states at the end of the runs."""
+    """SLAM of a data set. Deviations are the standard deviations that SLAM states for the runs' last poses."""
 
     dataset: str
     simulated: bool
     runs: int
     scans: int
     matched_mean: float = Field(description="share of a scan's points that lie on the map, mean over all scans")
-    matched_min: float = Field(description="the same of the worst scan")
-    position_deviation_mean_m: float = Field(description="along the direction that is known worst; mean over runs")
-    position_deviation_max_m: float = Field(description="the same of the worst run")
+    matched_min: float = Field(description="matched share of the worst scan")
+    position_deviation_mean_m: float = Field(description="along the least certain direction; mean over runs")
+    position_deviation_max_m: float = Field(description="along the least certain direction; worst run")
     heading_deviation_mean_rad: float
     heading_deviation_max_rad: float
-    recorded: Distances | None = Field(description="from the poses that the data set held before; None: not comparable")
+    recorded: Distances | None = Field(
+        description="distance from the poses that the data set held before; None: not comparable"
+    )
     accuracy: SlamAccuracy | None = Field(description="against the truth of a simulation, if that is known")
     warnings: tuple[str, ...]
 
@@ -47,7 +49,7 @@ class SlamSummary(Model):
 def summarise(
     before: Dataset, after: Dataset, paths: Sequence[SlamPath], accuracy: SlamAccuracy | None = None
 ) -> SlamSummary:
-    """What SLAM made of a data set's runs. before: with the poses recorded; after: with those of ``paths``."""
+    """Summary of SLAM. before: the data set with its recorded poses. after: with the poses of ``paths``."""
     matched = np.concatenate([path.matched for path in paths])
     last = np.array([path.covariances[-1] for path in paths])
     position = np.sqrt(np.linalg.eigvalsh(last[:, :2, :2])[:, -1])
@@ -70,15 +72,15 @@ def summarise(
 
 
 def distances(one: Dataset, other: Dataset) -> Distances | None:
-    """How far the reference poses of two data sets of the same runs are apart; None when no times are common to both.
+    """Distances between the reference poses of two data sets of the same runs; None when they have no common times.
 
-    Compared at the stamps of the one that has fewer poses, between poses of the other by a straight line.
+    Compared at the stamps of the data set with fewer poses; the other's poses are interpolated by straight lines.
     """
-    found = [
+    differences = [
         _apart((mine.pose_times, mine.poses), (theirs.pose_times, theirs.poses))
         for mine, theirs in zip(one.trajectories, other.trajectories, strict=True)
     ]
-    errors = np.concatenate(found)
+    errors = np.concatenate(differences)
     if not len(errors):
         return None
     position = np.hypot(errors[:, 0], errors[:, 1])

@@ -1,4 +1,4 @@
-"""Points of a scan and the surfaces of the map that they lie on: the algebra of one step of scan matching."""
+"""Correspondences of a scan's points with surfaces of the map: the algebra of one step of scan matching."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ from omnibench.robot.kinematics import Array
 from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints
 
-_OUTLIER = 4.0  # standard deviations
-_PARALLEL = 0.9  # least cosine between normals of one surface
-_FEIGNED = 4.0  # standard deviations of a normal that may be no more than its error
-_GRAZING = 0.25  # least share of a range's variance that counts across a surface
+_OUTLIER = 4.0  # standard deviations; a point farther from a surface does not match it
+_PARALLEL = 0.9  # least cosine between the normals of a point and of its surface
+_FEIGNED = 4.0  # standard deviations of a normal: information that so large an error explains does not count
+_GRAZING = 0.25  # least share of a range's variance across a surface that is seen at a grazing angle
 
 
 class Correspondences:
-    """Correspondences at a pose (3,) of the robot, whose deviations are (m, m, rad) along the axes of the run's frame.
+    """Points of a scan and their surfaces, as seen from a pose (3,) of the robot.
 
-    matched: share of the scan's points that have a surface.
+    Derivatives are with respect to the pose (m, m, rad) along the axes of the run's frame. matched: share of the scan's
+    points that have a surface.
     """
 
     def __init__(self, surroundings: ScanMap, scan: ScanPoints, pose: Array) -> None:
         cosine, sine = np.cos(pose[2]), np.sin(pose[2])
         turn = np.array([[cosine, sine], [-sine, cosine]])
-        # What is not straight misleads at corners and edges.
+        # Points that lie on no line mislead at corners and edges.
         straight = np.flatnonzero((scan.line >= 0) & surroundings.is_usable)
         seen = scan.points[straight] @ turn  # from the robot, along the axes of the run's frame
         index, _ = surroundings.nearest(pose[:2] + seen)
@@ -48,30 +49,31 @@ class Correspondences:
         self._seen_normals = normals_seen[kept]
 
     def information(self) -> Array:
-        """Of the points about the pose, (3, 3)."""
+        """Fisher information (3, 3) of the points about the pose."""
         return self._weighted(self._weights, self._slopes)
 
     def gradient(self) -> Array:
-        """Of half the weighted squares of the points' distances from their surfaces, (3,)."""
+        """Gradient (3,) of the point-to-line cost 1/2 sum w d^2."""
         return self._slopes.T @ (self._weights * self._distances)
 
     def certain_information(self, directions: Array) -> Array:
-        """Information along directions (3, k; columns) that errors of the map's normals cannot feign: (k,)."""
-        moved, feigned = self._slopes @ directions, self._along @ directions
-        doubtful = _FEIGNED**2 * self._surface.tilt_variances[:, None] * feigned**2
-        certain: Array = self._weights @ np.maximum(moved**2 - doubtful, 0.0)
+        """Information (k,) along directions (3, k; columns) that errors of the map's normals cannot explain."""
+        across, along = self._slopes @ directions, self._along @ directions
+        explained = _FEIGNED**2 * self._surface.tilt_variances[:, None] * along**2
+        certain: Array = self._weights @ np.maximum(across**2 - explained, 0.0)
         return certain
 
     def rise(self, step: Array, most: int) -> float:
-        """How far the squares of distances rise if the pose moves by a step (3,), as a share of what slopes promise.
+        """Actual rise of the cost when the pose moves by a step (3,), as a share of the rise that the slopes predict.
 
-        There the points find their surfaces anew; those that find none do not count. The mean of both ways, so that it
-        does not matter whether the pose is the best. 1 where nothing rises. most: points that are asked, at most.
+        At the moved pose the points are matched anew; those without a surface do not count. Both directions of the step
+        are added up, so that the pose need not be the minimum. 1 where no rise is predicted. most: points that are
+        used, at most.
         """
-        some = slice(None, None, 1 + len(self._weights) // most)
-        seen, weights, limit = self._seen[some], self._weights[some], _OUTLIER**2
-        distances, slopes, normals_seen = self._distances[some], self._slopes[some], self._seen_normals[some]
-        rises = promised = 0.0
+        chosen = slice(None, None, 1 + len(self._weights) // most)
+        seen, weights, limit = self._seen[chosen], self._weights[chosen], _OUTLIER**2
+        distances, slopes, normals_seen = self._distances[chosen], self._slopes[chosen], self._seen_normals[chosen]
+        rises = predicted = 0.0
         for moved in (step, -step):
             cosine, sine = np.cos(moved[2]), np.sin(moved[2])
             turn = np.array([[cosine, sine], [-sine, cosine]])
@@ -84,24 +86,24 @@ class Correspondences:
             there = alike & (apart**2 - across**2 < self._surroundings.spacing**2)
             before = (weights * distances**2)[there]
             rises += float((np.minimum(weights * across**2, limit)[there] - before).sum())
-            promised += float((np.minimum(weights * (distances + slopes @ moved) ** 2, limit)[there] - before).sum())
-        return rises / promised if promised > 0 else 1.0
+            predicted += float((np.minimum(weights * (distances + slopes @ moved) ** 2, limit)[there] - before).sum())
+        return rises / predicted if predicted > 0 else 1.0
 
     def scatter(self) -> Array:
-        """Covariance of the gradient (3, 3): noise of this scan and of the map's lines."""
+        """Covariance (3, 3) of the gradient from the noise of this scan and of the map's lines."""
         if not len(self._weights):
             return np.zeros((3, 3))
-        # Points on one line share its error, which is that of so many rays.
+        # Points on one line share its error, which falls with the number of rays that the line was fitted to.
         _, line = np.unique(self._surface.line, return_inverse=True)
         shared = np.bincount(line)[line] / self._surface.rays
         return self._weighted(self._weights * (1 + shared), self._slopes)
 
     def delayed(self) -> Array:
-        """What a twist along the same axes that was not deskewed makes of the gradient, (3, 3), s."""
+        """Derivative (3, 3) of the gradient with respect to a twist within the scan that was not deskewed, s."""
         return self._weighted(self._weights * self._delays, self._slopes)
 
     def by_keyframe(self) -> dict[int, Array]:
-        """Parts of the information by the keyframe that saw the surface."""
+        """Parts (3, 3) of the information, by the keyframe that saw the surface."""
         parts = {}
         for keyframe in np.unique(self._surface.keyframe):
             chosen: NDArray[np.bool_] = self._surface.keyframe == keyframe

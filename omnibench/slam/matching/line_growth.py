@@ -1,7 +1,7 @@
-"""Growing straight pieces along the points of a scan, compiled.
+"""Growing of line segments along the points of a scan, compiled.
 
 A line n.p = d is seen along the direction phi at the range 1 / (a cos phi + b sin phi) with (a, b) = n / d. The fit is
-to the ranges, which alone are noisy: one to the points would tilt towards the scanner.
+to the ranges, since only they are noisy; a fit to the points would tilt towards the scanner.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from numpy.typing import NDArray
 _Float = NDArray[np.float64]
 _Int = NDArray[np.int64]
 
-_SEED = 8  # points that a piece begins with
-_MOST = 256  # points
-_LONGEST = 5.0  # m
-_GAP = 6  # rays without a point that a piece may have
+_SEED = 8  # points that a segment begins with
+_MOST = 256  # points of a segment
+_LONGEST = 5.0  # m, length of a segment
+_GAP = 6  # rays without a point that a segment may have
 _STEPS = 2  # of Gauss-Newton
-_ON = 3.0  # standard deviations
-_OFF = 2  # neighbours off the line that end it
-_TRIMMED = 2  # points before such an end, which may be of the next piece already
+_ON = 3.0  # standard deviations within which a point is on the line
+_OFF = 2  # successive points off the line that end it
+_TRIMMED = 2  # points dropped before such an end, since they may belong to the next segment
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def grow_lines(ranges: _Float, cosines: _Float, sines: _Float, deviations: _Float, rays: _Int, part_of: _Int) -> Any:
-    """Lines through neighbouring points: (m, 7) of a, b, covariances aa, ab, bb, index of the first and last point.
+    """Lines through neighbouring points (m, 7): a, b, covariances aa, ab, bb, index of the first and last point.
 
-    ranges, cosines, sines, deviations (n,): of the points, in the order of their rays (n,). part_of (n,): gets the
-    number of the line that a point is part of, or -1.
+    ranges, cosines, sines, deviations (n,): of the points, in the order of their rays (n,). part_of (n,): output,
+    the number of the line that a point is part of, or -1.
     """
     count = len(ranges)
-    found = np.empty((count // _SEED + 1, 7))
+    grown = np.empty((count // _SEED + 1, 7))
     lines, first = 0, 0
     part_of[:] = -1
     while first + _SEED <= count:
@@ -53,14 +53,14 @@ def grow_lines(ranges: _Float, cosines: _Float, sines: _Float, deviations: _Floa
                 break
             last, fit = reach, longer
         for column in range(5):
-            found[lines, column] = fit[column]
-        found[lines, 5], found[lines, 6] = first, last - 1
+            grown[lines, column] = fit[column]
+        grown[lines, 5], grown[lines, 6] = first, last - 1
         for point in range(first, last):
             if abs(ranges[point] - _seen(fit, cosines[point], sines[point])) < _ON * deviations[point]:
                 part_of[point] = lines
         lines += 1
         first = last
-    return found[:lines]
+    return grown[:lines]
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -74,7 +74,7 @@ def _reach(
     last: int,
     fit: Any,
 ) -> Any:
-    """How far the points that follow lie on a line, looking as far ahead as it is long; whether it ends there."""
+    """Index up to which the following points lie on a line, at most twice its length on; and whether the line ends."""
     most = min(len(ranges), first + _MOST, 2 * last - first)
     off = 0
     point = last
@@ -95,7 +95,7 @@ def _reach(
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _fit(ranges: _Float, cosines: _Float, sines: _Float, deviations: _Float, first: int, last: int) -> Any:
-    """A line through points: a, b, covariances aa, ab, bb, misfit, points that count."""
+    """Fit a line: a, b, covariances aa, ab, bb, misfit (sum of squares), number of points without outliers."""
     a = b = 0.0
     aa = ab = bb = misfit = 0.0
     points = 0

@@ -1,4 +1,4 @@
-"""Straight pieces of the surroundings, fitted to neighbouring points of a scan."""
+"""Line segments fitted to neighbouring points of a scan."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array
 
-_TILT = 0.05  # rad; a line whose direction is less certain is none
+_TILT = 0.05  # rad; a line with a larger standard deviation of its direction is dropped
 
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Straight pieces. centres (m, 2), m. normals (m, 2): unit, towards the scanner. half_lengths (m,), m.
+    """Line segments.
 
-    rays (m,): how many were fitted. tilt_variances (m,): of the normals' direction, rad^2. delays (m,): since the
-    scan's stamp, s.
+    centres (m, 2): m. normals (m, 2): unit vectors towards the scanner. half_lengths (m,): m. rays (m,): number of rays
+    that were fitted. tilt_variances (m,): of the normals' direction, rad^2. delays (m,): since the scan's stamp, s.
     """
 
     centres: Array
@@ -31,10 +31,10 @@ class Lines:
 def fit_lines(
     points: Array, deviations: Array, delays: Array, rays: NDArray[np.intp]
 ) -> tuple[Lines, NDArray[np.int_]]:
-    """Straight pieces, and for each point (n,) the index of the piece it is part of, or -1.
+    """Line segments, and for each point (n,) the index of the segment that it is part of, or -1.
 
-    points (n, 2): from the scanner, m. deviations (n,): of their ranges, m. delays (n,): since the scan's stamp, s.
-    rays (n,): their numbers in the scan.
+    points (n, 2): from the scanner, m. deviations (n,): standard deviations of their ranges, m. delays (n,): since the
+    scan's stamp, s. rays (n,): their numbers in the scan.
     """
     from omnibench.slam.matching.line_growth import grow_lines  # numba takes half a second to load
 
@@ -42,11 +42,11 @@ def fit_lines(
     directions = points / ranges[:, None]
     part_of = np.empty(len(points), dtype=np.int64)
     cosines, sines = np.ascontiguousarray(directions.T)
-    found = grow_lines(ranges, cosines, sines, np.ascontiguousarray(deviations), rays.astype(np.int64), part_of)
-    line, first, last = found[:, :2], found[:, 5].astype(int), found[:, 6].astype(int)
+    grown = grow_lines(ranges, cosines, sines, np.ascontiguousarray(deviations), rays.astype(np.int64), part_of)
+    line, first, last = grown[:, :2], grown[:, 5].astype(int), grown[:, 6].astype(int)
     squared = (line**2).sum(axis=1)
     tilts = (
-        line[:, 1] ** 2 * found[:, 2] - 2 * line[:, 0] * line[:, 1] * found[:, 3] + line[:, 0] ** 2 * found[:, 4]
+        line[:, 1] ** 2 * grown[:, 2] - 2 * line[:, 0] * line[:, 1] * grown[:, 3] + line[:, 0] ** 2 * grown[:, 4]
     ) / squared**2
     kept = np.flatnonzero(tilts < _TILT**2)
     ends = [directions[at] / (line * directions[at]).sum(axis=1)[:, None] for at in (first, last)]
@@ -58,6 +58,6 @@ def fit_lines(
         tilt_variances=tilts[kept],
         delays=((delays[first] + delays[last]) / 2)[kept],
     )
-    number = np.full(len(line) + 1, -1)  # the last one: for points that are part of none
+    number = np.full(len(line) + 1, -1)  # the last one is for points that are part of no line
     number[kept] = np.arange(len(kept))
     return lines, number[part_of]

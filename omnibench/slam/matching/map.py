@@ -1,8 +1,8 @@
 """The growing map: points on the lines of scans, each with the line's normal, for small_gicp to match against.
 
-small_gicp estimates normals from neighbouring points, and on a planar cloud finds the vertical: its plane ICP then
-returns where it began. So each point of the map is given to it as an upright cross of five points a millimetre apart,
-whose five nearest neighbours are itself and whose normal so is the line's.
+small_gicp estimates normals from neighbouring points. On a planar cloud it finds the vertical, and its plane ICP
+returns the start. So each point of the map is given to it as an upright cross of five points a millimetre apart: these
+are its own five nearest neighbours, and their normal is the line's.
 """
 
 from __future__ import annotations
@@ -16,20 +16,21 @@ from numpy.typing import NDArray
 from omnibench.robot.kinematics import Array
 from omnibench.slam.matching.lines import Lines
 
-_CROSS = 1e-3  # m
-_FEWEST = 20  # points, without which nothing is matched
-_WORTH = 5  # new points, for which a map is made anew
-_SAME_SIDE = 0.7  # cosine between normals of what may be the same surface
+_CROSS = 1e-3  # m between the points of a cross
+_FEWEST = 20  # points that a map needs to be matched against
+_WORTH = 5  # new points that are worth rebuilding the search tree
+_SAME_SIDE = 0.7  # least cosine between normals that may be of one surface
 _FINEST = 1e-5  # m and rad; small_gicp's search ends with a step shorter than this
-_ITERATIONS = 20
+_ITERATIONS = 20  # of small_gicp, at most
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Points of the map. centres (m, 2), m. normals (m, 2): unit, towards where they were seen from.
+    """Points of the map.
 
-    line (m,): which line each is part of. rays (m,): that the line was fitted to. tilt_variances (m,), rad^2.
-    keyframe (m,): which keyframe saw it.
+    centres (m, 2): m. normals (m, 2): unit vectors towards the scanner that saw them. line (m,): number of the line
+    that a point is part of. rays (m,): number of rays that the line was fitted to. tilt_variances (m,): of the normal's
+    direction, rad^2. keyframe (m,): number of the keyframe that saw it.
     """
 
     centres: Array
@@ -48,7 +49,7 @@ _FIELDS = tuple(field.name for field in fields(Surface))
 
 
 class ScanMap:
-    """Where surfaces were seen, in the run's frame. What is there stays; later scans add what is new.
+    """Surfaces in the run's frame. Later scans add what is new and change nothing that is there.
 
     spacing: between the points of a surface, m.
     """
@@ -65,11 +66,11 @@ class ScanMap:
 
     @property
     def is_usable(self) -> bool:
-        """Whether there is enough to match against."""
+        """True if there are enough points to match against."""
         return len(self) >= _FEWEST
 
     def add(self, lines: Lines, pose: Array, keyframe: int) -> int:
-        """Add what is new of a scan's lines, seen from a pose (3,), if that is worth it; how many points that were."""
+        """Add the new part of a scan's lines, seen from a pose (3,), if it is large enough; return how many points."""
         seen = self._sampled(lines, pose, keyframe)
         new = np.ones(len(seen.centres), dtype=bool)
         if len(self) and len(new):
@@ -87,16 +88,16 @@ class ScanMap:
         return int(new.sum())
 
     def merge_oldest(self) -> None:
-        """What keyframe 0 saw counts as seen by the next; all others are one less."""
+        """Assign what keyframe 0 saw to keyframe 1, and count keyframes from there."""
         keyframes = np.maximum(self.surface.keyframe - 1, 0)
         self.surface = replace(self.surface, keyframe=keyframes)
 
     def nearest(self, points: Array) -> tuple[NDArray[np.int_], Array]:
-        """For points (n, 2) the nearest of the map: index (n,) and distance (n,), m."""
+        """Index (n,) and distance (n,), m, of the map's point nearest to each of the points (n, 2)."""
         if not len(points):
             return np.zeros(0, dtype=int), np.zeros(0)
-        found, squared = self._tree.batch_knn_search(_upright(points), 1)
-        return (found[:, 0] // 5).astype(int), np.sqrt(squared[:, 0])
+        indices, squared = self._tree.batch_knn_search(_upright(points), 1)
+        return (indices[:, 0] // 5).astype(int), np.sqrt(squared[:, 0])
 
     def align(self, points: Array, start: Array, distance: float, finest: float = _FINEST) -> Array:
         """The pose (3,) at which points (n, 2) lie best on the map, by small_gicp's plane ICP, from a start (3,).
@@ -118,10 +119,10 @@ class ScanMap:
             rotation_epsilon=finest,
             translation_epsilon=finest,
         )
-        found = result.T_target_source
-        turned = np.arctan2(found[1, 0], found[0, 0]) - start[2]
+        transform = result.T_target_source
+        turned = np.arctan2(transform[1, 0], transform[0, 0]) - start[2]
         heading = start[2] + turned - 2 * np.pi * np.round(turned / (2 * np.pi))
-        return np.array([found[0, 3], found[1, 3], heading])
+        return np.array([transform[0, 3], transform[1, 3], heading])
 
     def _sampled(self, lines: Lines, pose: Array, keyframe: int) -> Surface:
         counts = np.maximum(1, np.ceil(2 * lines.half_lengths / self.spacing).astype(int))

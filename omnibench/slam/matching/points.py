@@ -15,11 +15,11 @@ from omnibench.slam.motion_within_scan import MotionWithinScan
 
 @dataclass(frozen=True, eq=False)
 class ScanPoints:
-    """What a scan saw, in the frame of the robot as it stood at the scan's stamp, if its motion within is known.
+    """Points and lines of a deskewed scan, in the robot's frame at the scan's stamp.
 
-    points (n, 2), m. rays (n, 2): unit vectors from the scanner to the points. delays (n,): since the scan's stamp, s.
-    deviations (n,): of the ranges, m. lines: fitted to neighbouring points. line (n,): which one a point is part of, or
-    -1.
+    points (n, 2): m. rays (n, 2): unit vectors from the scanner to the points. delays (n,): since the scan's stamp, s.
+    deviations (n,): standard deviations of the ranges, m. lines: fitted to neighbouring points. line (n,): index of the
+    line that a point is part of, or -1.
     """
 
     points: Array
@@ -30,12 +30,12 @@ class ScanPoints:
     line: NDArray[np.int_]
 
     def deskewed(self, twist: Array) -> ScanPoints:
-        """The scan if the robot moved with one more twist (3,) than it was taken to, in its frame, m/s, m/s, rad/s."""
-        motions, of_lines = self.delays[:, None] * twist, self.lines.delays[:, None] * twist
+        """The scan, deskewed by a further twist (3,) in the robot's frame, m/s, m/s, rad/s."""
+        motions, line_motions = self.delays[:, None] * twist, self.lines.delays[:, None] * twist
         lines = replace(
             self.lines,
-            centres=_moved(self.lines.centres, of_lines),
-            normals=_turned(self.lines.normals, of_lines[:, 2]),
+            centres=_moved(self.lines.centres, line_motions),
+            normals=_turned(self.lines.normals, line_motions[:, 2]),
         )
         return replace(self, points=_moved(self.points, motions), rays=_turned(self.rays, motions[:, 2]), lines=lines)
 
@@ -43,7 +43,7 @@ class ScanPoints:
 def scan_points(ranges: Ranges, scanner: Scanner, noise_factor: float, within: MotionWithinScan) -> ScanPoints:
     """Points and lines of a scan (R,).
 
-    noise_factor: by which ranges are noisier than the scanner says. within: the robot's motion during the scan.
+    noise_factor: ratio of the ranges' noise to that of the scanner's description. within: motion during the scan.
     """
     returned = np.flatnonzero(scanner.valid(ranges))
     distances, delays = ranges[returned].astype(float), scanner.delays[returned]
@@ -59,18 +59,19 @@ def scan_points(ranges: Ranges, scanner: Scanner, noise_factor: float, within: M
 
 
 def noise_factor(ranges: Ranges, scanner: Scanner) -> float:
-    """By which factor, at least 1, the ranges (S, R) of scans are noisier than the scanner says.
+    """Ratio, at least 1, of the noise of ranges (S, R) to that of the scanner's description.
 
-    Second differences of neighbouring ranges are noise nearly everywhere; their median does not see edges.
+    Estimated by the median of second differences of neighbouring ranges, which are noise nearly everywhere but at
+    edges.
     """
     with np.errstate(invalid="ignore"):
-        seconds = ranges[:, 2:] - 2.0 * ranges[:, 1:-1] + ranges[:, :-2]
+        second_differences = ranges[:, 2:] - 2.0 * ranges[:, 1:-1] + ranges[:, :-2]
     valid = scanner.valid(ranges)
     whole = valid[:, 2:] & valid[:, 1:-1] & valid[:, :-2]
     if not whole.any():
         return 1.0
     expected = np.sqrt(6) * scanner.deviations(ranges[:, 1:-1][whole])
-    return max(1.0, float(np.median(np.abs(seconds[whole]) / expected)) / 0.6745)
+    return max(1.0, float(np.median(np.abs(second_differences[whole]) / expected)) / 0.6745)
 
 
 def _turned(vectors: Array, angles: Array | float) -> Array:
@@ -80,6 +81,6 @@ def _turned(vectors: Array, angles: Array | float) -> Array:
 
 
 def _moved(points: Array, motions: Array) -> Array:
-    """Points (n, 2) seen after motions (n, 3), each the twist that makes it in unit time, as seen from before."""
+    """Points (n, 2) that were seen after motions (n, 3), in the frame from before the motions."""
     half = motions[:, 2] / 2
     return _turned(points, motions[:, 2]) + np.sinc(half / np.pi)[:, None] * _turned(motions[:, :2], half)
