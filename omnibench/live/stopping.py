@@ -1,4 +1,4 @@
-"""Ending a command that runs until it is told to stop."""
+"""Stopping a command that runs until a signal or a time limit."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from contextlib import contextmanager
 
 @contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set, in place of ending the process. For the main thread.
+    """An event that Ctrl-C and SIGTERM set instead of ending the process. For the main thread.
 
-    A second signal acts as it would without this: nobody has to wait for a command that cannot end.
+    A second signal acts as usual, in case the command does not end.
     """
     stop = threading.Event()
-    watched = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.getsignal(number) for number in watched}
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.getsignal(number) for number in signals}
 
     def restore() -> None:
-        for number in watched:
+        for number in signals:
             signal.signal(number, before[number])
 
-    def heard(_number: int, _frame: object) -> None:
-        # In a thread, because the signal may find us inside the event, holding the lock that setting it takes.
+    def handle(_number: int, _frame: object) -> None:
+        # In a thread: the signal may interrupt a method of the event, which holds the lock that set() needs.
         threading.Thread(target=stop.set).start()
         restore()
 
-    for number in watched:
-        signal.signal(number, heard)
+    for number in signals:
+        signal.signal(number, handle)
     try:
         yield stop
     finally:
@@ -38,7 +38,7 @@ def stop_on_signals() -> Iterator[threading.Event]:
 
 
 def ticks(stop: threading.Event, period: float, seconds: float | None = None) -> Iterator[float]:
-    """Times since the start, s: 0, then one every ``period`` s until ``stop`` is set or ``seconds`` are over."""
+    """The time since the start, s: 0, then every ``period`` s until ``stop`` is set or ``seconds`` have passed."""
     began = time.monotonic()
     end = math.inf if seconds is None else seconds
     passed = 0.0

@@ -1,1 +1,1 @@
-"""Questions and orders: a node's query server and its clients."""
+"""Queries and orders: a node's query server and its clients."""

@@ -1,4 +1,4 @@
-"""What a request to a robot says, read and checked: a pose, a time, a calibration."""
+"""Parsing the content of requests to a robot: a pose, a time, a calibration."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from omnibench.config import Model, parse_yaml, validate
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.calibration import Calibration, parse_calibration
 
-_NANOSECONDS: Final = 10**14  # numbers of ``at`` from here on are ns; as s they would lie three million years ahead
-_LAST: Final = 2**63 - 1  # ns
-_LONGEST_NUMBER: Final = 40  # characters
-# What a calibration of a dozen wheels stays far below. What goes beyond would keep the interpreter from the stream.
-_DEEPEST: Final = 32
-_MOST_EVENTS: Final = 5_000
-_SCANNER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the one in C where there is one
+_NANOSECONDS: Final = 10**14  # values of ``at`` from this on are ns: as s they would be 3 million years from now
+_LAST: Final = 2**63 - 1  # ns, the last time in 64 bits
+_LONGEST_NUMBER: Final = 40  # characters of a time; chosen
+# Limits of a YAML document, far above a calibration of twelve wheels: parsing more would delay the stream of samples.
+_DEEPEST: Final = 32  # levels of nesting; chosen
+_MOST_EVENTS: Final = 5_000  # parser events, about two for each value; chosen
+_SCANNER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the fast one in C if PyYAML has it
 
 
 class PoseOrder(Model):
-    """What ``set_pose`` is told: m and rad in the map."""
+    """The content of a ``set_pose`` request: m and rad in the map."""
 
     x: float = Field(ge=-1e7, le=1e7, allow_inf_nan=False)
     y: float = Field(ge=-1e7, le=1e7, allow_inf_nan=False)
     theta: float = Field(ge=-100.0, le=100.0, allow_inf_nan=False)
     position_sigma: float = Field(0.05, ge=1e-6, le=1e4, allow_inf_nan=False, description="standard deviation, m")
-    heading_sigma: float = Field(0.05, ge=1e-6, le=10.0, allow_inf_nan=False, description="rad")
+    heading_sigma: float = Field(0.05, ge=1e-6, le=10.0, allow_inf_nan=False, description="standard deviation, rad")
 
 
 def read_pose(payload: bytes, parameters: dict[str, str]) -> PoseOrder:
@@ -46,13 +46,13 @@ def read_pose(payload: bytes, parameters: dict[str, str]) -> PoseOrder:
 
 
 def read_time(text: str) -> int:
-    """A time in s (or ns, if it is that large) as ns. ConfigError in one line.
+    """A time in s, or in ns if it is 10^14 or more, as ns. ConfigError in one line.
 
-    Not by way of a float, which has steps of 0.2 us there.
+    It is read as a decimal number, because a float of today's time in s is only exact to 0.2 us.
     """
     try:
         number = Decimal(text if len(text) <= _LONGEST_NUMBER else "too long")
-        if number.is_finite() and number.adjusted() < 20:  # digits before the point; else it is no use to multiply
+        if number.is_finite() and number.adjusted() < 20:  # digits before the point; more would be costly to multiply
             nanoseconds = int(number) if abs(number) >= _NANOSECONDS else int((number * 10**9).to_integral_value())
             if abs(nanoseconds) <= _LAST:
                 return nanoseconds
@@ -63,7 +63,7 @@ def read_time(text: str) -> int:
 
 
 def read_sent_calibration(payload: bytes, where: str) -> Calibration:
-    """A calibration that came over the network. DataError, with ``where`` in front, says what is wrong."""
+    """Parse a calibration that came over the network. DataError begins with ``where`` and says what is wrong."""
     try:
         text = payload.decode()
     except UnicodeDecodeError as error:
@@ -73,7 +73,7 @@ def read_sent_calibration(payload: bytes, where: str) -> Calibration:
     except ConfigError as error:
         raise DataError(str(error)) from None
     calibration = parse_calibration(text, where)
-    try:  # YAML knows characters that no file and no message can hold
+    try:  # YAML allows characters that UTF-8 cannot encode
         calibration.model_dump_json()
     except (PydanticSerializationError, UnicodeError):
         raise DataError(f"{where}: it holds text that is not Unicode (lone surrogates)") from None
@@ -81,7 +81,7 @@ def read_sent_calibration(payload: bytes, where: str) -> Calibration:
 
 
 def _check_size(text: str, where: str) -> None:
-    """Refuse what is small as a text and large or deep as a document. ConfigError."""
+    """ConfigError: a YAML text has too many values, is nested too deeply, or has aliases, which multiply values."""
     depth = 0
     try:
         for number, event in enumerate(yaml.parse(text, Loader=_SCANNER)):
@@ -93,4 +93,4 @@ def _check_size(text: str, where: str) -> None:
             if number >= _MOST_EVENTS:
                 raise ConfigError(f"{where}: more than {_MOST_EVENTS} values")
     except yaml.YAMLError:
-        return  # the reader tells it better
+        return  # the parser that follows gives the better message

@@ -1,4 +1,4 @@
-"""Answers to questions about a node's robots, and orders to them: ``omnibench/<robot>/<service>``, in JSON."""
+"""Answering queries about a node's robots, and orders to them: ``omnibench/<robot>/<service>``, in JSON."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from omnibench.robot.kinematics import Array
 LOG = logging.getLogger("omnibench.live")
 _READING: Final = ("info", "calibration", "health", "pose")
 _ORDERS: Final = ("set_pose", "reset", "swap")
-_LONGEST: Final = 1 << 16  # bytes of a request
-_MOST_WAITING: Final = 64  # requests
-_FAREWELL: Final = 6.0  # s
+_LONGEST: Final = 1 << 16  # bytes of a request; chosen
+_LONGEST_QUEUE: Final = 64  # requests that wait; chosen
+_CLOSE_TIMEOUT: Final = 6.0  # s to wait for a request under way: longer than Zenoh waits for a client, 5 s
 
 
 class QueryServer:
-    """Answers queries and takes calibrations for one robot after another, in a thread of its own.
+    """Answers queries and accepts calibrations, one request after another, in a thread of its own.
 
-    What is too long, or too much at once, is refused where it comes in, so that the wheels' stream goes on. A reply has
-    the congestion control of its query, whatever is said here: for a client that asked with BLOCK and does not read,
-    Zenoh waits up to 5 s and then parts with it. Until then the query server waits; the stream does not.
+    Requests that are too long or too many are refused on arrival, so that they do not delay the wheel samples. Zenoh
+    gives a reply its query's congestion control: for a client that queried with BLOCK and does not read, Zenoh waits up
+    to 5 s and then disconnects it. Until then this thread waits; the wheel samples are not delayed.
 
-    info: robot -> what ``info`` answers. memories: of the robots whose calibrations outlive the node.
+    info: makes the answer to ``info`` for a robot. memories: robot -> its saved state, for nodes that keep one.
     """
 
     def __init__(
@@ -54,28 +54,28 @@ class QueryServer:
         self._memories = memories
         self._rate_limiter = RateLimiter()
         self._refused = 0
-        self._work: queue.Queue[Callable[[], None] | None] = queue.Queue(_MOST_WAITING)
+        self._work: queue.Queue[Callable[[], None] | None] = queue.Queue(_LONGEST_QUEUE)
         self._thread = threading.Thread(target=self._run, name="query server", daemon=True)
-        self._open: list[Any] = []
+        self._declarations: list[Any] = []
         for name in trackers:
-            self._open += self._declare(session, name)
+            self._declarations += self._declare(session, name)
         self._thread.start()
 
     def close(self) -> None:
-        """Answer what was asked and no more."""
-        for each in self._open:
-            each.undeclare()
-        with suppress(queue.Full):  # a client that does not read may hold the query server: not for ever, nor us
-            self._work.put(None, timeout=_FAREWELL)
-        self._thread.join(_FAREWELL)
+        """Answer the requests that wait, and accept no more."""
+        for declaration in self._declarations:
+            declaration.undeclare()
+        with suppress(queue.Full):  # a client that does not read may block the thread for a while
+            self._work.put(None, timeout=_CLOSE_TIMEOUT)
+        self._thread.join(_CLOSE_TIMEOUT)
 
     def _declare(self, session: zenoh.Session, name: str) -> list[Any]:
-        def asked_for(service: str) -> Callable[[zenoh.Query], None]:
+        def handler(service: str) -> Callable[[zenoh.Query], None]:
             return lambda query: self._take_query(name, service, query)
 
         # declared one by one, so that access control can tell them apart
         services: list[Any] = [
-            session.declare_queryable(f"omnibench/{name}/{service}", _direct(asked_for(service)))
+            session.declare_queryable(f"omnibench/{name}/{service}", _direct(handler(service)))
             for service in _READING + _ORDERS
         ]
         put = _direct(lambda sample: self._take_sample(name, sample))
@@ -83,14 +83,14 @@ class QueryServer:
 
     def _take_query(self, name: str, service: str, query: zenoh.Query) -> None:
         if service in _ORDERS and str(query.key_expr) != f"omnibench/{name}/{service}":
-            return  # an order to whomever it may concern is one to nobody
+            return  # an order must name its robot: wildcards are ignored
         size = _size(query.payload) + _size(query.attachment) + len(str(query.parameters))
         reason = self._queued(lambda: self._answer(name, service, query), size)
         if reason is not None:
             _refuse(query, name, f"omnibench/{name}/{service}: {reason}")
 
     def _take_sample(self, name: str, sample: zenoh.Sample) -> None:
-        """A calibration that is put: there is nobody to answer (unlike ``swap``), so health and log tell."""
+        """Take a calibration that was put: it has no reply, unlike ``swap``, so health and log report a refusal."""
         if sample.kind != zenoh.SampleKind.PUT:
             return
         size = _size(sample.payload) + _size(sample.attachment)
@@ -99,7 +99,7 @@ class QueryServer:
             self._trackers[name].refuse_swap(f"omnibench/{name}/calibration: {reason}")
 
     def _queued(self, work: Callable[[], None], size: int) -> str | None:
-        """None, or why a request of so many bytes is not taken."""
+        """Queue a request of ``size`` bytes; None, or the reason why it is refused."""
         reason = None
         if size > _LONGEST:
             reason = f"{size} bytes are more than a request may have, {_LONGEST}"
@@ -107,7 +107,7 @@ class QueryServer:
             try:
                 self._work.put_nowait(work)
             except queue.Full:
-                reason = f"{_MOST_WAITING} requests are waiting; ask again later"
+                reason = f"{_LONGEST_QUEUE} requests are waiting; ask again later"
         if reason is not None:
             self._refused += 1
             if self._rate_limiter.allows("refused"):
@@ -118,9 +118,9 @@ class QueryServer:
         while (work := self._work.get()) is not None:
             try:
                 work()
-            except Exception as error:  # whatever was asked, the next one is answered
+            except Exception as error:  # whatever it was, the next request is answered
                 self._failed(error)
-            del work  # a query is over when nobody holds it any more
+            del work  # a query ends when the last reference to it is gone
 
     def _failed(self, error: Exception) -> None:
         if self._rate_limiter.allows(type(error).__name__):
@@ -149,7 +149,7 @@ class QueryServer:
         if service == "pose":
             return _pose_answer(tracker, parameters)
         if service == "calibration":
-            if payload:  # a right to read it must not be one to swap it
+            if payload:  # the right to query this key must not be a right to swap the calibration
                 raise ConfigError(f"omnibench/{name}/calibration: put it there, or ask omnibench/{name}/swap with it")
             return tracker.calibration
         if service == "swap":
@@ -168,7 +168,7 @@ class QueryServer:
         try:
             self._swap(name, sample.payload.to_bytes())
         except OmnibenchError:
-            return  # told already
+            return  # logged already
 
     def _swap(self, name: str, payload: bytes) -> Mapping[str, Any]:
         tracker = self._trackers[name]
@@ -176,24 +176,24 @@ class QueryServer:
             calibration = read_sent_calibration(payload, f"omnibench/{name}/calibration")
         except DataError as error:
             tracker.refuse_swap(str(error))
-            self._tell_refusal(tracker, error)
+            self._log_refusal(tracker, error)
             raise
         try:
             tracker.swap(calibration)
         except DataError as error:
-            self._tell_refusal(tracker, error)
+            self._log_refusal(tracker, error)
             raise
         LOG.info("%s: calibration %r runs", name, calibration.name)
         answer = {"robot": name, "accepted": True, "calibration": calibration.name, "kept": True}
         reason = self._not_kept(name, calibration)
         return answer if reason is None else answer | {"kept": False, "reason": reason}
 
-    def _tell_refusal(self, tracker: RobotTracker, error: DataError) -> None:
+    def _log_refusal(self, tracker: RobotTracker, error: DataError) -> None:
         if self._rate_limiter.allows(f"calibration of {tracker.name}"):
             LOG.warning("%s: calibration refused, %s runs on: %s", tracker.name, tracker.calibration.name, error)
 
     def _not_kept(self, name: str, calibration: Calibration) -> str | None:
-        """Keep a calibration that runs; None, or why the node's next start will not be with it."""
+        """Save a calibration that runs; None, or the reason why the node's next start will not use it."""
         if name not in self._memories:
             return "the node has no `state`, so that its next start is with the config's calibration"
         try:
@@ -218,12 +218,12 @@ def _refuse(query: zenoh.Query, name: str, reason: str) -> None:
 
 
 def _pose_answer(tracker: RobotTracker, parameters: dict[str, str]) -> Mapping[str, Any]:
-    found = tracker.pose_at(read_time(parameters["at"]) if "at" in parameters else None)
-    answer: dict[str, Any] = {"robot": tracker.name, "at": found.stamp / 1e9, "at_ns": found.stamp}
-    answer["odom"] = _planar(found.odometry)
+    estimate = tracker.pose_at(read_time(parameters["at"]) if "at" in parameters else None)
+    answer: dict[str, Any] = {"robot": tracker.name, "at": estimate.stamp / 1e9, "at_ns": estimate.stamp}
+    answer["odom"] = _planar(estimate.odometry)
     answer["map"] = None
-    if found.in_map is not None:
-        pose, covariance = found.in_map
+    if estimate.in_map is not None:
+        pose, covariance = estimate.in_map
         answer["map"] = _planar(pose) | {"covariance": covariance.tolist()}
     return answer
 

@@ -1,4 +1,4 @@
-"""Giving a running node another calibration, from outside."""
+"""Sending another calibration to a running node."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from omnibench.robot.calibration import read_calibration
 
 
 class Swapped(BaseModel):
-    """A node's answer. kept: whether the calibration outlives the node; reason: why not."""
+    """A node's answer. kept: whether the calibration is kept for the node's next start; reason: why not."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -24,15 +24,15 @@ class Swapped(BaseModel):
 
 
 class _Refused(BaseModel):
-    """A node's answer that says no."""
+    """A node's answer that refuses a calibration."""
 
     error: str
 
 
 def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: float = 10.0) -> Swapped:
-    """Send a calibration file to the node that runs ``robot``, and its answer.
+    """Send a calibration file to the node that runs ``robot``, and return its answer.
 
-    DataError: the file is none, nobody answers (with those that are alive), or the node refuses, with its reason.
+    DataError: the file is no calibration, no node answers (the message names the robots alive), or the node refuses.
     """
     read_calibration(file)
     payload = file.read_bytes()
@@ -40,8 +40,8 @@ def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: fl
         try:
             if reply.ok is not None:
                 return Swapped.model_validate_json(reply.ok.payload.to_bytes())
-            if reply.err is not None and (said := reply.err.payload.to_bytes()) != b"Timeout":
-                raise DataError(f"robot {robot!r} refuses {file}: {_Refused.model_validate_json(said).error}")
+            if reply.err is not None and (refusal := reply.err.payload.to_bytes()) != b"Timeout":
+                raise DataError(f"robot {robot!r} refuses {file}: {_Refused.model_validate_json(refusal).error}")
         except ValidationError:
-            raise DataError(f"robot {robot!r}: its node gives an answer that is none; is it omnibench's?") from None
+            raise DataError(f"robot {robot!r}: cannot read its node's answer; is it an omnibench node?") from None
     raise DataError(nothing_received(robot, timeout, alive_robots(session)))

@@ -1,1 +1,1 @@
-"""Recordings played onto Zenoh as a robot would send them."""
+"""Recordings replayed on Zenoh as a robot and its SLAM would send them."""

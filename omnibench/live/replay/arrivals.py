@@ -1,4 +1,4 @@
-"""How a recording is to be played, and when each of its messages arrives: late, jittered, dropped or twice."""
+"""The config of a replay, and its schedule: messages arrive delayed, jittered, not at all or twice."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from omnibench.live.replay.concatenated_drive import LONGEST_PAUSE, Concatenated
 from omnibench.robot.calibration import NonNegative
 from omnibench.robot.kinematics import Array
 
-WHEELS, SLAM = 0, 1
+WHEELS, SLAM = 0, 1  # indices in TOPICS_PLAYED
 TOPICS_PLAYED: Final = ("joint_states", "slam_pose")
 
-_SAME_TIME = 1e-6  # s
+_SAME_TIME = 1e-6  # s; times that differ by less are equal
 _LATEST_ORIGIN = (2**31 - 10**8) * 10**9  # ns; ROS 2's stamps end at 2^31 s
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -27,35 +27,35 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class Channel(Model):
-    """What happens to messages between being taken and arriving; s are of the recording, whatever the speed."""
+    """The network from sensor to node: delays and losses of messages, in s of the recording at any speed."""
 
-    delay: NonNegative = Field(0.0, description="of every message, s")
-    jitter: NonNegative = Field(0.0, description="more delay, half-normal: |N(0, jitter)| for each message, s")
+    delay: NonNegative = Field(0.0, description="of each message, s")
+    jitter: NonNegative = Field(0.0, description="additional delay of each message, half-normal: |N(0, jitter)|, s")
     drop: Share = Field(0.0, description="share of the messages that never arrive")
-    duplicate: Share = Field(0.0, description="share of the messages that arrive twice, with a jitter for each")
+    duplicate: Share = Field(0.0, description="share of the messages that arrive twice, each time with its own jitter")
 
 
 class WheelChannel(Channel):
-    """The wheel samples."""
+    """The network that wheel samples take."""
 
-    use: Literal["positions", "velocities", "both"] = Field("both", description="what the messages hold")
+    use: Literal["positions", "velocities", "both"] = Field("both", description="content of the messages")
 
 
 class PoseDeviation(Model):
     """Standard deviations of a pose."""
 
-    position: Positive = Field(0.02, description="of x and of y, m")
-    heading: Positive = Field(0.02, description="rad")
+    position: Positive = Field(0.02, description="standard deviation of x and of y, m")
+    heading: Positive = Field(0.02, description="standard deviation, rad")
 
 
 class SlamChannel(Channel):
-    """The poses of the SLAM."""
+    """The network that SLAM poses take."""
 
-    delay: NonNegative = Field(0.2, description="of every message, s")
-    jitter: NonNegative = Field(0.02, description="more delay, half-normal: |N(0, jitter)| for each message, s")
-    period: NonNegative = Field(0.25, description="poses at least so far apart, s")
+    delay: NonNegative = Field(0.2, description="of each message, s")
+    jitter: NonNegative = Field(0.02, description="additional delay of each message, half-normal: |N(0, jitter)|, s")
+    period: NonNegative = Field(0.25, description="least time between two poses, s")
     covariance: PoseDeviation | None = Field(
-        None, description="of poses that have none in the data set; default: from the noise model, or else 0.02 m, rad"
+        None, description="for poses without covariance in the data set; default: the noise model's, else 0.02 m, rad"
     )
 
 
@@ -64,25 +64,28 @@ def _speed(value: Any) -> Any:
 
 
 class ReplayConfig(Model):
-    """How a recording is played."""
+    """How a recording is replayed."""
 
     speed: Annotated[float, BeforeValidator(_speed, json_schema_input_type=float | Literal["max"])] = Field(
-        1.0, gt=0, description="1: as it was; 10: ten times as fast; max: as fast as it goes, without losing messages"
+        1.0, gt=0, description="1: real time; 10: ten times as fast; max: as fast as possible without losing messages"
     )
-    pause: float = Field(1.0, ge=0, le=LONGEST_PAUSE, description="rest between runs, s")
-    split: Split | None = Field(None, description="play these runs only")
-    seed: int = Field(0, ge=0, description="of jitter, drops and duplicates")
+    pause: float = Field(1.0, ge=0, le=LONGEST_PAUSE, description="standstill between two runs, s")
+    split: Split | None = Field(None, description="replay only the runs of this split")
+    seed: int = Field(0, ge=0, description="random seed of jitter, drops and duplicates")
     wheels: WheelChannel = WheelChannel()
     slam: SlamChannel = SlamChannel()
     stamp_origin: int | None = Field(
-        None, gt=0, le=_LATEST_ORIGIN, description="stamp of the recording's start, ns; default: when the replay starts"
+        None,
+        gt=0,
+        le=_LATEST_ORIGIN,
+        description="stamp of the recording's start, ns; default: the replay's start",
     )
-    wait: NonNegative = Field(10.0, description="how long to wait for a subscriber of the wheel samples, s; 0: play")
+    wait: NonNegative = Field(10.0, description="longest wait for a subscriber of the wheel samples, s; 0: do not wait")
 
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """All messages by time of arrival: arrivals (E,) s; topics (E,) index in TOPICS_PLAYED; rows (E,) of the drive."""
+    """All messages by time of arrival: arrivals (E,) s; topics (E,) in TOPICS_PLAYED; rows (E,) in the drive."""
 
     arrivals: Array
     topics: NDArray[np.int8]
@@ -93,7 +96,7 @@ class Schedule:
 
 
 def make_schedule(drive: ConcatenatedDrive, config: ReplayConfig) -> Schedule:
-    """When each message of a drive arrives. The same seed gives the same, and neither topic changes the other's."""
+    """The arrivals of a drive's messages. They depend on the seed only; each topic has its own random numbers."""
     wheel_seed, slam_seed = np.random.SeedSequence(config.seed).spawn(2)
     samples, sampled = _arrivals(drive.wheel_times, config.wheels, np.random.default_rng(wheel_seed))
     kept = _thinned(drive.slam_times, config.slam.period)
@@ -106,19 +109,19 @@ def make_schedule(drive: ConcatenatedDrive, config: ReplayConfig) -> Schedule:
 
 
 def _arrivals(times: Array, channel: Channel, rng: np.random.Generator) -> tuple[NDArray[np.intp], Array]:
-    """Indices (E,) of the messages that arrive, some twice, and when they do (E,)."""
+    """Indices (E,) of the messages that arrive, some of them twice, and their times of arrival (E,)."""
     chance, jitter = rng.random((2, len(times))), np.abs(rng.standard_normal((2, len(times))))
     arrives = chance[0] >= channel.drop
     twice = arrives & (chance[1] < channel.duplicate)
     late = times + channel.delay + channel.jitter * jitter
-    every = np.concatenate([np.flatnonzero(arrives), np.flatnonzero(twice)])
+    indices = np.concatenate([np.flatnonzero(arrives), np.flatnonzero(twice)])
     when = np.concatenate([late[0][arrives], late[1][twice]])
-    order = np.lexsort((every, when))
-    return every[order], when[order]
+    order = np.lexsort((indices, when))
+    return indices[order], when[order]
 
 
 def _thinned(times: Array, period: float) -> NDArray[np.intp]:
-    """Indices of times that are at least ``period`` apart, from the first on."""
+    """Indices of times that are at least ``period`` s apart, beginning with the first."""
     kept, index = [], 0
     while index < len(times):
         kept.append(index)

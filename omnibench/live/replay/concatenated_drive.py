@@ -1,7 +1,9 @@
-"""All runs of a recording one after another, as one drive: each starts at the pose where the one before ended.
+"""All runs of a recording concatenated to one drive: each run starts at the pose where the run before ended.
 
-A run goes from its first reference pose to its last; what the wheels do after that is left out. Between two runs the
-robot rests. With S_i the pose at which run i starts and p(t) its reference, the concatenated pose is S_i p(0)^-1 p(t).
+A run goes from its first reference pose to its last; wheel samples after that are left out. Between two runs the robot
+stands still. With S_i the start pose of run i in the drive and p(t) its reference, the concatenated pose is
+
+    S_i p(0)^-1 p(t).
 """
 
 from __future__ import annotations
@@ -20,19 +22,22 @@ from omnibench.robot.odometry import WheelLog
 from omnibench.robot.planar import moved_to, relative
 
 FULL_TURN = 2 * np.pi
-LONGEST_PAUSE = 3600.0  # s
-_SAME_TIME = 1e-9  # s, as stamps have it
+LONGEST_PAUSE = 3600.0  # s between two runs; chosen
+_SAME_TIME = 1e-9  # s, the resolution of stamps: times that differ by less are equal
 
 
 @dataclass(frozen=True, eq=False)
 class ConcatenatedDrive:
-    """n wheel samples and m reference poses of R runs on one time axis in s, which begins with 0.
+    """R runs with n wheel samples of N wheels and m reference poses on one time axis, s, which begins at 0.
 
-    wheel_times (n,) and angles (n, N) rad, continuous: the first are the baseline at 0. rates (n, N): mean over the
-    sample that ends then, rad/s, 0 for the baseline and in rests. run (n,): index of the run; a rest belongs to the
-    run before it. slam_times (m,), slam_poses (m, 3) in m, m, rad with continuous headings, slam_covariances
-    (m, 3, 3) if the data set has them, slam_run (m,). The first pose of a run is where the drive puts it and nothing
-    that was measured, so it is not among them, but for the very first. starts (R, 3) and begins (R,) of the runs.
+    wheel_times (n,): ends of the samples; the first, 0, is the baseline. angles (n, N): wheel angles, rad, continuous.
+    rates (n, N): mean rates over the samples, rad/s; 0 at the baseline and at standstill. run (n,): index of each
+    sample's run; a standstill belongs to the run before it.
+
+    slam_times (m,), slam_poses (m, 3) in m, m, rad with continuous headings, slam_covariances (m, 3, 3) if the data set
+    has them, slam_run (m,). Runs after the first have no pose at their start: the drive sets it, nobody measured it.
+
+    start_poses (R, 3) and start_times (R,), s: of the runs in the drive.
     """
 
     robot: Robot
@@ -50,13 +55,13 @@ class ConcatenatedDrive:
 
     @property
     def duration(self) -> float:
-        """From the first sample to the last, s."""
+        """Time from the first sample to the last, s."""
         return float(max(self.wheel_times[-1], self.slam_times[-1]))
 
     def log(self, stamps: Sequence[float] | Array | None = None, session: str | None = None) -> WheelLog:
-        """The wheel rates from the drive's start, for the batch odometry at ``stamps`` (s; default: every sample).
+        """The drive's wheel samples for the batch odometry, with poses at ``stamps`` (s; default: every sample).
 
-        The drive is one session, from its start on; session: what it is called.
+        session: name of the session, which starts with the drive.
         """
         wanted = self.wheel_times if stamps is None else np.asarray(stamps, dtype=float)
         return WheelLog(
@@ -67,7 +72,7 @@ class ConcatenatedDrive:
 def concatenate_runs(
     dataset: Dataset, *, pause: float = 1.0, split: Split | None = None, start_poses: Array | None = None
 ) -> ConcatenatedDrive:
-    """The runs of a data set (or of one split) as one drive with ``pause`` s of rest between them.
+    """The runs of a data set (or of one split) as one drive with ``pause`` s of standstill between them.
 
     Runs go session by session, in the order of ``started_at`` where it is known, else of the data set.
     start_poses (R, 3): where the runs start, in place of what follows from the reference.
@@ -76,28 +81,28 @@ def concatenate_runs(
     not finite.
     """
     if not 0 <= pause <= LONGEST_PAUSE:
-        raise ConfigError(f"pause: {pause:g} s between runs is not within 0 and {LONGEST_PAUSE:g} s")
+        raise ConfigError(f"pause: {pause:g} s between runs; expected 0 to {LONGEST_PAUSE:g} s")
     runs = _ordered(dataset, split)
-    moves = np.array([relative(each.start, each.final_pose) for each in runs])
+    moves = np.array([relative(run.start, run.final_pose) for run in runs])
     starts = _composed(runs[0].start, moves)
     if start_poses is not None:
         starts = _given_start_poses(dataset, np.asarray(start_poses, dtype=float), moves)
-    rests = [_rest_samples(each, pause, dataset.sample_period) for each in runs]
-    lengths = [each.times[-1] + count * dataset.sample_period for each, count in zip(runs, rests, strict=True)]
+    rests = [_rest_samples(run, pause, dataset.sample_period) for run in runs]
+    lengths = [run.times[-1] + count * dataset.sample_period for run, count in zip(runs, rests, strict=True)]
     begins = np.concatenate([[0.0], np.cumsum(lengths)[:-1]])
     rests[-1] = 0  # the drive ends with its last run
-    measured = [each.pose_times > 0 for each in runs]
+    measured = [run.pose_times > 0 for run in runs]
     measured[0] = np.ones(len(runs[0].pose_times), dtype=bool)
     return ConcatenatedDrive(
         robot=dataset.robot,
-        ids=tuple(each.id for each in runs),
+        ids=tuple(run.id for run in runs),
         wheel_times=_wheel_times(runs, rests, begins, dataset.sample_period),
         angles=_angles(runs, rests),
         rates=_rates(runs, rests),
         run=np.repeat(np.arange(len(runs)), _samples(runs, rests)),
-        slam_times=np.concatenate([b + each.pose_times[m] for b, each, m in zip(begins, runs, measured, strict=True)]),
+        slam_times=np.concatenate([b + run.pose_times[m] for b, run, m in zip(begins, runs, measured, strict=True)]),
         slam_poses=np.concatenate(
-            [moved_to(start, each.poses)[m] for start, each, m in zip(starts, runs, measured, strict=True)]
+            [moved_to(start, run.poses)[m] for start, run, m in zip(starts, runs, measured, strict=True)]
         ),
         slam_covariances=_covariances(runs, starts, measured),
         slam_run=np.repeat(np.arange(len(runs)), [np.count_nonzero(m) for m in measured]),
@@ -113,23 +118,23 @@ def concatenate_recording(recording: Recording, *, pause: float = 1.0, split: Sp
 
 
 def true_start_poses(recording: Recording, split: Split | None = None) -> Array:
-    """Start poses (R, 3) with which a simulated robot truly goes on where it was. DataError without a truth.
+    """Start poses (R, 3) at which each run truly starts where the one before truly ended. DataError without a truth.
 
-    The reference poses of a drive then err about the truth and do not drift away from it.
+    With them the errors of a drive's reference poses do not accumulate from run to run.
     """
     truth, runs = _TruthOfRuns(recording), _ordered(recording.dataset, split)
-    moves = [relative(each.start, truth.poses(each, each.times[-1:])[0]) for each in runs]
+    moves = [relative(run.start, truth.poses(run, run.times[-1:])[0]) for run in runs]
     return _composed(runs[0].start, np.array(moves))
 
 
 def concatenated_truth(drive: ConcatenatedDrive, recording: Recording) -> Array:
-    """True poses (n, 3) of a simulated robot at the drive's wheel times, each run from its start in the drive.
+    """True poses (n, 3) of a simulated robot at the drive's wheel times, each run from its start pose in the drive.
 
     Continuous if the drive has true start poses; else it jumps between runs by the error of the reference. DataError
     without a truth.
     """
     truth = _TruthOfRuns(recording)
-    known = {each.id: each for each in recording.dataset.trajectories}
+    known = {run.id: run for run in recording.dataset.trajectories}
     bounds = np.searchsorted(drive.run, np.arange(1, len(drive.ids)))
     poses = []
     for index, times in enumerate(np.split(drive.wheel_times, bounds)):
@@ -144,27 +149,27 @@ def concatenated_truth(drive: ConcatenatedDrive, recording: Recording) -> Array:
 
 
 def _ordered(dataset: Dataset, split: Split | None) -> list[Trajectory]:
-    """The runs in the order in which they are concatenated, each up to its last reference pose."""
+    """The runs in the order of the drive, each cut at its last reference pose."""
     chosen = dataset.trajectories if split is None else dataset.split(split)
     if not chosen:
-        raise DataError(f"data set {dataset.name}: no run in its split {split!r}; choose the other, or none")
+        raise DataError(f"data set {dataset.name}: no run in split {split!r}; choose another split, or none")
     sessions: dict[str | None, list[Trajectory]] = {}
-    for each in chosen:
-        sessions.setdefault(each.session, []).append(each)
+    for run in chosen:
+        sessions.setdefault(run.session, []).append(run)
     for runs in sessions.values():
-        if all(each.started_at is not None for each in runs):
-            runs.sort(key=lambda each: each.started_at or 0.0)
-    ordered = [each for runs in sessions.values() for each in runs]
-    for each in ordered:
-        if len(each.pose_times) < 2:
+        if all(run.started_at is not None for run in runs):
+            runs.sort(key=lambda run: run.started_at or 0.0)
+    ordered = [run for runs in sessions.values() for run in runs]
+    for run in ordered:
+        if len(run.pose_times) < 2:
             raise DataError(
-                f"data set {dataset.name}: run {each.id} has a single reference pose; it cannot be concatenated"
+                f"data set {dataset.name}: run {run.id} has a single reference pose; it cannot be concatenated"
             )
-    return [_trimmed(each) for each in ordered]
+    return [_trimmed(run) for run in ordered]
 
 
 def _trimmed(run: Trajectory) -> Trajectory:
-    """A run without what the wheels did after the last reference pose, the sample in which that lies cut short."""
+    """A run cut at its last reference pose; the wheel sample that contains the pose's time is shortened."""
     end = run.pose_times[-1]
     if run.times[-1] <= end + _SAME_TIME:
         return run
@@ -180,13 +185,13 @@ def _trimmed(run: Trajectory) -> Trajectory:
 
 
 def _rest_samples(run: Trajectory, pause: float, period: float) -> int:
-    """Samples at rest after a run, of which the first last until its last reference pose."""
+    """Number of samples at standstill after a run: up to its last reference pose if that is later, and the pause."""
     missing = (run.pose_times[-1] - run.times[-1] - _SAME_TIME) / period
     return max(0, int(np.ceil(missing))) + round(pause / period)
 
 
 def _samples(runs: Sequence[Trajectory], rests: Sequence[int]) -> list[int]:
-    """Samples of each run and the rest after it; the first has the baseline too."""
+    """Number of samples of each run with the standstill after it; the first run has the baseline too."""
     counts = [len(run.times) + rest for run, rest in zip(runs, rests, strict=True)]
     return [counts[0] + 1, *counts[1:]]
 
@@ -207,7 +212,7 @@ def _rates(runs: Sequence[Trajectory], rests: Sequence[int]) -> Array:
 
 
 def _angles(runs: Sequence[Trajectory], rests: Sequence[int]) -> Array:
-    """Recorded angles, or else rates integrated, each run moved to go on where the one before ended."""
+    """Recorded wheel angles, or integrated rates without them, made continuous from run to run."""
     parts: list[Array] = []
     last: Array | None = None
     for run, rest in zip(runs, rests, strict=True):
@@ -224,7 +229,7 @@ def _angles(runs: Sequence[Trajectory], rests: Sequence[int]) -> Array:
 
 
 def _covariances(runs: Sequence[Trajectory], starts: Array, measured: Sequence[NDArray[np.bool_]]) -> Array | None:
-    """Covariances of the reference, turned with their runs; None unless every run has them."""
+    """Covariances of the reference, rotated with their runs; None unless all runs have them."""
     parts = []
     for run, start, chosen in zip(runs, starts, measured, strict=True):
         if run.pose_covariances is None:
@@ -236,7 +241,7 @@ def _covariances(runs: Sequence[Trajectory], starts: Array, measured: Sequence[N
 
 
 def _composed(first: Array, moves: Array) -> Array:
-    """Where each of the moves (R, 3) starts that follow one another from the pose ``first``: (R, 3)."""
+    """Start poses (R, 3) of consecutive relative motions ``moves`` (R, 3), the first of which starts at ``first``."""
     headings = first[2] + np.concatenate([[0.0], np.cumsum(moves[:-1, 2])])
     steps = (moves[:-1, 0] + 1j * moves[:-1, 1]) * np.exp(1j * headings[:-1])
     path = complex(first[0], first[1]) + np.concatenate([[0.0], np.cumsum(steps)])
@@ -255,22 +260,22 @@ def _given_start_poses(dataset: Dataset, start_poses: Array, moves: Array) -> Ar
 
 
 class _TruthOfRuns:
-    """Where a simulated robot truly was. DataError without a truth."""
+    """The true motion of a simulated robot. DataError: the recording has no truth."""
 
     def __init__(self, recording: Recording) -> None:
         if recording.truth is None:
             raise DataError(
-                f"data set {recording.dataset.name}: its truth is not known; simulate it from a comparison's config"
+                f"data set {recording.dataset.name}: it has no truth; name a comparison's config, which simulates it"
             )
         self._paths = recording.paths
         self._robot = recording.truth.true_robot()
 
     def poses(self, run: Trajectory, stamps: Array) -> Array:
-        """Its poses (K, 3) at stamps (K,) s of a run."""
+        """True poses (K, 3) at stamps (K,), s since the run's start."""
         if run.id in self._paths:
             return moved_to(run.start, self._paths[run.id].at(np.append(0.0, stamps)))[1:]
         if run.targets is None or run.angles is None:
-            raise DataError(f"run {run.id}: what the motors were told is not recorded, so its truth is not known")
+            raise DataError(f"run {run.id}: its set points are not recorded, so its truth is not known")
         rates = self._robot.driven(run.times, run.targets)
         angles = run.angles[0] - run.rates[0] * run.times[0]  # before its first sample
         log = self._robot.log(run.times, rates, run.start, stamps, angles, run.started_at, run.session)

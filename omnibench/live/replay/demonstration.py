@@ -1,4 +1,4 @@
-"""the whole live system on one machine with no robot: a recording is played to a node and what comes out is judged."""
+"""The whole live system on one machine without a robot: a node's output is evaluated on a replayed recording."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.planar import moved_to
 
-_LAST_MESSAGES = 5.0  # s that they may take
+_LAST_MESSAGES = 5.0  # s to wait for the last messages after a replay; chosen
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """Of positions (m) and headings (rad), as root mean squares, and at the end."""
+    """Errors of an estimate: root mean squares of position (m) and heading (rad), last position's error (m)."""
 
     position: float
     heading: float
@@ -40,11 +40,11 @@ class Deviation:
 
 @dataclass(frozen=True, eq=False)
 class Demonstration:
-    """What a replay showed.
+    """The results of a replay to a node.
 
-    against: what the estimates are compared with, in words. theoretical, calibrated: odometry with the design matrix
-    and with the calibration. fused: None without fusion. batch_difference: the most by which a published odom differs
-    from the batch odometry of the same recording, m or rad. lost: messages of odom that never arrived.
+    against: the reference of all deviations, in words. theoretical, calibrated: odometry with the design matrix and
+    with the calibration. fused: None without fusion. batch_difference: largest difference between published odom and
+    the batch odometry of the same recording, m or rad. lost: number of odom messages that never arrived.
     """
 
     robot: str
@@ -61,7 +61,7 @@ class Demonstration:
 
 
 class _Collector:
-    """Every message of one topic, in the order of arrival."""
+    """Collects the messages of one topic in the order of arrival. stamps: ns; poses (K, 3)."""
 
     def __init__(self, session: zenoh.Session, robot: str, topic: str, config: LiveConfig) -> None:
         self.stamps: list[int] = []
@@ -94,10 +94,10 @@ def demonstrate(
     stop: threading.Event | None = None,
     watch: Callable[[Progress, Health], None] | None = None,
 ) -> Demonstration:
-    """Run the node of ``config``, play ``recording`` to it as the config's ``replay`` says, and judge what comes out.
+    """Run the node of ``config``, replay ``recording`` to it as the config's ``replay`` says, and evaluate its output.
 
-    The node begins afresh. ConfigError when the recording is of other wheels than the robot's calibration; other errors
-    as LiveNode's and Player's.
+    The node starts without saved state. ConfigError: the recording has other wheels than the robot's calibration; other
+    errors as from LiveNode and Player.
     """
     stop = stop or threading.Event()
     robot = robot_called(config, config.replay.robot)
@@ -135,16 +135,16 @@ def demonstrate(
         finally:
             if not guarded:
                 session.close()
-        return _judged(drive, recording, tracker.calibration, report, odometry, fused, health)
+        return _evaluated(drive, recording, tracker.calibration, report, odometry, fused, health)
 
 
 def _check_wheels(recording: Recording, calibration: Calibration, robot: str) -> None:
-    """The node knows wheels by name, and what is compared afterwards by place."""
+    """ConfigError: recording and calibration differ in wheels, which nodes match by name, the evaluation by index."""
     recorded, calibrated = recording.dataset.robot.wheel_names, calibration.robot.wheel_names
     if recorded != calibrated:
         raise ConfigError(
             f"recording {recording.dataset.name!r} has wheels {', '.join(recorded)}, calibration {calibration.name!r} "
-            f"of robot {robot!r} has {', '.join(calibrated)}; play one of that robot, or calibrate with this one"
+            f"of robot {robot!r} has {', '.join(calibrated)}; replay one of that robot, or calibrate with this one"
         )
 
 
@@ -161,7 +161,7 @@ def _wait_for_the_last(
             return
 
 
-def _judged(
+def _evaluated(
     drive: ConcatenatedDrive,
     recording: Recording,
     calibration: Calibration,
@@ -175,7 +175,7 @@ def _judged(
     design = OdometryModel.of_design(calibration.robot, calibration.integration).poses([drive.log()])[0]
     origin = odometry.stamps[0] if odometry.stamps else 0
     rows = _rows(odometry.stamps, origin, times)
-    # odom begins at its own origin, the recording anywhere
+    # odom begins at the origin, the drive at its start pose
     published = moved_to(drive.start_poses[0], odometry.poses) if odometry.stamps else odometry.poses
     if recording.truth is not None:
         against, reference = "the simulated truth", concatenated_truth(drive, recording)
@@ -199,7 +199,7 @@ def _judged(
 
 
 def _rows(stamps: list[int], origin: int, times: Array) -> Array:
-    """The wheel sample of each stamp."""
+    """Index of the wheel sample of each stamp."""
     seconds = (np.array(stamps, dtype=np.int64) - origin) / 1e9
     return np.clip(np.searchsorted(times, seconds - 1e-6), 0, len(times) - 1)
 
@@ -207,7 +207,7 @@ def _rows(stamps: list[int], origin: int, times: Array) -> Array:
 def _fused_deviation(
     fused: _Collector, origin: int, drive: ConcatenatedDrive, reference: Array, chosen: Array
 ) -> Deviation:
-    """From where SLAM has first been heard on: before that nobody knows where the robot is in the map."""
+    """Deviation from 1 s after the first SLAM pose on: before, the robot's pose in the map is not known."""
     rows = _rows(fused.stamps, origin, drive.wheel_times)
     known = np.isin(rows, chosen) & (drive.wheel_times[rows] > drive.slam_times[0] + 1.0)
     return _deviation(fused.poses[known], reference[rows[known]])
@@ -218,8 +218,8 @@ def _interpolated(drive: ConcatenatedDrive) -> Array:
     return np.column_stack(columns)
 
 
-def _turned(difference: Array) -> Array:
-    """Differences of headings the shortest way."""
+def _wrapped(difference: Array) -> Array:
+    """Heading differences wrapped to [-pi, pi)."""
     return (difference + np.pi) % (2 * np.pi) - np.pi
 
 
@@ -227,7 +227,7 @@ def _difference(poses: Array, others: Array) -> float:
     if not len(poses):
         return math.nan
     difference = poses - others
-    difference[:, 2] = _turned(difference[:, 2])
+    difference[:, 2] = _wrapped(difference[:, 2])
     return float(np.abs(difference).max())
 
 
@@ -235,5 +235,5 @@ def _deviation(poses: Array, reference: Array) -> Deviation:
     if not len(poses):
         return Deviation(math.nan, math.nan, math.nan)
     distance = np.hypot(*(poses - reference)[:, :2].T)
-    heading = _turned(poses[:, 2] - reference[:, 2])
+    heading = _wrapped(poses[:, 2] - reference[:, 2])
     return Deviation(float(np.sqrt(np.mean(distance**2))), float(np.sqrt(np.mean(heading**2))), float(distance[-1]))

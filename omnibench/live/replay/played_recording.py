@@ -1,4 +1,4 @@
-"""A recording to replay: a data set's folder, or a comparison's config whose simulated data set is made on the spot."""
+"""A recording to replay: a data set's folder, or a comparison's config, whose data set is simulated when loaded."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from omnibench.simulate.truth import TruthRecord
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A data set and, where it was simulated on the spot, what is hidden from it.
+    """A data set and, if it was simulated when loaded, its truth.
 
-    paths: where the robot truly was in each run, if that is no matter of its targets alone.
+    paths: run -> true poses, for robots whose true motion does not follow from the wheels' set points alone.
     """
 
     dataset: Dataset
@@ -31,7 +31,7 @@ class Recording:
 def load_recording(path: Path, dataset: str | None = None, watch: ProgressCallback = no_progress) -> Recording:
     """The data set in a folder, or the simulated one of a comparison's config, with its truth.
 
-    dataset: which one, if the config has several. ConfigError or DataError in one line when there is no such thing.
+    dataset: name of the data set if the config has several. ConfigError or DataError in one line: it does not exist.
     """
     path = Path(path)
     if not path.exists():

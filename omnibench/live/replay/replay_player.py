@@ -1,4 +1,4 @@
-"""Plays a recording onto Zenoh as the robot and its SLAM would have sent it, at any speed."""
+"""Replaying a recording on Zenoh as the robot and its SLAM would have sent it, at any speed."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ __all__ = [
 ]
 
 MAP = "map"
-_LEAST_DEVIATION = 1e-4  # m, rad: no covariance is singular
-_GRACE = 0.5  # s that a node has to subscribe to slam_pose, too, if it wants that
-_PROGRESS_PERIOD = 0.1  # s
+_LEAST_DEVIATION = 1e-4  # m, rad; least standard deviation, so that no covariance is singular; chosen
+_SLAM_WAIT = 0.5  # s for a node to subscribe to slam_pose after joint_states; chosen
+_PROGRESS_PERIOD = 0.1  # s between two reports of progress; chosen
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """A message and when it arrives, s of the recording. It is stamped with when it was taken."""
+    """A message and its time of arrival, s of the recording. Its stamp is the time at which it was measured."""
 
     arrival: float
     topic: str
@@ -64,16 +64,16 @@ def events(
     noise: Noise | None = None,
     names: Sequence[str] | None = None,
 ) -> Iterator[Event]:
-    """Every message of a drive, by time of arrival.
+    """The messages of a drive, by time of arrival.
 
-    origin: stamp of the drive's start, ns (default: the config's, or now). noise: of the reference, for poses whose
-    covariance neither the data set nor the config tells. names (N,) of the joints; default: the robot's wheels.
+    origin: stamp of the drive's start, ns (default: the config's, or now). noise: noise model of the reference, for
+    poses whose covariance neither the data set nor the config gives. names (N,): of the joints; default: the wheels'.
     """
     return _Messages(drive, config, noise, names).stamped_from(origin)
 
 
 class _Messages:
-    """All messages of a drive but for their stamps, made ready so that playing them can start at once."""
+    """All messages of a drive without stamps, prepared so that a replay starts without delay."""
 
     def __init__(
         self, drive: ConcatenatedDrive, config: ReplayConfig, noise: Noise | None, names: Sequence[str] | None
@@ -109,7 +109,7 @@ class _Messages:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a replay is: messages, and s of the recording and of the wall clock."""
+    """Progress of a replay: messages sent and in all, and seconds of the recording and of the wall clock."""
 
     done: int
     total: int
@@ -119,7 +119,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class PlayReport:
-    """What was played. sent: messages of each topic. late: the most that one went out after its time, s."""
+    """Result of a replay. sent: messages by topic; total: messages in all; late: largest delay in sending, s."""
 
     sent: dict[str, int]
     total: int
@@ -129,20 +129,20 @@ class PlayReport:
 
     @property
     def complete(self) -> bool:
-        """Whether it was played to its end."""
+        """True if all messages were sent."""
         return sum(self.sent.values()) == self.total
 
     @property
     def rate(self) -> float:
-        """Messages per second."""
+        """Messages sent per second."""
         return sum(self.sent.values()) / max(self.wall_seconds, 1e-9)
 
 
 class Player:
-    """Plays a drive as one robot. Its publishers go with the session of ``graph``.
+    """Replays a drive as one robot. Closing the session of ``graph`` closes its publishers.
 
-    A subscriber that does not keep up holds it up, so that nothing of the recording is lost at any speed. names, noise:
-    as for ``events``. ConfigError: a robot's name that cannot be, or not a name for each wheel.
+    A slow subscriber delays the replay, so that no message is lost at any speed. names, noise: as for ``events``.
+    ConfigError: the robot's name is not valid, or the names are not one for each wheel.
     """
 
     def __init__(
@@ -160,17 +160,17 @@ class Player:
         self._publishers = {topic: graph.publisher(robot, topic, lossless=True) for topic in TOPICS_PLAYED}
 
     def play(self, stop: threading.Event | None = None, watch: Callable[[Progress], None] | None = None) -> PlayReport:
-        """Play to the end, or until ``stop`` is set or Ctrl-C is pressed.
+        """Send all messages, or stop when ``stop`` is set or Ctrl-C is pressed.
 
-        First it waits for a subscriber; ConfigError when none comes. watch: told of the progress ten times a second,
-        and at the end.
+        Waits for a subscriber first; ConfigError: none comes in time. watch: called with the progress ten times a
+        second and at the end.
         """
         stop = stop or threading.Event()
         total, sent = len(self._messages), dict.fromkeys(TOPICS_PLAYED, 0)
         begin, arrival, late = time.perf_counter(), 0.0, 0.0
         try:
             self._wait_for_subscriber(stop)
-            begin = told = time.perf_counter()
+            begin = reported_at = time.perf_counter()
             for number, event in enumerate(self._messages.stamped_from(None), 1):
                 due = begin + event.arrival / self._config.speed
                 now = time.perf_counter()
@@ -182,13 +182,13 @@ class Player:
                 self._publishers[event.topic].put(event.message)
                 sent[event.topic] += 1
                 arrival, late = event.arrival, max(late, now - due)
-                if watch is not None and now - told >= _PROGRESS_PERIOD:
-                    told = now
+                if watch is not None and now - reported_at >= _PROGRESS_PERIOD:
+                    reported_at = now
                     watch(Progress(number, total, arrival, now - begin))
         except KeyboardInterrupt:
             pass
         except zenoh.ZError as error:
-            if not stop.is_set():  # else who stopped it has closed the session, too
+            if not stop.is_set():  # otherwise the session was closed after stopping
                 raise OmnibenchError(f"replay of {self._robot}: cannot publish any more: {error}") from None
         seconds = time.perf_counter() - begin
         if watch is not None:
@@ -196,7 +196,7 @@ class Player:
         return PlayReport(sent, total, arrival, seconds, 0.0 if math.isinf(self._config.speed) else late)
 
     def _wait_for_subscriber(self, stop: threading.Event) -> None:
-        """Until the wheel samples have a subscriber and, if one comes within a moment, the SLAM poses have."""
+        """Wait until the wheel samples have a subscriber, and then up to _SLAM_WAIT s for one of the SLAM poses."""
         wheels, slam = (self._publishers[topic] for topic in TOPICS_PLAYED)
         wait = self._config.wait
         deadline = time.perf_counter() + wait
@@ -206,7 +206,7 @@ class Player:
                     f"nobody subscribes to {wheels.key} after {wait:g} s; start omnibench live for robot "
                     f"{self._robot}, check robot, profile and endpoint of both, or wait longer"
                 )
-        deadline = time.perf_counter() + min(wait, _GRACE)
+        deadline = time.perf_counter() + min(wait, _SLAM_WAIT)
         while not slam.matched and time.perf_counter() < deadline and not stop.wait(0.01):
             pass
 
@@ -216,12 +216,12 @@ def _nanoseconds(times: Array) -> NDArray[np.int64]:
 
 
 def _pose_covariances(drive: ConcatenatedDrive, slam: SlamChannel, noise: Noise | None) -> Array:
-    """Covariances (m, 3, 3) of the SLAM poses about where the robot was."""
+    """Covariances (m, 3, 3) of the SLAM poses' errors."""
     if drive.slam_covariances is not None:
         return drive.slam_covariances
     count = len(drive.slam_times)
     if slam.covariance is None and noise is not None:
-        seconds = drive.slam_times - drive.start_times[drive.slam_run]  # that the walk has had since the run's start
+        seconds = drive.slam_times - drive.start_times[drive.slam_run]  # duration of the random walk
         position = np.sqrt(noise.pose_position**2 + noise.bias_position**2 + noise.walk_position**2 * seconds)
         heading = np.sqrt(noise.pose_heading**2 + noise.bias_heading**2 + noise.walk_heading**2 * seconds)
     else:
@@ -235,5 +235,7 @@ def _pose_covariances(drive: ConcatenatedDrive, slam: SlamChannel, noise: Noise 
 def _joint_names(drive: ConcatenatedDrive, names: Sequence[str] | None) -> tuple[str, ...]:
     joints, wheels = tuple(drive.robot.wheel_names if names is None else names), drive.robot.wheel_names
     if len(joints) != len(wheels) or len(set(joints)) != len(joints):
-        raise ConfigError(f"joints {', '.join(joints) or '(none)'}: give each of the wheels {', '.join(wheels)} a name")
+        raise ConfigError(
+            f"joints {', '.join(joints) or '(none)'}: name one for each of the wheels {', '.join(wheels)}"
+        )
     return joints

@@ -1,1 +1,1 @@
-"""Messages on the wire: ROS 2 types, topics, MCAP files, Foxglove."""
+"""Messages on the network and in files: ROS 2 types, topics, MCAP recordings, Foxglove."""

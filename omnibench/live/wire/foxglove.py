@@ -1,4 +1,4 @@
-"""The robots' topics on a WebSocket that the Foxglove application opens (foxglove-sdk, the extra ``foxglove``)."""
+"""A WebSocket server of the robots' topics for the Foxglove application (foxglove-sdk, the extra ``foxglove``)."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from omnibench.live.wire.topics import TOPICS, KeySpace
 if TYPE_CHECKING:
     from foxglove import Channel
 
-PORT: Final = 8765  # which the application proposes
+PORT: Final = 8765  # the application's default
 
 
 class FoxgloveServer:
-    """Serves on ``host`` and ``port`` (0: any free one) what it is told to ``forward``, until ``close``.
+    """Serves the topics given to ``forward`` on ``host`` and ``port`` (0: any free port), until ``close``.
 
-    Only programs of this machine reach it unless ``host`` says otherwise: the protocol has no password. A client that
-    does not keep up loses messages and holds up nobody.
+    By default only programs on this machine can connect, because the protocol has no password. A client that is too
+    slow loses messages and delays no other.
 
-    ConfigError: foxglove-sdk is not installed, the port is taken, or the host is none of this machine's.
+    ConfigError: foxglove-sdk is not installed, the port is in use, or the host is not an address of this machine.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = PORT) -> None:
@@ -51,10 +51,10 @@ class FoxgloveServer:
     def forward(
         self, session: zenoh.Session, keys: KeySpace, robots: Sequence[str], topics: Sequence[str] = tuple(TOPICS)
     ) -> None:
-        """Offer the robots' topics from now on; each message goes out as it came. ConfigError: no such topic."""
+        """Serve the robots' topics from now on, payloads unchanged. ConfigError: no such topic."""
         import foxglove
 
-        listener = TopicListener(session, keys, robots, topics, self._arrived)
+        listener = TopicListener(session, keys, robots, topics, self._forward)
         for name, topic in listener.topics.items():
             kind = TOPICS[topic]
             schema = foxglove.Schema(name=kind.name, encoding="ros2msg", data=kind.definition.encode())
@@ -62,7 +62,7 @@ class FoxgloveServer:
         self._listeners.append(listener)
 
     def subscribed(self, name: str) -> bool:
-        """Whether a client wants the topic, as /apr02/odom, now."""
+        """True if a client subscribes to the topic, as /apr02/odom, now."""
         return name in self._channels and self._channels[name].has_sinks()
 
     def close(self) -> None:
@@ -79,7 +79,7 @@ class FoxgloveServer:
     ) -> None:
         self.close()
 
-    def _arrived(self, arrival: Arrival) -> None:
+    def _forward(self, arrival: Arrival) -> None:
         channel = self._channels.get(arrival.name)
         if channel is not None:
             channel.log(arrival.payload, log_time=arrival.time)

@@ -1,8 +1,8 @@
-"""An MCAP file of ROS 2 messages that can be read at any time, also when its writer was killed or the disk was full.
+"""An MCAP file of ROS 2 messages that can be read at any time, even if its writer was killed or the disk was full.
 
-Each ``flush`` writes a chunk and, behind it, the end of a file that has no index, in one go; the next chunk overwrites
-that end. So whatever becomes of the writer, all up to the last flush is there, in a file that rosbags, mcap and
-Foxglove open; only ``complete`` adds the index.
+Each ``flush`` writes a chunk followed by the end of a file without an index, in one call; the next chunk overwrites
+that end. The file is therefore valid after each flush, and rosbags, mcap and Foxglove open it whatever happens to the
+writer. ``complete`` adds the index.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from omnibench.live.wire.messages import MessageType
 
 
 class McapFile:
-    """Writes ``path``, which must not exist yet. DataError when it exists or cannot be made.
+    """Writes ``path``, which must not exist yet. DataError: it exists or cannot be made.
 
-    OSError from the other methods: the disk refuses (full, taken away); what was flushed before stays readable.
+    OSError from the other methods: writing failed (disk full or removed); what was flushed before stays readable.
     """
 
     def __init__(self, path: Path) -> None:
@@ -36,7 +36,7 @@ class McapFile:
 
     @property
     def size(self) -> int:
-        """Bytes on the disk."""
+        """Size of the file, bytes."""
         return self._stream.size
 
     def write(self, name: str, kind: MessageType[Any], payload: bytes, *, log_time: int, publish_time: int) -> None:
@@ -48,7 +48,7 @@ class McapFile:
             self._writer.flush()
 
     def flush(self) -> None:
-        """What was written is in the file, and the file can be read."""
+        """Bring all messages so far into the file, which is valid then."""
         self._writer.flush()
 
     def complete(self) -> None:
@@ -61,7 +61,7 @@ class McapFile:
             self._stream.close()
 
     def close(self) -> None:
-        """Leave the file as the last flush left it."""
+        """Close the file as the last flush left it, without an index."""
         self._stream.close()
 
     def _schema(self, kind: MessageType[Any]) -> int:
@@ -71,7 +71,7 @@ class McapFile:
 
 
 def _ending() -> bytes:
-    """The end of a file without an index."""
+    """The bytes at the end of a file without an index."""
     records = RecordBuilder()
     DataEnd(0).write(records)
     Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(records)
@@ -82,7 +82,7 @@ _ENDING: Final = _ending()
 
 
 class _Stream:
-    """What mcap's Writer writes to."""
+    """The stream that mcap's Writer writes to; holds data back until ``flush`` or ``put``."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -92,9 +92,9 @@ class _Stream:
             where = path if path.exists() else path.parent
             raise DataError(f"{where}: exists already; name another file or remove it") from None
         except OSError as error:
-            raise DataError(f"{path}: cannot be written: {error.strerror or error}; choose another place") from None
-        self.waiting = bytearray()  # to be written
-        self._end = 0  # of the file's content, where its ending begins
+            raise DataError(f"{path}: cannot be written: {error.strerror or error}; choose another folder") from None
+        self.waiting = bytearray()  # data that is not in the file yet
+        self._end = 0  # position in the file at which its ending begins
         self.size = 0
 
     def write(self, data: bytes) -> int:
@@ -108,7 +108,7 @@ class _Stream:
         self.put(_ENDING)
 
     def put(self, ending: bytes) -> None:
-        """Write what waits, and an ending behind it; if the disk refuses (OSError), the file is as it was."""
+        """Write the waiting data and an ending after it; if that fails (OSError), the file is as before."""
         try:
             self._write_at(self._end, bytes(self.waiting) + ending)
         except OSError:

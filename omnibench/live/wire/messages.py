@@ -1,8 +1,8 @@
-"""ROS 2's messages as typed objects of the plane, to and from CDR (rosbags does the serialising).
+"""ROS 2 messages as typed planar objects, to and from CDR (rosbags serialises).
 
 Poses are (x, y, heading) in m, m, rad; twists (vx, vy, w) in m/s, m/s, rad/s in the child frame; stamps are ns.
-Covariances of the plane (3, 3) take their places in ROS 2's 6 x 6; the variances of z, roll and pitch there are 1e-9,
-so that the whole can be inverted.
+A planar covariance (3, 3) fills the x, y and yaw entries of ROS 2's 6 x 6 matrix; the variances of z, roll and pitch
+are 1e-9 there, so that the matrix can be inverted.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from omnibench.robot.kinematics import Array
 
 STORE: Final = get_typestore(Stores.ROS2_JAZZY)
 
-PLANAR_INDICES = np.array([0, 1, 5, 6, 7, 11, 30, 31, 35])  # the plane's nine places in the 36
-_ELSEWHERE = np.zeros(36)
-_ELSEWHERE[[14, 21, 28]] = 1e-9
-_SECOND = 1_000_000_000
-_LARGEST_TILT = math.radians(10.0)
+PLANAR_INDICES = np.array([0, 1, 5, 6, 7, 11, 30, 31, 35])  # x, y and yaw in a 6 x 6 covariance's 36 elements
+_OUT_OF_PLANE = np.zeros(36)  # covariance with the variances of z (m^2), roll and pitch (rad^2) only
+_OUT_OF_PLANE[[14, 21, 28]] = 1e-9
+_SECOND = 1_000_000_000  # ns
+_LARGEST_TILT = math.radians(10.0)  # rad; a pose that is tilted more is no pose of a wheeled robot; chosen
 
 
 class MessageError(DataError):
-    """A message that cannot be what its topic says."""
+    """A message that is not of its topic's type, or whose values are impossible."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointState:
-    """sensor_msgs/JointState. names (N,); positions (N,) rad and velocities (N,) rad/s, where the sender gives them."""
+    """sensor_msgs/JointState. names (N,); positions (N,) rad and velocities (N,) rad/s, None if not sent."""
 
     stamp: int
     names: tuple[str, ...]
@@ -55,7 +55,7 @@ class PoseEstimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Odometry:
-    """nav_msgs/Odometry: pose (3,) of ``child_frame`` in ``frame``, twist (3,) in ``child_frame``, and covariances."""
+    """nav_msgs/Odometry. pose (3,) of child_frame in frame, twist (3,) in child_frame; covariances (3, 3)."""
 
     stamp: int
     frame: str
@@ -105,9 +105,9 @@ M = TypeVar("M")
 
 @dataclass(frozen=True)
 class MessageType(Generic[M]):
-    """A ROS 2 message type and how it becomes one of the classes above.
+    """A ROS 2 message type with its conversion to and from one of the classes above.
 
-    name: as in ROS 2, sensor_msgs/msg/JointState.
+    name: ROS 2's name of the type, as sensor_msgs/msg/JointState.
     """
 
     name: str
@@ -116,12 +116,12 @@ class MessageType(Generic[M]):
 
     @property
     def hash(self) -> str:
-        """Its type hash (REP-2011), RIHS01_..."""
+        """The type hash (REP-2011), RIHS01_..."""
         return STORE.hash_rihs01(self.name)
 
     @property
     def definition(self) -> str:
-        """Its definition and those of the types within it in one text, as recordings and Foxglove want it (ros2msg)."""
+        """The definition with those of the types it contains, in the format ros2msg of recordings and Foxglove."""
         return STORE.generate_msgdef(self.name, ros_version=2)[0]
 
     def encode(self, message: M) -> bytes:
@@ -129,13 +129,13 @@ class MessageType(Generic[M]):
         return bytes(STORE.serialize_cdr(self._to_ros(message), self.name))
 
     def decode(self, payload: bytes) -> M:
-        """The message in a payload. MessageError says what is wrong of one that is not of this type."""
+        """The message in a payload. MessageError: the payload is not of this type, or a value is impossible."""
         return self._from_ros(self.parse(payload))
 
     def parse(self, payload: bytes) -> Any:
-        """The message in a payload as rosbags' object, whatever its values. MessageError: it is not of this type."""
+        """The message in a payload as rosbags' object, values unchecked. MessageError: it is not of this type."""
         try:
-            return STORE.deserialize_cdr(payload, self.name)  # which sees to it that nothing is left over
+            return STORE.deserialize_cdr(payload, self.name)  # checks that all bytes are used
         except (SerdeError, UnicodeError, ValueError, OverflowError, MemoryError) as error:
             raise MessageError(f"not a {self.name} of {len(payload)} bytes: {error}") from None
 
@@ -169,7 +169,7 @@ def _quaternion(heading: float) -> Any:
 
 
 def _heading(quaternion: Any) -> float:
-    """The yaw of a quaternion of length 1, of a body that stands upright."""
+    """The yaw of a quaternion, rad. MessageError: its length is not 1, or it tilts by more than _LARGEST_TILT."""
     x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     length = math.sqrt(x * x + y * y + z * z + w * w)
     if not abs(length - 1) < 0.01:
@@ -181,7 +181,7 @@ def _heading(quaternion: Any) -> float:
 
 
 def _covariance_36(covariance: Array) -> Array:
-    full = _ELSEWHERE.copy()
+    full = _OUT_OF_PLANE.copy()
     full[PLANAR_INDICES] = np.ravel(covariance)
     return full
 
@@ -264,11 +264,14 @@ def _transforms_to_ros(transforms: Sequence[Transform]) -> Any:
     return _ros("tf2_msgs/msg/TFMessage")(
         [
             _TransformStamped(
-                _header(each.stamp, each.frame),
-                each.child_frame,
-                _Transform(_Vector(float(each.pose[0]), float(each.pose[1]), 0.0), _quaternion(float(each.pose[2]))),
+                _header(transform.stamp, transform.frame),
+                transform.child_frame,
+                _Transform(
+                    _Vector(float(transform.pose[0]), float(transform.pose[1]), 0.0),
+                    _quaternion(float(transform.pose[2])),
+                ),
             )
-            for each in transforms
+            for transform in transforms
         ]
     )
 
@@ -276,19 +279,27 @@ def _transforms_to_ros(transforms: Sequence[Transform]) -> Any:
 def _transforms_from_ros(content: Any) -> tuple[Transform, ...]:
     return tuple(
         Transform(
-            _stamp(each.header),
-            each.header.frame_id,
-            each.child_frame_id,
-            np.array([each.transform.translation.x, each.transform.translation.y, _heading(each.transform.rotation)]),
+            _stamp(item.header),
+            item.header.frame_id,
+            item.child_frame_id,
+            np.array(
+                [
+                    item.transform.translation.x,
+                    item.transform.translation.y,
+                    _heading(item.transform.rotation),
+                ]
+            ),
         )
-        for each in content.transforms
+        for item in content.transforms
     )
 
 
 def _diagnostics_to_ros(message: Diagnostics) -> Any:
     statuses = [
-        _Status(each.level, each.name, each.message, each.hardware, [_KeyValue(*pair) for pair in each.values])
-        for each in message.statuses
+        _Status(
+            status.level, status.name, status.message, status.hardware, [_KeyValue(*pair) for pair in status.values]
+        )
+        for status in message.statuses
     ]
     return _ros("diagnostic_msgs/msg/DiagnosticArray")(_header(message.stamp, ""), statuses)
 
@@ -296,13 +307,13 @@ def _diagnostics_to_ros(message: Diagnostics) -> Any:
 def _diagnostics_from_ros(content: Any) -> Diagnostics:
     statuses = tuple(
         Diagnostic(
-            each.name,
-            int(each.level),
-            each.message,
-            each.hardware_id,
-            tuple((pair.key, pair.value) for pair in each.values),
+            status.name,
+            int(status.level),
+            status.message,
+            status.hardware_id,
+            tuple((pair.key, pair.value) for pair in status.values),
         )
-        for each in content.status
+        for status in content.status
     )
     return Diagnostics(_stamp(content.header), statuses)
 

@@ -1,6 +1,7 @@
-"""CDR for one robot's own messages, of which only stamps and numbers change: several times as fast as in general.
+"""Fast CDR for one robot's messages, in which only stamps and numbers change.
 
-The first message goes through rosbags; later ones are that one with other numbers in the same places.
+rosbags encodes or decodes the first message; for the later ones only the bytes of its stamps and numbers are exchanged,
+which is several times as fast.
 """
 
 from __future__ import annotations
@@ -23,15 +24,15 @@ from omnibench.live.wire.messages import (
 from omnibench.robot.kinematics import Array
 
 _SECOND = 1_000_000_000
-_STAMP_AT = 4  # bytes: after the CDR header
-_NUMBERS = 7 + 36 + 6 + 36  # at the end of an Odometry: pose, its covariance, twist, its covariance
-_TWIST = 7 + 36
+_STAMP_AT = 4  # byte at which the stamp begins: after the CDR header
+_NUMBERS = 7 + 36 + 6 + 36  # float64 values at the end of an Odometry: pose, covariance, twist, covariance
+_TWIST = 7 + 36  # index of the twist among these
 _POSE_COVARIANCE = 7 + PLANAR_INDICES
 _TWIST_COVARIANCE = _TWIST + 6 + PLANAR_INDICES
 
 
 class OdometryEncoder:
-    """Encodes odometry whose frames are always the same; the bytes are those of ``ODOMETRY.encode``."""
+    """Encodes odometry with constant frames into the same bytes as ``ODOMETRY.encode``."""
 
     def __init__(self, frame: str, child_frame: str) -> None:
         zeros = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
@@ -51,7 +52,7 @@ class OdometryEncoder:
 
 
 class TransformsEncoder:
-    """Encodes the transforms of always the same frames; the bytes are those of ``TRANSFORMS.encode``."""
+    """Encodes transforms between constant frames into the same bytes as ``TRANSFORMS.encode``."""
 
     def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
         marks = [Transform((index + 1) * _SECOND, *pair, np.zeros(3)) for index, pair in enumerate(frames)]
@@ -61,7 +62,7 @@ class TransformsEncoder:
         place = _STAMP_AT
         for index in range(len(frames)):
             place = self._buffer.index(struct.pack("<iI", index + 1, 0), place)
-            # the next rotation by nothing ends the seven numbers of this pose
+            # an identity rotation ends with the values 0, 0, 1, which are the last of the pose's seven
             pose = self._buffer.index(struct.pack("<ddd", 0.0, 0.0, 1.0), place) - 4 * 8
             self._stamps.append(place)
             self._poses.append(np.frombuffer(self._buffer, "<f8", 7, pose))
@@ -76,44 +77,46 @@ class TransformsEncoder:
 
 
 class JointStateDecoder:
-    """Decodes the wheel messages of one sender, whose joints are always the same; as ``JOINT_STATE.decode`` does."""
+    """Decodes one sender's wheel messages, with constant joint names, to the same as ``JOINT_STATE.decode``."""
 
     def __init__(self) -> None:
         self._length = -1
-        self._known: tuple[tuple[slice, bytes], ...] = ()  # what does not change
+        self._constant: tuple[tuple[slice, bytes], ...] = ()  # the parts of a payload that do not change
         self._template: JointState | None = None
-        self._positions = self._velocities = 0  # bytes to where they begin; 0: there are none
+        self._positions = self._velocities = 0  # bytes at which they begin; 0: there are none
         self._joints = 0
 
     def decode(self, payload: bytes) -> JointState:
-        """The message. MessageError says what is wrong of one that is none."""
-        like = self._template
-        if like is None or len(payload) != self._length or any(payload[at] != was for at, was in self._known):
+        """The message in a payload. MessageError: as from ``JOINT_STATE.decode``."""
+        template = self._template
+        if template is None or len(payload) != self._length or any(payload[at] != part for at, part in self._constant):
             return self._learn(payload)
         seconds, nanoseconds = struct.unpack_from("<iI", payload, _STAMP_AT)
         if nanoseconds >= _SECOND:
-            return self._learn(payload)  # which refuses it
+            return self._learn(payload)  # raises MessageError
         count, positions, velocities = self._joints, self._positions, self._velocities
         return JointState(
             seconds * _SECOND + nanoseconds,
-            like.names,
+            template.names,
             np.frombuffer(payload, "<f8", count, positions) if positions else None,
             np.frombuffer(payload, "<f8", count, velocities) if velocities else None,
-            like.frame,
+            template.frame,
         )
 
     def _learn(self, payload: bytes) -> JointState:
-        """Decode in general, and remember the places if nothing else stands at the end, as efforts would."""
+        """Decode by rosbags and remember where the numbers are, if the message has no efforts."""
         message = JOINT_STATE.decode(payload)
         self._template = None
         count = len(message.names)
-        place = len(payload) - 4  # of the number of efforts
+        place = len(payload) - 4  # where the number of efforts begins
         numbers_given = count and (message.positions is not None or message.velocities is not None)
         if payload[:4] != b"\x00\x01\x00\x00" or payload[place:] != bytes(4) or not numbers_given:
             return message
         size = 8 * count
         self._velocities = self._positions = 0
-        end = place - 4  # of what comes before the number of velocities, if there are none
+        end = (
+            place - 4
+        )  # end of the positions: their successor, the number of velocities, takes 4 bytes if there are none
         if message.velocities is not None:
             self._velocities = place - size
             end = self._velocities - 8
@@ -123,18 +126,18 @@ class JointStateDecoder:
         changing += [(begin, begin + size) for begin in (self._positions, self._velocities) if begin]
         ends = [0, *(end for _, end in changing)]
         begins = [*(begin for begin, _ in changing), len(payload)]
-        known = (slice(*each) for each in zip(ends, begins, strict=True))
-        self._known = tuple((at, payload[at]) for at in known)
+        constant = (slice(*bounds) for bounds in zip(ends, begins, strict=True))
+        self._constant = tuple((at, payload[at]) for at in constant)
         self._length, self._joints = len(payload), count
         self._template = message
-        again = self.decode(payload)  # by the places; they are right, or it is left to rosbags
-        for mine, theirs in ((again.positions, message.positions), (again.velocities, message.velocities)):
-            if mine is not None and (theirs is None or mine.tobytes() != theirs.tobytes()):
+        check = self.decode(payload)  # if this does not give the same, rosbags decodes the next message too
+        for fast, general in ((check.positions, message.positions), (check.velocities, message.velocities)):
+            if fast is not None and (general is None or fast.tobytes() != general.tobytes()):
                 self._template = None
         return message
 
 
 def _write_pose(numbers: Array, pose: Array) -> None:
-    """x, y, z and the quaternion."""
+    """Write a pose (3,) into the numbers x, y, z and quaternion, of which z, qx and qy stay 0."""
     numbers[0], numbers[1], heading = pose.tolist()
     numbers[5], numbers[6] = math.sin(heading / 2), math.cos(heading / 2)

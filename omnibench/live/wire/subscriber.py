@@ -1,4 +1,4 @@
-"""``omnibench.subscribe(robot)``: a robot's odometry in somebody's program, as an iterator or by callback."""
+"""``omnibench.subscribe(robot)``: a robot's odometry in a user's program, as an iterator or by callback."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from omnibench.live.network.session_config import SessionConfig
 from omnibench.live.wire.messages import ODOMETRY, MessageError, Odometry
 from omnibench.live.wire.topics import TOPICS, KeySpace, Profile
 
-ADDRESS: Final = "tcp/127.0.0.1:7447"
-_FIFO_CAPACITY: Final = 10_000
-_LOOK_AGAIN: Final = 0.001  # s; Zenoh's channels wait for ever or not at all
+ADDRESS: Final = "tcp/127.0.0.1:7447"  # where a node listens by default
+_FIFO_CAPACITY: Final = 10_000  # messages, 100 s at 100 Hz; chosen
+_POLL_PERIOD: Final = 0.001  # s; Zenoh's channels wait either for ever or not at all
 
 _log = logging.getLogger(__name__)
 
@@ -39,25 +39,25 @@ def subscribe(
     buffer: int | None = None,
     lossless: bool = False,
 ) -> Subscription:
-    """A robot's odometry as it comes.
+    """Subscribe to a robot's odometry.
 
-    topic: ``odom`` or, where the node fuses SLAM poses, ``odometry/filtered``. connect: where the node listens, or all
-    the settings of a session (certificate, password). session: one that is open already, and stays open; else one is
-    opened and closed with the subscription. profile, domain: as in the node's config.
+    topic: ``odom`` or, if the node fuses SLAM poses, ``odometry/filtered``. connect: the endpoint on which the node
+    listens, or a whole session config (certificate, password). session: an open session to use, which stays open; by
+    default one is opened and closed with the subscription. profile, domain: as in the node's config.
 
-    callback: called with each message, in a thread of its own, in place of iterating. buffer: how many messages wait
-    for a slow reader: one, and the newest wins, unless said otherwise; with ``lossless`` 10,000 in order, and only
-    when these are full are messages lost, at the sender.
+    callback: called with each message in a thread of its own, instead of iterating. buffer: how many messages wait for
+    a slow reader; by default only the newest. With ``lossless`` up to 10,000 messages wait, in order; only when these
+    are full does the sender drop messages.
 
-    ConfigError: a name that cannot be or nothing listens at ``connect``. ::
+    ConfigError: a name is not valid, or nothing listens at ``connect``. ::
 
         with omnibench.subscribe("apr02") as odometry:
             for message in odometry:
                 print(message.seconds, message.pose)
     """
-    known = [name for name, kind in TOPICS.items() if kind is ODOMETRY]
-    if topic not in known:
-        raise UnknownNameError("odometry topic", topic, known)
+    odometry_topics = [name for name, kind in TOPICS.items() if kind is ODOMETRY]
+    if topic not in odometry_topics:
+        raise UnknownNameError("odometry topic", topic, odometry_topics)
     if profile not in get_args(Profile):
         raise UnknownNameError("profile", profile, get_args(Profile))
     size = (_FIFO_CAPACITY if lossless else 1) if buffer is None else buffer
@@ -66,19 +66,19 @@ def subscribe(
     key = KeySpace(profile, domain).expression(checked_robot(robot), topic)
     channel: FifoChannel[zenoh.Sample] | RingChannel[zenoh.Sample]
     channel = FifoChannel(size) if lossless else RingChannel(size)
-    own = None
+    own_session = None
     if session is None:
         if isinstance(connect, str):
             connect = validate(SessionConfig, {"mode": "client", "connect": connect}, f"subscribing to {robot}")
-        session = own = open_session(connect, f"subscribing to {robot}")
-    return Subscription(session.declare_subscriber(key, channel), callback, own)
+        session = own_session = open_session(connect, f"subscribing to {robot}")
+    return Subscription(session.declare_subscriber(key, channel), callback, own_session)
 
 
 class Subscription:
-    """Odometry messages as they come: iterate, or ask for the ``latest``; a context manager.
+    """A stream of odometry messages: iterate over it, or get the ``latest``; a context manager.
 
-    received: messages decoded so far. undecodable: messages that were not odometry, passed over. callback_errors: how
-    often the callback raised; each kind of exception is logged once, and the stream goes on.
+    received: messages decoded so far. undecodable: messages skipped because they were not odometry. callback_errors:
+    how often the callback raised; each kind of exception is logged once, and the stream goes on.
     """
 
     def __init__(
@@ -91,11 +91,11 @@ class Subscription:
         self.undecodable = 0
         self.callback_errors = 0
         self._subscriber = subscriber
-        self._channel = subscriber.handler  # a reader that waits in it does not hold the subscriber, which can close
+        self._channel = subscriber.handler  # readers wait in the channel, so that the subscriber can be closed
         self._session = session
         self._callback = callback
         self._kinds: set[type[Exception]] = set()
-        self._closing = threading.Lock()  # two threads may close at once, which Zenoh does not bear
+        self._closing = threading.Lock()  # Zenoh does not allow two threads to close at once
         self._closed = False
         self._thread: threading.Thread | None = None
         if callback is not None:
@@ -110,7 +110,7 @@ class Subscription:
         return self._messages()
 
     def latest(self, timeout: float = 1.0) -> Odometry | None:
-        """The newest message that was not handed out yet, waiting for one up to ``timeout`` s; None if none came."""
+        """The newest message that was not returned before; waits up to ``timeout`` s, then None."""
         deadline = time.monotonic() + timeout
         newest = None
         try:
@@ -121,12 +121,12 @@ class Subscription:
                 elif newest is not None or time.monotonic() >= deadline:
                     return newest
                 else:
-                    time.sleep(_LOOK_AGAIN)
-        except zenoh.ZError:  # closed
+                    time.sleep(_POLL_PERIOD)
+        except zenoh.ZError:  # the subscription was closed
             return newest
 
     def close(self) -> None:
-        """End the stream, for whoever waits for a message too. Closing twice does no harm."""
+        """End the stream, also for a reader that waits for a message. Closing twice does no harm."""
         with self._closing:
             if not self._closed:
                 self._closed = True
@@ -148,7 +148,7 @@ class Subscription:
         while True:
             try:
                 sample = self._channel.recv()
-            except zenoh.ZError:  # closed
+            except zenoh.ZError:  # the subscription was closed
                 return
             message = self._decoded(sample)
             if message is not None:
@@ -169,7 +169,7 @@ class Subscription:
         for message in self._messages():
             try:
                 callback(message)
-            except Exception as error:  # the user's own code may raise anything
+            except Exception as error:  # the user's code may raise anything
                 self.callback_errors += 1
                 if type(error) not in self._kinds:
                     self._kinds.add(type(error))

@@ -1,4 +1,4 @@
-"""Every message of some robots' topics, as it arrives, undecoded: what the recorder and the Foxglove server feed on."""
+"""Listening to robots' topics without decoding, for the recorder and the Foxglove server."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from omnibench.live.wire.topics import TOPICS, KeySpace, topic_name
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """A message that came.
+    """A received message.
 
-    name: its ROS 2 topic with the leading slash, /apr02/odom. topic: as in TOPICS. time: ns of the system's clock when
-    it came, never less than that of the arrival before. payload: CDR.
+    name: its ROS 2 topic with the leading slash, /apr02/odom. topic: its key in TOPICS. time: ns of the system's clock
+    at its arrival, never before the previous arrival's. payload: CDR.
     """
 
     name: str
@@ -32,9 +32,9 @@ class Arrival:
 
 
 class TopicListener:
-    """Hands every message of the robots' topics to ``consume``, one at a time, in Zenoh's thread: it must be quick.
+    """Calls ``consume`` with each message of the robots' topics, one at a time, in Zenoh's thread: it must be quick.
 
-    Raises ConfigError for a topic that is not there or a robot's name that cannot be.
+    topics: ROS 2 name -> key in TOPICS. ConfigError: no such topic, or a robot's name is not valid.
     """
 
     def __init__(
@@ -49,25 +49,25 @@ class TopicListener:
         self._time = 0
         self._lock = Lock()
         sources = {f"/{topic_name(robot, topic)}": (robot, topic) for robot, topic in _pairs(robots, topics)}
-        self.topics = {name: topic for name, (_, topic) in sources.items()}  # tf is everybody's and there once
+        self.topics = {name: topic for name, (_, topic) in sources.items()}  # all robots share tf
         self._subscribers: list[zenoh.Subscriber[None]] = []
         for name, (robot, topic) in sources.items():
-            direct: Any = Callback(partial(self._arrived, name, topic), indirect=False)
+            direct: Any = Callback(partial(self._take, name, topic), indirect=False)
             self._subscribers.append(session.declare_subscriber(keys.expression(robot, topic), direct))
 
     def close(self) -> None:
-        """No message is handed on after this."""
+        """Stop listening; ``consume`` is not called after this."""
         for subscriber in self._subscribers:
             subscriber.undeclare()
-        with self._lock:  # the one under way has been handed on
+        with self._lock:  # waits for a call of consume that is under way
             self._subscribers = []
 
-    def _arrived(self, name: str, topic: str, sample: zenoh.Sample) -> None:
+    def _take(self, name: str, topic: str, sample: zenoh.Sample) -> None:
         if sample.kind != zenoh.SampleKind.PUT:
             return
         payload = sample.payload.to_bytes()
         with self._lock:
-            self._time = max(self._time, time.time_ns())  # readers of recordings want them in order
+            self._time = max(self._time, time.time_ns())  # readers of recordings expect increasing times
             self._consume(Arrival(name, topic, self._time, payload))
 
 

@@ -1,8 +1,8 @@
-"""Where a robot's messages are in Zenoh's key space, so that other programs find them: three profiles.
+"""The Zenoh keys of a robot's topics, in three profiles for other programs.
 
-plain: the key is the topic, as the DDS bridge (zenoh-bridge-ros2dds) maps it. rmw: as a ROS 2 node on rmw_zenoh, with
-liveliness tokens (else the topic is missing from ``ros2 topic list``) and an attachment to each message (else it is
-dropped). humble: rmw with Humble's place-holder for type hashes.
+plain: the key is the topic's name, as the DDS bridge (zenoh-bridge-ros2dds) maps it. rmw: keys, liveliness tokens and
+attachments of a ROS 2 node on rmw_zenoh; without tokens ``ros2 topic list`` would not show the topic, and without
+attachments ROS 2 would drop the messages. humble: rmw with Humble's placeholder for type hashes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from omnibench.live.wire.outputs import OUTPUTS
 Profile = Literal["plain", "rmw", "humble"]
 M = TypeVar("M")
 
-INPUTS: Final = ("joint_states", "slam_pose")
+INPUTS: Final = ("joint_states", "slam_pose")  # the topics that a node receives; it publishes the others
 # A robot's topics, below its name, and their message types; all robots share tf.
 TOPICS: Final[dict[str, MessageType[Any]]] = {
     "joint_states": JOINT_STATE,
@@ -32,47 +32,47 @@ TOPICS: Final[dict[str, MessageType[Any]]] = {
     "diagnostics": DIAGNOSTICS,
 }
 
-_QOS = "::,10:,:,:,,"  # reliable, volatile, depth 10
+_QOS = "::,10:,:,:,,"  # rmw_zenoh's code of: reliable, volatile, depth 10
 _HASH_OF_HUMBLE = "TypeHashNotSupported"
 
 
 def topic_name(robot: str, topic: str) -> str:
-    """The ROS 2 name of a robot's topic without its leading slash: ``apr02/odom``; ``tf`` stands alone."""
+    """The ROS 2 name of a robot's topic without its leading slash: ``apr02/odom``; ``tf`` has no robot's name."""
     return topic if topic == "tf" else f"{robot}/{topic}"
 
 
 def dds_name(message_type: MessageType[Any]) -> str:
-    """nav_msgs/msg/Odometry as rmw_zenoh writes it: nav_msgs::msg::dds_::Odometry_."""
+    """A type's name as rmw_zenoh writes it: nav_msgs::msg::dds_::Odometry_ of nav_msgs/msg/Odometry."""
     package, kind, name = message_type.name.split("/")
     return f"{package}::{kind}::dds_::{name}_"
 
 
 class KeySpace:
-    """The keys of one profile (and ROS domain)."""
+    """The keys of one profile and ROS domain."""
 
     def __init__(self, profile: Profile = "plain", domain: int = 0) -> None:
         self.profile: Profile = profile
         self.domain = domain
 
     def key(self, robot: str, topic: str) -> str:
-        """The key that a robot's topic is published to."""
+        """The key to which a robot's topic is published."""
         name, kind = topic_name(robot, topic), TOPICS[topic]
         return name if self.profile == "plain" else f"{self.domain}/{name}/{dds_name(kind)}/{self.type_hash(kind)}"
 
     def expression(self, robot: str, topic: str) -> str:
-        """The key expression that finds a robot's topic, whatever version of its type the sender has."""
+        """The key expression that matches a robot's topic with any version of its type."""
         name, kind = topic_name(robot, topic), TOPICS[topic]
         return name if self.profile == "plain" else f"{self.domain}/{name}/{dds_name(kind)}/*"
 
     def type_hash(self, message_type: MessageType[Any]) -> str:
-        """The type hash that stands in keys and tokens."""
+        """The type hash in keys and tokens."""
         return _HASH_OF_HUMBLE if self.profile == "humble" else message_type.hash
 
 
 class GraphNode:
-    """A session's topics, and the session as a node of the ROS graph where the profile has one.
+    """Makes a session's publishers and subscribers, and the session a node of the ROS graph if the profile has one.
 
-    Undeclare what it made by closing the session. name: the node's, as ``ros2 node list`` shows it.
+    Closing the session undeclares all of them. name: the node's name, as ``ros2 node list`` shows it.
     """
 
     def __init__(self, session: zenoh.Session, keys: KeySpace, name: str) -> None:
@@ -80,7 +80,7 @@ class GraphNode:
         self.keys = keys
         self._name = name
         self._numbers = count()
-        self._tokens: list[zenoh.LivelinessToken] = []  # a token that nobody holds vanishes
+        self._tokens: list[zenoh.LivelinessToken] = []  # kept, because a token without a reference is undeclared
         self._token("NN", next(self._numbers))
 
     def publisher(self, robot: str, topic: str, *, lossless: bool = False) -> Publisher[Any]:
@@ -89,13 +89,13 @@ class GraphNode:
         return Publisher(self.session, TOPICS[topic], self.keys.key(robot, topic), token, lossless=lossless)
 
     def subscribe(self, robot: str, topic: str, callback: Callable[[zenoh.Sample], None]) -> zenoh.Subscriber[None]:
-        """Call ``callback`` with every sample of a robot's topic, in Zenoh's own thread, which it must not hold up."""
+        """Call ``callback`` with each sample of a robot's topic, in Zenoh's thread: it must be quick."""
         self._token("MS", next(self._numbers), robot, topic)
         direct: Any = Callback(callback, indirect=False)
         return self.session.declare_subscriber(self.keys.expression(robot, topic), direct)
 
     def _token(self, kind: str, number: int, robot: str = "", topic: str = "") -> str:
-        """Declare a liveliness token of rmw_zenoh; its key, or an empty text in the profile without any."""
+        """Declare a liveliness token of rmw_zenoh and return its key; an empty text in the profile ``plain``."""
         if self.keys.profile == "plain":
             return ""
         zid = self.session.zid()
@@ -109,9 +109,9 @@ class GraphNode:
 
 
 class Publisher(Generic[M]):
-    """Publishes messages of one topic; a subscriber that does not keep up loses messages and holds up nobody.
+    """Publishes messages of one topic; a subscriber that is too slow loses messages and delays no other.
 
-    lossless: such a subscriber loses nothing and holds up the publisher instead, as a recording that is replayed wants.
+    lossless: a slow subscriber loses nothing and delays the publisher instead, for replays of recordings.
     """
 
     def __init__(
@@ -126,13 +126,13 @@ class Publisher(Generic[M]):
             priority=zenoh.Priority.INTERACTIVE_HIGH,
         )
         self._sequence = count(1)
-        # XXH3-128 of the token: its low 64 bits, then the high ones, little-endian
+        # XXH3-128 hash of the token: the low 64 bits, then the high ones, little-endian
         self._gid = xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little") if token else b""
 
     @property
     def matched(self) -> bool:
-        """Whether anybody subscribes to the topic now."""
-        status: Any = self._publisher.matching_status  # an object, and always true, whatever zenoh's stubs say
+        """True if the topic has a subscriber now."""
+        status: Any = self._publisher.matching_status  # an object that is always true, against zenoh's stubs
         return bool(getattr(status, "matching", status))
 
     def put(self, message: M) -> None:
@@ -140,7 +140,7 @@ class Publisher(Generic[M]):
         self.put_encoded(self.message_type.encode(message))
 
     def put_encoded(self, payload: bytes) -> None:
-        """Publish what is encoded already."""
+        """Publish a payload that is encoded already."""
         if not self._gid:
             self._publisher.put(payload)
             return

@@ -308,15 +308,15 @@ class TestTruth:
 
     def test_a_recording_whose_truth_is_not_known_says_so(self) -> None:
         recording = Recording(random_dataset(1))
-        with pytest.raises(DataError, match="data set random: its truth is not known; simulate it from"):
+        with pytest.raises(DataError, match="data set random: it has no truth; name a comparison's config"):
             true_start_poses(recording)
-        with pytest.raises(DataError, match="its truth is not known"):
+        with pytest.raises(DataError, match="it has no truth"):
             concatenated_truth(concatenate_recording(recording), recording)
 
 
 class TestMistakes:
     def test_a_split_without_runs_is_named(self) -> None:
-        with pytest.raises(DataError, match="data set random: no run in its split 'validation'"):
+        with pytest.raises(DataError, match="data set random: no run in split 'validation'"):
             concatenate_runs(random_dataset(1), split="validation")
 
     def test_a_run_with_a_single_pose_is_named(self) -> None:
@@ -333,7 +333,7 @@ class TestMistakes:
 
     @pytest.mark.parametrize("pause", [-1.0, np.nan, np.inf, 1e9])
     def test_a_pause_that_cannot_be_is_refused(self, pause: float) -> None:
-        with pytest.raises(ConfigError, match=r"pause: .* s between runs is not within 0 and 3600 s"):
+        with pytest.raises(ConfigError, match=r"pause: .* s between runs; expected 0 to 3600 s"):
             concatenate_runs(random_dataset(1), pause=pause)
 
 

@@ -166,7 +166,7 @@ class TestEvents:
 
     @pytest.mark.parametrize("names", [("left", "right"), ("left", "left", "rear"), ()])
     def test_names_that_are_not_one_for_each_wheel_are_refused(self, names: tuple[str, ...]) -> None:
-        with pytest.raises(ConfigError, match="give each of the wheels a, b, c a name"):
+        with pytest.raises(ConfigError, match="name one for each of the wheels a, b, c"):
             events(DRIVE, config(), names=names)
 
     def test_stamps_begin_with_the_time_of_the_replay_unless_given(self) -> None:
