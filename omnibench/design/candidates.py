@@ -31,7 +31,7 @@ from omnibench.simulate.flower import commanded_rates, commands_of, duration_of,
 
 @dataclass(frozen=True, eq=False)
 class CandidateRun:
-    """A command that a design may choose, and the runs that tell what it is worth: recorded, or one as designed."""
+    """A command that a design may choose, with runs of it: those recorded, or one at the design values."""
 
     name: str
     runs: tuple[Trajectory, ...]
@@ -43,7 +43,7 @@ class CandidateRun:
 
     @property
     def distance(self) -> float:
-        """The way of the robot's centre, m: as commanded, or else as the reference saw it."""
+        """The distance that the robot's centre drives, m: as commanded, or else along the reference poses."""
         given = self.runs[0].distance
         if given is not None:
             return float(given)
@@ -52,10 +52,10 @@ class CandidateRun:
 
 @dataclass(frozen=True, eq=False)
 class CandidatePool:
-    """All that a design is made from.
+    """Candidates, noise and baseline of a design.
 
     sets: indices of the candidates of each set. baseline (C,): how often each is driven in the experiment that
-    designs are measured by. recorded: the candidates' wheel logs are recordings; else rates are as designed.
+    designs are compared with. recorded: the candidates' wheel logs are recordings; else rates are as designed.
     """
 
     source: str
@@ -74,7 +74,7 @@ class CandidatePool:
     notes: tuple[str, ...]
 
     def runs(self, name: str) -> tuple[Trajectory, ...]:
-        """The runs of a set's candidates."""
+        """Runs of the candidates in a set."""
         return tuple(run for index in self.sets[name] for run in self.candidates[index].runs)
 
 
@@ -83,8 +83,8 @@ def read_candidates(
 ) -> CandidatePool:
     """The candidates of a data set folder, of a comparison config's data set, or of a design config.
 
-    dataset: which, where a comparison config has several. integration: in place of the config's, or of arcs.
-    OmnibenchError in one line that names the source, what is wrong and the way out.
+    dataset: the one to use where a comparison config has several. integration: default: the config's, or arc for a data
+    set. OmnibenchError in one line that names the source, what is wrong and what to do.
     """
     path = Path(source)
     if path.is_dir():
@@ -117,9 +117,9 @@ def candidates_of_dataset(dataset: Dataset, integration: Integration = "arc", so
         raise DataError(f"{place}: {next(iter(commands))} is its only command; a design needs several to choose from")
     named = [run for runs in commands.values() for run in runs]
     require_every_motion(dataset.robot, named, place, DataError)
-    told = identifiability(dataset.robot, named, integration)
-    if _silent(told.noise):
-        raise DataError(f"{place}: repetitions agree without any noise, so that nothing can be weighed against it")
+    identified = identifiability(dataset.robot, named, integration)
+    if _noiseless(identified.noise):
+        raise DataError(f"{place}: repetitions agree without any noise, so that runs cannot be weighed by it")
     unnamed = len(training) - len(named)
     notes = [f"{unnamed} of {len(training)} training runs have no command or one pose: left out"] if unnamed else []
     if dataset.simulated:
@@ -134,8 +134,8 @@ def candidates_of_dataset(dataset: Dataset, integration: Integration = "arc", so
         sets={dataset.name: tuple(range(len(commands)))},
         baseline=np.array([len(runs) for runs in commands.values()]),
         baseline_name=f"the {len(named)} training runs of {dataset.name}",
-        noise=told.noise,
-        noise_source=f"estimated from {told.noise_source}",
+        noise=identified.noise,
+        noise_source=f"estimated from {identified.noise_source}",
         simulated=dataset.simulated,
         recorded=True,
         notes=tuple(notes),
@@ -151,7 +151,7 @@ def candidates_of_config(config: DesignConfig, source: str = "") -> CandidatePoo
     periods = (config.sample_period, config.pose_period)
     commands = {name: config.commands(name) for name in config.sets}
     pool, candidates = _driven_as_designed(config.robot, config.integration, periods, commands)
-    sets = {name: tuple(pool[each] for each in own) for name, own in commands.items()}
+    sets = {name: tuple(pool[command] for command in of_set) for name, of_set in commands.items()}
     baseline = np.zeros(len(candidates), dtype=np.intp)
     baseline[list(sets[config.baseline.set])] = config.baseline.repetitions
     count = len(sets[config.baseline.set])
@@ -184,7 +184,8 @@ def candidates_of_simulation(
     """
     ramp = config.commands.ramp
     commands = tuple(
-        TimedCommand(each, duration_of(each, config.train, config.commands), ramp) for each in commands_of(config)
+        TimedCommand(command, duration_of(command, config.train, config.commands), ramp)
+        for command in commands_of(config)
     )
     periods = (config.sample_period, config.pose_period)
     _, candidates = _driven_as_designed(config.robot, integration, periods, {name: commands})
@@ -218,16 +219,16 @@ def _candidates_of_comparison(
     if name is None and len(config.datasets) > 1:
         raise ConfigError(f"{place}: it has several data sets; choose one with --dataset: {', '.join(config.datasets)}")
     name = name or next(iter(config.datasets))
-    found: DatasetSource = config.datasets[name]
+    source: DatasetSource = config.datasets[name]
     chosen = integration or config.integration
-    if isinstance(found.simulate, RobotConfig):
+    if isinstance(source.simulate, RobotConfig):
         raise ConfigError(
             f"{place}: data set {name} is a simulated robot, whose noise is not stated beforehand; make it with "
             "`omnibench simulate`, and design from its folder"
         )
-    if found.simulate is None:
-        return candidates_of_dataset(load_source(name, found), chosen, f"{place}: data set {name}")
-    return candidates_of_simulation(name, found.simulate, chosen, place, config.notes)
+    if source.simulate is None:
+        return candidates_of_dataset(load_source(name, source), chosen, f"{place}: data set {name}")
+    return candidates_of_simulation(name, source.simulate, chosen, place, config.notes)
 
 
 def _driven_as_designed(
@@ -236,16 +237,16 @@ def _driven_as_designed(
     periods: tuple[float, float],
     sets: Mapping[str, Iterable[TimedCommand]],
 ) -> tuple[dict[TimedCommand, int], tuple[CandidateRun, ...]]:
-    """Each command once, with its index, and its run: constant wheel rates by the design values, poses to match."""
-    commands = list(dict.fromkeys(each for own in sets.values() for each in own))
+    """Index of each distinct command, and its run: wheel rates and poses of a robot that is exactly as designed."""
+    commands = list(dict.fromkeys(timed for of_set in sets.values() for timed in of_set))
     model = OdometryModel.of_design(robot, integration)
-    names = [each.command.name for each in commands]
+    names = [timed.command.name for timed in commands]
     candidates = []
-    for each, name in zip(commands, names, strict=True):
-        command = each.command
-        title = name if names.count(name) == 1 else f"{name}_t{each.duration:.4g}"
-        times, pose_times = stamps_of_run(each.duration, *periods)
-        rates = commanded_rates(robot, command, times, each.ramp)
+    for timed, name in zip(commands, names, strict=True):
+        command = timed.command
+        title = name if names.count(name) == 1 else f"{name}_t{timed.duration:.4g}"
+        times, pose_times = stamps_of_run(timed.duration, *periods)
+        rates = commanded_rates(robot, command, times, timed.ramp)
         still = Trajectory(title, "train", times, rates, pose_times, np.zeros((len(pose_times), 3)))
         (poses,) = model.poses([still.log(pose_times)])
         run = replace(
@@ -256,24 +257,26 @@ def _driven_as_designed(
             alpha=command.direction,
             omega=command.turn_rate,
             duration=float(times[-1]),
-            distance=command.speed * (float(times[-1]) - each.ramp),
+            distance=command.speed * (float(times[-1]) - timed.ramp),
         )
         candidates.append(CandidateRun(title, (run,)))
-    return {each: index for index, each in enumerate(commands)}, tuple(candidates)
+    return {timed: index for index, timed in enumerate(commands)}, tuple(candidates)
 
 
 def _checked(pool: CandidatePool) -> CandidatePool:
-    if _silent(pool.noise):
-        raise ConfigError(f"{pool.source}: noise: give position and heading some noise, or nothing can be weighed")
-    for name, own in pool.sets.items():
+    if _noiseless(pool.noise):
+        raise ConfigError(
+            f"{pool.source}: noise: give position and heading some noise; without it, runs cannot be weighed"
+        )
+    for name, indices in pool.sets.items():
         place = f"{pool.source}: {name}"
-        if len(own) == 1:
+        if len(indices) == 1:
             raise ConfigError(f"{place}: it has one command only; a design needs several to choose from")
         require_every_motion(pool.robot, pool.runs(name), place, ConfigError)
     return pool
 
 
-def _silent(noise: Noise) -> bool:
+def _noiseless(noise: Noise) -> bool:
     """Whether position or heading has no noise of any kind."""
     return any(
         not any(getattr(noise, f"{kind}_{coordinate}") for kind in ("pose", "walk", "bias"))
@@ -282,9 +285,9 @@ def _silent(noise: Noise) -> bool:
 
 
 def require_every_motion(robot: Robot, runs: Sequence[Trajectory], place: str, error: type[OmnibenchError]) -> None:
-    """Refuse runs that leave a motion out which the robot can make: no design of them can tell the matrix there."""
-    # Of the whole space of wheel rates only this part belongs to a robot that does not slip.
-    possible, _ = np.linalg.qr(wheel_equations(robot.wheels))  # (N, 3)
+    """Raise ``error`` where runs leave out a motion that the robot can make, whose part of the matrix stays unknown."""
+    # Wheel rates (N, 3) of the robot's three motions without slip, orthonormal.
+    possible, _ = np.linalg.qr(wheel_equations(robot.wheels))
     _, strengths, motions = np.linalg.svd(np.vstack([driven_span(runs).strong @ possible, np.zeros((3, 3))]))
     missing = motions[strengths < 0.5] @ possible.T
     if len(missing):
@@ -300,4 +303,4 @@ def require_every_motion(robot: Robot, runs: Sequence[Trajectory], place: str, e
 
 def _no_choice(dataset: str | None, path: Path) -> None:
     if dataset is not None:
-        raise ConfigError(f"--dataset: is for a comparison config with several data sets; {path} is none")
+        raise ConfigError(f"--dataset: only a comparison config with several data sets needs it; {path} is none")

@@ -1,4 +1,4 @@
-"""What the YAML of a design says: a robot, its noise, and sets of commands to choose from."""
+"""The config of a design: a robot, the noise of its reference poses, and sets of commands to choose from."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from omnibench.robot.odometry import Integration
 from omnibench.simulate.config import MotionGrid, Positive
 from omnibench.simulate.flower import Command, grid_of
 
-_MOST_COMMANDS = 5000
-_MOST_SAMPLES = 2e7
+_MOST_COMMANDS = 5000  # of a set (chosen)
+_MOST_SAMPLES = 2e7  # wheel samples and poses of a set's commands together (chosen)
 Name = Annotated[str, Field(min_length=1, max_length=60)]
 
 
 @dataclass(frozen=True)
 class TimedCommand:
-    """A motion command, how long it is driven, and how long of that its speed rises and falls, s."""
+    """A motion command with its duration, s. ramp: time at its start and its end in which the speed changes, s."""
 
     command: Command
     duration: float
@@ -32,7 +32,7 @@ class TimedCommand:
 
 
 class CommandGrid(MotionGrid):
-    """Every direction with every rate of turn, at each speed."""
+    """A grid of commands: every direction with every turn rate, at each speed."""
 
     distance: Positive | None = Field(None, description="length of each run, m; or give duration")
     duration: Positive | None = Field(None, description="duration of each run that is not a turn on the spot, s")
@@ -71,7 +71,7 @@ class SingleCommand(Model):
 
 
 class OtherSet(Model):
-    """The commands of another set, taken over."""
+    """The commands of another set, included in this one."""
 
     set: Name = Field(description="its name")
 
@@ -90,14 +90,14 @@ Block = Annotated[
 
 
 class DesignBaseline(Model):
-    """The experiment that designs are measured by: every command of a set, so many times."""
+    """The experiment that designs are compared with: every command of a set, ``repetitions`` times."""
 
     set: Name = Field(description="a name among sets")
     repetitions: int = Field(5, gt=0, le=1000, description="runs of each command")
 
 
 class DesignConfig(Model):
-    """Commands worth considering, for a robot that nothing has been recorded of yet."""
+    """A robot without recordings so far, and the commands that could be driven with it."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=60)
     description: str = ""
@@ -127,16 +127,16 @@ class DesignConfig(Model):
             commands = self.commands(name)
             if not commands:
                 raise ValueError(f"sets.{name}: no command moves the robot")
-            samples = sum(each.duration for each in commands) * (1 / self.sample_period + 1 / self.pose_period)
+            samples = sum(command.duration for command in commands) * (1 / self.sample_period + 1 / self.pose_period)
             if len(commands) > _MOST_COMMANDS or samples > _MOST_SAMPLES:
                 raise ValueError(
-                    f"sets.{name}: these are {len(commands)} commands with {samples:.1g} wheel samples and poses, more "
+                    f"sets.{name}: {len(commands)} commands with {samples:.1g} wheel samples and poses, more "
                     f"than {_MOST_COMMANDS} or {_MOST_SAMPLES:.0e}; check the grids, durations and periods"
                 )
         return self
 
     def commands(self, name: str) -> tuple[TimedCommand, ...]:
-        """The commands of a set and of the sets that it takes over, each once. ValueError: unknown set, or a circle."""
+        """The commands of a set and of the sets that it includes, each once. ValueError: unknown set, or a circle."""
         return tuple(dict.fromkeys(self._expanded(name, ())))
 
     def _expanded(self, name: str, above: tuple[str, ...]) -> Iterator[TimedCommand]:
@@ -146,12 +146,12 @@ class DesignConfig(Model):
             elif block.set not in self.sets:
                 raise ValueError(str(UnknownNameError("set", block.set, self.sets, f"sets.{name}")))
             elif block.set in (*above, name):
-                raise ValueError(f"sets.{name}: takes over {block.set!r}, which takes over {name!r}; leave one out")
+                raise ValueError(f"sets.{name}: includes {block.set!r}, which includes {name!r}; leave one out")
             else:
                 yield from self._expanded(block.set, (*above, name))
 
 
 Use = Literal["final", "trajectory"]
-"""What a calibration is made from: the final pose alone, as Eq. (6), or every reference pose under the noise model."""
+"""Reference poses that a calibration uses: the final one alone, as Eq. (6), or all of them under the noise model."""
 Per = Literal["run", "second", "metre"]
-"""What a run costs: 1, its duration, or the way that its wheels roll (their mean; turns on the spot have one too)."""
+"""Cost of a run: 1, its duration, or the distance that its wheels roll (mean of the wheels)."""

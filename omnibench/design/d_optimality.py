@@ -1,14 +1,20 @@
 """D-optimal designs: how often to drive each of some candidate runs so that the covariance becomes smallest.
 
-A run of candidate c tells the Fisher information F_c (p, p) of the parameters and costs t_c (1 to count runs, or s, m).
-n_c runs of each tell M = sum_c n_c F_c, and the criterion is det(M)^(1/p) / sum_c n_c t_c, information for its cost.
-Over shares w_c = n_c t_c / sum n_c t_c, which need not be whole runs, its logarithm is concave, and by Kiefer and
-Wolfowitz (1960) no design at all has more than
+A run of candidate c gives Fisher information F_c (p, p) of the parameters and costs t_c (1 to count runs, or s, m).
+n_c runs of each candidate give M, and the criterion is the information for its cost:
 
-    det(M(w))^(1/p) * max_c tr(M(w)^-1 F_c / t_c) / p,      M(w) = sum_c w_c F_c / t_c,
+    M = sum_c n_c F_c                                                   (O1)
+    criterion = det(M)^(1/p) / sum_c n_c t_c                            (O2)
 
-whatever w: for the eigenvalues of M(w)^-1 M the geometric mean is at most the arithmetic one. See Fedorov, Theory of
-Optimal Experiments (1972), and Silvey, Titterington and Torsney, Commun. Stat. A7:1379 (1978) for the algorithm.
+In shares of the cost, w_c = n_c t_c / sum n_c t_c, which need not be whole runs, the logarithm of the criterion is
+concave, and by Kiefer and Wolfowitz (1960) no design has a criterion above
+
+    det(M(w))^(1/p) * max_c tr(M(w)^-1 F_c / t_c) / p                   (O3)
+    M(w) = sum_c w_c F_c / t_c                                          (O4)
+
+for any w, because the geometric mean of the eigenvalues of M(w)^-1 M is at most the arithmetic one. The multiplicative
+algorithm is that of Silvey, Titterington and Torsney, Commun. Stat. A7:1379 (1978), the exchange that of Fedorov,
+Theory of Optimal Experiments (1972).
 """
 
 from __future__ import annotations
@@ -24,26 +30,25 @@ from omnibench.robot.kinematics import Array
 
 Counts = NDArray[np.intp]
 
-# Stands for what is not known at all yet, so that the first few runs can be chosen by the same rule; as a share of the
-# information of an average candidate. If it were much smaller, rounding would decide between designs that leave
-# something open.
+# Information added in every direction, as a share of that of an average candidate: designs of the first few runs, whose
+# determinant is zero, can then be compared. Much smaller, and rounding would decide between them.
 _RIDGE = 1e-6
-# A direction with less than this share of what a run of an average candidate tells is not identified: its standard
-# deviation is a hundred times as large.
+# Share of the information of an average candidate: a direction with less is not identified. Its standard deviation is a
+# hundred times as large.
 _NULL_SHARE = 1e-4
-# Gains of the logarithm of the determinant below this are rounding, and could go round in circles.
+# Smallest gain of log det(M) that counts. Smaller ones are rounding, and exchanging runs for them may never end.
 _NO_GAIN = 1e-6
 _BLOCK = 256  # pairs whose exchange is tried at once
-# What comes this close to the bound is not improved further.
-_NEAR = 1e-4
-_STARTS = 120  # for the exchange of a run; of n runs, where a start matters less, one n-th of it
+_NEAR = 1e-4  # relative distance from the bound within which a design is not improved further (chosen)
+_STARTS = 120  # random starts of the exchange for designs of 1 run; 120 / n for n runs, where a start matters less
 
 
 class Candidates:
-    """Runs that a design may choose from, in coordinates where their information per cost is the identity on average.
+    """Runs that a design may choose from, in standard coordinates: their mean information per cost is the identity.
 
-    information (C, p, p): of a run of each, in any coordinates: no design depends on them. costs (C,): > 0. most: how
-    many runs of one candidate an exact design may have. ValueError when all together leave a direction open.
+    information (C, p, p): of one run of each, in any coordinates; designs do not depend on the choice. costs (C,): of
+    one run of each, > 0. most: how many runs of one candidate an exact design may have. ValueError when the candidates
+    together leave a direction of the parameters undetermined.
     """
 
     def __init__(self, information: Array, costs: Array | None = None, most: int | None = None) -> None:
@@ -68,44 +73,41 @@ class Candidates:
         return self.information.shape[1]
 
     def sum(self, counts: Array | Counts) -> Array:
-        """The information (p, p) of so many runs of each, in the standard coordinates."""
+        """The information M (p, p) of ``counts`` runs (C,), in standard coordinates, Eq. (O1)."""
         return np.tensordot(counts, self.information, 1)
 
     def cost(self, counts: Array | Counts) -> float:
-        """What so many runs of each cost in all."""
+        """The total cost of ``counts`` runs (C,)."""
         return float(counts @ self.costs)
 
     def root(self, counts: Array | Counts) -> float:
-        """det(M)^(1/p) in the coordinates of the information given; 0 when a direction is open."""
+        """det(M)^(1/p) in the coordinates of the information given; 0 when a direction is undetermined."""
         sign, log_determinant = np.linalg.slogdet(self.sum(counts))
         return float(np.exp((log_determinant + self._log_scale) / self.parameters)) if sign > 0 else 0.0
 
     def criterion(self, counts: Array | Counts) -> float:
-        """det(M)^(1/p) per cost: what a design is to make large."""
+        """det(M)^(1/p) per cost, Eq. (O2): a design maximises it."""
         return self.root(counts) / self.cost(counts)
 
     def score(self, counts: Array | Counts) -> float:
-        """What a search makes large: the logarithm of the criterion in standard coordinates.
-
-        A little information in every direction is added, so that designs which leave something open can be compared.
-        """
+        """p times the logarithm of the criterion in standard coordinates, with the ridge: searches maximise it."""
         return float(_log_determinants(self.sum(counts)[None])[0] - self.parameters * np.log(self.cost(counts)))
 
     def identifies(self, counts: Array | Counts) -> bool:
-        """Whether so many runs leave no direction open."""
+        """Whether ``counts`` runs (C,) determine every direction of the parameters."""
         share = np.linalg.eigvalsh(self.sum(counts))[0] / self.cost(counts)
         return bool(share > _NULL_SHARE)
 
     def covariance(self, counts: Array | Counts) -> Array:
-        """The covariance (p, p) of the parameters in the coordinates of the information given."""
+        """The covariance (p, p) that ``counts`` runs (C,) give, in the coordinates of the information given."""
         return self.basis @ np.linalg.inv(self.sum(counts)) @ self.basis.T
 
 
 @dataclass(frozen=True, eq=False)
 class ContinuousDesign:
-    """The optimum over shares (C,) of the cost. No design at all has a criterion above ``bound``.
+    """The optimum over shares (C,) of the cost. No design has a criterion above ``bound``, Eq. (O3).
 
-    gap: bound / criterion - 1, how far from the optimum the shares can be at most.
+    gap: bound / criterion - 1, an upper limit on the distance from the optimum.
     """
 
     shares: Array
@@ -116,10 +118,10 @@ class ContinuousDesign:
 
 
 def continuous_optimum(candidates: Candidates, gap: float = 1e-5, iterations: int = 20_000) -> ContinuousDesign:
-    """Shares within ``gap`` of the optimum by the multiplicative algorithm, or after so many iterations.
+    """Shares within ``gap`` of the optimum, or those after ``iterations`` steps of the multiplicative algorithm.
 
-    Every share is multiplied by tr(M^-1 F_c / t_c) / p, which never lowers the criterion. The bound holds wherever it
-    ends.
+    A step multiplies every share by tr(M^-1 F_c / t_c) / p, which never lowers the criterion. The bound holds wherever
+    the algorithm ends.
     """
     per_cost = candidates.information / candidates.costs[:, None, None]
     flat = per_cost.reshape(len(candidates), -1)
@@ -139,9 +141,9 @@ def continuous_optimum(candidates: Candidates, gap: float = 1e-5, iterations: in
 def exact_designs(candidates: Candidates, optimum: ContinuousDesign, most: int) -> Iterator[Counts]:
     """Good designs of 1, 2, ..., ``most`` runs: counts (C,).
 
-    Each is the best of several, all exchanged: the one before it with the run added that gains most, the optimum's
-    shares rounded and, while runs are few and a start matters, shares drawn about these; one that comes within 0.01 %
-    of the bound is good enough. Ends early when no candidate may be driven more often.
+    Each is the best of several after the exchange: the previous design with the run added that gains most, the rounded
+    shares of the optimum and, while runs are few and a start matters, rounded random shares about these. One within
+    0.01 % of the bound ends the search for its number of runs. Ends early when no candidate may be driven more often.
     """
     enough = (1 - _NEAR) * optimum.bound
     counts: Counts = np.zeros(len(candidates), dtype=np.intp)
@@ -164,7 +166,7 @@ def exact_designs(candidates: Candidates, optimum: ContinuousDesign, most: int) 
 
 
 def _shares_about(shares: Array, draws: int) -> Iterator[Array]:
-    """The shares (C,) themselves and some at random about them, always the same."""
+    """The shares (C,) themselves, then ``draws`` random ones about them, from a fixed seed."""
     yield shares
     rng = np.random.default_rng(draws)
     for _ in range(draws):
@@ -172,9 +174,10 @@ def _shares_about(shares: Array, draws: int) -> Iterator[Array]:
 
 
 def rounded(candidates: Candidates, shares: Array, runs: int, enough: float = math.inf) -> Counts:
-    """A design of so many runs near the shares (C,) of a continuous one, exchanged: counts (C,).
+    """A design of ``runs`` runs near the shares (C,) of a continuous one: counts (C,).
 
-    Whole runs by the largest remainders. ValueError when the candidates may not be driven that often.
+    The shares become whole runs by the largest remainders, then runs are exchanged. ValueError when the candidates may
+    not be driven that often.
     """
     limit = runs if candidates.most is None else candidates.most
     if limit * len(candidates) < runs:
@@ -189,9 +192,9 @@ def rounded(candidates: Candidates, shares: Array, runs: int, enough: float = ma
 
 
 def equal_design(candidates: Candidates, optimum: ContinuousDesign, target: float) -> Counts | None:
-    """A small design whose det(M)^(1/p) is ``target`` at least: counts (C,); None when no number of runs allowed is.
+    """A small design whose det(M)^(1/p) is at least ``target``: counts (C,); None when the runs allowed do not suffice.
 
-    By cost none can have less than target / optimum.bound. Where all cost the same the search starts from there.
+    No such design costs less than target / optimum.bound, Eq. (O3); the search starts a little below that cost.
     """
     least = target / optimum.bound  # cost
     runs_per_cost = float((optimum.shares / candidates.costs).sum())
@@ -208,9 +211,9 @@ def equal_design(candidates: Candidates, optimum: ContinuousDesign, target: floa
 
 
 def exchanged(candidates: Candidates, counts: Counts, enough: float = math.inf) -> Counts:
-    """A design after Fedorov's exchange: a good swap of one run for another, again and again, until none gains.
+    """A design after Fedorov's exchange: one run is swapped for another until no swap improves the score.
 
-    The score never falls. The result is a local optimum, which no single swap improves, or reaches ``enough``.
+    The result is a local optimum, or its criterion has reached ``enough``.
     """
     counts = counts.copy()
     while candidates.criterion(counts) < enough and (swap := _good_swap(candidates, counts)) is not None:
@@ -221,10 +224,10 @@ def exchanged(candidates: Candidates, counts: Counts, enough: float = math.inf) 
 
 
 def _good_swap(candidates: Candidates, counts: Counts) -> tuple[int, int] | None:
-    """The pair (driven, other) whose swap gains most among the promising ones; None when no swap at all gains.
+    """The best swap (driven, other) in the first block of pairs that has one; None when no swap gains.
 
-    log det is concave, so that its slope tells how much a swap can gain at most: pairs that cannot gain are not tried,
-    and others block by block from the most promising on.
+    log det is concave, so that its slope is an upper limit on the gain of a swap: pairs that cannot gain are not tried,
+    the others block by block, from the highest limit on.
     """
     moment, cost = candidates.sum(counts), candidates.cost(counts)
     identity = np.eye(candidates.parameters)
@@ -254,6 +257,6 @@ def _free(candidates: Candidates, counts: Counts) -> Counts:
 
 
 def _log_determinants(moments: Array) -> Array:
-    """log det of information matrices (m, p, p) in standard coordinates, the ridge added."""
+    """log det (m,) of information matrices (m, p, p) in standard coordinates, with the ridge added."""
     signs, values = np.linalg.slogdet(moments + _RIDGE * np.eye(moments.shape[-1]))
     return np.where(signs > 0, values, -np.inf)

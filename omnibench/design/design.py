@@ -1,4 +1,4 @@
-"""Which commands are worth driving: read candidates, choose D-optimal runs among them, say what they are worth."""
+"""Optimal experiment design: which commands to drive so that a calibration becomes most precise."""
 
 from __future__ import annotations
 
@@ -14,12 +14,10 @@ from omnibench.design.run_information import USES, DesignProblem
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.robot.odometry import Integration
 
-# The recommended design comes this close to the bound.
-GOOD_EFFICIENCY = 0.99
-# Designs are listed up to the baseline's runs, or to so many if that has more.
-_MOST_STEPS = 400
-_MOST_RUNS = 2000
-_LEAST_SHARE = 1e-4  # of the continuous optimum, to be worth a line
+GOOD_EFFICIENCY = 0.99  # share of the bound: the recommended design is the smallest that reaches it (chosen)
+_MOST_STEPS = 400  # runs: designs are listed up to the baseline's number, but no further than this
+_MOST_RUNS = 2000  # runs or repetitions that may be asked for
+_LEAST_SHARE = 1e-4  # a command with less of the continuous optimum is not listed
 
 
 def design_experiment(
@@ -34,13 +32,13 @@ def design_experiment(
 ) -> Design:
     """Choose the runs that shrink the covariance of the matrix elements most, from each set of candidates.
 
-    source: a data set folder, a comparison config or a design config. use: the reference poses that a calibration is
-    made from. per: what is to be spared: runs, s, or metres of wheel. runs: how many to choose; default: the fewest
-    within 1 % of the D-optimum. repetitions: how often a command may be chosen. dataset, integration: see
-    ``read_candidates``. The information is that at the design values (Fisher; wheel rates taken as exact), so that
-    designs are optimal for matrices near them.
+    source: a data set folder, a comparison config or a design config. use: the reference poses that a calibration
+    uses. per: the cost that is saved: runs, s of driving, or m that the wheels roll. runs: how many to choose; default:
+    the fewest within 1 % of the D-optimum. repetitions: how often a command may be chosen at most. dataset,
+    integration: see ``read_candidates``. The Fisher information is taken at the design values, with wheel rates as
+    exact, so that designs are optimal for matrices near them.
 
-    OmnibenchError in one line: bad source or arguments, candidates that leave part of the matrix open.
+    OmnibenchError in one line: bad source or arguments, candidates that do not determine the whole matrix.
     """
     for name, value, known in (("use", use, get_args(Use)), ("per", per, get_args(Per))):
         if value not in known:
@@ -87,8 +85,8 @@ def _design_of_set(problem: DesignProblem, name: str, runs: int | None) -> SetDe
         if candidates.identifies(counts)
     ]
     steps = [problem.step(counts, optimum.bound) for counts in designs]
-    index = _wanted(steps, runs, f"{problem.pool.source}: {name}")
-    commands = [problem.described[each].name for each in problem.pool.sets[name]]
+    chosen = _wanted(steps, runs, f"{problem.pool.source}: {name}")
+    commands = [problem.described[index].name for index in problem.pool.sets[name]]
     shares = zip(commands, optimum.shares.tolist(), strict=True)
     return SetDesign(
         name=name,
@@ -98,9 +96,9 @@ def _design_of_set(problem: DesignProblem, name: str, runs: int | None) -> SetDe
             gap=optimum.gap,
             iterations=optimum.iterations,
         ),
-        chosen=problem.chosen(designs[index]),
-        step=steps[index],
-        reached=steps[index].efficiency >= GOOD_EFFICIENCY,
+        chosen=problem.chosen(designs[chosen]),
+        step=steps[chosen],
+        reached=steps[chosen].efficiency >= GOOD_EFFICIENCY,
         baseline_efficiency=problem.everything(problem.use).criterion(baseline) / optimum.bound,
         steps=tuple(steps),
         equivalents=tuple(
@@ -111,7 +109,7 @@ def _design_of_set(problem: DesignProblem, name: str, runs: int | None) -> SetDe
 
 
 def _wanted(steps: Sequence[Step], runs: int | None, place: str) -> int:
-    """Which step is the design: that of so many runs, or the first that is good enough, or else the best."""
+    """Index of the recommended step: the one with ``runs``, else the first that is good enough, else the best."""
     if runs is None:
         good = [index for index, step in enumerate(steps) if step.efficiency >= GOOD_EFFICIENCY]
         if not steps:
@@ -126,7 +124,7 @@ def _wanted(steps: Sequence[Step], runs: int | None, place: str) -> int:
 
 
 def _equal_otherwise(problem: DesignProblem, name: str, use: Use) -> Equivalent:
-    """The same for the use that the design is not made for, which may not tell the whole matrix."""
+    """The equivalent for the use that the design is not made for, which may leave part of the matrix undetermined."""
     try:
         optimum = continuous_optimum(problem.candidates(use, name))
     except ConfigError:
@@ -137,13 +135,13 @@ def _equal_otherwise(problem: DesignProblem, name: str, use: Use) -> Equivalent:
 def _equal(
     problem: DesignProblem, name: str, use: Use, optimum: ContinuousDesign, designs: Sequence[Counts] = ()
 ) -> Equivalent:
-    """The smallest design that tells as much as the baseline, among ``designs`` if it is there."""
+    """The smallest design with as much information as the baseline, from ``designs`` where one of them has it."""
     everything = problem.everything(use)
     target = everything.root(problem.pool.baseline)
-    counts = next((each for each in designs if everything.root(each) >= target), None)
+    counts = next((design for design in designs if everything.root(design) >= target), None)
     if counts is None:
-        found = equal_design(problem.candidates(use, name), optimum, target)
-        counts = None if found is None else problem.of_all(name, found)
+        in_set = equal_design(problem.candidates(use, name), optimum, target)
+        counts = None if in_set is None else problem.of_all(name, in_set)
     return Equivalent(
         use=use,
         effort=None if counts is None else problem.effort(counts),
@@ -153,7 +151,7 @@ def _equal(
 
 
 def _remarks(pool: CandidatePool, use: Use, per: Per) -> tuple[str, ...]:
-    """What the numbers rest on."""
+    """Assumptions behind the numbers."""
     logs = "as recorded" if pool.recorded else "as the design values command them"
     remarks = [
         f"Information is that of the matrix elements at the robot's design values, with wheel rates {logs} and taken "

@@ -1,4 +1,4 @@
-"""What a design says: the document of ``omnibench design --json``."""
+"""The result of a design: the document of ``omnibench design --json``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Candidate(Model):
 
 
 class Effort(Model):
-    """What driving some runs takes."""
+    """Number, time and distance of some runs."""
 
     runs: int
     seconds: float
@@ -35,7 +35,7 @@ class Effort(Model):
 
 
 class PhysicalSpread(Model):
-    """Standard deviation of the physical parameters, of each kind the largest."""
+    """Largest standard deviation of each kind of physical parameter."""
 
     radius_percent: float
     distance_percent: float
@@ -43,7 +43,7 @@ class PhysicalSpread(Model):
 
 
 class Precision(Model):
-    """How well some runs tell the matrix.
+    """Precision of the matrix that some runs give.
 
     relative: the geometric mean of the standard deviations as a multiple of the baseline's. row_percent: the largest
     standard deviation of an element of each row, % of the row's largest element. physical: for three wheels.
@@ -56,7 +56,7 @@ class Precision(Model):
 
 
 class Step(Precision):
-    """A design of some runs. efficiency: its det(M)^(1/p) per run (or s, m) as a share of what none can exceed."""
+    """A design of some runs. efficiency: its det(M)^(1/p) per run (or s, m) as a share of the bound on all designs."""
 
     efficiency: float
 
@@ -69,10 +69,10 @@ class Chosen(Model):
 
 
 class Equivalent(Model):
-    """The smallest design found that tells as much as the baseline; effort None when there is none within the limits.
+    """The smallest design found that gives as much information as the baseline.
 
-    least: no design whatever does it with less, in runs, s or m, by the bound; None where such a calibration leaves
-    part of the matrix open.
+    effort: None when there is none within the repetitions allowed. least: lower bound on the cost of any such design,
+    in runs, s or m; None where this use leaves part of the matrix undetermined.
     """
 
     use: Use
@@ -82,7 +82,7 @@ class Equivalent(Model):
 
 
 class Optimum(Model):
-    """The continuous optimum: shares of the cost, and by how much it can fall short of the bound at most."""
+    """The continuous optimum. shares: of the cost, by command. gap: how far it can be below the bound, relative."""
 
     shares: dict[str, float]
     gap: float
@@ -104,7 +104,7 @@ class SetDesign(Model):
 
 
 class Baseline(Model):
-    """The experiment that designs are measured by."""
+    """The experiment that designs are compared with."""
 
     name: str
     precision: Precision
@@ -133,5 +133,5 @@ class Design(Model):
     notes: tuple[str, ...]
 
     def candidate(self, name: str) -> Candidate:
-        """The candidate of a name."""
-        return next(each for each in self.candidates if each.name == name)
+        """The candidate called ``name``."""
+        return next(candidate for candidate in self.candidates if candidate.name == name)

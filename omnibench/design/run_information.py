@@ -1,4 +1,4 @@
-"""The information of candidate runs, and what so many of each mean in numbers that a person reads."""
+"""Fisher information of candidate runs, and the precision and effort of a design made of them."""
 
 from __future__ import annotations
 
@@ -20,20 +20,23 @@ from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array, Robot
 
 USES: tuple[Use, ...] = get_args(Use)
-_PATH_POINTS = 160
+_PATH_POINTS = 160  # points that a path is drawn with
 
 
 class DesignProblem:
-    """The information of all candidates for each use, and what counts of them (C,) mean in numbers a person reads."""
+    """The candidates with their information for each use; effort and precision of designs, given as counts (C,).
+
+    basis (3N, p): elements of the matrix = basis @ parameters. Directions of wheel rates that no candidate drives are
+    not among the parameters: the matrix keeps its start values there.
+    """
 
     def __init__(self, pool: CandidatePool, use: Use, per: Per, repetitions: int | None) -> None:
         self.pool, self.use, self.per, self.repetitions = pool, use, per, repetitions
-        self.described = tuple(_described(each, pool.robot) for each in pool.candidates)
-        self.costs = np.array([_cost(each, per) for each in self.described])
-        directions = driven_span([run for each in pool.candidates for run in each.runs]).strong
-        # What no candidate drives keeps its start values: elements (3N,) = basis @ parameters (p,).
+        self.described = tuple(_described(candidate, pool.robot) for candidate in pool.candidates)
+        self.costs = np.array([_cost(candidate, per) for candidate in self.described])
+        directions = driven_span([run for candidate in pool.candidates for run in candidate.runs]).strong
         self.basis: Array = np.kron(np.eye(3), directions.T)
-        self.information = {each: self._information(each) for each in USES}
+        self.information = {name: self._information(name) for name in USES}
         self._everything: dict[Use, Candidates] = {}
         self._physical = _element_slopes(pool.robot) if len(directions) == 3 and is_invertible(pool.robot) else None
 
@@ -43,20 +46,20 @@ class DesignProblem:
         matrix = self.pool.robot.inverse_kinematic_matrix
         means = [
             information_of_runs(
-                each.runs, matrix, self.pool.integration, noise, stamps="final" if use == "final" else "reference"
+                candidate.runs, matrix, self.pool.integration, noise, stamps="final" if use == "final" else "reference"
             ).mean(axis=0)
-            for each in self.pool.candidates
+            for candidate in self.pool.candidates
         ]
         return self.basis.T @ np.array(means) @ self.basis
 
     def everything(self, use: Use) -> Candidates:
-        """All candidates, so that designs from different sets are measured alike."""
+        """All candidates, as a common measure for designs from different sets."""
         if use not in self._everything:
             self._everything[use] = self.candidates(use)
         return self._everything[use]
 
     def candidates(self, use: Use, name: str | None = None) -> Candidates:
-        """The candidates of a set, or all, as a design chooses from them. ConfigError when something stays open."""
+        """The candidates of a set, or all. ConfigError when they leave part of the matrix undetermined."""
         chosen = list(range(len(self.described)) if name is None else self.pool.sets[name])
         information = self.information[use][chosen]
         try:
@@ -83,12 +86,12 @@ class DesignProblem:
         return every
 
     def effort(self, counts: Counts) -> Effort:
-        """What driving so many runs of each takes."""
-        sums = np.array([[each.duration_s, each.distance_m, each.rolled_m] for each in self.described]).T @ counts
+        """Time and distance of driving ``counts`` runs (C,) of the candidates."""
+        sums = np.array([[run.duration_s, run.distance_m, run.rolled_m] for run in self.described]).T @ counts
         return Effort(runs=int(counts.sum()), seconds=sums[0], metres=sums[1], wheel_metres=sums[2])
 
     def precision(self, counts: Counts) -> Precision:
-        """How well so many runs of each tell the matrix."""
+        """Standard deviations that ``counts`` runs (C,) of the candidates give."""
         everything = self.everything(self.use)
         covariance = self.basis @ everything.covariance(counts) @ self.basis.T
         deviations = np.sqrt(np.maximum(np.diagonal(covariance), 0.0)).reshape(3, -1)
@@ -101,21 +104,21 @@ class DesignProblem:
         )
 
     def step(self, counts: Counts, bound: float) -> Step:
-        """The same with the efficiency against a bound."""
+        """The precision of ``counts`` (C,), with its efficiency as a share of ``bound``."""
         efficiency = self.everything(self.use).criterion(counts) / bound
         return Step(**dict(self.precision(counts)), efficiency=efficiency)
 
     def chosen(self, counts: Counts) -> tuple[Chosen, ...]:
-        """The commands with runs."""
+        """The commands that are driven at least once."""
         return tuple(
-            Chosen(command=each.name, runs=int(count))
-            for each, count in zip(self.described, counts, strict=True)
+            Chosen(command=candidate.name, runs=int(count))
+            for candidate, count in zip(self.described, counts, strict=True)
             if count
         )
 
 
 def evenly(noise: Noise) -> Noise:
-    """A noise model with the same figures (m, rad) for position and heading, as Eq. (6) weighs them: their RMS."""
+    """A noise model with equal figures (m, rad) for x, y and heading, as Eq. (6) weighs them: the RMS of the three."""
     return Noise(
         **{
             f"{kind}_{coordinate}": math.sqrt(

@@ -270,7 +270,7 @@ def test_the_document_holds_everything_but_the_drawings(papers: Design) -> None:
         ({"noise": {"pose_position": 0.01}}, ("noise", "heading")),
         ({"baseline": {"set": "stars"}}, ("baseline: unknown set 'stars'; did you mean 'star'?",)),
         ({"sets": {"star": [{"set": "sta"}]}}, ("sets.star: unknown set 'sta'; did you mean 'star'?",)),
-        ({"sets": {"star": [{"set": "other"}], "other": [{"set": "star"}]}}, ("sets.", "takes over")),
+        ({"sets": {"star": [{"set": "other"}], "other": [{"set": "star"}]}}, ("sets.", "includes")),
         ({"sets": {"star": {"directions_deg": [0], "turn_rates": [0]}}}, ("distance (m) or duration",)),
         ({"sets": {"star": [{"speed": 1, "duration": 2, "direction": 3}]}}, ("did you mean 'direction_deg'?",)),
         ({"sets": {"star": [{"speed": 0, "duration": 2}]}}, ("does not move the robot",)),

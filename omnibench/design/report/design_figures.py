@@ -1,4 +1,4 @@
-"""The plots of a design: the chosen paths, and precision and efficiency against the number of runs."""
+"""Figures of a design: the chosen paths, and precision and efficiency against the number of runs."""
 
 from __future__ import annotations
 
@@ -17,22 +17,24 @@ from omnibench.robot.kinematics import Array
 
 _LEFT, _STRAIGHT, _RIGHT = PALETTE[0], "#5b6772", PALETTE[1]
 _UNUSED = "#d4d9df"
-_STRAIGHT_BELOW = math.radians(2)
+_STRAIGHT_BELOW = math.radians(2)  # rad: a run that turns by less is drawn as straight (chosen)
 _ROW_DASHES: tuple[Dash, ...] = ("solid", "dash", "dot")
 _ROW_NAMES = ("x (row 1)", "y (row 2)", "heading (row 3)")
 
 
 def path_figures(design: Design) -> FigureGrid:
-    """The commands of each set as a flower: chosen ones in colour, as wide as they are often driven."""
+    """Paths of each set's commands; a chosen one is in colour, and the wider the more often it is driven."""
     figures = tuple(
         Figure(
-            f"{found.name}: {plural(found.step.effort.runs, 'run')} of {plural(len(found.chosen), 'command')}",
-            _flower(design, found),
-            f"Paths of the {len(found.commands)} commands of {found.name}; chosen: "
-            + ", ".join(f"{command_in_words(design.candidate(each.command))} {each.runs}x" for each in found.chosen),
+            f"{of_set.name}: {plural(of_set.step.effort.runs, 'run')} of {plural(len(of_set.chosen), 'command')}",
+            _flower(design, of_set),
+            f"Paths of the {len(of_set.commands)} commands of {of_set.name}; chosen: "
+            + ", ".join(
+                f"{command_in_words(design.candidate(chosen.command))} {chosen.runs}x" for chosen in of_set.chosen
+            ),
             560,
         )
-        for found in design.sets
+        for of_set in design.sets
     )
     legend = (
         LegendItem("left", "turning left", _LEFT),
@@ -98,29 +100,29 @@ def precision_figures(design: Design) -> FigureGrid:
 
 
 def efficiency_figure(design: Design) -> FigureGrid:
-    """How close exact designs come to the bound that no design exceeds."""
+    """Efficiency of exact designs against the number of runs; 100 % is the bound that no design exceeds."""
     traces = []
-    lowest = min(step.efficiency for found in design.sets for step in found.steps)
-    for found, colour in _coloured(design):
+    lowest = min(step.efficiency for of_set in design.sets for step in of_set.steps)
+    for of_set, colour in _coloured(design):
         traces.append(
             _line(
-                [step.effort.runs for step in found.steps],
-                [100 * step.efficiency for step in found.steps],
-                [f"{found.name}, {_step_in_words(step)}" for step in found.steps],
-                found.name,
+                [step.effort.runs for step in of_set.steps],
+                [100 * step.efficiency for step in of_set.steps],
+                [f"{of_set.name}, {_step_in_words(step)}" for step in of_set.steps],
+                of_set.name,
                 colour,
                 "solid",
             )
         )
-        traces.append(_ring(found.step.effort.runs, 100 * found.step.efficiency, found.name, colour))
-    most = max(found.steps[-1].effort.runs for found in design.sets)
+        traces.append(_ring(of_set.step.effort.runs, 100 * of_set.step.efficiency, of_set.name, colour))
+    most = max(of_set.steps[-1].effort.runs for of_set in design.sets)
     figure = plot(*traces, xaxis_title_text="runs", yaxis_title_text="efficiency (% of the bound)")
-    few = min(found.steps[0].effort.runs for found in design.sets)
+    few = min(of_set.steps[0].effort.runs for of_set in design.sets)
     logarithmic(figure, "x", few, most)
     figure.update_yaxes(range=[max(0.0, 100 * lowest - 3), 102])
     figure.add_hline(y=100, line={"color": INK, "width": 1.2})
     figure.add_hline(y=99, line={"color": QUIET, "width": 1, "dash": "dot"})
-    baselines = ", ".join(f"{percent(found.baseline_efficiency)} of {found.name}'s" for found in design.sets)
+    baselines = ", ".join(f"{percent(of_set.baseline_efficiency)} of {of_set.name}'s" for of_set in design.sets)
     return FigureGrid(
         (
             Figure(
@@ -146,12 +148,12 @@ def _curves(
 ) -> go.Figure:
     baseline = design.baseline.precision
     traces = []
-    for found, colour in _coloured(design):
-        words = [f"{found.name}, {_step_in_words(step)}" for step in found.steps]
-        x = [across(step) for step in found.steps]
+    for of_set, colour in _coloured(design):
+        words = [f"{of_set.name}, {_step_in_words(step)}" for step in of_set.steps]
+        x = [across(step) for step in of_set.steps]
         for value, dash in upwards:
-            traces.append(_line(x, [value(step) for step in found.steps], words, found.name, colour, dash))
-            traces.append(_ring(across(found.step), value(found.step), found.name, colour))
+            traces.append(_line(x, [value(step) for step in of_set.steps], words, of_set.name, colour, dash))
+            traces.append(_ring(across(of_set.step), value(of_set.step), of_set.name, colour))
     for value, _ in upwards:
         traces.append(
             go.Scatter(
@@ -165,7 +167,7 @@ def _curves(
     figure = plot(*traces, xaxis_title_text=x_title, yaxis_title_text=y_title)
     if len(upwards) == 1:
         figure.add_hline(y=value(baseline), line={"color": QUIET, "width": 1, "dash": "dot"})
-    shown = [step for found in design.sets for step in found.steps] + [baseline]
+    shown = [step for of_set in design.sets for step in of_set.steps] + [baseline]
     logarithmic(figure, "x", min(map(across, shown)), max(map(across, shown)))
     heights = [value(step) for value, _ in upwards for step in shown]
     logarithmic(figure, "y", min(heights), max(heights))
@@ -203,7 +205,7 @@ def _line(
         mode="lines",
         line={"color": colour, "width": 2, "dash": dash},
         legendgroup=key,
-        text=[text(each) for each in words],
+        text=[text(line) for line in words],
         hovertemplate="%{text}<br>%{y:.4g}<extra></extra>",
     )
 
@@ -220,24 +222,25 @@ def _ring(x: float, y: float, key: str, colour: str) -> go.Scatter:
 
 
 def _coloured(design: Design) -> Iterator[tuple[SetDesign, str]]:
-    for index, found in enumerate(design.sets):
-        yield found, PALETTE[index % len(PALETTE)]
+    for index, of_set in enumerate(design.sets):
+        yield of_set, PALETTE[index % len(PALETTE)]
 
 
 def _legend(design: Design) -> tuple[LegendItem, ...]:
-    return tuple(LegendItem(found.name, found.name, colour) for found, colour in _coloured(design))
+    return tuple(LegendItem(of_set.name, of_set.name, colour) for of_set, colour in _coloured(design))
 
 
-def _flower(design: Design, found: SetDesign) -> go.Figure:
-    counts: Mapping[str, int] = {each.command: each.runs for each in found.chosen}
-    candidates = [design.candidate(name) for name in found.commands]
-    reach = max(max(math.hypot(x, y) for x, y, _ in each.path) for each in candidates) or 1.0
-    spots = [each for each in candidates if _on_the_spot(each)]
-    radii = {each.name: reach * (0.1 + 0.3 * index / len(spots)) for index, each in enumerate(spots)}
+def _flower(design: Design, of_set: SetDesign) -> go.Figure:
+    counts: Mapping[str, int] = {chosen.command: chosen.runs for chosen in of_set.chosen}
+    candidates = [design.candidate(name) for name in of_set.commands]
+    reach = max(max(math.hypot(x, y) for x, y, _ in candidate.path) for candidate in candidates) or 1.0
+    spots = [candidate for candidate in candidates if _on_the_spot(candidate)]
+    radii = {spot.name: reach * (0.1 + 0.3 * index / len(spots)) for index, spot in enumerate(spots)}
     traces = []
-    for each in sorted(candidates, key=lambda each: (counts.get(each.name, 0) > 0, -_turned(each))):
-        points = _arc(each, radii[each.name]) if each.name in radii else np.array(each.path)[:, :2]
-        traces += _path(each, points, counts.get(each.name, 0))
+    for candidate in sorted(candidates, key=lambda command: (counts.get(command.name, 0) > 0, -_turned(command))):
+        name = candidate.name
+        points = _arc(candidate, radii[name]) if name in radii else np.array(candidate.path)[:, :2]
+        traces += _path(candidate, points, counts.get(name, 0))
     traces.append(
         go.Scatter(x=[0], y=[0], mode="markers", marker={"color": INK, "size": 7}, hovertemplate="start<extra></extra>")
     )
@@ -278,7 +281,7 @@ def _path(candidate: Candidate, points: Array, runs: int) -> list[go.Scatter]:
 
 
 def _turned(candidate: Candidate) -> float:
-    """How far a run turns, rad; to the left if positive."""
+    """The angle that a run turns by, rad; positive to the left."""
     return candidate.path[-1][2] - candidate.path[0][2]
 
 
@@ -287,7 +290,7 @@ def _on_the_spot(candidate: Candidate) -> bool:
 
 
 def _arc(candidate: Candidate, radius: float) -> Array:
-    """A turn on the spot as an arc about the origin, at most most of a circle."""
+    """Points (60, 2) of an arc about the origin that stands for a turn on the spot; at most 330 deg."""
     turned = _turned(candidate)
     shown = math.copysign(min(abs(turned), math.radians(330)), turned)
     angles = np.linspace(0.0, shown, 60)

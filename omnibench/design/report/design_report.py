@@ -70,17 +70,17 @@ def _badges(design: Design) -> tuple[Badge, ...]:
 
 def _result(design: Design) -> tuple[Block, ...]:
     tiles = []
-    for found in design.sets:
-        equal = next(each for each in found.equivalents if each.use == design.use)
+    for of_set in design.sets:
+        equal = next(equal for equal in of_set.equivalents if equal.use == design.use)
         effort = equal.effort
         tiles += [
             Fact(
-                f"{found.name}: chosen",
-                plural(found.step.effort.runs, "run"),
-                f"{percent(found.step.efficiency, 2)} of the bound; {duration_in_words(found.step.effort.seconds)}",
+                f"{of_set.name}: chosen",
+                plural(of_set.step.effort.runs, "run"),
+                f"{percent(of_set.step.efficiency, 2)} of the bound; {duration_in_words(of_set.step.effort.seconds)}",
             ),
             Fact(
-                f"{found.name}: equal to the baseline's {baseline_runs(design)}",
+                f"{of_set.name}: equal to the baseline's {baseline_runs(design)}",
                 "none allowed" if effort is None else plural(effort.runs, "run"),
                 "" if effort is None else f"{duration_in_words(effort.seconds)} of driving",
             ),
@@ -95,8 +95,8 @@ def _result(design: Design) -> tuple[Block, ...]:
 
 def _equal_table(design: Design) -> Table:
     rows = []
-    for found in design.sets:
-        for equal in found.equivalents:
+    for of_set in design.sets:
+        for equal in of_set.equivalents:
             effort = equal.effort
             reason = (
                 "they leave part of the matrix open" if equal.least is None else "not within the repetitions allowed"
@@ -109,7 +109,7 @@ def _equal_table(design: Design) -> Table:
                     Cell(f"{significant(effort.metres, 3)} m"),
                 ]
             least = NOTHING if equal.least is None else least_in_words(equal.least)
-            rows.append(Row((Cell(found.name), Cell(USE_IN_WORDS[equal.use]), *cells, Cell(least))))
+            rows.append(Row((Cell(of_set.name), Cell(USE_IN_WORDS[equal.use]), *cells, Cell(least))))
     effort = design.baseline.precision.effort
     return Table(
         f"As good as the baseline: {design.baseline.name} ({effort_in_words(effort)})",
@@ -122,35 +122,38 @@ def _equal_table(design: Design) -> Table:
             Column("Bound", UNIT_OF_COST[design.per]),
         ),
         tuple(rows),
-        "The smallest design found whose det(information)^(1/p) is at least the baseline's; by the bound no design "
-        "at all does it with less than the last column. Final poses are taken as Eq. (6) does, with equal noise in m "
+        "The smallest design found whose det(information)^(1/p) is at least the baseline's; no design at all can do "
+        "it with less than the bound in the last column. Final poses are taken as Eq. (6) does, with equal noise in m "
         "and rad; whole trajectories by every reference pose under the noise model.",
     )
 
 
 def _commands(design: Design) -> tuple[Block, ...]:
     blocks: list[Block] = [path_figures(design)]
-    for found in design.sets:
-        blocks += [Paragraph(f"{found.name}: {choice_in_words(design, found)}"), _chosen_table(design, found)]
-        equal = f"{found.name} equals the baseline with {equal_in_words(design, found, design.use)}"
+    for of_set in design.sets:
+        blocks += [
+            Paragraph(f"{of_set.name}: {choice_in_words(design, of_set)}"),
+            _chosen_table(design, of_set),
+        ]
+        equal = f"{of_set.name} equals the baseline with {equal_in_words(design, of_set, design.use)}"
         blocks.append(Paragraph(f"{equal}, calibrated from {USE_IN_WORDS[design.use]}.", "note"))
     return tuple(blocks)
 
 
-def _chosen_table(design: Design, found: SetDesign) -> Table:
+def _chosen_table(design: Design, of_set: SetDesign) -> Table:
     rows = tuple(
         Row(
             (
-                *_command_cells(design.candidate(each.command)),
-                Cell(count(each.runs)),
-                Cell(percent(found.optimum.shares.get(each.command, 0.0))),
+                *_command_cells(design.candidate(chosen.command)),
+                Cell(count(chosen.runs)),
+                Cell(percent(of_set.optimum.shares.get(chosen.command, 0.0))),
             )
         )
-        for each in found.chosen
+        for chosen in of_set.chosen
     )
-    unit = {"run": "runs", "second": "time", "metre": "wheels' way"}[design.per]
+    unit = {"run": "runs", "second": "time", "metre": "wheels' distance"}[design.per]
     return Table(
-        f"What to drive of {found.name}: {effort_in_words(found.step.effort)}",
+        f"What to drive of {of_set.name}: {effort_in_words(of_set.step.effort)}",
         (*_COMMAND_COLUMNS, Column("Runs"), Column("Continuous optimum", f"share of the {unit}")),
         rows,
         "Other choices may be as good: turning all directions of a design by the same angle often changes nothing.",
@@ -185,19 +188,19 @@ def _precision(design: Design) -> tuple[Block, ...]:
     if physical:
         columns += [Column("Radius", "%"), Column("Distance", "%"), Column("Angle", "deg")]
     rows = []
-    for title, each in (
-        *((found.name, found.step) for found in design.sets),
+    for title, precision in (
+        *((of_set.name, of_set.step) for of_set in design.sets),
         (f"baseline: {design.baseline.name}", design.baseline.precision),
     ):
         cells = [
             Cell(title),
-            Cell(count(each.effort.runs)),
-            Cell(duration_in_words(each.effort.seconds)),
-            Cell(f"× {significant(each.relative, 3)}"),
-            *(Cell(significant(value, 3)) for value in each.row_percent),
+            Cell(count(precision.effort.runs)),
+            Cell(duration_in_words(precision.effort.seconds)),
+            Cell(f"× {significant(precision.relative, 3)}"),
+            *(Cell(significant(value, 3)) for value in precision.row_percent),
         ]
-        if each.physical is not None:
-            spread = each.physical
+        if precision.physical is not None:
+            spread = precision.physical
             values = (spread.radius_percent, spread.distance_percent, spread.angle_deg)
             cells += [Cell(significant(value, 3)) for value in values]
         rows.append(Row(tuple(cells)))
@@ -228,13 +231,13 @@ def _basis(design: Design) -> tuple[Block, ...]:
             f"bias {_small(noise.bias_heading)} rad",
         ),
         Fact("Robot", design.robot),
-        Fact("Elements told", f"{design.parameters} of the inverse kinematic matrix"),
+        Fact("Elements determined", f"{design.parameters} of the inverse kinematic matrix"),
         Fact("Odometry", "exact arcs" if design.integration == "arc" else "Euler steps, Eq. (1)"),
         Fact("Calibrated from", USE_IN_WORDS[design.use]),
-        Fact("Spared", f"information per {design.per}"),
+        Fact("Measure", f"information per {design.per}"),
         Fact(
             "Continuous optima",
-            listing([f"{found.name}: within {100 * found.optimum.gap:.1g} % of its bound" for found in design.sets]),
+            listing([f"{of_set.name}: within {100 * of_set.optimum.gap:.1g} % of its bound" for of_set in design.sets]),
         ),
     )
     rows = tuple(Row(_command_cells(candidate)) for candidate in design.candidates)

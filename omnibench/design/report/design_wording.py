@@ -1,4 +1,4 @@
-"""A design in words: commands, efforts and sentences that terminal and report share."""
+"""A design in words: commands, efforts and sentences that the terminal and the report share."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ UNIT_OF_COST: Mapping[Per, str] = {"run": "runs", "second": "s", "metre": "m of 
 
 
 def command_in_words(candidate: Candidate) -> str:
-    """A command as ``0.2 m/s at 30°, −0.35 rad/s``; by its name where it is not known."""
+    """A command as ``0.2 m/s at 30°, −0.35 rad/s``; its name where speed, direction or turn rate are not known."""
     if candidate.speed is None or candidate.direction is None or candidate.turn_rate is None:
         return candidate.name
     turn = f"{_plain(candidate.turn_rate)} rad/s"
@@ -25,12 +25,12 @@ def command_in_words(candidate: Candidate) -> str:
 
 
 def duration_in_words(seconds: float) -> str:
-    """A time of driving, s or min."""
+    """A duration of driving, in s, or in min from 120 s on."""
     return f"{significant(seconds, 3)} s" if seconds < 120 else f"{fixed(seconds / 60, 1)} min"
 
 
 def effort_in_words(effort: Effort) -> str:
-    """``6 runs, 33.5 s, 6.7 m``."""
+    """An effort as ``6 runs, 33.5 s, 6.7 m``."""
     runs = plural(effort.runs, "run")
     return f"{runs}, {duration_in_words(effort.seconds)}, {significant(effort.metres, 3)} m"
 
@@ -43,22 +43,22 @@ def origin_in_words(design: Design) -> str:
     return f"candidates: commands as designed, nothing recorded; noise {design.noise_source}"
 
 
-def choice_in_words(design: Design, found: SetDesign) -> str:
-    """How good the chosen runs of a set are, and by what guarantee."""
-    runs = plural(found.step.effort.runs, "run")
-    share = percent(found.step.efficiency, 2)
-    lost = percent(1 - found.step.efficiency, 2)
-    bound = f"{share} of the bound that no design from these {plural(len(found.commands), 'command')} exceeds"
+def choice_in_words(design: Design, of_set: SetDesign) -> str:
+    """How close the chosen runs of a set come to the bound that no design exceeds."""
+    runs = plural(of_set.step.effort.runs, "run")
+    share = percent(of_set.step.efficiency, 2)
+    lost = percent(1 - of_set.step.efficiency, 2)
+    bound = f"{share} of the bound that no design from these {plural(len(of_set.commands), 'command')} exceeds"
     if design.runs_asked is not None:
         return f"{runs}, as asked for, reach {bound}."
-    if found.reached:
+    if of_set.reached:
         return f"{runs} are within 1 % of the D-optimum: they reach {bound} (at most {lost} is lost)."
     return f"No design found is within 1 % of the bound; the best, of {runs}, reaches {bound}."
 
 
-def equal_in_words(design: Design, found: SetDesign, use: Use) -> str:
-    """How many runs of a set tell as much as the baseline."""
-    equal = next(each for each in found.equivalents if each.use == use)
+def equal_in_words(design: Design, of_set: SetDesign, use: Use) -> str:
+    """How many runs of a set give as much information as the baseline."""
+    equal = next(equal for equal in of_set.equivalents if equal.use == use)
     if equal.least is None:
         return "none: they leave part of the matrix open"
     least = f"{least_in_words(equal.least)} {UNIT_OF_COST[design.per]}"
@@ -69,16 +69,16 @@ def equal_in_words(design: Design, found: SetDesign, use: Use) -> str:
 
 def headline(design: Design) -> str:
     """The answer, a sentence for each set."""
-    return " ".join(_verdict(design, found) for found in design.sets)
+    return " ".join(_verdict(design, of_set) for of_set in design.sets)
 
 
-def _verdict(design: Design, found: SetDesign) -> str:
-    equal = next(each for each in found.equivalents if each.use == design.use)
-    words = f"{found.name}: {plural(found.step.effort.runs, 'run')} of {plural(len(found.chosen), 'command')} tell "
-    if found.reached:
-        words += f"as much per {design.per} as the best design from {len(found.commands)} commands, within 1 %"
+def _verdict(design: Design, of_set: SetDesign) -> str:
+    equal = next(equal for equal in of_set.equivalents if equal.use == design.use)
+    words = f"{of_set.name}: {plural(of_set.step.effort.runs, 'run')} of {plural(len(of_set.chosen), 'command')} tell "
+    if of_set.reached:
+        words += f"as much per {design.per} as the best design from {len(of_set.commands)} commands, within 1 %"
     else:
-        words += f"{percent(found.step.efficiency)} of what the best design may per {design.per}"
+        words += f"{percent(of_set.step.efficiency)} of what the best design may per {design.per}"
     if equal.effort is not None:
         words += f"; {count(equal.effort.runs)} of the best runs tell as much as the baseline's {baseline_runs(design)}"
     return words + "."
