@@ -23,7 +23,7 @@ from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 
-Watch = Callable[["Proof"], None]
+ProofCallback = Callable[["Proof"], None]
 _NO_ERROR = 1e-9  # m, rad: a smaller cost is rounding, of which no share can be proven
 
 
@@ -75,7 +75,7 @@ def certify_optimum(
     box: Box | None = None,
     gap: float = 1e-3,
     seconds: float = 60.0,
-    watch: Watch | None = None,
+    watch: ProofCallback | None = None,
 ) -> CertifiedCalibration:
     """Bound how much better than a calibration any matrix of the box could be, on a data set's training split.
 
@@ -132,7 +132,12 @@ def proven_gap(cost: float, lower_bound: float) -> float:
 
 
 def prove(
-    problem: CalibrationProblem, known: Array, *, gap: float = 1e-3, seconds: float = 60.0, watch: Watch | None = None
+    problem: CalibrationProblem,
+    known: Array,
+    *,
+    gap: float = 1e-3,
+    seconds: float = 60.0,
+    watch: ProofCallback | None = None,
 ) -> Proof:
     """A lower bound of the cost over the problem's box, within ``gap`` of the best cost known unless time runs out.
 

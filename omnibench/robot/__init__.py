@@ -1,1 +1,1 @@
-"""What the robot is: kinematics, odometry, effects and the calibration file."""
+"""Model of the robot: kinematics, odometry, effects and the calibration file."""

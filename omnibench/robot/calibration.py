@@ -1,4 +1,4 @@
-"""The calibration file, ``omnibench-calibration/1``: what a calibrator writes and everything else reads."""
+"""The calibration file, format ``omnibench-calibration/1``: written by calibrators, read by all other commands."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 
 FORMAT: Final = "omnibench-calibration/1"
-_LARGEST_ELEMENT = 1e3  # m or rad per rad of wheel
+_LARGEST_ELEMENT = 1e3  # of the matrix, m or rad per rad of wheel; no wheel is so large
 Row = tuple[FiniteFloat, ...]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Deviation = Annotated[float, Field(ge=0, le=1e3, allow_inf_nan=False)]
 
 
 class EffectTerm(Model):
-    """A named effect and its parameters."""
+    """An effect by its name, with the values of its parameters."""
 
     name: str
     parameters: dict[str, FiniteFloat] = {}
 
 
 class Noise(Model):
-    """Standard deviations of the reference's noise: white, random walk along the way, bias of a run."""
+    """Standard deviations of the reference's noise: white noise, random walk over time, bias of a run."""
 
     pose_position: Deviation = Field(0.0, description="white noise of each pose, m")
     pose_heading: Deviation = Field(0.0, description="white noise of each pose, rad")
@@ -43,7 +43,7 @@ class Noise(Model):
 
 
 class Provenance(Model):
-    """Where a calibration comes from."""
+    """Origin of a calibration: data set, calibrator with options, versions, costs and outcome."""
 
     dataset: str
     dataset_hash: str
@@ -100,37 +100,38 @@ class Calibration(Model):
     @classmethod
     def _can_be_written(cls, name: str) -> str:
         if not name.isprintable():
-            raise ValueError("holds what cannot be printed")
+            raise ValueError("contains characters that cannot be printed")
         return name
 
     @property
     def model(self) -> OdometryModel:
-        """The odometry model that the file describes. OmnibenchError: an effect or its parameters are not known."""
+        """The odometry model of the file. OmnibenchError: an effect or one of its parameters is unknown."""
         where = f"calibration {self.name!r}"
         terms = tuple(make_term(term.name, term.parameters, self.robot, where) for term in self.effects)
         return OdometryModel(self.robot, self.matrix_array, self.integration, terms, self.sample_period)
 
     @property
     def matrix_array(self) -> Array:
+        """The matrix as an array (3, N)."""
         return np.array(self.matrix)
 
 
 def _check_covariance(covariance: Array) -> None:
     largest = float(np.abs(covariance).max())
     if largest > _LARGEST_ELEMENT**2 or not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-9 * largest):
-        raise ValueError("covariance is not symmetric, or its values cannot be")
+        raise ValueError("covariance is not symmetric, or its values are impossibly large")
     if np.linalg.eigvalsh(covariance)[0] < -1e-6 * largest:
         raise ValueError("covariance is not positive semi-definite: it has a negative variance in some direction")
 
 
 def matrix_rows(matrix: Array) -> tuple[Row, Row, Row]:
-    """A matrix (3, N) as the rows that documents hold."""
+    """A matrix (3, N) as rows of a document."""
     first, second, third = (tuple(float(value) for value in row) for row in matrix)
     return first, second, third
 
 
 def covariance_rows(covariance: Array) -> tuple[Row, ...]:
-    """A covariance (n, n) as the rows that documents hold."""
+    """A covariance (n, n) as rows of a document."""
     return tuple(tuple(float(value) for value in row) for row in covariance)
 
 
@@ -143,7 +144,7 @@ def read_calibration(path: Path | str) -> Calibration:
 
 
 def parse_calibration(text: str, where: str) -> Calibration:
-    """A calibration file's text, checked. DataError, with ``where`` in front, says what is wrong."""
+    """Parse and check the text of a calibration file. DataError begins with ``where`` and says what is wrong."""
     try:
         return _checked(parse_yaml(text, where), where)
     except ConfigError as error:
@@ -151,9 +152,9 @@ def parse_calibration(text: str, where: str) -> Calibration:
 
 
 def _checked(content: Any, where: str) -> Calibration:
-    found = content.get("format") if isinstance(content, dict) else None
-    if found != FORMAT:
-        raise DataError(f"{where}: format is {found!r}, expected {FORMAT!r}; is this a calibration file?")
+    version = content.get("format") if isinstance(content, dict) else None
+    if version != FORMAT:
+        raise DataError(f"{where}: format is {version!r}, expected {FORMAT!r}; is this a calibration file?")
     calibration = validate(Calibration, content, where)
     for term in calibration.effects:
         make_term(term.name, term.parameters, calibration.robot, where)
@@ -161,5 +162,5 @@ def _checked(content: Any, where: str) -> Calibration:
 
 
 def write_calibration(calibration: Calibration, path: Path | str) -> None:
-    """Write a calibration file; it is complete or it is not there. DataError when it cannot be written."""
+    """Write a calibration file, whole or not at all. DataError when it cannot be written."""
     write_text(Path(path), to_yaml(calibration))

@@ -1,4 +1,4 @@
-"""What all terms of a model together make of wheel samples; the same code runs in batch and in a stream."""
+"""Twists of wheel samples, corrected by all terms of a model; batch and stream share this code."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.signals import Signals
 
-_WHAT_IS_NEEDED: dict[Need, str] = {
+_MISSING: dict[Need, str] = {
     "wheel_angles": "absolute wheel angles (phi_* in wheels), which were not recorded",
     "session_time": "the time since the session's start (started_at in trajectories), which is not known",
     "session": "the session's name (session in trajectories), which is not known",
@@ -19,10 +19,10 @@ _WHAT_IS_NEEDED: dict[Need, str] = {
 
 
 def corrected_twists(terms: Sequence[Term], signals: Signals, matrix: Array) -> tuple[Array, Array | None]:
-    """Twists (F, 3) with the corrections of motion effects, and what they add to the velocity (F, 2) in the world.
+    """Twists (F, 3) corrected by motion effects, and the velocity (F, 2) that world effects add in the world frame.
 
     Every correction is computed from the uncorrected signals, and corrections add up, so that their order does not
-    matter. The velocity is None where no term acts in the world. PluginError: a correction has another shape.
+    matter. The velocity is None if no term acts in the world. PluginError: a correction has a wrong shape.
     """
     rates, of_body, of_world = signals.rates, None, None
     for term in terms:
@@ -38,18 +38,18 @@ def corrected_twists(terms: Sequence[Term], signals: Signals, matrix: Array) -> 
 
 
 def check_needs(terms: Sequence[Term], log: WheelLog) -> None:
-    """DataError in one line when a log lacks what an effect needs."""
-    found = {"wheel_angles": log.wheel_angles, "session_time": log.started_at, "session": log.session}
+    """Raise DataError, in one line, if a log lacks data that an effect needs."""
+    recorded = {"wheel_angles": log.wheel_angles, "session_time": log.started_at, "session": log.session}
     for term in terms:
         for need in sorted(term.effect.needs):
-            if need in found and found[need] is None:
+            if need in recorded and recorded[need] is None:
                 raise DataError(
-                    f"effect {term.name!r} needs {_WHAT_IS_NEEDED[need]}; "
-                    "record it, or take the effect out of the calibration"
+                    f"effect {term.name!r} needs {_MISSING[need]}; record it, or take the effect out of the calibration"
                 )
 
 
 def _correction(term: Term, signals: Signals) -> Array:
+    """The correction of one term, its shape checked."""
     effect = term.effect
     assert isinstance(effect, MotionEffect)
     added = effect.correction(signals, term.values)

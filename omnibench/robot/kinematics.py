@@ -1,4 +1,4 @@
-"""From wheel geometry to the inverse kinematic matrix: Eq. (3) for three omni wheels, its general form for N >= 3.
+"""Inverse kinematic matrix of a wheel geometry: Eq. (3) for three omni wheels, its general form for N >= 3.
 
 A wheel's equation is ``omega = row . (vx, vy, w)`` with the row ``(-sin d + tan g cos d, cos d + tan g sin d, R) / r``:
 d is the direction of the wheel's axle, g the angle of its rollers (0: omni), R the lever arm of the driving force
@@ -22,9 +22,9 @@ Array = NDArray[np.floating[Any]]
 class Wheel(Model):
     """Design values of one wheel, in the robot's frame (x forward, y left).
 
-    ``angle`` is the direction of the axle, ``distance`` the lever arm about the centre. For an omni wheel whose axle
-    points at the centre these are where the wheel stands. For a mecanum wheel at (lx, ly) with its axle along y they
-    are +pi/2 (left) or -pi/2 (right) and ``abs(lx) + abs(ly)`` for rollers at 45 degrees.
+    angle: direction of the axle. distance: lever arm about the centre. For an omni wheel whose axle points at the
+    centre they are the wheel's position in polar coordinates. For a mecanum wheel at (lx, ly) with its axle along y
+    the angle is +pi/2 (left) or -pi/2 (right), and the distance ``abs(lx) + abs(ly)`` for rollers at 45 degrees.
     """
 
     name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_]+$", description="ends the column names: omega_<name>")
@@ -69,7 +69,7 @@ class Robot(Model):
 
 
 def wheel_equations(wheels: tuple[Wheel, ...]) -> Array:
-    """The matrix M that turns a twist (vx, vy, w) into wheel rates: shape (N, 3), 1/m and 1."""
+    """The matrix M (N, 3) that maps a twist (vx, vy, w) to wheel rates: 1/m (columns 1, 2) and 1 (column 3)."""
     radius, distance, angle = _columns(wheels)
     return _wheel_equations(radius, distance, angle, np.array([wheel.roller_angle for wheel in wheels]))
 
@@ -84,11 +84,11 @@ def inverse_kinematic_matrix(wheels: tuple[Wheel, ...]) -> Array:
 def inverse_kinematic_matrices(
     radius: ArrayLike, distance: ArrayLike, angle: ArrayLike, roller_angle: ArrayLike = 0.0
 ) -> Array:
-    """M^-1 of P geometries at once.
+    """M^-1 (P, 3, N) of P geometries at once.
 
-    ``radius`` and ``distance`` (m) and ``angle`` (rad) have shape (P, N), ``roller_angle`` (rad) (N,). Returns
-    (P, 3, N). Three omni wheels: Eq. (3) of Palacin et al. 2023. Otherwise the Moore-Penrose inverse of the wheel
-    equations, which is the twist of least squares for the N wheel rates. NaN or infinity for a geometry without one.
+    radius, distance (P, N): m. angle (P, N): rad. roller_angle (N,): rad. Three omni wheels: Eq. (3) of Palacin et al.
+    2023. Others: the Moore-Penrose inverse of the wheel equations, which gives the least-squares twist of N wheel
+    rates. NaN or infinity for a geometry without inverse.
     """
     r, R, d = (np.asarray(values, dtype=float) for values in (radius, distance, angle))
     rollers = np.broadcast_to(np.asarray(roller_angle, dtype=float), r.shape[-1:])
@@ -98,6 +98,7 @@ def inverse_kinematic_matrices(
 
 
 def _columns(wheels: tuple[Wheel, ...]) -> Array:
+    """Radii, distances and angles (3, N)."""
     return np.array([[wheel.radius, wheel.distance, wheel.angle] for wheel in wheels]).T
 
 
@@ -109,7 +110,7 @@ def _wheel_equations(radius: Array, distance: Array, angle: Array, rollers: Arra
 
 
 def _pseudo_inverse(equations: Array) -> Array:
-    finite = np.isfinite(equations).all(axis=(-2, -1))  # LAPACK raises on NaN and does not come back from infinity
+    finite = np.isfinite(equations).all(axis=(-2, -1))  # LAPACK raises on NaN and never returns on infinity
     inverse: Array = np.full(np.swapaxes(equations, -2, -1).shape, np.nan)
     inverse[finite] = np.linalg.pinv(equations[finite])
     return inverse

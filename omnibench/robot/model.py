@@ -17,15 +17,15 @@ from omnibench.robot.odometry import Integration, OdometryBatch, OdometryStream,
 from omnibench.robot.path import Path
 from omnibench.robot.signals import SignalStream, signals_of
 
-_LAST = 5  # samples whose mean rate tells how the robot goes on after the last
+_LAST = 5  # samples whose mean rate continues the path after the last sample; chosen
 
 
 @dataclass(frozen=True, eq=False)
 class OdometryModel:
-    """A robot's odometry: ``matrix`` (3, N) in m and rad per rad of wheel, how a sample is integrated, and effects.
+    """A robot's odometry: ``matrix`` (3, N) in m and rad per rad of wheel, integration of a sample, and effects.
 
-    terms: effects of any stage; those of stage actuator are for simulation and do nothing here. sample_period: the
-    nominal one, s; effects need it.
+    terms: effects of any stage; those of stage actuator are for simulation and ignored here. sample_period: nominal, s;
+    needed with effects.
     """
 
     robot: Robot
@@ -45,18 +45,18 @@ class OdometryModel:
 
     @cached_property
     def motion_terms(self) -> tuple[Term, ...]:
-        """Those of stage wheel, clock, body and world."""
+        """Terms of stage wheel, clock, body and world."""
         return tuple(term for term in self.terms if isinstance(term.effect, MotionEffect))
 
     @cached_property
     def reference_terms(self) -> tuple[Term, ...]:
-        """Those of stage reference."""
+        """Terms of stage reference."""
         return tuple(term for term in self.terms if isinstance(term.effect, ReferenceEffect))
 
     def poses(self, logs: Sequence[WheelLog]) -> list[Array]:
-        """Odometry of each log at its stamps: a list of (S, 3) in m, m, rad. Effects of the reference do nothing here.
+        """Odometry of each log at its stamps: a list of (S, 3) in m, m, rad. Effects of the reference are ignored.
 
-        After the last sample the pose stays. DataError in one line: a log lacks what an effect needs.
+        After the last sample the pose is constant. DataError in one line: a log lacks data that an effect needs.
         """
         if self.motion_terms:
             return [self._path(log).poses(log.stamps) for log in logs]
@@ -65,11 +65,11 @@ class OdometryModel:
         return [poses[batch.trajectory == index] for index in range(len(logs))]
 
     def reported(self, logs: Sequence[WheelLog]) -> list[Array]:
-        """What the reference reports at each log's stamps: a list of (S, 3) in m, m, rad; ``poses`` where no effect of
-        the reference is in the model.
+        """Poses that the reference reports at each log's stamps: a list of (S, 3) in m, m, rad.
 
-        With one, a pose is the odometry's at the time when it was taken: before t = 0 the start pose; after the last
-        sample the robot goes on with the mean rate of its last five samples. DataError as for ``poses``.
+        They equal ``poses`` unless the model has effects of the reference. Then a pose is the odometry's at the time
+        when it was taken: before t = 0 the start pose; after the last sample the robot continues with the mean rate of
+        its last five samples. DataError as for ``poses``.
         """
         if not self.reference_terms:
             return self.poses(logs)
@@ -78,9 +78,9 @@ class OdometryModel:
     def stream(
         self, start: Array | None = None, session: str | None = None, session_time: float = 0.0
     ) -> OdometryStream:
-        """The model as a stream of samples, from a start pose (default: the origin).
+        """Odometry by this model one sample at a time, from a start pose (default: the origin).
 
-        session: its name; None for one that no calibration knows. session_time: at the start, s.
+        session: its name; None if it is unknown to the calibration. session_time: at the stream's start, s.
         """
         if not self.motion_terms:
             return OdometryStream(self.matrix, self.integration, start)
@@ -89,6 +89,7 @@ class OdometryModel:
         return EffectStream(self.motion_terms, signals, self.integration, start)
 
     def _path(self, log: WheelLog) -> Path:
+        """The path of a log under the effects of motion."""
         durations = np.diff(log.times, prepend=0.0)[:, None]
         if not self.motion_terms:
             return Path(log.times, log.start, (log.rates @ self.matrix.T) * durations, self.integration)
@@ -101,12 +102,13 @@ class OdometryModel:
         return Path(log.times, log.start, twists * durations, self.integration, world)
 
     def _reported(self, log: WheelLog) -> Array:
+        """Poses (S, 3) of one log as the effects of the reference report them."""
         taken, heading_taken = log.stamps, log.stamps
         for term in self.reference_terms:
             assert isinstance(term.effect, ReferenceEffect)
             of_position, of_heading = term.effect.delays(log.stamps, term.values)
             taken, heading_taken = taken - of_position, heading_taken - of_heading
-        path = self._path(_going_on(log, max(taken.max(initial=0.0), heading_taken.max(initial=0.0))))
+        path = self._path(_extended(log, max(taken.max(initial=0.0), heading_taken.max(initial=0.0))))
         poses = path.poses(taken)
         poses[:, 2] = path.poses(heading_taken)[:, 2]
         for term in self.reference_terms:
@@ -115,8 +117,8 @@ class OdometryModel:
         return poses
 
 
-def _going_on(log: WheelLog, until: float) -> WheelLog:
-    """The log with a sample more if its samples end before ``until`` (s): the mean rate of the last ones goes on."""
+def _extended(log: WheelLog, until: float) -> WheelLog:
+    """The log, with one more sample of the last mean rate up to ``until`` (s) if its samples end before."""
     end = log.times[-1]
     if until <= end:
         return log

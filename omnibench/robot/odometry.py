@@ -24,18 +24,17 @@ from omnibench.robot.kinematics import Array
 Integration = Literal["euler", "arc"]
 Complex = NDArray[np.complex128]
 
-# Candidates go in blocks of about this many samples, whose temporaries stay in the processor's cache.
-_BLOCK = 120_000
+_BLOCK = 120_000  # samples at a time (candidates x samples), so that temporaries stay in the processor's cache
 
 
 @dataclass(frozen=True)
 class WheelLog:
-    """What odometry needs of one trajectory.
+    """Input of odometry for one trajectory.
 
     times (F,): end of each sample, s, increasing, > 0. rates (F, N): mean wheel rates over each sample, rad/s.
     start (3,): pose at t = 0 (m, m, rad). stamps (S,): when poses are wanted, s, increasing, >= 0.
-    What only some effects need, None where it is not known: wheel_angles (F, N): absolute, at the end of each sample,
-    rad. started_at: s since the session's start. session: its name.
+    Needed by some effects only, None if unknown: wheel_angles (F, N): absolute, at the end of each sample, rad.
+    started_at: s since the session's start. session: its name.
     """
 
     times: Array
@@ -112,9 +111,9 @@ class OdometryBatch:
         )
 
     def position_design(self, headings: Sequence[Array]) -> Complex:
-        """Regressors (S, N) of (x - x0) + i(y - y0) on m1 + i m2 when the headings are known beforehand.
+        """Regressors (S, N) of (x - x0) + i(y - y0) on m1 + i m2 for given headings.
 
-        ``headings``: absolute heading at the start of each sample of each log, rad; a list of (F,).
+        headings: for each log (F,), the absolute heading at the start of each sample, rad.
         """
         turn: Complex = np.ones(self._angles.shape[:2], dtype=complex)
         for row, values in enumerate(headings):
@@ -125,6 +124,7 @@ class OdometryBatch:
         return design
 
     def _phase_basis(self, angles: Array, before: Array) -> Array:
+        """Wheel angles (..., N) whose product with m3 is psi, relative to the start heading."""
         return before + angles / 2 if self.integration == "arc" else before
 
     def _final_displacement(self, matrices: Array) -> Complex:
@@ -151,7 +151,7 @@ class OdometryBatch:
         )
 
     def _at_stamps(self, whole: Sequence[Complex], pieces: Sequence[Complex]) -> tuple[Complex, ...]:
-        """Sums of whole samples (T, F, n) before each stamp plus the stamp's own piece (S, n)."""
+        """Sums (S, n) of the whole samples (T, F, n) before each stamp and the piece (S, n) of the stamp's sample."""
         sums = []
         for samples, piece in zip(whole, pieces, strict=True):
             total = np.cumsum(samples, axis=1)
@@ -160,6 +160,7 @@ class OdometryBatch:
         return tuple(sums)
 
     def _steps(self, angles: Array, before: Array, matrix: Array) -> Complex:
+        """dx + i dy of every sample, relative to the start heading."""
         rotation, stretch, _ = self._rotation(angles, before, matrix)
         return (angles @ (matrix[0] + 1j * matrix[1])) * stretch * rotation
 
@@ -228,7 +229,7 @@ def advance(pose: Array, moved: Array, integration: Integration) -> Array:
 
 
 def _locate(log: WheelLog) -> tuple[NDArray[np.intp], Array]:
-    """For each stamp the sample that contains it and the share of that sample which lies before it."""
+    """For each stamp (S,) the sample that contains it and the share of that sample before it."""
     sample = np.minimum(np.searchsorted(log.times, log.stamps), len(log.times) - 1)
     begin = np.where(sample > 0, log.times[sample - 1], 0.0)
     share = np.clip((log.stamps - begin) / (log.times[sample] - begin), 0.0, 1.0)
@@ -236,11 +237,12 @@ def _locate(log: WheelLog) -> tuple[NDArray[np.intp], Array]:
 
 
 def _sinc(angle: Array) -> Array:
+    """sin(h)/h."""
     return np.sinc(np.asarray(angle) / np.pi)
 
 
 def _sinc_slope(angle: Array) -> Array:
-    """d/dh of sin(h)/h, by its series near 0 where the quotient would cancel."""
+    """d/dh of sin(h)/h; by its series near 0, where the quotient loses digits."""
     small = np.abs(angle) < 1e-2
     safe = np.where(small, 1.0, angle)
     exact = (safe * np.cos(safe) - np.sin(safe)) / safe**2

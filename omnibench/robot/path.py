@@ -1,4 +1,4 @@
-"""The path of a robot that keeps its twist within every sample, at any times: Eq. (1) and (2), or exact arcs."""
+"""Path of a robot with constant twist within every sample, at any times: Eq. (1) and (2), or exact arcs."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from omnibench.robot.odometry import Complex, Integration
 
 
 class Path:
-    """The path that F samples make.
+    """The path of F samples.
 
-    times (F,): their ends, s. start (3,): pose at t = 0. moved (F, 3): in the robot's frame, m, m, rad. drift (F, 2):
-    what the reference's frame adds to every sample, m; None for nothing.
+    times (F,): their ends, s. start (3,): pose at t = 0. moved (F, 3): motion in the robot's frame, m, m, rad. drift
+    (F, 2): further displacement in the reference's frame, m; None for none.
     """
 
     def __init__(
@@ -28,7 +28,7 @@ class Path:
     def poses(self, stamps: Array) -> Array:
         """Poses (S, 3) in m, m, rad at stamps (S,) in s, in any order; headings are not wrapped.
 
-        Before t = 0 that is the start pose, after the last sample the pose at its end.
+        Before t = 0 it is the start pose, after the last sample the pose at its end.
         """
         sample = np.minimum(np.searchsorted(self._times, stamps), len(self._times) - 1)
         begin = np.where(sample > 0, self._times[sample - 1], 0.0)

@@ -1,4 +1,4 @@
-"""Poses of the plane (x, y, heading), m, m, rad, one after another. Headings are not wrapped."""
+"""Algebra of planar poses (x, y, heading), m, m, rad. Headings are not wrapped."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from omnibench.robot.odometry import advance
 
 
 def compose(first: Array, second: Array) -> Array:
-    """The pose (3,) of what has the pose ``second`` in a frame that has the pose ``first``."""
+    """Composition (3,) of two poses: ``second``, given in the frame ``first``, in the frame of ``first``'s parent."""
     return advance(first, second, "euler")
 
 
 def relative(first: Array, second: Array) -> Array:
-    """The pose (3,) of ``second`` in the frame that has the pose ``first``: compose(first, relative) is ``second``."""
+    """``second`` as seen from ``first`` (3,), the inverse of composition: compose(first, relative) is ``second``."""
     x, y, heading = (second - first).tolist()
     cosine, sine = math.cos(first[2]), math.sin(first[2])
     return np.array([cosine * x + sine * y, -sine * x + cosine * y, heading])
 
 
 def moved_to(start: Array, poses: Array) -> Array:
-    """A path (K, 3), K >= 1, as a whole moved and turned so that it begins at the pose ``start`` (3,)."""
+    """A path (K, 3), K >= 1, moved rigidly so that it begins at the pose ``start`` (3,)."""
     first, turn = poses[0], start[2] - poses[0, 2]
     path = ((poses[:, 0] - first[0]) + 1j * (poses[:, 1] - first[1])) * np.exp(1j * turn)
     return np.column_stack([start[0] + path.real, start[1] + path.imag, poses[:, 2] + turn])
@@ -32,9 +32,8 @@ def moved_to(start: Array, poses: Array) -> Array:
 def unit_twist(motion: Array) -> Array:
     """The constant twist that makes a motion in unit time: the logarithm map of SE(2).
 
-    motion (..., 3): the pose after it as seen from before, m, m, rad. ``advance`` by arcs is the way back. A motion of
-    more than half a turn, for which the twist becomes the less certain the nearer it is to a whole one, is taken to be
-    no longer than one of half a turn.
+    motion (..., 3): the pose after it as seen from before, m, m, rad. ``advance`` by arcs is the inverse. Beyond half a
+    turn the twist grows without bound towards a whole turn; it is limited to the length of half a turn.
     """
     half = motion[..., 2] / 2
     longer = 1 / np.sinc(np.minimum(np.abs(half), np.pi / 2) / np.pi)
@@ -43,7 +42,7 @@ def unit_twist(motion: Array) -> Array:
 
 
 def correction(in_map: Array, in_odom: Array) -> Array:
-    """The pose (3,) of frame odom in frame map, from the robot's pose in both."""
+    """Pose (3,) of frame odom in frame map, from the robot's pose (3,) in both (REP-105)."""
     x, y, heading = in_map.tolist()
     odom_x, odom_y, odom_heading = in_odom.tolist()
     turned = heading - odom_heading

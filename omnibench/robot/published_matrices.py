@@ -1,4 +1,4 @@
-"""Matrices that were published for the APR-02, to be compared with or simulated from."""
+"""Matrices published for the APR-02 robot, for comparison and simulation."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PUBLISHED = tuple(_ROWS)
 
 
 def published_matrix(name: str) -> Array:
-    """A published inverse kinematic matrix (3, 3) of the APR-02; UnknownNameError lists the names."""
+    """A published inverse kinematic matrix (3, 3) of the APR-02. UnknownNameError lists the names."""
     if name not in _ROWS:
         raise UnknownNameError("published matrix", name, _ROWS)
     return np.array(_ROWS[name])

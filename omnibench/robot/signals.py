@@ -1,4 +1,4 @@
-"""What a correction may depend on: causal quantities of every wheel sample, the same in batch and in a stream."""
+"""Signals that a correction may depend on: causal quantities of every wheel sample, equal in batch and in a stream."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog, advance
 from omnibench.robot.path import Path
 
-STILL = 1e-3  # rad/s; a slower wheel stands
-_SMOOTHING = 0.05  # s, the time constant of the twist of which accelerations are taken
+STILL = 1e-3  # rad/s: a slower wheel counts as standing; chosen
+_SMOOTHING = 0.05  # s, time constant of the smoothed twist whose derivative is the acceleration; chosen
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -20,12 +20,12 @@ class Signals:
     """F wheel samples as recorded; every quantity is computed from the uncorrected rates.
 
     durations (F,): s. rates (F, N): mean wheel rates, rad/s. elapsed (F,): s from the start of the run to the middle of
-    the sample. twists (F, 3): by the model's matrix, m/s, m/s, rad/s. accelerations (F, 3): of the twists, smoothed
-    over 50 ms, at rest before the first sample. travelled (F,): way since the robot last stood still, m. wheel_angles
-    (F, N): absolute, in the middle of the sample, rad; None where they were not recorded. session_time (F,): s since
-    the session's start; None where it is not known. session: its name. poses (F, 3): in the reference's frame by the
-    twists alone and exact arcs, the mean of those before and after the sample, m, m, rad; None where no effect needs
-    them.
+    the sample. twists (F, 3): by the model's matrix, m/s, m/s, rad/s. accelerations (F, 3): derivatives of the twists,
+    smoothed over 50 ms, from rest before the first sample. travelled (F,): distance since the robot last stood still,
+    m. wheel_angles (F, N): absolute, in the middle of the sample, rad; None if they were not recorded. session_time
+    (F,): s since the session's start; None if unknown. session: its name. poses (F, 3): in the reference's frame, m, m,
+    rad, by the uncorrected twists and exact arcs: mean of the poses before and after the sample; None if no effect
+    needs them.
     """
 
     robot: Robot
@@ -44,15 +44,15 @@ class Signals:
 def signals_of(
     log: WheelLog, robot: Robot, matrix: Array, sample_period: float, *, with_poses: bool = False
 ) -> Signals:
-    """The signals of a log's F samples by a matrix (3, N); sample_period: the nominal one, s.
+    """The signals of a log's F samples by a matrix (3, N).
 
-    with_poses: an effect needs them.
+    sample_period: nominal, s. with_poses: compute the poses, which some effects need.
 
     With u_k the twist of sample k, d_k its duration and y_k = y_{k-1} + a (u_k - y_{k-1}), y_0 = 0, the twist smoothed
-    with a = 1 - exp(-sample_period / 50 ms), its acceleration is (y_k - y_{k-1}) / d_k: causal, and their sum over time
-    is right whatever the samples' durations are.
+    with a = 1 - exp(-sample_period / 50 ms), its acceleration is (y_k - y_{k-1}) / d_k: causal, and
+    with the right integral over time for any durations of samples.
     """
-    from scipy.signal import lfilter  # takes as long to import as a live node takes to start
+    from scipy.signal import lfilter  # slow to import, and not needed by a live node
 
     durations = np.diff(log.times, prepend=0.0)
     twists = log.rates @ matrix.T
@@ -75,10 +75,10 @@ def signals_of(
 
 
 class SignalStream:
-    """The same signals, one sample at a time, from rest.
+    """The signals of ``signals_of``, one sample at a time, from rest.
 
-    session_time: at the first sample's start, s. pose (3,): where the twists alone have led by now, m, m, rad; None
-    where no effect needs it.
+    session_time: at the first sample's start, s. pose (3,): by the uncorrected twists so far, m, m, rad; None if no
+    effect needs it.
     """
 
     def __init__(
@@ -99,11 +99,11 @@ class SignalStream:
         self._angles = np.zeros(matrix.shape[1])
 
     def turn(self, angles: Array, wheel_angles: Array | None = None) -> None:
-        """The wheels turned by angles (N,) rad, to absolute ones (N,) where they are known."""
+        """Turn the wheels by angles (N,) rad, or to the absolute ``wheel_angles`` (N,) if they are known."""
         self._angles = self._angles + angles if wheel_angles is None else np.asarray(wheel_angles, dtype=float)
 
     def move(self, moved: Array) -> Array | None:
-        """The robot moved (3,) in its own frame, m, m, rad: the mean of its poses (1, 3) before and after."""
+        """Move the robot by (3,) in its own frame, m, m, rad; return the mean of its poses (1, 3) before and after."""
         if self.pose is None:
             return None
         before = self.pose
@@ -116,8 +116,8 @@ class SignalStream:
     ) -> Signals:
         """The signals (F = 1) of one sample: mean rates (N,) rad/s over a duration > 0 s, absolute angles at its end.
 
-        Angles that are not known are counted on from the last, at first from 0. frame_heading: of the stream's frame
-        in the reference's, with which it shares its origin, rad.
+        Unknown angles are integrated from the last known ones, or from 0. frame_heading: heading of the stream's frame
+        in the reference's, rad; both have the same origin.
         """
         turned = rates * duration
         self.turn(turned, wheel_angles)
@@ -151,7 +151,7 @@ class SignalStream:
 
 
 def smoothing_share(sample_period: float) -> float:
-    """The share a of a new twist in the smoothed one."""
+    """The weight a of a new twist in the smoothed one."""
     return -math.expm1(-sample_period / _SMOOTHING)
 
 
@@ -163,7 +163,7 @@ def _middles(log: WheelLog, moved: Array) -> Array:
 
 
 def _turned(poses: Array | None, angle: float) -> Array | None:
-    """Poses (F, 3) about the origin by an angle, rad."""
+    """Poses (F, 3) rotated about the origin by an angle, rad."""
     if poses is None or not angle:
         return poses
     cosine, sine = math.cos(angle), math.sin(angle)
@@ -172,7 +172,7 @@ def _turned(poses: Array | None, angle: float) -> Array | None:
 
 
 def _travelled(rates: Array, steps: Array) -> Array:
-    """Way (F,) to the middle of each sample since the last one in which all wheels stood, from the samples' own."""
+    """Distance (F,) to the middle of each sample since all wheels last stood, from each sample's distance (F,), m."""
     still = (np.abs(rates) < STILL).all(axis=1)
     way = np.cumsum(steps)
     last = np.maximum.accumulate(np.where(still, np.arange(len(steps)), -1))

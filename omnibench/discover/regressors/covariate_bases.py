@@ -17,7 +17,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.paths import Paths
 from omnibench.robot.effects.effect import Stage
 from omnibench.robot.effects.smooth import lever, surfaces, waves
-from omnibench.robot.effects.smooth_wheels import HARMONICS, tents
+from omnibench.robot.effects.smooth_wheels import HARMONICS, hat_functions
 from omnibench.robot.kinematics import Array
 
 _ORDERS = 6  # smooth functions of time; chosen
@@ -155,7 +155,7 @@ def _wheel_rate(paths: Paths) -> Iterator[Basis]:
     top = float(np.quantile(np.abs(rates), 0.999))
     if top < _SMALL:
         return
-    changes, shapes = tents(rates, top), {"top": top}
+    changes, shapes = hat_functions(rates, top), {"top": top}
     of_wheels = [paths.of_wheel(wheel, changes[:, wheel]) for wheel in range(rates.shape[1])]
     yield Basis("wheel rate", "wheel", "how fast the wheels turn", np.sum(of_wheels, axis=0), term="smooth_wheel_rate",
                 shapes=shapes)  # fmt: skip

@@ -1,1 +1,1 @@
-"""Terms that can be added to the odometry model, one family a file; plug-ins register theirs beside them."""
+"""Effects: terms that can be added to the odometry model, one family in each file. Importing registers them."""

@@ -1,4 +1,4 @@
-"""Effects that another matrix reproduces exactly: a recording of wheels and reference cannot tell them."""
+"""Effects that a change of the matrix reproduces exactly, so that no recording of wheels and poses identifies them."""
 
 from __future__ import annotations
 
@@ -43,12 +43,13 @@ class LidarLeverArm(ReferenceEffect):
 
 
 def _arm(poses: Array, start: Array, values: Values) -> Complex:
-    """By how much the arm has swung since the start: x + iy (K,), m."""
+    """Displacement of the tracked point by the arm's rotation since the start: x + iy (K,), m."""
     arm: Complex = (np.exp(1j * poses[:, 2]) - np.exp(1j * start[2])) * complex(values["x"], values["y"])
     return arm
 
 
 def _shifted(poses: Array, shift: Complex) -> Array:
+    """Poses (K, 3) with positions displaced by x + iy (K,), m."""
     return np.column_stack([poses[:, 0] + shift.real, poses[:, 1] + shift.imag, poses[:, 2]])
 
 

@@ -1,4 +1,4 @@
-"""What motors and their controllers make of target wheel rates. For simulation: odometry sees the wheels themselves."""
+"""Motors and their controllers: from target to true wheel rates. For simulation; odometry measures the true ones."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class MotorLag(ActuatorEffect):
     fixed_parameters = (Parameter("tau", "s", 0.0, 0.3, "time constant"),)
 
     def driven(self, durations: Array, targets: Array, values: Values) -> Array:
-        """Means over the samples of the exact solution for targets that are constant within each."""
+        """Means over each sample of the exact solution for targets that are constant within samples."""
         tau = values["tau"]
         if tau <= 0:
             return targets.copy()
@@ -31,8 +31,8 @@ class MotorLag(ActuatorEffect):
 
 
 def _reached(left: Array, targets: Array) -> Array:
-    """Rates (F, N) at the beginning of each sample; left (F,): what a sample leaves of the distance to its target."""
-    from scipy.signal import lfilter  # takes as long to import as a live node takes to start
+    """Rates (F, N) at the beginning of each sample; left (F,): share of the distance to the target after a sample."""
+    from scipy.signal import lfilter  # slow to import, and not needed by a live node
 
     before = np.zeros(targets.shape)
     if np.allclose(left, left[0], rtol=1e-9, atol=0.0):
@@ -45,7 +45,7 @@ def _reached(left: Array, targets: Array) -> Array:
 
 @effects.register("motor_dead_band")
 class MotorDeadBand(ActuatorEffect):
-    """Targets below a threshold do not move a wheel, and larger ones lose as much."""
+    """Targets below a threshold do not move a wheel, and larger ones are reduced by it."""
 
     physics = "Static friction takes a part of what drives the motor."
     source = "H. Olsson et al., Friction models and friction compensation, 1998"

@@ -1,4 +1,4 @@
-"""What friction takes off a wheel, whatever its rate: dead zone and creep."""
+"""Losses by friction that do not depend on the wheel's rate: dead zone and creep."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
 from omnibench.robot.kinematics import Array
 from omnibench.robot.signals import Signals
 
-_KNEE = 0.05  # rad/s, over which the sign of a wheel rate changes
+_KNEE = 0.05  # rad/s, half-width of the smoothed sign function; chosen
 
 
 def _smooth_sign(rates: Array) -> Array:
+    """Sign of wheel rates, smoothed near 0."""
     return np.tanh(rates / _KNEE)
 
 

@@ -1,4 +1,4 @@
-"""Motion that no wheel rate tells of: drifts while the robot drives, at its start, and across the floor."""
+"""Drift: motion that the wheel rates do not show, while driving, at the start of a run, or relative to the floor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from omnibench.robot.signals import STILL, Signals
 
 
 def _driving(rates: Array) -> NDArray[np.bool_]:
-    """Where a wheel turns (F,)."""
+    """True for samples (F,) in which a wheel turns."""
     driving: NDArray[np.bool_] = np.abs(rates).max(axis=1) > STILL
     return driving
 

@@ -1,4 +1,4 @@
-"""What an effect is: a named correction of the odometry model, with its physics and the range that is plausible."""
+"""The interface of effects: named corrections of the odometry model, with their physics and plausible ranges."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ Values = Mapping[str, float]
 class Parameter:
     """A parameter of an effect.
 
-    low, high: its plausible range, in ``unit``; a fitted value may lie outside. choices: values to try, for a parameter
-    that shapes the correction (a number of rollers, a length); the correction is linear in all others and vanishes
-    where they are 0.
+    low, high: plausible range, in ``unit``; a fitted value may lie outside. choices: values to try, for a parameter in
+    which the correction is not linear (a number of rollers, a length). The correction is linear in all other parameters
+    and vanishes where they are 0.
     """
 
     name: str
@@ -41,11 +41,11 @@ class Parameter:
 class Effect(ABC):
     """A term that can be added to the odometry model. Derive from one of the three kinds below.
 
-    stage: where it acts. physics: a sentence on why it happens. source: where it is described. shows_in: the covariate
-    over which the residual shows it. needs: what must have been recorded. run_nuisance: one value for each run, which
-    is estimated and reported and is never an answer. measurement: what would tell it, where a matrix absorbs it.
-    fixed_parameters: for an effect that has the same for every robot; else override ``parameters``. in_catalogue: it is
-    a name for what is missing; else it is a shape without physics, never tried as a name.
+    stage: where it acts. physics: a sentence on its cause. source: literature. shows_in: the covariate on which the
+    residual depends. needs: data that must have been recorded. run_nuisance: True if it has one value for each run,
+    which is estimated and reported but is no answer of ``discover``. measurement: how to measure it, for an effect that
+    a change of the matrix can absorb. fixed_parameters: parameters that are the same for every robot; otherwise
+    override ``parameters``. in_catalogue: False for a smooth function without physics, which ``discover`` never names.
     """
 
     name: ClassVar[str]
@@ -63,11 +63,11 @@ class Effect(ABC):
         self.options = options or Options()
 
     def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """The parameters for a robot; sessions: in their order, of the recordings that are fitted."""
+        """The parameters for a robot; sessions: names, in order, of the sessions that are fitted."""
         return self.fixed_parameters
 
     def accepts(self, parameter: str) -> bool:  # noqa: ARG002
-        """Whether a parameter may be given that ``parameters`` does not list: one of a session that is not known."""
+        """True for a parameter that ``parameters`` does not list but that is valid: one of an unknown session."""
         return False
 
 
@@ -76,7 +76,7 @@ class MotionEffect(Effect):
 
     @abstractmethod
     def correction(self, signals: Signals, values: Values) -> Array:
-        """What is to be added, for every sample by itself (no memory beyond the signals).
+        """The correction that is added, for every sample by itself (no memory beyond the signals).
 
         Stage wheel or clock: to the wheel rates, (F, N) rad/s. Body: to the twist, (F, 3) m/s, m/s, rad/s. World: to
         the velocity in the reference's frame, (F, 2) m/s. Corrections of several effects add up.
@@ -84,20 +84,20 @@ class MotionEffect(Effect):
 
 
 class ReferenceEffect(Effect):
-    """An effect of stage reference: what the reference reports of the robot's pose. It acts on no odometry."""
+    """An effect of stage reference: it changes the poses that the reference reports, not the odometry."""
 
     stage: ClassVar[Stage] = "reference"
 
     def delays(self, stamps: Array, values: Values) -> tuple[Array, Array]:  # noqa: ARG002
-        """By how much earlier than their stamps (K,) position and heading were taken: two of (K,), s."""
+        """Delays (K,) of position and of heading, s: how much earlier than their stamps (K,) they were measured."""
         return 0 * stamps, 0 * stamps
 
     def reported(self, poses: Array, start: Array, values: Values) -> Array:  # noqa: ARG002
-        """What the reference reports of true poses (K, 3), start: the run's true start pose (3,)."""
+        """Poses (K, 3) that the reference reports for true poses (K, 3); start (3,): the run's true start pose."""
         return poses
 
     def corrected(self, poses: Array, start: Array, values: Values) -> Array:  # noqa: ARG002
-        """The inverse of ``reported``."""
+        """True poses (K, 3) for reported ones: the inverse of ``reported``."""
         return poses
 
 
@@ -108,7 +108,7 @@ class ActuatorEffect(Effect):
 
     @abstractmethod
     def driven(self, durations: Array, targets: Array, values: Values) -> Array:
-        """Mean wheel rates (F, N) that the motors reach for targets (F, N), rad/s, from rest; durations (F,) s."""
+        """Mean wheel rates (F, N) under targets (F, N), rad/s, from rest; durations (F,): of the samples, s."""
 
 
 effects.contract = Effect

@@ -1,4 +1,4 @@
-"""Parameters that every wheel has for itself: a prefix with the wheel's name behind it."""
+"""Parameters with one value for each wheel, named by a prefix and the wheel's name."""
 
 from __future__ import annotations
 
@@ -18,5 +18,5 @@ def one_for_each_wheel(
 
 
 def of_wheels(robot: Robot, prefix: str, values: Values) -> Array:
-    """Their values (N,)."""
+    """The values (N,) of the parameters ``prefix_<wheel>``."""
     return np.array([values[f"{prefix}_{name}"] for name in robot.wheel_names])

@@ -1,4 +1,4 @@
-"""Wheel radii that are not one constant: by wheel rate, direction, time in the session, session."""
+"""Wheel radii that vary: with wheel rate, direction, time in the session, or from session to session."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ThermalRadiusDrift(MotionEffect):
     source = "first principles"
     shows_in = "order of runs"
     needs = frozenset({"session_time"})
-    # 2 % within 1000 s; sessions that last for hours see less of a rate.
+    # 2 % within 1000 s; over hours the drift levels off, and its mean rate is smaller.
     fixed_parameters = (Parameter("k", "1/s", -2e-5, 2e-5, "relative change of the radius per second of the session"),)
 
     def correction(self, signals: Signals, values: Values) -> Array:
@@ -82,5 +82,5 @@ class TyreWear(MotionEffect):
         return parameter.startswith(_RADIUS_OF)
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        """None in a session of which no radius is known."""
+        """The correction; zero in a session without a radius of its own."""
         return values.get(f"{_RADIUS_OF}{signals.session}", 0.0) * signals.rates

@@ -1,4 +1,4 @@
-"""When the reference takes its poses: offsets, latencies and the drift of its clock."""
+"""Timing of the reference: offset, latency and drift of its clock."""
 
 from __future__ import annotations
 

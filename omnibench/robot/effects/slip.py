@@ -1,4 +1,4 @@
-"""Slip in proportion to what the floor has to hold: accelerations, and turning while driving."""
+"""Slip in proportion to forces: from accelerations, and from turning while driving."""
 
 from __future__ import annotations
 

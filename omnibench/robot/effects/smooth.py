@@ -1,8 +1,8 @@
-"""Smooth functions of a covariate, for what has no name: changes of the motion along the way, across it and in turning.
+"""Smooth functions of a covariate for unknown effects: changes of the motion along, across and in turning.
 
-They say how a robot errs and not why, and are never tried as names. A change in turning is counted per way of the
-wheels, so that a robot that stands is never changed. Beyond what was seen no function is extrapolated: each holds its
-value at the edge or fades to zero.
+They describe an error without its cause, and are never proposed as names. A change in turning is proportional to the
+distance that the wheels move, so that a standing robot is never changed. No function extrapolates beyond the data: each
+is constant there or fades to zero.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from omnibench.robot.signals import Signals
 NO_PHYSICS = "None: a function that was fitted to what the model left, without a cause."
 NO_SOURCE = "fitted to data"
 SURFACES = ("x", "y", "xx", "xy", "yy", "xxx", "xxy", "xyy", "yyy")
-_LARGEST = 0.1  # of a share
-_SLOW = 1e-3  # m/s
+_LARGEST = 0.1  # plausible size of a coefficient, a share of the motion; chosen
+_SLOW = 1e-3  # m/s, below which the direction of travel is ill-defined; chosen
 _MODES = {
     "along": "along the way",
     "across": "across the way, to the left",
@@ -33,12 +33,12 @@ _MODES = {
 
 
 def scale(name: str, unit: str, low: float, high: float, usual: float, description: str) -> Parameter:
-    """A parameter that says where a function begins and ends."""
+    """A parameter that sets the range of a function; usual: the value to try."""
     return Parameter(name, unit, low, high, description, choices=(usual,))
 
 
 def shared(modes: Sequence[str], labels: Sequence[str], of_what: str) -> tuple[Parameter, ...]:
-    """Coefficients ``mode_label``, all of them shares of the motion."""
+    """Coefficients ``<mode>_<label>``, each a share of the motion."""
     return tuple(
         Parameter(f"{mode}_{label}", "1", -_LARGEST, _LARGEST, f"change {_MODES[mode]}, with {label} of {of_what}")
         for mode in modes
@@ -47,7 +47,7 @@ def shared(modes: Sequence[str], labels: Sequence[str], of_what: str) -> tuple[P
 
 
 def direction(mode: str, signals: Signals) -> Array:
-    """The change of the twist (F, 3) that a share of 1 is."""
+    """The change of the twist (F, 3) by a mode at a share of 1."""
     twists = signals.twists
     changes = np.zeros(twists.shape)
     if mode == "along":
@@ -62,29 +62,29 @@ def direction(mode: str, signals: Signals) -> Array:
 
 
 def lever(robot: Robot) -> float:
-    """Mean distance of the wheels, m: what turning is compared with driving by."""
+    """Mean lever arm of the wheels, m, which converts turning to speed at the wheels."""
     return float(np.mean([wheel.distance for wheel in robot.wheels]))
 
 
 def waves(angle: Array, harmonics: Sequence[float]) -> Array:
-    """Cosine and sine (F, 2 m) of multiples of an angle (F,)."""
-    return np.concatenate([[np.cos(each * angle), np.sin(each * angle)] for each in harmonics]).T
+    """Cosines and sines (F, 2 m) of m multiples of an angle (F,)."""
+    return np.concatenate([[np.cos(multiple * angle), np.sin(multiple * angle)] for multiple in harmonics]).T
 
 
 def surfaces(inside: Array) -> Array:
-    """The nine polynomials (F, 9) of degree 1 to 3 in the plane, of places (F, 2)."""
+    """The nine monomials (F, 9) of degree 1 to 3 in x and y of points (F, 2)."""
     x, y = inside.T
     return np.column_stack([x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3])
 
 
 def inside_of(places: Array, values: Values) -> Array:
-    """Places (F, 2) from the centre in units of the reach; those beyond are moved to the edge of that circle."""
+    """Positions (F, 2) relative to the centre, in units of the reach; those beyond 1 are moved to the unit circle."""
     away = (places - [values["centre_x"], values["centre_y"]]) / values["reach"]
     return away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1.0)
 
 
 def bump(places: Array, values: Values) -> Array:
-    """A Gaussian bell (F, 1) about the centre, of places (F, 2)."""
+    """A Gaussian function (F, 1) of positions (F, 2), with value 1 at the centre."""
     away = (places - [values["centre_x"], values["centre_y"]]) / values["radius"]
     return np.exp(-np.square(away).sum(axis=1, keepdims=True))
 
@@ -101,7 +101,7 @@ PATCH = (
 
 
 class SmoothEffect(MotionEffect):
-    """Shares of the motion that vary with a covariate: sums of ``labels`` functions, for each of the ``modes``."""
+    """Changes of the motion that depend on a covariate: for each of ``modes`` a sum of the ``labels`` functions."""
 
     stage = "body"
     physics = NO_PHYSICS
@@ -112,7 +112,7 @@ class SmoothEffect(MotionEffect):
 
     @abstractmethod
     def shares(self, signals: Signals, values: Values) -> Array:
-        """The functions (F, J)."""
+        """Values (F, J) of the J functions."""
 
     def correction(self, signals: Signals, values: Values) -> Array:
         shares, added = self.shares(signals, values), np.zeros(signals.twists.shape)
@@ -128,7 +128,7 @@ _TIMES = tuple(str(order) for order in range(16))
 
 @effects.register("smooth_elapsed_time")
 class SmoothElapsedTime(SmoothEffect):
-    """Without a name: cosines of the time since the start of a run; after the longest run seen the value is held."""
+    """Unknown effect: cosines of the time since the start of a run; after the longest run seen the value is held."""
 
     shows_in = "elapsed time"
     labels = _TIMES
@@ -147,7 +147,7 @@ _TURNS = ("cos1", "sin1", "cos2", "sin2", "cos3", "sin3")
 
 @effects.register("smooth_heading")
 class SmoothHeading(SmoothEffect):
-    """Without a name: the first three harmonics of the robot's heading."""
+    """Unknown effect: the first three harmonics of the robot's heading."""
 
     shows_in = "heading"
     needs = frozenset({"poses"})
@@ -161,7 +161,7 @@ class SmoothHeading(SmoothEffect):
 
 @effects.register("smooth_course")
 class SmoothCourse(SmoothEffect):
-    """Without a name: a steady push along the way in the world, and two harmonics of the direction of travel there.
+    """Unknown effect: a steady push along the way in the world, and two harmonics of the direction of travel there.
 
     The harmonics fade to zero below 1 mm/s, where there is no direction of travel.
     """
@@ -193,7 +193,7 @@ class SmoothCourse(SmoothEffect):
 
 @effects.register("smooth_place")
 class SmoothPlace(SmoothEffect):
-    """Without a name: polynomials of degree 3 in the place on the floor; beyond the places seen the value is held."""
+    """Unknown effect: polynomials of degree 3 in the place on the floor; beyond the places seen the value is held."""
 
     shows_in = "place"
     needs = frozenset({"poses"})
@@ -207,7 +207,7 @@ class SmoothPlace(SmoothEffect):
 
 @effects.register("smooth_patch")
 class SmoothPatch(SmoothEffect):
-    """Without a name: a round patch of the floor, outside of which the change fades to zero."""
+    """Unknown effect: a round patch of the floor, outside of which the change fades to zero."""
 
     shows_in = "place"
     needs = frozenset({"poses"})
@@ -221,7 +221,7 @@ class SmoothPatch(SmoothEffect):
 
 @effects.register("smooth_command")
 class SmoothCommand(SmoothEffect):
-    """Without a name: motions near one, by direction of travel and turning; for all others the change fades to zero."""
+    """Unknown effect: motions near one, by direction of travel and turning; for all others the change fades to zero."""
 
     shows_in = "command"
     labels = ("bump",)
@@ -241,7 +241,7 @@ class SmoothCommand(SmoothEffect):
 
 @effects.register("smooth_order_of_runs")
 class SmoothOrderOfRuns(SmoothEffect):
-    """Without a name: polynomials of the time since the session's start; after the longest seen the value is held."""
+    """Unknown effect: polynomials of the time since the session's start; after the longest seen the value is held."""
 
     shows_in = "order of runs"
     needs = frozenset({"session_time"})

@@ -1,4 +1,4 @@
-"""Smooth functions of where and when the reference is read, for what has no name. They act on no odometry."""
+"""Smooth functions of position and time for unknown errors of the reference. They do not act on odometry."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from omnibench.robot.effects.smooth import (
 from omnibench.robot.kinematics import Array
 
 _AXES = {"x": "m", "y": "m", "theta": "rad"}
-_ROUNDS = 200
-_SAME = 1e-13  # m, rad
+_ROUNDS = 200  # of the fixed-point iteration that inverts a map; chosen
+_SAME = 1e-13  # m, rad: a smaller change ends the iteration
 
 
 class BentMap(ReferenceEffect):
-    """Poses are reported beside, by functions of the place; at the run's start they agree.
+    """A distorted map: reported poses are shifted by functions of the position, relative to the run's start.
 
-    ``corrected`` supposes that the map is not folded.
+    ``corrected`` assumes that the map is invertible.
     """
 
     physics = NO_PHYSICS
@@ -43,7 +43,7 @@ class BentMap(ReferenceEffect):
 
     @abstractmethod
     def functions(self, places: Array, values: Values) -> Array:
-        """Of places (K, 2), m: (K, J)."""
+        """Values (K, J) of the J functions at positions (K, 2), m."""
 
     def reported(self, poses: Array, start: Array, values: Values) -> Array:
         return poses + self._shift(poses, start, values)
@@ -57,7 +57,7 @@ class BentMap(ReferenceEffect):
         return true
 
     def _shift(self, poses: Array, start: Array, values: Values) -> Array:
-        """By how much poses (K, 3) are reported beside, more than the start is."""
+        """Shift (K, 3) of reported poses relative to the shift of the start, m, m, rad."""
         factors = np.array([[values[f"{axis}_{label}"] for label in self.labels] for axis in _AXES])
         there = self.functions(poses[:, :2], values) - self.functions(start[None, :2], values)
         shift: Array = there @ factors.T
@@ -65,7 +65,7 @@ class BentMap(ReferenceEffect):
 
 
 def _shifts(labels: Sequence[str]) -> tuple[Parameter, ...]:
-    """Coefficients ``axis_label``."""
+    """Coefficients ``<axis>_<label>``."""
     return tuple(
         Parameter(f"{axis}_{label}", unit, -0.01, 0.01, f"shift of {axis}, with {label} of the place")
         for axis, unit in _AXES.items()
@@ -75,7 +75,7 @@ def _shifts(labels: Sequence[str]) -> tuple[Parameter, ...]:
 
 @effects.register("smooth_map")
 class SmoothMap(BentMap):
-    """Without a name: a bent map, by polynomials of degree 3 in the place; beyond the places seen the value is held."""
+    """Unknown effect: a bent map, by polynomials of degree 3 in the place; beyond the places seen the value is held."""
 
     labels = SURFACES
     fixed_parameters = (*_shifts(SURFACES), *AREA)
@@ -86,7 +86,7 @@ class SmoothMap(BentMap):
 
 @effects.register("smooth_map_patch")
 class SmoothMapPatch(BentMap):
-    """Without a name: a round patch of the map that is shifted, outside of which the shift fades to zero."""
+    """Unknown effect: a round patch of the map that is shifted, outside of which the shift fades to zero."""
 
     labels = ("bump",)
     fixed_parameters = (*_shifts(labels), *PATCH)
@@ -97,7 +97,7 @@ class SmoothMapPatch(BentMap):
 
 @effects.register("smooth_stamps")
 class SmoothStamps(ReferenceEffect):
-    """Without a name: delays that grow with the stamp, up to the last one seen, and that alternate."""
+    """Unknown effect: delays that grow with the stamp, up to the last one seen, and that alternate."""
 
     physics = NO_PHYSICS
     source = NO_SOURCE
@@ -128,7 +128,7 @@ class SmoothStamps(ReferenceEffect):
 
 @effects.register("smooth_stamp_wave")
 class SmoothStampWave(ReferenceEffect):
-    """Without a name: a delay of the poses that swings with their stamps, at one frequency."""
+    """Unknown effect: a delay of the poses that swings with their stamps, at one frequency."""
 
     physics = NO_PHYSICS
     source = NO_SOURCE

@@ -1,4 +1,4 @@
-"""Smooth functions of what wheels do, for what has no name: of their rates, their angles and the acceleration."""
+"""Smooth functions of wheel rates, wheel angles and acceleration, for unknown effects."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from omnibench.robot.effects.wheel_angle import ripple
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import STILL, Signals
 
-KNOTS = 8  # of each wheel's rate
-_COMMON_KNOTS = 33
-HARMONICS = (0.5, *(float(number) for number in range(1, 17)), 1.5, 2.5, 3.5)  # of a wheel's turn
+KNOTS = 8  # of the function of each wheel's rate; chosen
+_COMMON_KNOTS = 33  # of the function that all wheels share; chosen
+HARMONICS = (0.5, *(float(number) for number in range(1, 17)), 1.5, 2.5, 3.5)  # waves in a turn of a wheel; chosen
 
 _TOP = scale("top", "rad/s", 1e-6, 1e6, 6.0, "the fastest rate that was seen; knots are spread from -top to top")
 
 
-def tents(rates: Array, top: float) -> Array:
-    """Piecewise linear functions (..., 8) of rates between -top and top, rad/s, the outermost held beyond.
+def hat_functions(rates: Array, top: float) -> Array:
+    """Piecewise linear hat functions (..., 8) of rates between -top and top, rad/s, constant beyond.
 
-    Zero for wheels that stand.
+    Zero for standing wheels.
     """
     return np.stack([_between_knots(rates, top, heights) for heights in np.eye(KNOTS)], axis=-1)
 
 
 def _between_knots(rates: Array, top: float, heights: Array) -> Array:
-    """The sum (...) of such functions, as many as there are heights."""
-    found: Array = np.interp(rates, np.linspace(-top, top, len(heights)), heights)
-    return np.where(np.abs(rates) > STILL, found, 0.0)
+    """The piecewise linear function (...) of rates with given heights at the knots; zero for standing wheels."""
+    interpolated: Array = np.interp(rates, np.linspace(-top, top, len(heights)), heights)
+    return np.where(np.abs(rates) > STILL, interpolated, 0.0)
 
 
 @effects.register("smooth_wheel_rate")
 class SmoothWheelRate(MotionEffect):
-    """Without a name: a piecewise linear function of each wheel's rate, which holds its value beyond the rates seen."""
+    """Unknown effect: a piecewise linear function of each wheel's rate, which holds its value beyond the rates seen."""
 
     stage = "wheel"
     physics = NO_PHYSICS
@@ -48,17 +48,17 @@ class SmoothWheelRate(MotionEffect):
             one_for_each_wheel(robot, f"change_{knot}", "rad/s", -0.02, 0.02, f"change at knot {knot} of 0 to 7")
             for knot in range(KNOTS)
         ]
-        return (*(each for knot in at_knots for each in knot), _TOP)
+        return (*(parameter for knot in at_knots for parameter in knot), _TOP)
 
     def correction(self, signals: Signals, values: Values) -> Array:
         heights = np.array([of_wheels(signals.robot, f"change_{knot}", values) for knot in range(KNOTS)])
-        each = zip(signals.rates.T, heights.T, strict=True)
-        return np.column_stack([_between_knots(rates, values["top"], own) for rates, own in each])
+        wheels = zip(signals.rates.T, heights.T, strict=True)
+        return np.column_stack([_between_knots(rates, values["top"], at_knots) for rates, at_knots in wheels])
 
 
 @effects.register("smooth_common_rate")
 class SmoothCommonRate(MotionEffect):
-    """Without a name: a finer function of the wheel rate, the same for all wheels, held beyond the rates seen."""
+    """Unknown effect: a finer function of the wheel rate, the same for all wheels, held beyond the rates seen."""
 
     stage = "wheel"
     physics = NO_PHYSICS
@@ -80,7 +80,7 @@ class SmoothCommonRate(MotionEffect):
 
 @effects.register("smooth_wheel_angle")
 class SmoothWheelAngle(MotionEffect):
-    """Without a name: a wave of each wheel's angle, so many times a turn."""
+    """Unknown effect: a wave of each wheel's angle, so many times a turn."""
 
     stage = "wheel"
     physics = NO_PHYSICS
@@ -100,7 +100,7 @@ class SmoothWheelAngle(MotionEffect):
         return ripple(signals, values["harmonic"], values)
 
 
-_OF_ACCELERATION = (  # in the order of the functions below
+_OF_ACCELERATION = (
     Parameter("straight", "s", -0.1, 0.1, "change of the velocity, of the acceleration"),
     Parameter("aside", "s", -0.1, 0.1, "change of the velocity to the left of the acceleration, of its size"),
     Parameter("about_x", "rad s/m", -0.1, 0.1, "change of the rate of turn, of the acceleration forwards"),
@@ -116,7 +116,7 @@ _OF_ACCELERATION = (  # in the order of the functions below
 
 @effects.register("smooth_acceleration")
 class SmoothAcceleration(MotionEffect):
-    """Without a name: changes that grow with the acceleration, up to the largest that was seen, and then no more."""
+    """Unknown effect: changes that grow with the acceleration, up to the largest that was seen, and then no more."""
 
     stage = "body"
     physics = NO_PHYSICS
@@ -132,15 +132,15 @@ class SmoothAcceleration(MotionEffect):
     def correction(self, signals: Signals, values: Values) -> Array:
         forward, left, angular = signals.accelerations.T
         size = np.hypot(forward, left)
-        held = np.minimum(1.0, values["top"] / np.maximum(size, 1e-300))
-        forward, left, size = held * forward, held * left, held * size
+        limit = np.minimum(1.0, values["top"] / np.maximum(size, 1e-300))
+        forward, left, size = limit * forward, limit * left, limit * size
         angular = np.clip(angular, -values["top_turning"], values["top_turning"])
-        nothing, own = np.zeros(len(size)), {each.name: values[each.name] for each in _OF_ACCELERATION}
-        turning = own["about_x"] * forward + own["about_y"] * left + own["about_omega"] * angular
-        turning = turning + own["about_size"] * size + own["about_turning"] * np.abs(angular)
-        added = own["straight"] * np.column_stack([forward, left, nothing])
-        added += own["aside"] * np.column_stack([-left, forward, nothing])
+        zeros = np.zeros(len(size))
+        turning = values["about_x"] * forward + values["about_y"] * left + values["about_omega"] * angular
+        turning = turning + values["about_size"] * size + values["about_turning"] * np.abs(angular)
+        added = values["straight"] * np.column_stack([forward, left, zeros])
+        added += values["aside"] * np.column_stack([-left, forward, zeros])
         added[:, 2] += turning
         for mode in ("along", "across", "rotation"):
-            added += own[mode] * size[:, None] * direction(mode, signals)
+            added += values[mode] * size[:, None] * direction(mode, signals)
         return added

@@ -13,7 +13,7 @@ from omnibench.registry import effects
 from omnibench.robot.effects.effect import Effect, Parameter, Values
 from omnibench.robot.kinematics import Robot
 
-_FAR_OUTSIDE = 1e3  # times the plausible range
+_FAR_OUTSIDE = 1e3  # multiple of the plausible range beyond which a value is refused; chosen
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -37,27 +37,26 @@ def make_term(
     *,
     sessions: tuple[str, ...] = (),
 ) -> Term:
-    """The effect called ``name`` with its parameters for a robot, in the order in which they are given.
+    """The effect called ``name`` with values of its parameters for a robot, in the given order.
 
-    UnknownNameError: no such effect, or no such parameter of it. DataError: a parameter is missing, is no finite
-    number, is a thousand times as large as is plausible, or shapes the correction and lies outside its range.
-    Messages begin with ``where``.
+    UnknownNameError: no such effect, or no such parameter. DataError: a parameter is missing, is no finite number, is a
+    thousand times larger than plausible, or has ``choices`` and lies outside its range. Messages begin with ``where``.
     """
     effect = effects.create(name, where=where)
-    place = f"{where}: effect {name!r}" if where else f"effect {name!r}"
+    prefix = f"{where}: effect {name!r}" if where else f"effect {name!r}"
     known = {parameter.name: parameter for parameter in effect.parameters(robot, sessions)}
     for given, value in parameters.items():
         if given not in known and not effect.accepts(given):
-            raise UnknownNameError("parameter", given, known, place)
+            raise UnknownNameError("parameter", given, known, prefix)
         if not _is_number(value) or not math.isfinite(value):
-            raise DataError(f"{place}: parameter {given!r} is {value!r}, not a finite number")
+            raise DataError(f"{prefix}: parameter {given!r} is {value!r}, not a finite number")
         low, high = _limits(known.get(given))
         if not low <= value <= high:
-            raise DataError(f"{place}: parameter {given!r} is {value:g}, not within {low:g} and {high:g}")
+            raise DataError(f"{prefix}: parameter {given!r} is {value:g}, not within {low:g} and {high:g}")
     for parameter in known.values():
         if parameter.name not in parameters:
             raise DataError(
-                f"{place}: parameter {parameter.name!r} ({parameter.unit}) is missing; {parameter.description}"
+                f"{prefix}: parameter {parameter.name!r} ({parameter.unit}) is missing; {parameter.description}"
             )
     return Term(effect, MappingProxyType({given: float(value) for given, value in parameters.items()}))
 
@@ -67,7 +66,7 @@ def _is_number(value: object) -> bool:
 
 
 def _limits(parameter: Parameter | None) -> tuple[float, float]:
-    """Between which a value can be at all; None: of a parameter that is accepted without being known."""
+    """Lowest and highest allowed value; None: a parameter that is accepted but not listed."""
     if parameter is None:
         return -_FAR_OUTSIDE, _FAR_OUTSIDE
     if parameter.choices:

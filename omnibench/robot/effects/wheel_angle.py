@@ -1,4 +1,4 @@
-"""What repeats with every turn of a wheel: its eccentricity, and the ripple of its rollers."""
+"""Periodic changes of a wheel's radius over a turn: eccentricity, and the ripple of rollers."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from omnibench.robot.signals import Signals
 
 
 def ripple(signals: Signals, harmonic: float, values: Values) -> Array:
-    """The mean of omega (a cos(n phi) + b sin(n phi)) over each sample, phi turning at the constant rate omega.
+    """Mean of omega (a cos(n phi) + b sin(n phi)) over each sample (F, N), phi turning at the constant rate omega.
 
-    Of the phase n phi in the middle of a sample of duration d, it is (a cos + b sin) 2 sin(n omega d / 2) / (n d).
+    With phi in the middle of a sample of duration d it is (a cos(n phi) + b sin(n phi)) 2 sin(n omega d / 2) / (n d).
+    harmonic: n. values: a_<wheel> and b_<wheel>.
     """
     assert signals.wheel_angles is not None  # they are needed
     if len(signals.rates) == 1:
@@ -33,7 +34,7 @@ def ripple(signals: Signals, harmonic: float, values: Values) -> Array:
 
 
 def _ripple_of_one_sample(signals: Signals, angles: Array, harmonic: float, values: Values) -> Array:
-    """The same in Python's own floats, for a stream: three numbers are no work for NumPy."""
+    """``ripple`` of one sample in Python floats, which are faster than NumPy for a few wheels in a stream."""
     half = harmonic / 2 * float(signals.durations[0])
     samples = zip(signals.robot.wheels, signals.rates[0].tolist(), angles[0].tolist(), strict=True)
     added = []

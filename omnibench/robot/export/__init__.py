@@ -1,1 +1,1 @@
-"""Calibrations for other software, one format a file."""
+"""Export of calibrations to other software, one format in each file."""

@@ -1,4 +1,4 @@
-"""A calibration as a self-contained C99 header: the matrix and one step of the odometry."""
+"""Export of a calibration as a self-contained C99 header: the matrix and one step of the odometry."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _EULER = """\
 
 
 def c_header(calibration: Calibration, prefix: str) -> tuple[str, tuple[str, ...]]:
-    """The header's text, its identifiers beginning with ``prefix``, and warnings of what it cannot hold."""
+    """The header's text, with identifiers that begin with ``prefix``, and a warning for everything left out."""
     upper = prefix.upper()
     wheels = calibration.robot.wheel_names
     names = ", ".join(f'"{name}"' for name in wheels)
@@ -76,7 +76,7 @@ def _rows(matrix: Array) -> str:
 
 
 def _literal(value: float) -> str:
-    """A double literal that reads back to the same bits."""
+    """A C literal that is read as exactly the same double."""
     text = f"{float(value):.17g}"
     return text if any(mark in text for mark in ".e") else f"{text}.0"
 

@@ -1,4 +1,4 @@
-"""Writing a calibration for other software: parameters of a ROS 2 controller, or a C header."""
+"""Export formats of calibrations: parameters of a ROS 2 controller, or a C header."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from omnibench.robot.export.ros2_controllers import ros2_controllers
 
 @dataclass(frozen=True)
 class Export:
-    """The text of a file, what it could not hold, in words, and a name for the file."""
+    """The text of an exported file, a warning for everything left out, and a name for the file."""
 
     text: str
     warnings: tuple[str, ...]

@@ -24,12 +24,12 @@ from omnibench.errors import ConfigError
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array, Robot
 
-_SPACING_TOLERANCE = math.radians(10)
+_SPACING_TOLERANCE = math.radians(10)  # rad, largest deviation from equal spacing; chosen
 
 
 @dataclass(frozen=True)
 class OmniWheelDrive:
-    """The controller's parameters: order of the wheels (indices), m, m, rad."""
+    """The controller's parameters: order of the wheels (indices), radii in m, offset in rad."""
 
     order: tuple[int, ...]
     robot_radius: float
@@ -50,7 +50,7 @@ class OmniWheelDrive:
 
 @dataclass(frozen=True)
 class RemainingError:
-    """What a matrix gets wrong against another: worst direction of straight driving, and turning on the spot."""
+    """Odometry error of a matrix against another, in the worst direction of straight driving and on the spot."""
 
     straight_position: float  # m per m
     straight_heading: float  # rad per m
@@ -68,8 +68,8 @@ class RemainingError:
 def closest_omni_wheel_drive(robot: Robot, matrix: Array) -> OmniWheelDrive:
     """The parameters whose matrix is closest to ``matrix`` (3, N) in the sum of squares of each row.
 
-    Raises ConfigError when the robot is none that the controller can describe: wheels with slanted rollers, wheels
-    farther than 10 degrees from equal spacing, or a matrix that turns it clockwise.
+    Raises ConfigError for a robot that the controller cannot describe: wheels with slanted rollers, wheels farther than
+    10 degrees from equal spacing, or a matrix that turns the robot clockwise.
     """
     order = _counter_clockwise(robot)
     count = len(order)
@@ -83,7 +83,7 @@ def closest_omni_wheel_drive(robot: Robot, matrix: Array) -> OmniWheelDrive:
 
 
 def remaining_error(used: Array, true: Array) -> RemainingError:
-    """What odometry with the matrix ``used`` (3, N) gets wrong on a robot whose matrix is ``true`` (3, N)."""
+    """Error of odometry with the matrix ``used`` (3, N) on a robot whose matrix is ``true`` (3, N)."""
     error = used @ np.linalg.pinv(true) - np.eye(3)
     return RemainingError(
         float(np.linalg.norm(error[:2, :2], 2)),
@@ -94,7 +94,7 @@ def remaining_error(used: Array, true: Array) -> RemainingError:
 
 
 def ros2_controllers(calibration: Calibration) -> tuple[str, tuple[str, ...]]:
-    """The controller's parameters as YAML, and warnings of what they cannot hold. ConfigError: not such a robot."""
+    """The controller's parameters as YAML, and warnings of their errors. ConfigError: another kind of robot."""
     robot, matrix = calibration.robot, calibration.matrix_array
     fitted = closest_omni_wheel_drive(robot, matrix)
     design = closest_omni_wheel_drive(robot, robot.inverse_kinematic_matrix)
@@ -152,7 +152,7 @@ def _counter_clockwise(robot: Robot) -> tuple[int, ...]:
         )
     angles = np.array([wheel.angle for wheel in robot.wheels])
     turned = np.mod(angles - angles[0], 2 * np.pi)
-    # Rounding may put the first wheel, or one at its angle, at a full turn.
+    # By rounding, the first wheel or one at the same angle may be a full turn away.
     turned[np.isclose(turned, 2 * np.pi)] = 0.0
     order = np.argsort(turned, kind="stable")
     slots = 2 * np.pi * np.arange(len(order)) / len(order)
