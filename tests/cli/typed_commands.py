@@ -25,8 +25,8 @@ def commands_in(markdown: str) -> list[str]:
 def parse(command: str) -> None:
     """Parse a command. Click's UsageError when a command, an option or an argument of it does not exist."""
     _, *arguments = shlex.split(command, comments=True)
-    if arguments in (["--help"], ["--version"]):
-        return
+    if len(arguments) == 1 and any(arguments[0] in option.opts for option in _APP.params):
+        return  # --version
     group, name, context = _APP, "omnibench", None
     while hasattr(group, "commands"):
         context = group.context_class(group, info_name=name, parent=context)
