@@ -12,7 +12,7 @@ from omnibench.live.network.presence import alive_robots, checked_robot, nothing
 from omnibench.robot.calibration import read_calibration
 
 
-class Swapped(BaseModel):
+class SwapReply(BaseModel):
     """A node's answer. kept: whether the calibration is kept for the node's next start; reason: why not."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -23,13 +23,13 @@ class Swapped(BaseModel):
     reason: str = ""
 
 
-class _Refused(BaseModel):
+class _Refusal(BaseModel):
     """A node's answer that refuses a calibration."""
 
     error: str
 
 
-def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: float = 10.0) -> Swapped:
+def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: float = 10.0) -> SwapReply:
     """Send a calibration file to the node that runs ``robot``, and return its answer.
 
     DataError: the file is no calibration, no node answers (the message names the robots alive), or the node refuses.
@@ -39,9 +39,9 @@ def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: fl
     for reply in session.get(f"omnibench/{checked_robot(robot)}/swap", payload=payload, timeout=timeout):
         try:
             if reply.ok is not None:
-                return Swapped.model_validate_json(reply.ok.payload.to_bytes())
+                return SwapReply.model_validate_json(reply.ok.payload.to_bytes())
             if reply.err is not None and (refusal := reply.err.payload.to_bytes()) != b"Timeout":
-                raise DataError(f"robot {robot!r} refuses {file}: {_Refused.model_validate_json(refusal).error}")
+                raise DataError(f"robot {robot!r} refuses {file}: {_Refusal.model_validate_json(refusal).error}")
         except ValidationError:
             raise DataError(f"robot {robot!r}: cannot read its node's answer; is it an omnibench node?") from None
     raise DataError(nothing_received(robot, timeout, alive_robots(session)))

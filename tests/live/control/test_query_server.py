@@ -139,13 +139,13 @@ def test_a_failure_of_its_own_is_answered_in_one_line_and_logged(
 def test_more_requests_than_the_server_holds_are_refused_and_the_stream_goes_on(tmp_path: Path) -> None:
     path = drive(1.0)
     with running(config_of(tmp_path, "apr", "bob")) as (node, session):
-        heard = ReceivedMessages(session, bob__odom=ODOMETRY)
+        received = ReceivedMessages(session, bob__odom=ODOMETRY)
         wheels = session.declare_publisher("bob/joint_states")
         until(lambda: wheels.matching_status.matching, "the node's subscription")
         with node.trackers["apr"]._lock:  # the query server is held up by the first
             waiting = [session.get("omnibench/apr/health", timeout=20.0) for _ in range(100)]
             sent(wheels, path.samples())
-            until(lambda: len(heard["bob__odom"]) == 101, "the odometry")
+            until(lambda: len(received["bob__odom"]) == 101, "the odometry")
         replies = [reply for each in waiting for reply in each]
     refused = [json.loads(reply.err.payload.to_bytes())["error"] for reply in replies if reply.err is not None]
     assert len(replies) == 100
@@ -156,16 +156,16 @@ def test_more_requests_than_the_server_holds_are_refused_and_the_stream_goes_on(
 def test_a_calibration_that_is_put_runs_from_the_next_sample_on_and_odom_does_not_jump(tmp_path: Path) -> None:
     path, other = drive(1.0), calibration(scale=1.2)
     with running(config_of(tmp_path)) as (node, session):
-        heard = ReceivedMessages(session, apr__odom=ODOMETRY)
+        received = ReceivedMessages(session, apr__odom=ODOMETRY)
         wheels = session.declare_publisher("apr/joint_states")
         until(lambda: wheels.matching_status.matching, "the node's subscription")
         sent(wheels, path.samples()[:51])
-        until(lambda: len(heard["apr__odom"]) == 51, "the first half")
+        until(lambda: len(received["apr__odom"]) == 51, "the first half")
         session.put("omnibench/apr/calibration", as_text(other))
         until(lambda: node.health("apr").counts["swaps"] == 1, "the swap")
         sent(wheels, path.samples()[51:])
-        until(lambda: len(heard["apr__odom"]) == 101, "the second half")
-    poses = np.array([each.pose for each in heard["apr__odom"]])
+        until(lambda: len(received["apr__odom"]) == 101, "the second half")
+    poses = np.array([each.pose for each in received["apr__odom"]])
     steps = np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)
     before = np.linalg.norm(np.diff(path.poses[:, :2], axis=0), axis=1)
     np.testing.assert_allclose(steps[:50], before[:50], atol=1e-9)

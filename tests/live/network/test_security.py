@@ -249,25 +249,25 @@ class TestAccess:
 
     def test_a_robot_reads_what_is_its_own_only(self, fleet: RouterProcess, keys: Path) -> None:
         with open_session(member(fleet, keys, "apr02"), "apr02") as session:
-            heard: list[zenoh.Sample] = []
-            subscribers = [session.declare_subscriber(key, heard.append) for key in ("apr03/odom", "*/odom", "**")]
+            received: list[zenoh.Sample] = []
+            subscribers = [session.declare_subscriber(key, received.append) for key in ("apr03/odom", "*/odom", "**")]
             works(session, fleet)
             for key in ("apr03/odom", "*/odom", "**"):
                 fleet.until_logged(f"may not declare subscriber {key}\n")
-            assert {str(sample.key_expr).split("/")[0] for sample in heard} == {"apr02"}
+            assert {str(sample.key_expr).split("/")[0] for sample in received} == {"apr02"}
             for subscriber in subscribers:
                 subscriber.undeclare()
 
     def test_a_certificate_without_rights_can_do_nothing(self, fleet: RouterProcess, keys: Path) -> None:
         with open_session(member(fleet, keys, "stranger"), "stranger") as session:
-            heard: list[zenoh.Sample] = []
-            subscriber = session.declare_subscriber("apr02/odom", heard.append)
+            received: list[zenoh.Sample] = []
+            subscriber = session.declare_subscriber("apr02/odom", received.append)
             for _ in range(20):
                 session.put("apr02/joint_states", b"forged")
                 time.sleep(0.005)
             fleet.until_logged("may not declare subscriber apr02/odom")
             fleet.until_logged("may not write apr02/joint_states")
-            assert not heard
+            assert not received
             subscriber.undeclare()
         assert fleet.got("apr02/joint_states") == 0
 
@@ -309,21 +309,21 @@ class TestAccess:
             open_session(member(fleet, keys, "viewer"), "viewer") as viewer,
             open_session(member(fleet, keys, "apr02"), "robot") as robot,
         ):
-            heard: list[bytes] = []
+            received: list[bytes] = []
             subscriber = node.declare_subscriber(
-                "omnibench/apr07/calibration", lambda each: heard.append(bytes(each.payload))
+                "omnibench/apr07/calibration", lambda each: received.append(bytes(each.payload))
             )
 
             def again() -> bool:
                 operator.put("omnibench/apr07/calibration", b"operator")
-                return b"operator" in heard
+                return b"operator" in received
 
             until(again, "the operator's calibration")
             for session in (viewer, robot):
                 session.put("omnibench/apr07/calibration", b"forged")
             fleet.until_logged("certificate 'viewer' at")
             fleet.until_logged("certificate 'apr02' at")
-            assert set(heard) == {b"operator"}
+            assert set(received) == {b"operator"}
             subscriber.undeclare()
 
     def test_tokens_of_ros_nodes_pass(self, fleet: RouterProcess, keys: Path) -> None:
@@ -347,15 +347,15 @@ class TestAccess:
                 node, "apr07/odom", cache=CacheConfig(max_samples=1), publisher_detection=True
             )
             publisher.put(b"before")
-            heard: list[bytes] = []
+            received: list[bytes] = []
             subscriber = declare_advanced_subscriber(
                 viewer,
                 "apr07/odom",
-                lambda each: heard.append(bytes(each.payload)),
+                lambda each: received.append(bytes(each.payload)),
                 history=HistoryConfig(detect_late_publishers=True),
             )
-            until(lambda: heard, "what was published before")
-            assert heard == [b"before"]
+            until(lambda: received, "what was published before")
+            assert received == [b"before"]
             subscriber.undeclare()
             publisher.undeclare()
 

@@ -142,8 +142,8 @@ def test_clients_come_back_soon_after_the_router_was_gone(address: str) -> None:
         first.close()
         until(lambda: not (one.info.routers_zid() or two.info.routers_zid()), "the clients to notice")
         with open_session(router(address), "router"):
-            began, heard = time.monotonic(), len(samples)
-            publish_until(one, "key", lambda: len(samples) > heard)
+            began, count_before = time.monotonic(), len(samples)
+            publish_until(one, "key", lambda: len(samples) > count_before)
             assert time.monotonic() - began < 3.0  # 0.5 s; Zenoh's own settings may take 4 s
 
 

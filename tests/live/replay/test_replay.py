@@ -41,17 +41,17 @@ def played(drive: ConcatenatedDrive = DRIVE, *, noise: Noise | None = None, **ch
     return list(events(drive, config(**changes), noise=noise))
 
 
-def of(found: list[Event], topic: str) -> list[Event]:
-    return [each for each in found if each.topic == topic]
+def of(played_events: list[Event], topic: str) -> list[Event]:
+    return [each for each in played_events if each.topic == topic]
 
 
-def taken(found: list[Event]) -> Array:
+def taken(played_events: list[Event]) -> Array:
     """When the messages were taken, s of the recording."""
-    return np.array([each.message.stamp - ORIGIN for each in found]) / 1e9
+    return np.array([each.message.stamp - ORIGIN for each in played_events]) / 1e9
 
 
-def arrivals(found: list[Event]) -> Array:
-    return np.array([each.arrival for each in found])
+def arrivals(played_events: list[Event]) -> Array:
+    return np.array([each.arrival for each in played_events])
 
 
 def same(one: JointState | PoseEstimate, other: JointState | PoseEstimate) -> bool:
@@ -80,20 +80,20 @@ class TestEvents:
         self, seed: int, delay: float, jitter: float, drop: float, duplicate: float, period: float
     ) -> None:
         channel = {"delay": delay, "jitter": jitter, "drop": drop, "duplicate": duplicate}
-        found = played(seed=seed, wheels=channel, slam=channel | {"period": period})
-        assert (np.diff(arrivals(found)) >= 0).all()
-        assert (arrivals(found) - taken(found) >= delay - 1e-9).all()
+        played_events = played(seed=seed, wheels=channel, slam=channel | {"period": period})
+        assert (np.diff(arrivals(played_events)) >= 0).all()
+        assert (arrivals(played_events) - taken(played_events) >= delay - 1e-9).all()
 
     def test_without_jitter_stamps_increase_and_delays_are_as_asked(self) -> None:
-        found = played(wheels={"delay": 0.03}, slam={"delay": 0.2, "jitter": 0, "period": 0})
+        played_events = played(wheels={"delay": 0.03}, slam={"delay": 0.2, "jitter": 0, "period": 0})
         for topic, delay in (("joint_states", 0.03), ("slam_pose", 0.2)):
-            messages = of(found, topic)
+            messages = of(played_events, topic)
             assert (np.diff([each.message.stamp for each in messages]) > 0).all()
             np.testing.assert_allclose(arrivals(messages) - taken(messages), delay, atol=1e-8)
 
     def test_every_sample_and_pose_of_the_drive_is_there(self) -> None:
-        found = played(slam={"period": 0})
-        samples, poses = of(found, "joint_states"), of(found, "slam_pose")
+        played_events = played(slam={"period": 0})
+        samples, poses = of(played_events, "joint_states"), of(played_events, "slam_pose")
         poses.sort(key=lambda each: each.message.stamp)
         np.testing.assert_allclose(taken(samples), DRIVE.wheel_times, atol=1e-9)
         np.testing.assert_array_equal([each.message.positions for each in samples], DRIVE.angles)
@@ -179,19 +179,19 @@ class TestEvents:
 class TestCovariances:
     @staticmethod
     def covariances(drive: ConcatenatedDrive = DRIVE, noise: Noise | None = None, **slam: Any) -> Array:
-        found = of(played(drive, noise=noise, slam={"period": 0, "jitter": 0} | slam), "slam_pose")
-        return np.array([each.message.covariance for each in found])
+        poses = of(played(drive, noise=noise, slam={"period": 0, "jitter": 0} | slam), "slam_pose")
+        return np.array([each.message.covariance for each in poses])
 
     def test_those_of_the_data_set_come_first(self) -> None:
         recorded = np.random.default_rng(1).normal(size=(len(DRIVE.slam_times), 3, 3))
-        found = self.covariances(
+        covariances = self.covariances(
             replace(DRIVE, slam_covariances=recorded), Noise(pose_position=1), covariance={"position": 1, "heading": 1}
         )
-        np.testing.assert_array_equal(found, recorded)
+        np.testing.assert_array_equal(covariances, recorded)
 
     def test_then_those_of_the_config(self) -> None:
-        found = self.covariances(noise=Noise(pose_position=1), covariance={"position": 0.03, "heading": 0.01})
-        np.testing.assert_allclose(found, np.tile(np.diag([9e-4, 9e-4, 1e-4]), (len(found), 1, 1)))
+        covariances = self.covariances(noise=Noise(pose_position=1), covariance={"position": 0.03, "heading": 0.01})
+        np.testing.assert_allclose(covariances, np.tile(np.diag([9e-4, 9e-4, 1e-4]), (len(covariances), 1, 1)))
 
     def test_then_what_the_noise_model_makes_of_the_time_since_the_run_began(self) -> None:
         noise = Noise(
@@ -202,12 +202,12 @@ class TestCovariances:
             bias_heading=0,
             walk_heading=0.1,
         )
-        found = self.covariances(noise=noise)
+        covariances = self.covariances(noise=noise)
         since = DRIVE.slam_times - DRIVE.start_times[DRIVE.slam_run]
         assert since.max() == pytest.approx(0.8)
-        np.testing.assert_allclose(found[:, 0, 0], 0.0025 + 0.0004 * since)
-        np.testing.assert_allclose(found[:, 1, 1], found[:, 0, 0])
-        np.testing.assert_allclose(found[:, 2, 2], 0.0001 + 0.01 * since)
+        np.testing.assert_allclose(covariances[:, 0, 0], 0.0025 + 0.0004 * since)
+        np.testing.assert_allclose(covariances[:, 1, 1], covariances[:, 0, 0])
+        np.testing.assert_allclose(covariances[:, 2, 2], 0.0001 + 0.01 * since)
 
     def test_without_any_they_are_moderate_and_never_singular(self) -> None:
         np.testing.assert_allclose(self.covariances()[0], np.diag([4e-4, 4e-4, 4e-4]))

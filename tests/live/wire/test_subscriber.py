@@ -149,16 +149,16 @@ def test_a_message_that_cannot_be_decoded_is_counted_and_passed_over(
 
 
 def test_a_callback_gets_every_message(loopback: Loopback, odom: Publisher[Odometry]) -> None:
-    heard: list[int] = []
+    received: list[int] = []
     with subscribe(
-        "apr02", connect=loopback.address, lossless=True, callback=lambda message: heard.append(message.stamp)
+        "apr02", connect=loopback.address, lossless=True, callback=lambda message: received.append(message.stamp)
     ) as subscription:
         until(lambda: odom.matched, "the subscription")
         for k in range(20):
             odom.put(odometry(k))
-        until(lambda: len(heard) == 20, "all messages")
+        until(lambda: len(received) == 20, "all messages")
         assert subscription.received == 20
-    assert heard == [odometry(k).stamp for k in range(20)]
+    assert received == [odometry(k).stamp for k in range(20)]
 
 
 def test_a_callback_that_raises_is_counted_logged_once_a_kind_and_goes_on(
