@@ -76,7 +76,7 @@ def discover_effects(
     check_names(without)
     rng = np.random.default_rng(seed)
     runs = usable_runs(dataset.split("train"))
-    start = _start(dataset, calibration)
+    start = _start_matrix(dataset, calibration)
 
     progress.stage("fitting the plain matrix")
     plain = fit_matrix(runs, dataset.robot, dataset.sample_period, start)
@@ -84,7 +84,8 @@ def discover_effects(
     progress.stage("looking where it fails, and at the catalogue")
     screening = screen_plain(plain, without)
     selection = select_effects(screening, rng)
-    model = _Model(screening, selection, extend(plain, selection.chosen))
+    extended = extend(plain, selection.chosen)
+    model = _ExtendedModel(screening, selection, extended)
     if selection.tentative:
         model = _extend_by_tentative(plain, model, without, rng)
     if model.selection.chosen:
@@ -109,6 +110,11 @@ def discover_effects(
     extended = models.used
     baseline = without_effects(plain, extended)
     validation = validation_runs(dataset, extended.fit)
+    held_out = compare_held_out(baseline, extended, validation)
+    steps = waterfall_steps(plain, baseline, extended, validation.kept)
+    extrapolations = extrapolations_of(validation.kept, baseline, models.weighted)
+    detectability = detectability_of(screening, models.selection)
+
     findings = Findings(
         screening=screening,
         selection=selection,
@@ -119,17 +125,17 @@ def discover_effects(
         baseline=baseline,
         extended=extended,
         validation=validation,
-        held_out=compare_held_out(baseline, extended, validation),
-        steps=waterfall_steps(plain, baseline, extended, validation.kept),
-        extrapolations=extrapolations_of(validation.kept, baseline, models.weighted),
-        detectability=detectability_of(screening, models.selection),
+        held_out=held_out,
+        steps=steps,
+        extrapolations=extrapolations,
+        detectability=detectability,
     )
     request = Request(tuple(without), unknown_term, seed)
     return conclude(dataset, request, findings, time.monotonic() - began)
 
 
 @dataclass(frozen=True, eq=False)
-class _Model:
+class _ExtendedModel:
     """An extended model with the selection of its effects, and the screening that these were selected from."""
 
     screening: Screening
@@ -137,7 +143,9 @@ class _Model:
     extended: Extended
 
 
-def _extend_by_tentative(plain: Fit, model: _Model, without: Sequence[str], rng: np.random.Generator) -> _Model:
+def _extend_by_tentative(
+    plain: Fit, model: _ExtendedModel, without: Sequence[str], rng: np.random.Generator
+) -> _ExtendedModel:
     """Try the effects that were given up, fitted in full, and keep them if most of what they left is then explained.
 
     To first order, an effect many times as large as the noise leaves residuals that look like another effect.
@@ -146,19 +154,19 @@ def _extend_by_tentative(plain: Fit, model: _Model, without: Sequence[str], rng:
     screening = screen_extended(extended, without)
     selection = select_effects(screening, rng)
     if selection.chosen and selection.left_share < _EXPLAINED * model.selection.left_share:
-        return _Model(screening, selection, extended)
+        return _ExtendedModel(screening, selection, extended)
     return model
 
 
-def _confirm(plain: Fit, model: _Model, without: Sequence[str], rng: np.random.Generator) -> _Model:
+def _confirm(plain: Fit, model: _ExtendedModel, without: Sequence[str], rng: np.random.Generator) -> _ExtendedModel:
     """Screen and select once more with the noise of the extended model; extend anew if other effects are selected."""
     screening = screen_again(model.extended, model.screening, without)
     selection = select_effects(screening, rng)
     same = selection.is_same_as(model.selection)
-    return _Model(screening, selection, model.extended if same else extend(plain, selection.chosen))
+    return _ExtendedModel(screening, selection, model.extended if same else extend(plain, selection.chosen))
 
 
-def _start(dataset: Dataset, calibration: Calibration | None) -> Array:
+def _start_matrix(dataset: Dataset, calibration: Calibration | None) -> Array:
     """The matrix (3, N) to begin at. Raises DataError for a calibration that has effects or other wheels."""
     if calibration is None:
         return dataset.robot.inverse_kinematic_matrix

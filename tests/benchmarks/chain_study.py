@@ -65,9 +65,7 @@ def rows(variants: list[str], seeds: int) -> Iterator[dict[str, Any]]:
                 },
                 "false": false_names(found),
                 "left": [
-                    (place.covariate, place.p_value, place.within_ticks)
-                    for place in found.left
-                    if place.stage != "actuator"
+                    (each.covariate, each.p_value, each.within_ticks) for each in found.left if each.stage != "actuator"
                 ],
                 "slam_mm": 1e3 * slam_accuracy(made.dataset, made.paths).final.position_mean_m,
                 "seconds": time.monotonic() - began,

@@ -94,7 +94,7 @@ class Judgement(Model):
 def judge(discovery: Discovery, truth: Truth, seconds: float) -> Judgement:
     """Compare what is said with what is hidden. seconds: how long it took."""
     names = tuple(_name(effect, truth.names) for effect in discovery.effects)
-    where = tuple(place.covariate for place in discovery.where[:2])
+    where = tuple(dependence.covariate for dependence in discovery.where[:2])
     found = {name.name for name in names}
     said = _said(discovery, truth)
     true = _closed_in_truth(discovery, truth) if said is not None else (None, None)
