@@ -20,7 +20,7 @@ from omnibench.robot.kinematics import Robot
 
 
 def print_certificate(console: Console, certified: CertifiedCalibration) -> None:
-    """What is proven of a calibration, in words."""
+    """Print a calibration's cost, its proven lower bound and what that means."""
     certificate, proof = certified.certificate, certified.proof
     kind = "simulated data" if certified.dataset.simulated else "recorded data"
     console.print(f"{certified.dataset.name} ({kind}), training split, cost {certified.cost_name}", soft_wrap=True)
@@ -42,7 +42,7 @@ def print_certificate(console: Console, certified: CertifiedCalibration) -> None
 
 
 def print_calibration(console: Console, run: CalibrationRun) -> None:
-    """The matrix, its deviation from the design, its intervals if there are any, and how it was found."""
+    """Print the matrix beside its deviation from the design, its intervals, if any, and how the search ended."""
     calibration, result = run.calibration, run.result
     design = calibration.robot.inverse_kinematic_matrix
     simulated = calibration.provenance is not None and calibration.provenance.simulated
@@ -78,7 +78,7 @@ def _intervals(run: CalibrationRun) -> Iterator[tuple[str, ElementIntervals]]:
 
 
 def _noise_in_words(noise: Noise) -> str:
-    """Positions and headings apart, without what is zero."""
+    """White noise, random walk and bias of a run: those of positions, then those of headings."""
     kinds = (("white", ""), ("walk", "/sqrt s"), ("bias of a run", ""))
     position = (noise.pose_position, noise.walk_position, noise.bias_position)
     heading = (noise.pose_heading, noise.walk_heading, noise.bias_heading)
@@ -98,7 +98,7 @@ def _print_parameters(console: Console, robot: Robot, parameters: Sequence[Param
         factor, form = (math.degrees(1.0), "{:.3f} deg") if parameter.unit == "rad" else (1.0, "{:.5f} m")
         shown = [form.format(factor * value) for value in (start, parameter.value)]
         deviation = "design 0" if not start else f"{100 * (parameter.value / start - 1):+.2f} %"
-        interval = "not told by these data"
+        interval = "not identified by these data"
         if parameter.low is not None and parameter.high is not None:
             interval = f"{form.format(factor * parameter.low)} .. {form.format(factor * parameter.high)}"
         table.add_row(parameter.name, *shown, deviation, interval)
@@ -106,7 +106,7 @@ def _print_parameters(console: Console, robot: Robot, parameters: Sequence[Param
 
 
 def print_evaluation(console: Console, evaluation: Evaluation) -> None:
-    """Cost and final errors on every split, with the design values for comparison."""
+    """Print cost and final errors on every split, beside those of the design values."""
     kind = " (simulated data)" if evaluation.simulated else ""
     table = Table(title=f"{evaluation.dataset}{kind}", title_justify="left")
     table.add_column("split")

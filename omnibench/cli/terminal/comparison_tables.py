@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from omnibench.cli.terminal.tables import folding_table
 from omnibench.compare.result import ComparisonResult, EntryStatistics, Interval
 from omnibench.data.dataset import SPLITS, Split
 from omnibench.report.numbers import plural
 
+_TITLES: dict[Split, str] = {"train": "Training", "validation": "Validation"}
+_MATRIX = "M^-1"  # heading of the column with the entries' labels, as in the paper's tables
+
 
 def print_result(console: Console, result: ComparisonResult) -> None:
-    """The tables of every data set, how each matrix was found, and the runs without an answer."""
+    """Print the tables of every data set, how each matrix was found, and the runs without an answer."""
     for name, dataset in result.datasets.items():
         entries = [entry for entry in result.statistics if entry.dataset == name]
         where = f"{name}{' (simulated data)' if dataset.simulated else ''}"
@@ -30,32 +33,24 @@ def print_result(console: Console, result: ComparisonResult) -> None:
             title = f"{record.dataset} {record.label} seed {record.seed}"
             console.print(f"no answer: {title}: {record.outcome}: {record.reason}", soft_wrap=True)
     console.print(
-        "intervals: 95 % bootstrap over trajectories;  = : practically equal to the best;  gap: above the "
-        "exact optimum in the same box;  proven: what any optimiser could still save of the cost there, at most",
+        "intervals: 95 % bootstrap over trajectories;  = : practically equal to the best;  gap: relative to the exact "
+        "optimum in the same box;  proven: what any optimiser could still save of the cost there, at most",
         soft_wrap=True,
     )
 
 
-_TITLES: dict[Split, str] = {"train": "Training", "validation": "Validation"}
-
-
-def _new_table(title: str, words: Sequence[str], numbers: Sequence[str]) -> Table:
-    """A table that folds in a narrow terminal and leaves nothing out."""
-    table = Table(
-        title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0)
-    )
-    for heading in words:
-        table.add_column(heading, overflow="fold", min_width=len("closed_form") if heading == "M^-1" else None)
-    for heading in numbers:
-        table.add_column(heading, justify="right", overflow="fold")
+def _entries_table(title: str, words: Sequence[str], numbers: Sequence[str]) -> Table:
+    """A table in which the names of the usual calibrators do not fold."""
+    table = folding_table(title, words, numbers)
+    table.columns[words.index(_MATRIX)].min_width = len("closed_form")
     return table
 
 
 def _cost_table(title: str, entries: Iterable[EntryStatistics], split: Split) -> Table:
-    """The paper's Table 2 or 3, with intervals."""
+    """The paper's Table 2 (training) or 3 (validation), with intervals."""
     calibrated = f"CF {_TITLES[split].lower()}"
     headings = ("CF theoretical", calibrated, "95 % interval", "Improvement", "95 % interval")
-    table = _new_table(title, ["M^-1"], headings)
+    table = _entries_table(title, [_MATRIX], headings)
     for entry in entries:
         if entry.typical is None:
             table.add_row(entry.label, "", "no answer")
@@ -69,7 +64,7 @@ def _cost_table(title: str, entries: Iterable[EntryStatistics], split: Split) ->
 def _error_table(title: str, entries: Iterable[EntryStatistics]) -> Table:
     """Mean errors of the final pose on both splits, and how the entries compare."""
     errors = ("training: position", "heading", "validation: position", "heading")
-    table = _new_table(title, ["M^-1"], [*errors, "cost against best", "95 % interval"])
+    table = _entries_table(title, [_MATRIX], [*errors, "cost against best", "95 % interval"])
     for entry in entries:
         if entry.typical is None:
             table.add_row(entry.label, "no answer")
@@ -93,7 +88,7 @@ def _error_cells(position: float | None, heading: float | None) -> tuple[str, st
 def _search_table(result: ComparisonResult) -> Table:
     headings = ("runs", "evaluations", "time", "gap", "proven", "on a bound")
     several = len(result.datasets) > 1
-    table = _new_table("How each was found", [*(["data set"] * several), "M^-1", "box", "outcome"], headings)
+    table = _entries_table("How each was found", [*(["data set"] * several), _MATRIX, "box", "outcome"], headings)
     for entry in result.statistics:
         records = [run.record for run in result.runs]
         of_entry = [record for record in records if (record.dataset, record.label) == (entry.dataset, entry.label)]

@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from omnibench.cli.terminal.tables import folding_table
 from omnibench.discover.document import experiment_file
 from omnibench.discover.report.wording import (
     VERDICTS,
@@ -28,15 +28,18 @@ from omnibench.discover.report.wording import (
 from omnibench.discover.result import Discovery, Gap, NamedEffect
 from omnibench.report.numbers import fixed, listing, plural
 
-_WIDTH = 80
-_HIDDEN = 4  # effects of which the terminal says how large they could be
-_PLACES = 4
-_PARAMETERS = 9  # of each effect
-_LINES = 3  # of notes, and of warnings
+# So much is shown that the answer fits into a screen; the report has the rest.
+_WIDTH = 80  # columns
+_HIDDEN = 4  # lines of effects that could still hide
+_PLACES = 4  # lines of covariates that the residuals depend on
+_PARAMETERS = 9  # lines for an effect
+_LINES = 3  # notes, and as many warnings
+
+_INTERVAL = "95 % interval"
 
 
 def print_discovery(console: Console, discovery: Discovery, folder: Path) -> None:
-    """Verdict, effects, places, gap, what could still hide, and the files in ``folder``."""
+    """Print verdict, effects, what the residuals depend on, the gap, what could still hide, and the files' paths."""
     width = min(console.width, _WIDTH)
     console.print(data_in_words(discovery), soft_wrap=True)
     console.print(f"verdict: {discovery.verdict} ({VERDICTS[discovery.verdict]})", style="bold", width=width)
@@ -67,7 +70,7 @@ def _effect_title(effect: NamedEffect) -> str:
 
 
 def _effect_table(effect: NamedEffect) -> Table:
-    table = _table(None, ("parameter",), ("value", "95 % interval"))
+    table = _discovery_table(None, ("parameter",), ("value", _INTERVAL))
     for parameter in effect.parameters[:_PARAMETERS]:
         value, interval, unit = value_and_interval(parameter)
         table.add_row(parameter.name, with_unit(value, unit), "chosen" if parameter.shape else interval)
@@ -78,7 +81,7 @@ def _effect_table(effect: NamedEffect) -> Table:
 
 
 def _place_table(discovery: Discovery) -> Table:
-    table = _table("where the plain matrix fails", ("residual over", "in words"), ("chance",))
+    table = _discovery_table("where the plain matrix fails", ("residual over", "in words"), ("chance",))
     strongest = {place.covariate: place for place in reversed(discovery.where)}  # the first of each
     for place in [place for place in discovery.where if strongest[place.covariate] is place][:_PLACES]:
         table.add_row(place.covariate, place.description, chance(place.p_value))
@@ -86,7 +89,7 @@ def _place_table(discovery: Discovery) -> Table:
 
 
 def _gap_table(discovery: Discovery) -> Table:
-    table = _table("the gap", ("data", "measure"), ("before", "after", "floor", "closed"))
+    table = _discovery_table("the gap", ("data", "measure"), ("before", "after", "floor", "closed"))
     for held in discovery.held_out:
         where = f"{held_out_in_words(discovery, held)}, {plural(held.runs, 'run')}"
         table.add_row(where, *_gap_cells(held.eq6))
@@ -108,12 +111,12 @@ def _gap_cells(gap: Gap) -> tuple[str, ...]:
 
 
 def _hidden_table(discovery: Discovery) -> Table:
-    """The effects that could be largest for what is plausible of them."""
-    table = _table("what could still hide", ("effect", "parameter"), ("at most ±", "plausible ±"))
+    """The effects whose bound is largest, compared with what is plausible for them."""
+    table = _discovery_table("what could still hide", ("effect", "parameter"), ("at most ±", "plausible ±"))
     worst = worst_of_each(discovery.hidden)
-    for each in worst[:_HIDDEN]:
-        shown = reading(each.unit)
-        table.add_row(each.name, each.parameter, shown.words(each.limit, 2), shown.words(each.plausible, 2))
+    for effect in worst[:_HIDDEN]:
+        shown = reading(effect.unit)
+        table.add_row(effect.name, effect.parameter, shown.words(effect.limit, 2), shown.words(effect.plausible, 2))
     if len(worst) > _HIDDEN:
         table.caption = f"the largest for their kind; {plural(len(worst) - _HIDDEN, 'more effect')} in the report"
         table.caption_justify = "left"
@@ -132,7 +135,7 @@ def _remarks(discovery: Discovery) -> Iterator[str]:
     if discovery.classes:
         yield f"These data cannot tell apart: {'; '.join(' or '.join(names) for names in discovery.classes)}."
     if discovery.absorbed:
-        absorbed = listing([each.name for each in discovery.absorbed], 12)
+        absorbed = listing([effect.name for effect in discovery.absorbed], 12)
         yield f"Absorbed by any matrix, and so never named: {absorbed}."
     yield from _first(
         extrapolations_in_words(discovery.extrapolations), "warning: not driven in training: ", "such warning"
@@ -141,7 +144,7 @@ def _remarks(discovery: Discovery) -> Iterator[str]:
 
 
 def _first(lines: Sequence[str], head: str, kind: str) -> Iterator[str]:
-    """As many lines as a screen has room for."""
+    """The first lines, with ``head`` before each, and how many more there are."""
     yield from (f"{head}{line}" for line in lines[:_LINES])
     if len(lines) > _LINES:
         yield f"{plural(len(lines) - _LINES, f'more {kind}')} in the report"
@@ -149,19 +152,15 @@ def _first(lines: Sequence[str], head: str, kind: str) -> Iterator[str]:
 
 def _print_files(console: Console, discovery: Discovery, folder: Path) -> None:
     console.print(f"extended calibration: {folder / 'model.yaml'}", soft_wrap=True)
-    for number, each in enumerate(discovery.experiments, 1):
+    for number, experiment in enumerate(discovery.experiments, 1):
         file = folder / experiment_file(number)
-        console.print(f"to separate {listing(list(each.separates))}:\n{file}", soft_wrap=True)
+        console.print(f"to separate {listing(list(experiment.separates))}:\n{file}", soft_wrap=True)
     console.print(f"report: {folder / 'report.html'}", soft_wrap=True)
 
 
-def _table(title: str | None, words: Sequence[str], numbers: Sequence[str]) -> Table:
-    """A table that folds in a narrow terminal and leaves nothing out."""
-    table = Table(
-        title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0)
-    )
-    for heading in words:
-        table.add_column(heading, overflow="fold")
-    for heading in numbers:
-        table.add_column(heading, justify="right", overflow="fold", no_wrap=heading != "95 % interval")
+def _discovery_table(title: str | None, words: Sequence[str], numbers: Sequence[str]) -> Table:
+    """A table in which only words and intervals fold."""
+    table = folding_table(title, words, numbers)
+    for column in table.columns[len(words) :]:
+        column.no_wrap = column.header != _INTERVAL
     return table

@@ -12,27 +12,28 @@ from omnibench.fit.uncertainty.identifiability import ROWS, Identifiability
 from omnibench.report.numbers import plural
 
 
-def print_inspection(console: Console, found: Inspection) -> None:
-    """A data set in a table and its findings in words."""
-    kind = "simulated data" if found.simulated else "recorded data"
-    described = f"; {found.description}" if found.description else ""
-    console.print(f"{found.dataset}: {kind}{described}", soft_wrap=True)
-    for label, text in (("source", found.source), ("licence", found.licence)):
+def print_inspection(console: Console, inspection: Inspection) -> None:
+    """Print what a data set holds, what can be identified from it, and the findings."""
+    kind = "simulated data" if inspection.simulated else "recorded data"
+    described = f"; {inspection.description}" if inspection.description else ""
+    console.print(f"{inspection.dataset}: {kind}{described}", soft_wrap=True)
+    for label, text in (("source", inspection.source), ("licence", inspection.licence)):
         if text:
             console.print(f"{label}: {text}", soft_wrap=True)
-    shortest, longest = (1000 * period for period in found.sample_period_range_s)
+    shortest, longest = (1000 * period for period in inspection.sample_period_range_s)
     console.print(
-        f"robot {found.robot}, wheels {', '.join(found.wheels)}; {plural(found.wheel_samples, 'wheel sample')} every "
-        f"{1000 * found.sample_period_s:g} ms ({shortest:.3g} to {longest:.3g} ms), "
-        f"{plural(found.reference_poses, 'reference pose')} every {1000 * found.pose_period_s:.3g} ms",
+        f"robot {inspection.robot}, wheels {', '.join(inspection.wheels)}; "
+        f"{plural(inspection.wheel_samples, 'wheel sample')} every {1000 * inspection.sample_period_s:g} ms "
+        f"({shortest:.3g} to {longest:.3g} ms), {plural(inspection.reference_poses, 'reference pose')} "
+        f"every {1000 * inspection.pose_period_s:.3g} ms",
         soft_wrap=True,
     )
-    if found.scans is not None:
-        _print_scans(console, found.scans)
+    if inspection.scans is not None:
+        _print_scans(console, inspection.scans)
     table = Table()
     for heading in ("split", "runs", "commands", "repetitions", "sessions", "duration", "distance", "turned"):
         table.add_column(heading, justify="left" if heading == "split" else "right")
-    for name, split in found.splits.items():
+    for name, split in inspection.splits.items():
         repetitions = f"{split.repetitions_min}"
         if split.repetitions_max != split.repetitions_min:
             repetitions += f" to {split.repetitions_max}"
@@ -47,10 +48,12 @@ def print_inspection(console: Console, found: Inspection) -> None:
             f"{math.degrees(split.turned_rad):.0f} deg",
         )
     console.print(table)
-    shares = ", ".join(f"{share:.2g}" for share in found.driven_shares)
-    console.print(f"directions of wheel rates driven: {found.driven_directions} of {len(found.wheels)} ({shares})")
-    _print_identifiability(console, found.identifiability)
-    for finding in found.findings:
+    shares = ", ".join(f"{share:.2g}" for share in inspection.driven_shares)
+    console.print(
+        f"directions of wheel rates driven: {inspection.driven_directions} of {len(inspection.wheels)} ({shares})"
+    )
+    _print_identifiability(console, inspection.identifiability)
+    for finding in inspection.findings:
         console.print(f"- {finding}", soft_wrap=True)
 
 
@@ -64,14 +67,18 @@ def _print_scans(console: Console, scans: ScansContent) -> None:
     )
 
 
-def _print_identifiability(console: Console, told: Identifiability) -> None:
-    table = Table(title="what a calibration can tell, +- % of the row's largest element", title_justify="left")
-    for heading in ("wheel rates along", "which is", "driven", *(f"row {row}" for row in ROWS)):
-        table.add_column(heading, justify="left" if heading in ("wheel rates along", "which is") else "right")
-    for each in told.directions:
+def _print_identifiability(console: Console, identifiability: Identifiability) -> None:
+    table = Table(
+        title="precision of a calibration from these data, +- % of the row's largest element", title_justify="left"
+    )
+    for heading in ("wheel rates along", "motion", "driven", *(f"row {row}" for row in ROWS)):
+        table.add_column(heading, justify="left" if heading in ("wheel rates along", "motion") else "right")
+    for direction in identifiability.directions:
         deviations = ["open"] * len(ROWS)
-        if each.state == "driven" and each.deviations is not None:
-            deviations = [f"{100 * value:.2g} %" for value in each.deviations]
-        table.add_row(each.direction, each.motion or "slip of the wheels", f"{100 * each.share:.3g} %", *deviations)
+        if direction.state == "driven" and direction.deviations is not None:
+            deviations = [f"{100 * value:.2g} %" for value in direction.deviations]
+        table.add_row(
+            direction.direction, direction.motion or "slip of the wheels", f"{100 * direction.share:.3g} %", *deviations
+        )
     console.print(table)
-    console.print(f"noise: {told.noise_source}", soft_wrap=True)
+    console.print(f"noise: {identifiability.noise_source}", soft_wrap=True)

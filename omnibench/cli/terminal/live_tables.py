@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class LogLines(logging.Handler):
-    """What the node has to say, a line each, above whatever the console shows."""
+    """Log messages as lines of a console, above a progress bar if there is one."""
 
     def __init__(self, console: Console) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ def node_log(console: Console, warnings_only: bool = False) -> Iterator[logging.
 
 
 def print_played(console: Console, report: PlayReport, simulated: bool) -> None:
-    """What was played."""
+    """Print how much of a recording was played, and how long it took."""
     kind = "simulated" if simulated else "recorded"
     console.print(
         f"{plural(report.sent['joint_states'], 'wheel sample')} and "
@@ -60,7 +60,7 @@ def print_played(console: Console, report: PlayReport, simulated: bool) -> None:
 
 
 def print_demonstration(console: Console, shown: Demonstration) -> None:
-    """What a replay to a node showed."""
+    """Print what was played to a node, its errors against the reference, and its agreement with the batch odometry."""
     print_played(console, shown.report, shown.simulated)
     table = Table(title=f"{shown.robot} against {shown.against}", title_justify="left")
     for heading in ("estimate", "position RMS", "heading RMS", "position at the end"):

@@ -9,7 +9,7 @@ from omnibench.registry import REGISTRIES, Entry, PluginFailure
 
 
 def print_registries(console: Console) -> None:
-    """Everything that a config can name."""
+    """Print a table for each kind: calibrators, costs, effects, importers."""
     for registry in REGISTRIES:
         entries = registry.entries()
         table = Table(title=f"{registry.kind}s", title_justify="left", title_style="bold", expand=False)
@@ -21,7 +21,7 @@ def print_registries(console: Console) -> None:
 
 
 def registry_document(failures: list[PluginFailure]) -> dict[str, object]:
-    """Everything that a config can name, with options, as one JSON document."""
+    """Everything that a config can name, with the JSON schema of its options, and the plug-ins that failed."""
 
     def row(entry: Entry[object]) -> dict[str, object]:
         options = entry.options.model_json_schema().get("properties", {})
