@@ -1,4 +1,4 @@
-"""What a config says of a node: its robots, how they are fused, where messages go, and how Zenoh is reached."""
+"""Config of a node: its robots, fusion, topics, Zenoh session, recording and replay."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from omnibench.live.wire.topics import Profile
 
 
 def _form(value: Any) -> str:
-    """Which of the two forms a choice has, so that a mistake in one is not explained by the other."""
+    """The form of a choice, a name or settings, so that a mistake in one is not explained as one in the other."""
     return "settings" if isinstance(value, Mapping | Model) else "name"
 
 
@@ -40,13 +40,13 @@ class RobotConfig(Model):
     frames: FramesChoice | None = Field(
         None,
         description="default: map, odom, base_link (REP-105); of several robots in a node map, <name>/odom, "
-        "<name>/base_link. tf is everybody's: prefixed names them so for a single robot, too, as robots of several "
-        "nodes on one network need it",
+        "<name>/base_link. All robots of a network share tf: prefixed gives a single robot such names too, as robots "
+        "of several nodes need them",
     )
 
 
 class ReplaySource(ReplayConfig):
-    """What ``--replay`` plays unless it names something else, and how."""
+    """Recording that ``--replay`` plays unless another one is named, and how it is played."""
 
     dataset: Path | None = Field(None, description="a data set folder, or a comparison's config with a simulated one")
     robot: str | None = Field(None, description="whose messages are played; default: the first robot")
@@ -59,7 +59,9 @@ class LiveConfig(Model):
     description: str = ""
     robots: tuple[RobotConfig, ...] = Field((), description="may be empty for a router")
     fusion: FusionChoice = Field("none", description="of SLAM poses: none, ekf, or its settings")
-    stale_after: float = Field(0.5, gt=0, allow_inf_nan=False, description="no wheel sample for so long is told, s")
+    stale_after: float = Field(
+        0.5, gt=0, allow_inf_nan=False, description="no wheel sample for so long makes the health stale, s"
+    )
     profile: Profile = Field("plain", description="plain: plain Zenoh and the DDS bridge; rmw, humble: rmw_zenoh")
     domain: int = Field(0, ge=0, le=232, description="ROS_DOMAIN_ID, for rmw and humble")
     zenoh: SessionConfig = SessionConfig()
@@ -88,14 +90,14 @@ class LiveConfig(Model):
         return self
 
     def fusion_of(self, robot: RobotConfig) -> FusionSettings | None:
-        """How a robot's SLAM poses are fused, if they are."""
+        """Settings with which a robot's SLAM poses are fused; None: they are not."""
         chosen = self.fusion if robot.fusion is None else robot.fusion
         if isinstance(chosen, FusionSettings):
             return chosen
         return FusionSettings() if chosen == "ekf" else None
 
     def frames_of(self, robot: RobotConfig) -> Frames:
-        """A robot's frames: tf is everybody's, so that those of several robots carry their names."""
+        """A robot's frames; those of several robots carry the robots' names, because all share tf."""
         if isinstance(robot.frames, Frames):
             return robot.frames
         if robot.frames is None and len(self.robots) == 1:
@@ -103,7 +105,7 @@ class LiveConfig(Model):
         return Frames(odom=f"{robot.name}/odom", base=f"{robot.name}/base_link")
 
     def on_common_frames(self) -> list[str]:
-        """The robots that publish tf between frames whose names another node's robot has as well by default."""
+        """Robots that publish tf between frames of the default names, which another node's robot may have too."""
         common, fusing = Frames(), (robot for robot in self.robots if self.fusion_of(robot) is not None)
         framed = ((robot.name, self.frames_of(robot)) for robot in fusing)
         return [name for name, frames in framed if frames.odom == common.odom or frames.base == common.base]
@@ -119,9 +121,11 @@ def read_live_config(path: Path | str) -> LiveConfig:
         return None if value is None else folder / value
 
     changes: dict[str, Any] = {
-        "robots": tuple(each.model_copy(update={"calibration": folder / each.calibration}) for each in config.robots),
+        "robots": tuple(
+            robot.model_copy(update={"calibration": folder / robot.calibration}) for robot in config.robots
+        ),
         "zenoh": config.zenoh.relative_to(folder),
-        "plugins": tuple(folder / each for each in config.plugins),
+        "plugins": tuple(folder / plugin for plugin in config.plugins),
         "state": there(config.state),
         "record": there(config.record),
         "replay": config.replay.model_copy(update={"dataset": there(config.replay.dataset)}),
@@ -130,7 +134,7 @@ def read_live_config(path: Path | str) -> LiveConfig:
 
 
 class ClientConfig(Model):
-    """How a program reaches a node: what ``--config`` of listen, replay and record holds."""
+    """Config of a program that reaches a node, as ``--config`` of listen, replay and record takes it."""
 
     zenoh: SessionConfig = SessionConfig(mode="client")
     profile: Profile = "plain"
@@ -138,7 +142,7 @@ class ClientConfig(Model):
 
 
 def read_client_config(path: Path | str) -> ClientConfig:
-    """Read how a node is reached: a client's config, or the node's own. ConfigError in one line."""
+    """Read a client's config, or make it from the node's own. ConfigError in one line."""
     path = Path(path)
     content = read_yaml(path)
     if isinstance(content, dict) and "robots" in content:
@@ -149,11 +153,11 @@ def read_client_config(path: Path | str) -> ClientConfig:
 
 
 def client_session(node: SessionConfig) -> SessionConfig:
-    """How a client on the same machine reaches a node with these settings, as the same user."""
+    """Session settings of a client on the node's machine, with the node's user and keys."""
     if node.mode == "client":
         return node
-    here = [each.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for each in node.listening]
-    return SessionConfig(mode="client", connect=tuple(here) or node.connecting, user=node.user, tls=node.tls)
+    local = [address.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for address in node.listening]
+    return SessionConfig(mode="client", connect=tuple(local) or node.connecting, user=node.user, tls=node.tls)
 
 
 def robot_called(config: LiveConfig, name: str | None) -> RobotConfig:

@@ -1,4 +1,4 @@
-"""What a robot's inputs brought, counted: everything that was taken, refused or put right."""
+"""Counters of a robot's inputs: everything that was taken, refused or put right."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ class Counts:
     irregular: int = 0  # periods off the mean by a quarter or more, missing samples aside
     duplicates: int = 0  # the same stamp again
     late: int = 0  # out of order: a newer one had been taken
-    gaps: int = 0  # longer than max_gap
+    gaps: int = 0  # silences longer than max_gap
     clock_jumps: int = 0  # the stamps went on somewhere else
-    bad_stamps: int = 0  # a stamp far away, which the next ones did not confirm
+    bad_stamps: int = 0  # stamps far from the last one, which the next ones did not confirm
     wraps: int = 0  # angles that started again after a turn of the counter
-    counter_restarts: int = 0  # angles that started again at random
-    not_finite: int = 0  # NaN or infinity among what the wheels say
+    counter_restarts: int = 0  # angles that started again elsewhere, or moved faster than max_rate
+    not_finite: int = 0  # NaN or infinity among angles and rates
     too_fast: int = 0  # beyond max_rate
     wrong_joints: int = 0  # a wheel is not among the names, or has neither angle nor rate
     undecodable: int = 0  # wheel messages that are no sensor_msgs/JointState
-    poses: int = 0  # SLAM poses that were believed
-    pose_rejected: int = 0  # by the gate
+    poses: int = 0  # SLAM poses that were fused
+    pose_rejected: int = 0  # SLAM poses too far from the expected one, by the gate
     pose_too_late: int = 0  # older than the history
     pose_ahead: int = 0  # stamps in the future, or more than can wait for their wheel samples
     pose_duplicates: int = 0
     pose_invalid: int = 0  # not finite, no covariance, wrong frame
     pose_undecodable: int = 0  # not a geometry_msgs/PoseWithCovarianceStamped
-    reacquired: int = 0  # times that the filter gave up its pose for that of SLAM
+    reacquired: int = 0  # times that the filter gave up its pose for SLAM's
     swaps: int = 0  # calibrations taken
     swaps_refused: int = 0
     failures: int = 0  # errors of omnibench itself while it took a message; each is logged
@@ -40,6 +40,6 @@ class Counts:
         return {item.name: getattr(self, item.name) for item in fields(self)}
 
     def anomalies(self) -> dict[str, int]:
-        """What is not as it should be, and how often."""
+        """The counters above 0 of what should not happen."""
         usual = ("samples", "poses", "swaps", "wraps")
         return {name: value for name, value in self.as_dict().items() if value and name not in usual}

@@ -1,4 +1,4 @@
-"""How a robot's stream is: one word, the reason, and the figures, as JSON and as ROS 2 diagnostics."""
+"""Health of a robot's stream: status, reason and figures, as JSON and as ROS 2 diagnostics."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LEVELS: dict[Status, int] = {"ok": 0, "waiting": 1, "degraded": 1, "stale": 3}
 
 
 class FusionHealth(Model):
-    """How fusing goes. pose_age_s: since the last pose that was fused came."""
+    """Health of the fusion. located: SLAM has said where the robot is. pose_age_s: since the last fused pose came."""
 
     located: bool
     pose_age_s: float | None
@@ -21,7 +21,7 @@ class FusionHealth(Model):
 
 
 class SwapRecord(Model):
-    """What became of the last calibration that was sent."""
+    """Outcome of the last calibration that was sent."""
 
     accepted: bool
     name: str | None
@@ -30,11 +30,11 @@ class SwapRecord(Model):
 
 
 class Health(Model):
-    """A robot's health, as the queryable ``health`` gives it.
+    """A robot's health, as the query ``health`` answers it.
 
-    rate_hz: wheel samples a second, as they came. age_s: since the last one came. position_sigma_m, heading_sigma_rad:
-    standard deviations now, growing while nothing comes. unfitted_motion_s: for how long the robot has driven motions
-    that the effects of its calibration were not fitted to, where these are known.
+    rate_hz: wheel samples a second. age_s: since the last one came. position_sigma_m, heading_sigma_rad: standard
+    deviations now; they grow while no sample comes. unfitted_motion_s: time outside the training domain of the
+    calibration's effects, where that is known.
     """
 
     robot: str
@@ -55,7 +55,7 @@ class Health(Model):
 
 
 def diagnostic(health: Health, hardware: str) -> Diagnostic:
-    """The same for ``<robot>/diagnostics``."""
+    """A health as a status of ``<robot>/diagnostics``."""
     values: dict[str, Any] = {
         "calibration": health.calibration,
         "rate_hz": f"{health.rate_hz:.1f}",

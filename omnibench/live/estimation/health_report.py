@@ -75,10 +75,10 @@ def _covariance(state: RobotState, silence: float | None) -> Array:
     """Covariance (3, 3) of the fused pose, or of odometry's; it grows in a silence of the wheels (s)."""
     odometry, fusion = state.odometry, state.fusion
     if fusion is None:
-        return odometry.covariance if silence is None else odometry.grown(silence)
+        return odometry.covariance if silence is None else odometry.covariance_after_silence(silence)
     if silence is None:
         return fusion.covariance
-    return fusion.covariance + (odometry.grown(silence) - odometry.covariance)
+    return fusion.covariance + (odometry.covariance_after_silence(silence) - odometry.covariance)
 
 
 def _fusion_health(state: RobotState, now: float) -> FusionHealth | None:

@@ -1,4 +1,12 @@
-"""Odometry with its covariance, one wheel step at a time: the calibration's model, and what its noise makes of it."""
+"""Odometry with its covariance, one wheel step at a time, from a calibration's model and noise.
+
+The covariance P of the pose (x, y, heading) has two parts, P = W + J C J^T:                                    (L1)
+
+- W is that of a random walk: each step adds the noise model's variances and carries W along, W <- F W F^T + Q, with F
+  the derivative of the pose after the step with respect to the pose before it.                                 (L2)
+- C is the covariance of the matrix's elements, J the derivative of the pose with respect to them. The matrix errs in
+  the same way all the time, so that J adds up along the way.                                                   (L3)
+"""
 
 from __future__ import annotations
 
@@ -13,20 +21,20 @@ from omnibench.robot.calibration import Calibration, Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryStream
 
-# For a calibration file that says nothing of noise: generous, so that a filter follows SLAM.
+# Noise for a calibration file without a noise model; chosen generously, so that a filter follows SLAM.
 UNKNOWN_NOISE = Noise(pose_position=0.02, pose_heading=0.02, walk_position=0.03, walk_heading=0.03)
-_BLIND_SHARE = 0.3  # of a motion whose path nobody saw
-_STILL = 1e-3  # rad/s; slower wheels stand
-_CORRELATION = 1.0  # s over which an error of the matrix looks like noise to the filter
-_REMEMBERED = 200  # steps from which effects of another calibration learn how the robot is driving
+_BLIND_SHARE = 0.3  # standard deviation of a motion without samples, as a share of its length or turn; chosen
+_STILL = 1e-3  # rad/s; a slower wheel counts as standing; chosen
+_CORRELATION = 1.0  # s, correlation time with which the filter takes the matrix's error as noise; chosen
+_REMEMBERED = 200  # steps that are replayed to a new calibration, whose effects depend on the recent motion; chosen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """One step of the robot, as odometry and filter take it.
+    """The robot's motion in one wheel step, as the filter takes it.
 
-    moved (3,): in the robot's frame, m, m, rad. variances: what the step adds to those of position (m2, each axis) and
-    heading (rad2).
+    stamp: ns, at its end. duration: s. moved (3,): in the robot's frame, m, m, rad. position_variance (m2, each axis),
+    heading_variance (rad2): noise that the step adds. restarted: the clock jumped before the stamp.
     """
 
     stamp: int
@@ -38,7 +46,7 @@ class Motion:
     restarted: bool = False
 
     def part(self, share: float) -> Motion:
-        """A share of the motion, at constant twist."""
+        """The first ``share`` (0 to 1) of the motion, at constant twist."""
         return Motion(
             self.stamp,
             share * self.duration,
@@ -50,16 +58,13 @@ class Motion:
 
 
 class LiveOdometry:
-    """Pose and twist of one robot with covariances; they never jump, also when the calibration changes.
+    """Pose and twist of one robot with covariances; the pose does not jump when the calibration changes.
 
-    The covariance is the sum of what the noise model's random walk adds along the way (bent by the heading's own error)
-    and of the uncertainty of the matrix, which errs in the same way all the time and therefore adds up.
+    Effects take the session that the calibration names as the one that is driven. Wheel angles that the sender does not
+    give are counted from 0.
 
-    Effects take the session that the calibration names for the one that is driven. Where no wheel angles are told they
-    are counted from 0.
-
-    standstill: share of the noise that is left while no wheel turns. session_time: s since the session began, at first
-    that of the node.
+    standstill: share of the noise that is left while no wheel turns. session_time: s since the session began; a new
+    node starts at 0.
     """
 
     def __init__(self, calibration: Calibration, standstill: float = 0.01, session_time: float = 0.0) -> None:
@@ -74,16 +79,16 @@ class LiveOdometry:
         noise = calibration.noise or UNKNOWN_NOISE
         self._position_walk = noise.walk_position**2 or UNKNOWN_NOISE.walk_position**2 / 100
         self._heading_walk = noise.walk_heading**2 or UNKNOWN_NOISE.walk_heading**2 / 100
-        self._walked = _Walked()
+        self._walk = _RandomWalk()
         wheels = len(calibration.robot.wheels)
-        self._slopes = _Slopes(wheels, calibration.integration)
+        self._jacobian = _MatrixJacobian(wheels, calibration.integration)
         self._elements: Array | None = None
         self._blocks = np.zeros((3, wheels, wheels))
         if calibration.covariance is not None:
             self._elements = np.array(calibration.covariance)[: 3 * wheels, : 3 * wheels]
             by_row = self._elements.reshape(3, wheels, 3, wheels)
             self._blocks = np.stack([by_row[row, :, row] for row in range(3)])
-        self._of_matrix = [0.0, 0.0, 0.0]  # variances of the twist by the matrix's uncertainty
+        self._matrix_variances = [0.0, 0.0, 0.0]  # of the twist, from the covariance of the matrix
 
     @property
     def pose(self) -> Array:
@@ -92,42 +97,39 @@ class LiveOdometry:
 
     @property
     def covariance(self) -> Array:
-        """Of the pose, (3, 3)."""
+        """Covariance (3, 3) of the pose, Eq. (L1)."""
         if self._elements is None:
-            return self._walked.covariance
-        slopes = self._slopes.jacobian
-        return self._walked.covariance + slopes @ self._elements @ slopes.T
+            return self._walk.covariance
+        jacobian = self._jacobian.values
+        return self._walk.covariance + jacobian @ self._elements @ jacobian.T
 
     @property
     def twist_covariance(self) -> Array:
-        """Of the twist, (3, 3), in the robot's frame."""
+        """Covariance (3, 3) of the twist in the robot's frame."""
         position, heading = self._position_walk / self._duration, self._heading_walk / self._duration
-        along_x, along_y, turning = self._of_matrix
+        along_x, along_y, turning = self._matrix_variances
         covariance = np.zeros((3, 3))
         covariance[0, 0], covariance[1, 1] = position + along_x, position + along_y
         covariance[2, 2] = heading + turning
         return covariance
 
-    def face(self, heading: float) -> None:
-        """The heading of odom in the map is ``heading`` (rad): effects of the world act along the axes of the map.
-
-        Until it is known they act along those of odom.
-        """
+    def set_odom_heading(self, heading: float) -> None:
+        """Set the heading of odom in the map, rad, along whose axes effects of the world act; at first it is 0."""
         self._stream.frame_heading = heading
 
     def resume(self, pose: Array, covariance: Array, session_time: float = 0.0) -> None:
-        """Go on from a pose and covariance that another process reached, and its time in the session (s)."""
+        """Continue from the pose, covariance and session time (s) that another process reached."""
         self._stream = self._new_stream(session_time)
         self.session_time = session_time
         self._begin(pose, covariance)
 
     def _begin(self, pose: Array, covariance: Array) -> None:
         self._stream.pose = np.array(pose, dtype=float)
-        self._walked.set(covariance)
-        self._slopes.clear()
+        self._walk.set(covariance)
+        self._jacobian.clear()
 
     def continued(self, calibration: Calibration) -> LiveOdometry:
-        """Odometry with another calibration from the same pose on; what is uncertain by now stays uncertain."""
+        """Odometry with another calibration from the same pose and covariance on."""
         other = LiveOdometry(calibration, self._standstill)
         begun = self.session_time - sum(step.duration for step in self._recent)
         other._stream = other._new_stream(begun)
@@ -140,7 +142,7 @@ class LiveOdometry:
         return other
 
     def step(self, step: WheelStep) -> Motion:
-        """Take a wheel step; the motion that it made."""
+        """Integrate a wheel step and its covariance; the motion that it made."""
         before, twist = self._stream.pose, self.twist
         positions = step.positions
         self._wheel_angles = self._wheel_angles + step.angles if positions is None else positions
@@ -151,15 +153,20 @@ class LiveOdometry:
         if step.duration > 0:
             self.twist = self._stream.matrix @ step.rates if step.blind else moved / step.duration
             self._duration = step.duration
-            self._of_matrix = ((self._blocks @ step.rates) @ step.rates).tolist()
-        position, heading = self._variances(step, moved, twist)
-        self._spread(before, step.angles, position, heading)
+            self._matrix_variances = ((self._blocks @ step.rates) @ step.rates).tolist()
+        position, heading = self._walk_variances(step, moved, twist)
+        self._propagate(before, step.angles, position, heading)
         return Motion(
-            step.stamp, step.duration, moved, self._stream.integration, *self._of_filter(step, position, heading)
+            step.stamp,
+            step.duration,
+            moved,
+            self._stream.integration,
+            *self._filter_variances(step.duration, position, heading),
+            step.restarted,
         )
 
-    def grown(self, seconds: float) -> Array:
-        """The covariance after so long without any news, the robot having done what it last did, or not."""
+    def covariance_after_silence(self, seconds: float) -> Array:
+        """Covariance (3, 3) of the pose after a silence, in which the robot may have kept its twist or stood."""
         position = (_BLIND_SHARE * math.hypot(self.twist[0], self.twist[1]) * seconds) ** 2
         heading = (_BLIND_SHARE * abs(float(self.twist[2])) * seconds) ** 2
         growth = [
@@ -172,38 +179,38 @@ class LiveOdometry:
     def _new_stream(self, session_time: float) -> OdometryStream:
         return self._calibration.model.stream(session=self._calibration.session, session_time=session_time)
 
-    def _variances(self, step: WheelStep, moved: Array, twist: Array) -> tuple[float, float]:
-        """What the step's noise adds to the variances of position and heading; twist: before it."""
+    def _walk_variances(self, step: WheelStep, moved: Array, twist: Array) -> tuple[float, float]:
+        """Variances of position (m2) and heading (rad2) that a step adds. twist (3,): before the step."""
         still = max(map(abs, step.angles.tolist())) <= _STILL * step.duration
         share = self._standstill if still and not step.blind else 1.0
         position, heading = share * self._position_walk * step.duration, share * self._heading_walk * step.duration
         if step.blind:
             length, turn = math.hypot(moved[0], moved[1]), 0.0
-            if not step.counted:  # it may have gone on as before, or as after, or have stood
-                length = step.blind * max(math.hypot(each[0], each[1]) for each in (twist, self.twist))
-                turn = step.blind * max(abs(float(each[2])) for each in (twist, self.twist))
+            if not step.counted:  # the robot may have kept the twist before, had the one after, or stood
+                length = step.blind * max(math.hypot(vx, vy) for vx, vy, _ in (twist, self.twist))
+                turn = step.blind * max(abs(float(turning)) for _, _, turning in (twist, self.twist))
             position += (_BLIND_SHARE * length) ** 2
             heading += (_BLIND_SHARE * turn) ** 2
         return position, heading
 
-    def _of_filter(self, step: WheelStep, position: float, heading: float) -> tuple[float, float, bool]:
-        """The same for a filter that has no memory: an error of the matrix looks like noise to it."""
-        along_x, along_y, turning = self._of_matrix
-        time = _CORRELATION * step.duration
-        return position + time * (along_x + along_y) / 2, heading + time * turning, step.restarted
+    def _filter_variances(self, duration: float, position: float, heading: float) -> tuple[float, float]:
+        """Variances for a filter, which has no state for the matrix: the matrix's error counts as noise."""
+        along_x, along_y, turning = self._matrix_variances
+        time = _CORRELATION * duration
+        return position + time * (along_x + along_y) / 2, heading + time * turning
 
-    def _spread(self, before: Array, angles: Array, position: float, heading: float) -> None:
-        """Carry the covariance along the step from the pose ``before``, and add the step's own variances."""
+    def _propagate(self, before: Array, angles: Array, position: float, heading: float) -> None:
+        """Eq. (L2) and (L3) for the step from the pose ``before``; position (m2), heading (rad2): Q of the step."""
         x, y, start = before.tolist()
         to_x, to_y, end = self._stream.pose.tolist()
-        self._walked.carry(to_x - x, to_y - y)
-        self._walked.add(position, heading)
+        self._walk.carry(to_x - x, to_y - y)
+        self._walk.add(position, heading)
         if self._elements is not None:
-            self._slopes.add(angles, to_x - x, to_y - y, start, end)
+            self._jacobian.add(angles, to_x - x, to_y - y, start, end)
 
 
-class _Walked:
-    """A covariance (3, 3) of a pose, by its six numbers: in Python's own floats it is three times as fast."""
+class _RandomWalk:
+    """Covariance W (3, 3) of Eq. (L2), as six Python floats, which is three times as fast as an array."""
 
     def __init__(self) -> None:
         self._xx = self._xy = self._yy = self._xt = self._yt = self._tt = 0.0
@@ -218,7 +225,7 @@ class _Walked:
         (self._xx, self._xy, self._xt), (_, self._yy, self._yt), (_, _, self._tt) = np.asarray(covariance).tolist()
 
     def carry(self, along_x: float, along_y: float) -> None:
-        """F P F^T with the heading's error bending the path (m) in the world's frame."""
+        """W <- F W F^T for a path (m) in the world's frame, whose direction has the heading's error."""
         xt, yt, tt = self._xt, self._yt, self._tt
         self._xx += along_y * (along_y * tt - 2 * xt)
         self._xy += along_x * xt - along_y * yt - along_x * along_y * tt
@@ -227,33 +234,34 @@ class _Walked:
         self._yt += along_x * tt
 
     def add(self, position: float, heading: float) -> None:
-        """White noise on each axis (m2) and the heading (rad2)."""
+        """W <- W + Q with variances of each axis (m2) and of the heading (rad2)."""
         self._xx += position
         self._yy += position
         self._tt += heading
 
 
-class _Slopes:
-    """Derivatives of the pose with respect to the matrix, to first order in the turn of one step.
+class _MatrixJacobian:
+    """Derivative J of the pose with respect to the matrix, Eq. (L3), to first order in the turn of one step.
 
-    jacobian (3, 3N): of (x, y, heading) on the elements row by row.
+    values (3, 3N): of (x, y, heading), by the matrix's elements row by row.
     """
 
     def __init__(self, wheels: int, integration: Integration) -> None:
         self._arc = integration == "arc"
-        self.jacobian = np.zeros((3, 3 * wheels))
-        self._by_row = self.jacobian.reshape(3, 3, wheels)
+        self.values = np.zeros((3, 3 * wheels))
+        self._by_row = self.values.reshape(3, 3, wheels)
 
     def clear(self) -> None:
-        self.jacobian[:] = 0.0
+        self.values[:] = 0.0
 
     def add(self, angles: Array, along_x: float, along_y: float, start: float, end: float) -> None:
-        """Take a step: angles (N,) rad, path (m) in the world's frame, headings at its ends (rad)."""
+        """Add a step: wheel angles (N,) rad, path (m) in the world's frame, headings at its ends (rad)."""
         direction, half = ((start + end) / 2, 0.5) if self._arc else (start, 0.0)
         cosine, sine = math.cos(direction), math.sin(direction)
         by_row = self._by_row
         turned = by_row[2, 2]
-        by_row[0, 2] -= along_y * turned  # row 3 has bent the path so far, and bends this step by half of its own turn
+        # row 3 turns this step by the heading's error so far, and by half of the turn in the step itself
+        by_row[0, 2] -= along_y * turned
         by_row[1, 2] += along_x * turned
         shares = ((cosine, -sine, -half * along_y), (sine, cosine, half * along_x), (0.0, 0.0, 1.0))
         by_row += np.array(shares)[:, :, None] * angles

@@ -1,4 +1,4 @@
-"""No stamp twice: listeners (tf2 among them) take a repeated stamp for repeated data."""
+"""Published stamps: none is published twice, since listeners such as tf2 take a repeated stamp for repeated data."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from bisect import bisect_left
 
 
 class PublishedStamps:
-    """Stamps (ns) that were published, so that none is again when the robot's clock jumps back.
+    """Stamps (ns) that were published, to be told apart from those that come when the robot's clock jumps back.
 
-    They are kept in runs, each sorted, from the oldest published to the latest. While the clock goes forward the latest
-    run grows at its end; whenever it jumps back a new one begins, and neighbours of like length are merged, so that
-    however often it jumps there are some twenty runs to look into.
+    The stamps are kept in sorted runs, from the oldest published to the latest. While the clock goes forward the latest
+    run grows at its end. When it jumps back a new run begins, and neighbours of similar length are merged, so that
+    there are never more than some twenty runs to search.
 
-    remembered: how many of the latest are kept at least (8 bytes each); after a clock that jumps back further than
-    these reach, a stamp can meet a forgotten one by chance.
+    remembered: how many of the latest stamps are kept at least (8 bytes each). A stamp older than these can be
+    published twice by chance, after a clock that jumped back so far.
     """
 
     def __init__(self, remembered: int = 120_000) -> None:
@@ -23,10 +23,10 @@ class PublishedStamps:
         self._runs: list[array[int]] = [array("q")]
         self._count = 0
         self._highest: int | None = None
-        self._shift = 1  # ns that the last repeated stamp was moved; a recording played in a loop moves all alike
+        self._shift = 1  # ns by which the last repeated stamp was moved; a recording in a loop moves all alike
 
     def unique(self, stamp: int) -> int:
-        """``stamp``, or one soon after it (ns) when it was published already; from now on it is."""
+        """``stamp``, or the next free one (ns) if it was published already; the result counts as published."""
         if self._highest is None or stamp > self._highest:
             self._highest = stamp
         elif self._holds(stamp):

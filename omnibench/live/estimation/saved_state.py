@@ -1,6 +1,6 @@
-"""What a node remembers of a robot beyond its own death: pose, wheel angles, and a calibration that was swapped in.
+"""Saved state of a robot, which outlives the node: pose, wheel angles, and a calibration that was swapped in.
 
-The pose goes into one of two slots of one file in turn, so that a node killed in mid-write leaves the other.
+The pose goes to the two slots of one file in turn, so that a node that is killed while it writes leaves the other slot.
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ from omnibench.robot.calibration import Calibration, read_calibration
 from omnibench.robot.kinematics import Array
 
 LOG = logging.getLogger("omnibench.live")
-_SLOT = 4096  # bytes
+_SLOT = 4096  # bytes, a block of most disks; a state takes some 1000
 
 SavedPose = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 SavedCovariance = Annotated[tuple[FiniteFloat, ...], Field(min_length=9, max_length=9)]
 
 
 class SavedState(Model):
-    """Where a robot was. stamp: ns, of the wheel sample; wall: unix time of its arrival, s; positions: wheel angles.
+    """A robot's state after a wheel sample; poses in m, m, rad, covariances (3, 3) row by row.
 
-    Poses in m, m, rad; covariances (3, 3), row by row. session_time: s since the session began.
+    sequence: number of the state. stamp: of the sample, ns. wall: unix time of its arrival, s. positions: wheel angles,
+    rad. map_pose: fused pose, once SLAM has located the robot. session_time: s since the session began.
     """
 
     sequence: int = Field(ge=0)
@@ -54,14 +55,17 @@ class SavedState(Model):
 
 
 class SwappedCalibration(Model):
-    """A calibration that took the place of the file that the config names, whose SHA-256 is ``instead_of``."""
+    """A calibration that replaces the config's calibration file, whose SHA-256 is ``instead_of``."""
 
     instead_of: str
     calibration: Calibration
 
 
 class RobotMemory:
-    """The memory of one robot in a folder. ConfigError when another node uses it, or it cannot be written."""
+    """Files with one robot's saved state in a folder, locked for one node.
+
+    ConfigError: another node uses them, or they cannot be written.
+    """
 
     def __init__(self, folder: Path, robot: str) -> None:
         self._path = folder / f"{robot}.state.json"
@@ -80,17 +84,17 @@ class RobotMemory:
         self._configured = ""  # SHA-256 of the config's file when the node started
 
     def load(self) -> SavedState | None:
-        """The newest state that was written whole, if there is one; a damaged one is told in the log."""
+        """The newest state that was written whole, or None; a damaged file is a warning in the log."""
         if self._file is None:
             return None
-        found: list[SavedState] = []
+        states: list[SavedState] = []
         slots = [os.pread(self._file, _SLOT, slot * _SLOT) for slot in range(2)]
         for content in slots:
             with suppress(ValueError, ValidationError, RecursionError):  # torn, or never written
-                found.append(SavedState.model_validate(json.loads(content)))
-        if not found and any(slots):
+                states.append(SavedState.model_validate(json.loads(content)))
+        if not states and any(slots):
             LOG.warning("%s: damaged; odom starts at its origin", self._path)
-        newest = max(found, key=lambda state: state.sequence, default=None)
+        newest = max(states, key=lambda state: state.sequence, default=None)
         self._sequence = 0 if newest is None else newest.sequence
         return newest
 
@@ -103,7 +107,7 @@ class RobotMemory:
         fused: tuple[Array, Array] | None,
         session_time: float = 0.0,
     ) -> None:
-        """Write where the robot is; pairs are pose (3,) and covariance (3, 3). OSError when the disk refuses."""
+        """Write a state; odometry, fused: pose (3,) and covariance (3, 3). OSError: the disk refuses."""
         if self._file is None:
             return
         self._sequence += 1
@@ -122,9 +126,9 @@ class RobotMemory:
         os.pwrite(self._file, text, (self._sequence % 2) * _SLOT)
 
     def keep_calibration(self, calibration: Calibration) -> None:
-        """Go on with this calibration after a restart, as long as the config's own file stays what it was at the start.
+        """Use this calibration after a restart too, unless the config's own file has changed by then.
 
-        DataError when the disk refuses.
+        DataError: the disk refuses.
         """
         write_text(self._swapped, to_yaml(SwappedCalibration(instead_of=self._configured, calibration=calibration)))
 

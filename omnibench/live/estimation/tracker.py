@@ -126,7 +126,7 @@ class RobotTracker:
         state = self._state
         self._warn_of_guessed_angles(step)
         if state.fusion is not None and state.fusion.located:
-            state.odometry.face(float(state.fusion.pose[2] - state.odometry.pose[2]))
+            state.odometry.set_odom_heading(float(state.fusion.pose[2] - state.odometry.pose[2]))
         motion = state.odometry.step(step)
         state.monitor.take(step)
         return motion

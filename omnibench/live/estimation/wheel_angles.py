@@ -1,4 +1,4 @@
-"""What wheels turned between two readings of their counters, which may wrap, start again, or have been out of sight."""
+"""How far wheels turned between two readings of their counters, which may wrap, restart, or miss a silence."""
 
 from __future__ import annotations
 
@@ -10,43 +10,44 @@ from omnibench.live.estimation.counts import Counts
 from omnibench.robot.kinematics import Array
 
 _TURN = 2 * math.pi
-_WITHIN_A_TURN = _TURN + 1e-6
-_RESTARTED = 0.05  # of what a counter was; a robot hardly drives back so near to where its counters began
-_JITTER = 0.01  # s
-_FASTER = 1.5  # than the wheels were ever seen; out of sight they are not believed to be
+_WITHIN_A_TURN = _TURN + 1e-6  # rad, a turn and rounding
+# Share of its last reading below which a counter has restarted; chosen: a robot seldom drives back so near its start.
+_RESTARTED = 0.05
+_JITTER = 0.01  # s, by which stamps may be too close together; chosen
+_FASTER = 1.5  # times the fastest rate so far is the fastest that is believed of a silence; chosen
 
 
 class WheelAngles:
     """The counters of one robot's wheels.
 
-    wrap: angles start again after so much, rad; None: angles that stay within one turn are found out. max_rate: rad/s.
+    wrap: the angle after which counters start again, rad; None: a counter that stays within one turn is taken to wrap
+    there. max_rate: of any wheel, rad/s. known (N,): the last reading, rad; None before the first.
     """
 
     def __init__(self, wheels: int, wrap: float | None, max_rate: float, counts: Counts) -> None:
         self._wrap = wrap
         self._max_rate = max_rate
         self._counts = counts
-        self._fastest = 0.0  # seen so far, rad/s
-        self._beyond_a_turn = np.zeros(wheels, dtype=bool)  # such a counter does not wrap at a turn
+        self._fastest = 0.0  # rad/s, of any wheel so far
+        self._beyond_a_turn = np.zeros(wheels, dtype=bool)  # counters that have been there do not wrap at a turn
         self._wraps = wrap is not None
         self.known: Array | None = None
 
     def begin(self, positions: Array | None) -> None:
-        """Count from here; None: from what comes next."""
+        """Count from these angles (N,) rad; None: from the next reading."""
         self.known = positions
         if positions is not None:
             self._beyond_a_turn |= np.abs(positions) > _WITHIN_A_TURN
 
     def drive(self, angles: Array) -> None:
-        """The wheels turned by ``angles`` (N,) which the counters did not tell."""
+        """Add a turn by ``angles`` (N,) rad that comes from rates and not from the counters."""
         if self.known is not None:
             self.known = self.known + angles
 
     def turned(self, positions: Array, rates: Array, elapsed: float) -> tuple[Array, bool]:
-        """Angles (N,) since the last reading, and whether they hold the whole motion.
+        """Angles (N,) rad since the last reading, and True if they hold the whole motion.
 
-        rates (N,): with which they are believed to have turned, rad/s; they bridge a counter that started again.
-        elapsed: s, in which samples came; stamps may jitter by more than they are apart.
+        rates (N,): expected, rad/s; they stand in for a counter that restarted. elapsed: s since the last reading.
         """
         assert self.known is not None
         expected = rates * elapsed
@@ -60,16 +61,16 @@ class WheelAngles:
         return np.where(np.abs(angles) > self._max_rate * span, expected, angles), False
 
     def turned_unseen(self, positions: Array, elapsed: float) -> tuple[Array, bool]:
-        """The same after a silence: whole turns may be lost, and a counter may have started again with its robot."""
+        """Angles and flag of ``turned`` after a silence of ``elapsed`` s: turns may be lost, counters restarted."""
         assert self.known is not None
         before = self.known
-        # how far it went is anybody's guess: the shortest way, if these counters wrap at all
+        # counters that wrap do not tell how far the wheels went: the shortest way is taken
         angles = self._unwrapped(positions, np.zeros(len(positions))) if self._wraps else positions - before
         self.begin(positions)
         fastest = (_FASTER * self._fastest or self._max_rate) * elapsed + math.pi
         far = np.abs(before) > math.pi
-        again = bool(far.any()) and bool((np.abs(positions) < _RESTARTED * np.abs(before))[far].all())
-        if again or (np.abs(angles) > fastest).any():
+        restarted = bool(far.any()) and bool((np.abs(positions) < _RESTARTED * np.abs(before))[far].all())
+        if restarted or (np.abs(angles) > fastest).any():
             self._counts.counter_restarts += 1
             return np.zeros(len(angles)), False
         turns_may_be_lost = self._wrap is not None or not self._beyond_a_turn.all()
@@ -77,14 +78,14 @@ class WheelAngles:
         return angles, not (turns_may_be_lost and fastest > length / 2 + math.pi)
 
     def _unwrapped(self, positions: Array, expected: Array) -> Array:
-        """Differences, by as many wraps more or less as bring them next to what is expected."""
+        """Differences (N,) rad from the last reading, with the wraps that bring them nearest to those expected."""
         assert self.known is not None
         angles: Array = positions - self.known
         length = self._wrap or _TURN
         if max(map(abs, (angles - expected).tolist())) <= length / 2:
             return angles
         wraps = np.round((angles - expected) / length)
-        if self._wrap is None:  # as ROS 2's continuous joints have it, if they have
+        if self._wrap is None:  # a continuous joint of ROS 2 may wrap at a turn
             wraps[self._beyond_a_turn | (np.abs(positions) > _WITHIN_A_TURN)] = 0.0
         if wraps.any():
             self._counts.wraps += 1

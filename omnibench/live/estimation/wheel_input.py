@@ -1,4 +1,8 @@
-"""From wheel messages to wheel steps: what a real sender gets wrong is put right or refused, and counted."""
+"""From wheel messages to wheel steps: messages are put in order, repaired or refused, and counted.
+
+A message is late, doubled, or next. One whose stamp is too far from the last one waits until others confirm the new
+time (a clock that jumped); one after a silence that this machine's clock saw too is a step of unknown path.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +23,15 @@ from omnibench.live.wire.messages import JointState, MessageError
 from omnibench.robot.kinematics import Array
 
 _SECOND = 1e9  # ns
-_CONFIRMATION = 3  # stamps in a row that make a new time of a stamp that cannot be
-_REORDERED = 0.2  # s; what is late by less is out of order, or a clock that was set back a little
-_SET_BACK = 3  # late samples in a row that cannot be out of order any more
-_SLACK = 0.1  # s by which arrivals may scatter
-_LEARNING = 10  # samples from which the period is learnt
+# All of these are chosen.
+_CONFIRMATION = 3  # stamps in a row that confirm a new time of the sender's clock
+_REORDERED = 0.2  # s; a sample that is late by less is out of order, or the clock was set back a little
+_SET_BACK = 3  # late samples in a row; so many are of a clock that was set back, and not out of order
+_SLACK = 0.1  # s, by which arrivals may scatter
+_LEARNING = 10  # samples, whose median gives the first period
 _SMOOTHING = 0.02  # share of a new period in the mean
-_IRREGULAR = 0.25  # of the mean period
-_MEMORY = 0.995  # of how fast stamps go on by our clock: 1 of a robot, more of a replay
+_IRREGULAR = 0.25  # share of the mean period by which a regular one may be off
+_MEMORY = 0.995  # share of the past in the pace of the stamps, which is 1 of a robot and more of a fast replay
 
 
 class WheelSettings(Model):
@@ -35,7 +40,10 @@ class WheelSettings(Model):
     joints: tuple[str, ...] | None = Field(None, description="names in the messages, in the robot's order of wheels")
     use: Literal["auto", "positions", "velocities"] = Field("auto", description="auto: positions where there are any")
     wrap: float | None = Field(
-        None, gt=0, allow_inf_nan=False, description="angles start again after so much, rad; one turn is found out"
+        None,
+        gt=0,
+        allow_inf_nan=False,
+        description="angle after which angles start again, rad; default: one turn where they seem to",
     )
     max_rate: float = Field(100.0, gt=0, allow_inf_nan=False, description="no wheel turns faster, rad/s")
     max_gap: float = Field(1.0, gt=0, allow_inf_nan=False, description="a longer silence makes the path unknown, s")
@@ -43,12 +51,12 @@ class WheelSettings(Model):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WheelStep:
-    """What the wheels did from one sample to the next.
+    """Motion of the wheels from one sample to the next.
 
-    angles (N,): rad. rates (N,): at its end, rad/s. blind: s of the duration of whose motion nothing is known beyond
-    ``angles``. counted: angles are differences of counters, so that they hold the whole motion of blind times too.
-    restarted: the clock jumped, and stamps before have no meaning any more. positions (N,): what the counters say at
-    its end, rad; None where there are none.
+    stamp: ns, at its end. duration: s. angles (N,): rad. rates (N,): at its end, rad/s. blind: s of the duration for
+    which only ``angles`` are known and not the path. counted: angles are differences of counters, which hold the whole
+    motion of blind times too. restarted: the clock jumped, and stamps before have no meaning. positions (N,): readings
+    of the counters at its end, rad; None where there are none.
     """
 
     stamp: int
@@ -63,6 +71,8 @@ class WheelStep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sample:
+    """A checked message, its joints in the order of the wheels. stamp: ns. arrival: s."""
+
     stamp: int
     arrival: float
     positions: Array | None
@@ -72,7 +82,8 @@ class _Sample:
 class WheelInput:
     """Takes the wheel messages of one robot in the order of their arrival.
 
-    last_refusal: why the latest refused message was refused, in words. period: s from sample to sample, on average.
+    wheels: names in the robot's order. last_refusal: reason of the latest refusal, in words. period: mean time from
+    sample to sample, s, at first the calibration's.
     """
 
     def __init__(self, wheels: Sequence[str], settings: WheelSettings, period: float, counts: Counts) -> None:
@@ -81,29 +92,29 @@ class WheelInput:
         self._counts = counts
         self._places: dict[tuple[str, ...], NDArray[np.intp]] = {}
         self._angles = WheelAngles(len(self._joints), settings.wrap, settings.max_rate, counts)
-        self._counting = settings.use == "positions"  # rather than integrating rates
+        self._counting = settings.use == "positions"  # True: angles come from counters, False: from rates
         self._last: _Sample | None = None
         self._rates: Array = np.zeros(len(self._joints))
-        self._suspects: list[_Sample] = []
+        self._unconfirmed: list[_Sample] = []  # samples of a new time of the clock, until enough of them came
         self._late_in_a_row = 0
         self._learnt: list[float] = []
-        self._stamped, self._waited = 1.0, 1.0  # s by stamps and by our clock, the latest counting most
+        self._stamped, self._waited = 1.0, 1.0  # s by stamps and by this machine's clock, recent ones weighing most
         self.period = period
         self.last_refusal = ""
 
     @property
     def last_sample(self) -> tuple[int, Array | None] | None:
-        """Stamp and wheel angles of the last sample taken, for a node that starts again."""
+        """Stamp (ns) and wheel angles (N,) of the last sample taken, for a node that starts again."""
         return None if self._last is None else (self._last.stamp, self._angles.known)
 
     def resume(self, stamp: int, positions: Array | None, arrival: float) -> None:
-        """Go on after a sample that another process took."""
+        """Continue after a sample that another process took; arrival: s, by this process's clock."""
         self._last = _Sample(stamp, arrival, positions, None)
         self._counting = positions is not None and self._settings.use != "velocities"
         self._angles.begin(positions if self._counting else None)
 
     def take(self, message: JointState, arrival: float) -> list[WheelStep]:
-        """The steps that a message makes: mostly one; none when it is refused or has to be confirmed first.
+        """The steps that a message makes: mostly one; none while it is refused or has to be confirmed.
 
         arrival: s, by a clock of this machine that never jumps.
         """
@@ -115,12 +126,12 @@ class WheelInput:
         if self._last is None:
             return [self._first(sample)]
         elapsed = (sample.stamp - self._last.stamp) / _SECOND
-        if elapsed == 0 or (self._suspects and sample.stamp == self._suspects[-1].stamp):
+        if elapsed == 0 or (self._unconfirmed and sample.stamp == self._unconfirmed[-1].stamp):
             self._counts.duplicates += 1
             return []
         if 0 < elapsed <= self._settings.max_gap:
-            if self._suspects:
-                self._drop_suspects()
+            if self._unconfirmed:
+                self._drop_unconfirmed()
             return [self._step(sample, elapsed)]
         if -_REORDERED <= elapsed < 0:
             self._counts.late += 1
@@ -128,9 +139,10 @@ class WheelInput:
             return []
         if elapsed > 0 and abs(elapsed - self._waited_for(sample)) <= 0.5 + 0.1 * elapsed:
             return [self._after_silence(sample, elapsed)]
-        return self._suspect(sample)
+        return self._confirmed(sample)
 
     def _read(self, message: JointState, arrival: float) -> _Sample:
+        """Check a message and take the wheels' values from it. MessageError: why it is refused."""
         places = self._places.get(message.names)
         if places is None:
             places = self._find(message.names)
@@ -154,19 +166,20 @@ class WheelInput:
         return _Sample(message.stamp, arrival, positions, velocities)
 
     def _find(self, names: tuple[str, ...]) -> NDArray[np.intp]:
+        """Places (N,) of the wheels among a message's joints. MessageError: one is not there."""
         missing = [joint for joint in self._joints if joint not in names]
         if missing:
             self._counts.wrong_joints += 1
             raise MessageError(
                 f"no joint {missing[0]!r} among {', '.join(names[:12]) or 'no names'}; set wheels.joints"
             )
-        if len(self._places) > 16:  # a sender that makes up names forever shall not fill the memory
+        if len(self._places) > 16:  # so that a sender of ever new names cannot fill the memory
             self._places.clear()
         places = self._places[names] = np.array([names.index(joint) for joint in self._joints])
         return places
 
     def _first(self, sample: _Sample) -> WheelStep:
-        """Where counting begins, and what is counted from now on: angles if there are any, else rates."""
+        """The first step, which has no duration; from here on angles are counted if there are any, else rates."""
         self._counting = sample.positions is not None
         self._angles.begin(sample.positions)
         self._counts.samples += 1
@@ -181,7 +194,7 @@ class WheelInput:
         waited = self._waited_for(sample)
         set_back = self._late_in_a_row >= _SET_BACK and waited > elapsed + 2 * self.period
         set_ahead = elapsed > max(waited + _SLACK, 3 * self.period)
-        if set_back or set_ahead:  # by less than what makes another time of it: what passed is told by our clock
+        if set_back or set_ahead:  # the clock jumped within the limits of a next sample: this machine's clock counts
             self._counts.clock_jumps += 1
             elapsed = min(max(waited, self.period), self._settings.max_gap)
         else:
@@ -194,7 +207,7 @@ class WheelInput:
         return self._by_rates(sample, elapsed, elapsed, blind=0.0)
 
     def _after_silence(self, sample: _Sample, elapsed: float, *, restarted: bool = False) -> WheelStep:
-        """The step over a time of which nothing is known but its two ends."""
+        """The step over a silence of ``elapsed`` s, of which only the two ends are known."""
         if not restarted:
             self._counts.gaps += 1
         self._late_in_a_row = 0
@@ -207,11 +220,11 @@ class WheelInput:
     def _by_rates(
         self, sample: _Sample, elapsed: float, seen: float, *, blind: float, restarted: bool = False
     ) -> WheelStep:
-        """A step of a sample without angles to compare with: its rates, or the last ones, for as long as was seen."""
+        """The step of a sample without angles to compare with: its rates, or the last ones, for ``seen`` s."""
         rates = self._rates if sample.velocities is None else sample.velocities
         angles = rates * min(seen, elapsed)
         if sample.positions is not None and (self._counting or sample.velocities is None):
-            self._counting = True  # from here on
+            self._counting = True
             self._angles.begin(sample.positions)
         else:
             self._angles.drive(angles)
@@ -227,12 +240,13 @@ class WheelInput:
         counted: bool,
         restarted: bool = False,
     ) -> WheelStep:
+        """The step of a sample that is taken, which becomes the last one."""
         self._counts.samples += 1
         self._last, self._rates = sample, rates
         return WheelStep(sample.stamp, elapsed, angles, rates, blind, counted, restarted, self._angles.known)
 
     def _learn(self, elapsed: float, waited: float) -> None:
-        """The period, what does not keep to it, and how fast stamps go on by our clock."""
+        """Update the mean period and the pace of the stamps, and count missing and irregular samples."""
         self._stamped = _MEMORY * self._stamped + elapsed
         self._waited = _MEMORY * self._waited + waited
         if len(self._learnt) < _LEARNING:
@@ -246,22 +260,25 @@ class WheelInput:
         self.period += _SMOOTHING * (min(elapsed, 3 * self.period) - self.period)
 
     def _waited_for(self, sample: _Sample) -> float:
-        """How much time our clock says has passed since the last sample, in the time of the stamps, s."""
+        """Time since the last sample by this machine's clock, s, at the pace of the stamps."""
         assert self._last is not None
         pace = self._stamped / self._waited if self._waited > 1e-6 else 1e6
         return (sample.arrival - self._last.arrival) * (pace if not 0.5 < pace < 2 else 1.0)
 
-    def _suspect(self, sample: _Sample) -> list[WheelStep]:
-        """A stamp too far off: taken for the new time once others follow it, else dropped."""
+    def _confirmed(self, sample: _Sample) -> list[WheelStep]:
+        """The steps of samples at a new time of the clock, once enough follow each other; till then none."""
         assert self._last is not None
-        if self._suspects and not 0 < (sample.stamp - self._suspects[-1].stamp) / _SECOND <= self._settings.max_gap:
-            self._drop_suspects()
-        self._suspects.append(sample)
-        if len(self._suspects) < _CONFIRMATION:
+        if (
+            self._unconfirmed
+            and not 0 < (sample.stamp - self._unconfirmed[-1].stamp) / _SECOND <= self._settings.max_gap
+        ):
+            self._drop_unconfirmed()
+        self._unconfirmed.append(sample)
+        if len(self._unconfirmed) < _CONFIRMATION:
             self.last_refusal = f"its stamp is {(sample.stamp - self._last.stamp) / _SECOND:+.3f} s from the last one"
             return []
-        first, *others = self._suspects
-        self._suspects = []
+        first, *others = self._unconfirmed
+        self._unconfirmed = []
         self._counts.clock_jumps += 1
         elapsed = (first.stamp - self._last.stamp) / _SECOND
         waited = max(self._waited_for(first), self.period)
@@ -271,13 +288,13 @@ class WheelInput:
             steps = [self._after_silence(first, waited, restarted=True)]
         else:
             steps = [replace(self._step(first, waited), restarted=True)]
-        for each in others:
-            steps.append(self._step(each, (each.stamp - self._last.stamp) / _SECOND))
+        for other in others:
+            steps.append(self._step(other, (other.stamp - self._last.stamp) / _SECOND))
         return steps
 
-    def _drop_suspects(self) -> None:
+    def _drop_unconfirmed(self) -> None:
         assert self._last is not None
-        late = sum(each.stamp < self._last.stamp for each in self._suspects)
+        late = sum(sample.stamp < self._last.stamp for sample in self._unconfirmed)
         self._counts.late += late
-        self._counts.bad_stamps += len(self._suspects) - late
-        self._suspects = []
+        self._counts.bad_stamps += len(self._unconfirmed) - late
+        self._unconfirmed = []

@@ -1,4 +1,4 @@
-"""The extended Kalman filter over (x, y, heading): filterpy's, behind what fusion needs of it."""
+"""Extended Kalman filter over the pose (x, y, heading), by filterpy."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import advance
 
 _TURN = 2 * math.pi
-_POSE = np.eye(3)  # SLAM measures the pose itself
+_POSE = np.eye(3)  # measurement matrix: SLAM measures the pose itself
 
 
 class _Planar(ExtendedKalmanFilter):  # type: ignore[misc]
-    """A pose of the plane that motions in its own frame drive."""
+    """filterpy's filter with the motion model of odometry."""
 
     x: Array
 
@@ -31,7 +31,7 @@ class _Planar(ExtendedKalmanFilter):  # type: ignore[misc]
 
 
 class PoseFilter:
-    """Pose (3,) and covariance (3, 3), which motions move and measured poses correct."""
+    """Pose (3,) and covariance (3, 3); motions predict them, measured poses correct them."""
 
     def __init__(self, pose: Array, covariance: Array) -> None:
         self._filter: Any = _Planar(dim_x=3, dim_z=3)
@@ -48,7 +48,7 @@ class PoseFilter:
         return self._filter.P
 
     def set(self, pose: Array, covariance: Array) -> None:
-        """Start from here, whatever was before."""
+        """Replace pose and covariance."""
         self._filter.x = np.array(pose, dtype=float)
         self._filter.P = np.array(covariance, dtype=float)
 
@@ -56,18 +56,18 @@ class PoseFilter:
         """Carry pose and covariance along a motion."""
         self._filter.predict(motion)
 
-    def distance(self, pose: Array, covariance: Array) -> float:
-        """Squared Mahalanobis distance of a measured pose from the expected one."""
+    def normalised_innovation(self, pose: Array, covariance: Array) -> float:
+        """Normalised innovation squared of a measured pose: chi-square with 3 degrees of freedom in theory."""
         innovation = innovation_of(pose, self.pose)
         return float(innovation @ np.linalg.solve(self.covariance + covariance, innovation))
 
     def correct(self, pose: Array, covariance: Array) -> None:
-        """Fuse a measured pose (3,) with its covariance (3, 3)."""
+        """Correct pose and covariance by a measured pose (3,) with its covariance (3, 3)."""
         self._filter.update(pose, lambda _: _POSE, lambda x: x, R=covariance, residual=innovation_of)
 
 
 def innovation_of(measured: Array, expected: Array) -> Array:
-    """The difference of two poses (3,), the heading the shortest way."""
+    """Innovation (3,): measured minus expected pose, the heading the shortest way."""
     difference: Array = measured - expected
     difference[2] -= _TURN * round(float(difference[2]) / _TURN)
     return difference

@@ -1,4 +1,8 @@
-"""Fusing SLAM poses at their own time: late ones are put where they belong and what came after is taken again."""
+"""Fusion of SLAM poses with odometry, each at its own time.
+
+A pose that comes late is inserted where it belongs, and the motions and poses after it are filtered again. A gate
+refuses poses whose normalised innovation is too large; several refused poses that agree replace the filter's.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +25,9 @@ from omnibench.live.fusion.timeline import Entry, PoseMeasurement, Timeline
 from omnibench.robot.kinematics import Array
 
 _SECOND = 1e9  # ns
-_NOWHERE = np.diag([100.0**2, 100.0**2, math.pi**2])  # before anybody said where the robot is
-_WAITING = 16  # poses that may wait for the wheel samples of their time
-_EVER = -(2**63)  # ns
+_NOWHERE = np.diag([100.0**2, 100.0**2, math.pi**2])  # m, rad: covariance before the robot is located; chosen
+_WAITING = 16  # poses that may wait for the wheel samples of their time; chosen
+_EVER = -(2**63)  # ns, before every stamp
 
 Outcome = Literal["fused", "located", "reacquired", "rejected", "too late", "ahead", "waiting", "duplicate"]
 
@@ -33,19 +37,19 @@ class FusionSettings(Model):
 
     history: float = Field(5.0, ge=2.0, le=600.0, description="how late a pose may come, s")
     ahead: float = Field(1.0, ge=0.0, le=60.0, description="how far its stamp may lie in the future, s")
-    gate: float = Field(0.999, gt=0.0, lt=1.0, description="probability with which a true pose passes")
+    gate: float = Field(0.999, gt=0.0, lt=1.0, description="probability with which a correct pose passes")
     reacquire_after: int = Field(
         10, ge=1, description="rejected poses that agree with each other: then SLAM is believed"
     )
     standstill: float = Field(0.01, gt=0.0, le=1.0, description="share of the wheels' noise while none turns")
-    stale_after: float = Field(2.0, gt=0.0, description="no pose for so long is told, s")
+    stale_after: float = Field(2.0, gt=0.0, description="no pose for so long makes the health degraded, s")
 
 
 class Fusion:
-    """The pose of one robot in the map.
+    """Pose of one robot in the map, by a Kalman filter over its timeline.
 
-    located: whether anybody has said yet where the robot is. outcome: of the pose that was taken last. fused_at: when
-    the last pose came that was believed, s, monotonic; None since a reset.
+    located: True once a pose or an order has said where the robot is. outcome: of the pose that was taken last.
+    fused_at: arrival of the last pose that was fused, s, monotonic; None since a reset.
     """
 
     def __init__(self, settings: FusionSettings, timeline: Timeline, counts: Counts) -> None:
@@ -56,46 +60,46 @@ class Fusion:
         self._limit = float(chi2.ppf(settings.gate, 3))
         self._rejections = Rejections(settings.reacquire_after, self._limit)
         self._waiting: deque[PoseMeasurement] = deque()
-        self._since = _EVER  # what was measured before has no meaning: the pose was set
+        self._since = _EVER  # ns; poses measured before are too late, as the pose was set then
         self.located = False
         self.outcome: Outcome | None = None
         self.fused_at: float | None = None
 
     @property
     def pose(self) -> Array:
-        """(3,): m, m, rad in the map; the heading is not wrapped."""
+        """Pose (3,) in the map, m, m, rad; the heading is not wrapped."""
         return self._filter.pose
 
     @property
     def covariance(self) -> Array:
-        """(3, 3)."""
+        """Covariance (3, 3) of the pose."""
         return self._filter.covariance
 
     @property
     def rejected_in_a_row(self) -> int:
-        """Poses that the gate rejected since one was believed."""
+        """Poses that the gate rejected since one was fused."""
         return self._rejections.in_a_row
 
     def begin(self, pose: Array, covariance: Array | None) -> None:
-        """Where the robot is before the first wheel sample; None: nobody knows."""
+        """Set the pose before the first wheel sample; covariance None: the robot is not located."""
         self.located = covariance is not None
         self._filter.set(pose, _NOWHERE if covariance is None else covariance)
 
     def predict(self, motion: Motion) -> tuple[Array, Array]:
-        """Pose and covariance after a motion, for the entry of the timeline that is to be added."""
+        """Pose and covariance after a motion, for the new entry of the timeline."""
         self._filter.predict(motion)
         return self._filter.pose, self._filter.covariance
 
     def take_waiting(self) -> None:
-        """Fuse poses that came before the wheel samples of their time, once these are there."""
+        """Fuse the poses that came before the wheel samples of their time, if these are there now."""
         if self._waiting and min(measurement.latest for measurement in self._waiting) <= self._timeline.newest:
             waiting, self._waiting = self._waiting, deque()
             for measurement in waiting:
                 self.correct(measurement)
 
     def correct(self, measurement: PoseMeasurement) -> Outcome:
-        """Fuse a pose at its own time, or say why not; every outcome is counted."""
-        self.outcome = self._refused(measurement) or self._judged(self._at_one_time(measurement))
+        """Fuse a pose at its own time, or refuse it; every outcome is counted."""
+        self.outcome = self._refused(measurement) or self._fused_or_rejected(self._at_one_time(measurement))
         if self.outcome in ("fused", "located", "reacquired"):
             self._counts.poses += 1
             self._rejections.clear()
@@ -103,9 +107,9 @@ class Fusion:
         return self.outcome
 
     def set_pose(self, pose: Array, covariance: Array) -> None:
-        """The robot is here, now; what was measured before counts no more."""
+        """Set the pose now; poses that were measured before are not fused any more."""
         if not self._timeline.entries:
-            self.begin(pose, covariance)
+            self.begin(pose, covariance)  # before the first wheel sample
             return
         self._since = self._timeline.newest + 1
         self._waiting.clear()
@@ -114,7 +118,7 @@ class Fusion:
         self._now(pose, covariance)
 
     def reset(self) -> None:
-        """Forget where the robot is; the next pose of SLAM says it anew."""
+        """Forget where the robot is; the next pose of SLAM locates it."""
         if not self._timeline.entries:
             self.begin(np.zeros(3), None)
             return
@@ -122,13 +126,13 @@ class Fusion:
         self.located, self.outcome, self.fused_at = False, None, None
 
     def restart(self) -> None:
-        """The clock jumped: stamps of poses that are waiting, or of the past, have no meaning."""
+        """Forget the poses that wait or were rejected: the clock jumped, and their stamps have no meaning."""
         self._waiting.clear()
         self._rejections.clear()
         self._since = _EVER
 
     def at(self, stamp: int) -> tuple[Array, Array] | None:
-        """Pose and covariance at a time, between samples at constant twist; None outside of what is remembered."""
+        """Pose and covariance at a time (ns), between samples at constant twist; None outside the timeline."""
         entries = self._timeline.entries
         index = self._timeline.index(stamp)
         if not entries or index == len(entries) or stamp < self._timeline.oldest:
@@ -136,12 +140,12 @@ class Fusion:
         if entries[index].stamp == stamp:
             return entries[index].pose, entries[index].covariance
         self._to(index, stamp)
-        found = self._filter.pose, self._filter.covariance
+        estimate = self._filter.pose, self._filter.covariance
         self._filter.set(entries[-1].pose, entries[-1].covariance)
-        return found
+        return estimate
 
     def _refused(self, measurement: PoseMeasurement) -> Outcome | None:
-        """Why a pose cannot be fused now, whatever it says."""
+        """Why a pose's stamp does not let it be fused now; None if it can be."""
         timeline = self._timeline
         if not timeline.entries or measurement.latest > timeline.newest:
             ahead = (measurement.latest - timeline.newest) / _SECOND if timeline.entries else 0.0
@@ -153,30 +157,31 @@ class Fusion:
         if measurement.earliest < timeline.oldest or measurement.stamp < self._since:
             self._counts.pose_too_late += 1
             return "too late"
-        known = timeline.entries[timeline.index(measurement.stamp)].measurements
-        if any(each.stamp == measurement.stamp for each in known) or self._rejections.known(measurement.stamp):
+        fused = timeline.entries[timeline.index(measurement.stamp)].measurements
+        if any(earlier.stamp == measurement.stamp for earlier in fused) or self._rejections.known(measurement.stamp):
             self._counts.pose_duplicates += 1
             return "duplicate"
         return None
 
     def _at_one_time(self, measurement: PoseMeasurement) -> PoseMeasurement:
-        """A pose whose heading is of another time, with the odometry's turn until its own."""
+        """A pose whose heading was measured at another time, turned by odometry to the time of its position."""
         if measurement.heading_stamp is None:
             return measurement
-        before, after = (self._timeline.odometry_at(each) for each in (measurement.heading_stamp, measurement.stamp))
+        before = self._timeline.odometry_at(measurement.heading_stamp)
+        after = self._timeline.odometry_at(measurement.stamp)
         assert before is not None
         assert after is not None
         return turned(measurement, before, after)
 
-    def _judged(self, measurement: PoseMeasurement) -> Outcome:
-        """What becomes of a pose whose time is known to the timeline."""
+    def _fused_or_rejected(self, measurement: PoseMeasurement) -> Outcome:
+        """Fuse a pose whose time is within the timeline, or reject it by the gate."""
         index = self._timeline.index(measurement.stamp)
         self._to(index, measurement.stamp)
         if not self.located:
             self._replace(index, measurement)
             self.located = True
             return "located"
-        if self._filter.distance(measurement.pose, measurement.covariance) <= self._limit:
+        if self._filter.normalised_innovation(measurement.pose, measurement.covariance) <= self._limit:
             self._insert(index, measurement)
             return "fused"
         odometry = self._timeline.odometry_at(measurement.stamp)
@@ -190,16 +195,16 @@ class Fusion:
         return "rejected"
 
     def _replace(self, index: int, measurement: PoseMeasurement) -> None:
-        """Believe a pose alone: what other poses said of the time around it and after is forgotten."""
+        """Set the filter to a pose; the other poses of its entry and of later ones are forgotten."""
         for entry in self._timeline.entries[index:]:
             entry.measurements = ()
         self._insert(index, replace(measurement, absolute=True))
 
     def _insert(self, index: int, measurement: PoseMeasurement) -> None:
-        """Put a pose where it belongs and take what came after it again."""
+        """Add a pose to its entry, and filter what came after it again."""
         entry = self._timeline.entries[index]
-        entry.measurements = tuple(sorted((*entry.measurements, measurement), key=lambda each: each.stamp))
-        if index == 0:  # nothing is known of the motion up to the oldest entry: it is corrected as it stands
+        entry.measurements = tuple(sorted((*entry.measurements, measurement), key=lambda one: one.stamp))
+        if index == 0:  # the motion up to the oldest entry is not known: its pose is corrected as it is
             self._apply(measurement)
             entry.pose, entry.covariance = self._filter.pose, self._filter.covariance
         self._replay(max(index, 1))
@@ -210,7 +215,7 @@ class Fusion:
         newest.pose, newest.covariance = self._filter.pose, self._filter.covariance
 
     def _replay(self, first: int) -> None:
-        """Take all motions and poses from entry ``first`` on again."""
+        """Filter all motions and poses from entry ``first`` on again."""
         entries = self._timeline.entries
         self._filter.set(entries[first - 1].pose, entries[first - 1].covariance)
         for index in range(first, len(entries)):
@@ -222,7 +227,7 @@ class Fusion:
             entry.pose, entry.covariance = self._filter.pose, self._filter.covariance
 
     def _to(self, index: int, stamp: int) -> None:
-        """Bring the filter to a time within an entry's motion, with the entry's poses up to then."""
+        """Bring the filter to a time (ns) within an entry's motion, with the entry's poses up to then."""
         before, entry = self._timeline.entries[max(index - 1, 0)], self._timeline.entries[index]
         self._filter.set(before.pose, before.covariance)
         if index == 0:
@@ -242,6 +247,7 @@ class Fusion:
             self._filter.correct(measurement.pose, measurement.covariance)
 
     def _drive(self, entry: Entry, done: float, to: float) -> float:
+        """Predict the part of an entry's motion between two shares (0 to 1); the second share."""
         if to > done:
             self._filter.predict(entry.motion.part(to - done))
         return to

@@ -1,4 +1,4 @@
-"""What effects of the reference make of SLAM poses, undone before a pose is fused."""
+"""Reference correction: what effects of the reference do to SLAM poses is undone before a pose is fused."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _SECOND = 1e9  # ns
 
 
 class ReferenceCorrection:
-    """The effects of the reference in a model, undone.
+    """Undoes a model's effects of the reference.
 
-    A run starts with the first pose that comes: effects that act from a run's start pose on begin there.
+    start: the first pose of a run, from which some effects act on; None: the next pose that comes.
     """
 
     def __init__(self, model: OdometryModel, start: PoseMeasurement | None = None) -> None:
@@ -27,7 +27,7 @@ class ReferenceCorrection:
         self._start = start
 
     def continued(self, model: OdometryModel) -> ReferenceCorrection:
-        """Those of another model, from the same start on."""
+        """The correction by another model, from the same start on."""
         return ReferenceCorrection(model, self._start)
 
     def restart(self) -> None:
@@ -35,14 +35,14 @@ class ReferenceCorrection:
         self._start = None
 
     def corrected(self, measurement: PoseMeasurement) -> PoseMeasurement:
-        """The pose as it truly was, at the time at which its position was taken; its heading may be of another time."""
+        """The true pose at the time at which its position was measured; its heading may be of another time."""
         if self._start is None:
             self._start = measurement
         if not self._terms:
             return measurement
         stamps = np.array([(measurement.stamp - self._start.stamp) / _SECOND])
         delays = [effect.delays(stamps, values) for effect, values in self._terms]
-        of_position, of_heading = (sum(float(each[kind][0]) for each in delays) for kind in range(2))
+        of_position, of_heading = (sum(float(delay[kind][0]) for delay in delays) for kind in range(2))
         poses = measurement.pose[None]
         for effect, values in reversed(self._terms):
             poses = effect.corrected(poses, self._start.pose, values)
@@ -55,7 +55,7 @@ class ReferenceCorrection:
 
 
 def turned(measurement: PoseMeasurement, before: Array, after: Array) -> PoseMeasurement:
-    """A pose whose heading was taken at another time, with its heading at its own.
+    """A pose whose heading was measured at another time, with its heading turned to the time of the position.
 
     before, after: odometry's poses (3,) at the time of the heading and at that of the position.
     """

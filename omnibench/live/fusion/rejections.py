@@ -1,4 +1,4 @@
-"""Poses that the gate rejected: when they agree with each other, it is the filter that errs."""
+"""Poses that the gate rejected one after another; when they agree with each other, it is the filter that errs."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ from omnibench.live.fusion.timeline import PoseMeasurement
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import compose, relative
 
-_DRIFT = np.diag([0.1**2, 0.1**2, 0.1**2])  # m, rad: by which odometry may err from one rejected pose to another
+# Covariance of odometry's error from one rejected pose to another, m, rad; chosen.
+_DRIFT = np.diag([0.1**2, 0.1**2, 0.1**2])
 
 
 class Rejections:
-    """The poses that were rejected one after another, and where odometry saw the robot at their times.
+    """The latest rejected poses, with odometry's poses at their times.
 
-    enough: after so many that agree, SLAM is believed. limit: squared Mahalanobis distance of poses that agree.
+    enough: number of poses that have to agree. limit: of the squared Mahalanobis distance of two poses that agree.
+    in_a_row: poses rejected since one was fused.
     """
 
     def __init__(self, enough: int, limit: float) -> None:
@@ -27,25 +29,25 @@ class Rejections:
         self.in_a_row = 0
 
     def clear(self) -> None:
-        """A pose was fused, or what was rejected has no meaning any more."""
+        """Forget them: a pose was fused, or the map's frame or the clock has changed."""
         self._poses.clear()
         self.in_a_row = 0
 
     def known(self, stamp: int) -> bool:
-        """Whether a pose of this time was rejected already."""
+        """True if a pose of this time was rejected already."""
         return any(measurement.stamp == stamp for measurement, _ in self._poses)
 
     def add(self, measurement: PoseMeasurement, odometry: Array) -> bool:
-        """Another one; whether the last ones agree on where the robot is. odometry (3,): pose in odom at its time."""
+        """Add a rejected pose; True if enough agree on where the robot is. odometry (3,): pose in odom at its time."""
         self.in_a_row += 1
         self._poses.append((measurement, odometry))
         return len(self._poses) == self._enough and all(
             self._agrees(*each, measurement, odometry) for each in self._poses
         )
 
-    def _agrees(self, earlier: PoseMeasurement, seen: Array, measurement: PoseMeasurement, odometry: Array) -> bool:
-        """Whether the earlier pose, carried along by odometry, is the later one."""
-        carried = compose(earlier.pose, relative(seen, odometry))
+    def _agrees(self, earlier: PoseMeasurement, before: Array, measurement: PoseMeasurement, odometry: Array) -> bool:
+        """True if the earlier pose, moved on by odometry from ``before``, is the later one."""
+        carried = compose(earlier.pose, relative(before, odometry))
         innovation = innovation_of(measurement.pose, carried)
         spread = measurement.covariance + earlier.covariance + _DRIFT
         return float(innovation @ np.linalg.solve(spread, innovation)) <= self._limit

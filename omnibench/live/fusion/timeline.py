@@ -1,4 +1,4 @@
-"""The last seconds of a robot: its motions, and the poses after them."""
+"""Timeline: the motions of a robot's last seconds, the poses after them, and the poses measured in between."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import advance
 
 _SECOND = 1e9  # ns
-_MOST_A_SECOND = 2000  # samples; a sender with nonsense for stamps shall not fill the memory
+_MOST_A_SECOND = 2000  # samples that are kept, whatever the stamps say, so that wrong ones cannot fill the memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseMeasurement:
-    """A pose in the map at its own time.
+    """Measurement of a pose (3,) in the map, m, m, rad, at ``stamp`` (ns), with its covariance (3, 3).
 
-    arrival: s, monotonic. absolute: it replaces what the filter believes, instead of correcting it. heading_stamp: when
-    its heading was taken, if that is another time.
+    arrival: s, monotonic. absolute: it replaces the filter's pose instead of correcting it. heading_stamp: when its
+    heading was measured (ns), if that is another time.
     """
 
     stamp: int
@@ -32,20 +32,20 @@ class PoseMeasurement:
 
     @property
     def latest(self) -> int:
-        """The time from which on all of it can be placed."""
+        """The later of its two times, ns: from there on odometry is known for all of it."""
         return self.stamp if self.heading_stamp is None else max(self.stamp, self.heading_stamp)
 
     @property
     def earliest(self) -> int:
-        """The time since which motions must be known to place all of it."""
+        """The earlier of its two times, ns."""
         return self.stamp if self.heading_stamp is None else min(self.stamp, self.heading_stamp)
 
 
 @dataclass(slots=True, eq=False)
 class Entry:
-    """What is known at one wheel sample: the motion up to it, odometry's pose after it, and the filter's.
+    """One wheel sample: the motion up to it, and after it odometry's pose (3,), the filter's pose and covariance.
 
-    measurements: poses in the map whose time lies within the motion, by time.
+    measurements: poses whose time lies within the motion, in the order of time.
     """
 
     stamp: int
@@ -78,7 +78,7 @@ class Timeline:
         self.entries.append(entry)
         self._stamps.append(entry.stamp)
         first = 0
-        if self._stamps[0] < entry.stamp - 2 * self._length:  # now and then, many at once
+        if self._stamps[0] < entry.stamp - 2 * self._length:  # seldom, and then many at once, which is fast
             first = bisect_left(self._stamps, entry.stamp - self._length) - 1
         elif len(self._stamps) > 2 * self._most:
             first = self._most
@@ -86,7 +86,7 @@ class Timeline:
             del self.entries[:first], self._stamps[:first]
 
     def restart(self, stamp: int) -> None:
-        """Keep the newest entry alone, at another time: the clock jumped, or all before has no meaning any more."""
+        """Keep the newest entry alone, at another stamp: the clock jumped, and the times before have no meaning."""
         newest = self.entries[-1]
         newest.stamp, newest.measurements = stamp, ()
         self.entries, self._stamps = [newest], [stamp]
@@ -96,12 +96,12 @@ class Timeline:
         return bisect_left(self._stamps, stamp)
 
     def share(self, index: int, stamp: int) -> float:
-        """How much of an entry's motion lies before ``stamp``."""
+        """Share (0 to 1) of an entry's motion that lies before ``stamp``."""
         begin, end = self._stamps[index - 1], self._stamps[index]
         return (stamp - begin) / (end - begin)
 
     def odometry_at(self, stamp: int) -> Array | None:
-        """Odometry's pose (3,) at a time, between samples at constant twist; None outside of what is remembered."""
+        """Odometry's pose (3,) at a time (ns), between samples at constant twist; None outside the timeline."""
         index = self.index(stamp)
         if not self.entries or index == len(self.entries) or stamp < self.oldest:
             return None

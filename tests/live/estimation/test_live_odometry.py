@@ -108,7 +108,7 @@ def test_what_nobody_saw_makes_the_pose_less_certain() -> None:
 def test_the_covariance_grows_while_nothing_comes() -> None:
     live = LiveOdometry(calibration())
     live.step(step(0.01, [0.02, 0.01, -0.02]))
-    traces = [float(np.trace(live.grown(seconds))) for seconds in (0.0, 0.5, 1.0, 5.0)]
+    traces = [float(np.trace(live.covariance_after_silence(seconds))) for seconds in (0.0, 0.5, 1.0, 5.0)]
     assert traces == sorted(traces)
     assert traces[-1] > 2 * traces[0]
 
