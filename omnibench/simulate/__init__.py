@@ -1,1 +1,1 @@
-"""Simulated recordings."""
+"""Simulated recordings of known truth."""

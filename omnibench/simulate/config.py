@@ -1,4 +1,4 @@
-"""What a config says of a simulated experiment."""
+"""Configuration of a simulated experiment: the flower generator, and what all generators share."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from omnibench.robot.published_matrices import PUBLISHED
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
-_MOST_ROWS = 1e8
+_MOST_ROWS = 1e8  # wheel samples and poses; more do not fit into memory
 
 
 def _named(robot: Robot) -> Robot:
@@ -32,19 +32,19 @@ NamedRobot = Annotated[Robot, AfterValidator(_named)]
 class Tolerances(Model):
     """Standard deviations of the true wheels about their design values."""
 
-    radius: float = Field(0.0, ge=0, lt=0.3, description="share of the radius")
-    distance: float = Field(0.0, ge=0, lt=0.3, description="share of the distance")
+    radius: float = Field(0.0, ge=0, lt=0.3, description="relative to the radius")
+    distance: float = Field(0.0, ge=0, lt=0.3, description="relative to the distance")
     angle_deg: float = Field(0.0, ge=0, lt=30, description="degrees")
     seed: int = Field(0, ge=0)
 
 
 class Truth(Model):
-    """What the simulated robot really is: its matrix, by exactly one of the first three, and effects."""
+    """The true robot: its matrix, given by exactly one of published, matrix and tolerances, and its effects."""
 
     published: str | None = Field(None, description=f"one of {', '.join(PUBLISHED)}")
     matrix: tuple[tuple[FiniteFloat, ...], ...] | None = Field(None, description="3 rows of N")
     tolerances: Tolerances | None = Field(None, description="drawn about the design")
-    effects: tuple[EffectTerm, ...] = Field((), description="what is hidden in the data; see omnibench list")
+    effects: tuple[EffectTerm, ...] = Field((), description="effects hidden in the data; see omnibench list")
 
     @model_validator(mode="after")
     def _one_is_given(self) -> Truth:
@@ -73,7 +73,7 @@ class Session(Model):
 
     seed: int = Field(ge=0)
     distance: Positive = Field(description="length of each run, m")
-    noise_scale: float = Field(1.0, ge=0, allow_inf_nan=False, description="factor on all the reference's noise")
+    noise_scale: float = Field(1.0, ge=0, allow_inf_nan=False, description="factor on all noise of the reference")
 
 
 class MotionGrid(Model):
@@ -88,21 +88,24 @@ class MotionGrid(Model):
 
 
 class Commands(MotionGrid):
-    """How the commands of a grid are driven."""
+    """Motion commands and the ramps with which they are driven."""
 
     ramp: float = Field(
-        0.0, ge=0, allow_inf_nan=False, description="wheel rates rise and fall in so long; the run takes longer, s"
+        0.0,
+        ge=0,
+        allow_inf_nan=False,
+        description="time in which wheel rates rise and fall, which is added to the run, s",
     )
 
 
 class EncoderNoise(Noise):
-    """The whole noise model: encoders, and the reference poses as in a calibration file."""
+    """Noise of the encoders, and of the reference poses as in a calibration file."""
 
     encoder: float = Field(0.0, ge=0, allow_inf_nan=False, description="white noise of each wheel rate, rad/s")
 
 
 class FlowerConfig(Model):
-    """A flower-shaped experiment, simulated: constant commands or ramps, wheel rates and reference poses with noise."""
+    """A simulated flower-shaped experiment: constant commands or ramps, wheel rates and reference poses with noise."""
 
     generator: Literal["flower"] = "flower"
     robot: NamedRobot
@@ -111,7 +114,7 @@ class FlowerConfig(Model):
     commands: Commands
     repetitions: int = Field(5, gt=0)
     truth: Truth
-    integration: Integration = Field("arc", description="how the true robot moves")
+    integration: Integration = Field("arc", description="how the true robot moves within a sample")
     noise: EncoderNoise = EncoderNoise()
     train: Session
     validation: Session | None = None
@@ -142,7 +145,7 @@ class FlowerConfig(Model):
         return self
 
     def _rows(self) -> float:
-        """Wheel samples and poses in all."""
+        """Number of wheel samples and poses of the experiment."""
         chosen = self.commands
         ways = [session.distance for session in self._sessions()]
         driven = [way / speed + chosen.ramp for way in ways for speed in chosen.speeds if speed]

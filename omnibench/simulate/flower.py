@@ -1,4 +1,4 @@
-"""The flower benchmark: a robot of known truth drives every command, wheels and reference are recorded with noise."""
+"""The flower experiment: a robot of known truth drives every command; wheels and reference are recorded with noise."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def simulate_flower(config: FlowerConfig, name: str = "flower", description: str
 
 
 def commands_of(config: FlowerConfig) -> list[Command]:
-    """The commands of a config, in its order."""
+    """The commands of a config, in the order of its grid."""
     return grid_of(config.commands)
 
 
@@ -94,7 +94,7 @@ def runs_of(
 
 
 def duration_of(command: Command, session: Session, chosen: Commands) -> float:
-    """How long a command is driven in a session, s; ramps lengthen a run so that the way stays."""
+    """Duration of a command in a session, s; ramps lengthen a run, so that its length in m stays."""
     driven = session.distance / command.speed if command.speed else chosen.turn_duration
     return driven + chosen.ramp
 
@@ -102,14 +102,14 @@ def duration_of(command: Command, session: Session, chosen: Commands) -> float:
 def commanded_rates(robot: Robot, command: Command, times: Array, ramp: float) -> Array:
     """Mean wheel rates (F, N) by the design values, rad/s, in samples that end at times (F,), s.
 
-    ramp: s in which they rise and fall, linearly.
+    ramp: time in which the rates rise and fall linearly, s.
     """
     rates: Array = np.tile(wheel_equations(robot.wheels) @ command.twist, (len(times), 1))
     return rates if not ramp else rates * _mean_shares(times, ramp)[:, None]
 
 
 def _mean_shares(times: Array, ramp: float) -> Array:
-    """The share of its full speed (F,) that a robot has on average in each sample, from rest to rest."""
+    """Mean speed (F,) in each sample as a share of the full speed, from rest to rest."""
     ends = np.append(0.0, times)
     ramp = min(ramp, times[-1] / 2)
     rising, falling = np.minimum(ends, ramp), np.maximum(ends - (times[-1] - ramp), 0.0)
@@ -149,7 +149,7 @@ def _session(config: FlowerConfig, robot: TrueRobot, split: Split, session: Sess
 
 @dataclass(frozen=True)
 class _Before:
-    """What a run begins with: session, s since its start, and wheel angles (N,), rad."""
+    """State at the begin of a run: session, s since its start, and wheel angles (N,), rad."""
 
     session: str
     started_at: float
@@ -174,9 +174,9 @@ def _drive(
     rng: np.random.Generator,
     before: _Before,
 ) -> _Run:
-    """One run: the design values turn the command into targets, motors these into rates, the truth these into motion.
+    """One run: target rates by the design values, wheel rates by the motors, motion by the true robot.
 
-    Encoders are exact between runs: their noise does not part the true wheel angles from the recorded ones.
+    Encoders are exact between runs, so that recorded and true wheel angles do not drift apart.
     """
     duration = duration_of(command, session, config.commands)
     times, pose_times = stamps_of_run(duration, config.sample_period, config.pose_period)

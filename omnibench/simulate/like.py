@@ -1,4 +1,4 @@
-"""A recording simulated again: its own wheel samples, and poses as a model says that the reference reports them."""
+"""Simulation of a recording: its own wheel samples, with reference poses by a calibration's model."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from omnibench.simulate.pose_noise import reference_noise
 def simulate_like(dataset: Dataset, calibration: Calibration, noise_seed: int | None = None) -> Dataset:
     """The runs of a data set with poses by a calibration's model, from each run's recorded start pose on.
 
-    Everything else is as recorded, stamps, wheel samples, splits and sessions too, so that both lie side by side.
-    noise_seed: adds the calibration's noise of the reference; None: poses without noise. Its warnings tell of motions
-    that the calibration's effects were not fitted to, too. DataError in one line: the calibration is another robot's,
-    it has no noise, or the recording lacks what one of its effects needs.
+    Everything else (stamps, wheel samples, splits, sessions) is as recorded, so that both can be compared run by run.
+    noise_seed: seed of the calibration's noise of the reference, which is added; None: poses without noise. Warnings
+    include motions that the calibration's effects were not fitted to. DataError in one line: the calibration is for
+    another robot or has no noise, or the recording lacks what one of its effects needs.
     """
     ours, theirs = calibration.robot.wheel_names, dataset.robot.wheel_names
     if ours != theirs:
@@ -35,7 +35,7 @@ def simulate_like(dataset: Dataset, calibration: Calibration, noise_seed: int | 
         poses = _with_noise(dataset, poses, calibration, noise_seed)
         how = f"with its noise, seed {noise_seed}"
     runs = zip(dataset.trajectories, poses, strict=True)
-    made = make_dataset(
+    simulated = make_dataset(
         dataset.name,
         dataset.robot,
         dataset.sample_period,
@@ -50,7 +50,7 @@ def simulate_like(dataset: Dataset, calibration: Calibration, noise_seed: int | 
     warnings = [] if warning is None else [warning]
     if dataset.scans is not None:
         warnings.append("the recording's scans are left out: they show where its robot was")
-    return replace(made, warnings=(*made.warnings, *warnings))
+    return replace(simulated, warnings=(*simulated.warnings, *warnings))
 
 
 def _with_noise(dataset: Dataset, poses: list[Array], calibration: Calibration, seed: int) -> list[Array]:
@@ -68,5 +68,5 @@ def _with_noise(dataset: Dataset, poses: list[Array], calibration: Calibration, 
 def _described(dataset: Dataset, calibration: Calibration, how: str) -> str:
     names = ", ".join(term.name for term in calibration.effects)
     model = f"calibration {calibration.name}" + (f" with {names}" if names else "")
-    told = f"Simulated like {dataset.name} by {model}, {how}: its wheels, and poses as the model has them."
-    return f"{told} {dataset.description}".strip()
+    how_made = f"Simulated like {dataset.name} by {model}, {how}: its wheels, and poses as the model has them."
+    return f"{how_made} {dataset.description}".strip()

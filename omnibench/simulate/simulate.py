@@ -1,4 +1,4 @@
-"""Simulated data sets of every kind that a config can ask for."""
+"""Simulation of a data set by the generator that its config names."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _FLOWER, _ROBOT = CHOSEN + FlowerConfig.__name__, CHOSEN + RobotConfig.__name__
 
 
 def _generator(config: Any) -> str | None:
-    """Which config is meant; None where none is."""
-    found = config.get("generator", "flower") if isinstance(config, Mapping) else getattr(config, "generator", "flower")
-    return {"flower": _FLOWER, "robot": _ROBOT}.get(str(found))
+    """Tag of the config's class by its key ``generator``; None for an unknown generator."""
+    name = config.get("generator", "flower") if isinstance(config, Mapping) else getattr(config, "generator", "flower")
+    return {"flower": _FLOWER, "robot": _ROBOT}.get(str(name))
 
 
 SimulatedConfig = Annotated[
@@ -44,6 +44,6 @@ def simulate_dataset(
     """
     if isinstance(config, FlowerConfig):
         return simulate_flower(config, name, description)
-    from omnibench.simulate.chain.robot_simulator import simulate_robot  # and what it takes a second to load
+    from omnibench.simulate.chain.robot_simulator import simulate_robot  # loads for a second (numba)
 
     return simulate_robot(config, name, description, watch)

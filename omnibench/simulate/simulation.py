@@ -1,4 +1,4 @@
-"""What a simulation makes: a data set and, apart from it, what is hidden in it."""
+"""Result of a simulation: a data set and, apart from it, the truth."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from omnibench.simulate.truth import TruthRecord
 class Simulation:
     """A simulated data set and, apart from it, the truth behind it.
 
-    Of a robot that was simulated from command to SLAM also: paths: where it truly was in each run. plan: its room.
-    starts: its true start pose (3,) in the room for each run, m, m, rad.
+    The robot simulator also gives paths: the true path of each run. plan: the room. starts: the true start pose (3,) in
+    the room of each run, m, m, rad.
     """
 
     dataset: Dataset

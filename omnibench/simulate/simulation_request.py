@@ -1,4 +1,4 @@
-"""What ``omnibench simulate`` is asked for: a config's data set, or a recording simulated again, into a folder."""
+"""The job of ``omnibench simulate``: write a config's data set, or a recording simulated again, into a folder."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ ACCURACY_FILE = "slam_accuracy.json"
 
 
 @dataclass(frozen=True)
-class Made:
-    """A data set that was written. simulation: with what is hidden in it, if a config said that. accuracy: of SLAM."""
+class WrittenSimulation:
+    """A data set that was written. simulation: with its truth, if it came from a config. accuracy: of SLAM."""
 
     dataset: Dataset
     simulation: Simulation | None = None
@@ -34,10 +34,10 @@ class Made:
 
 @dataclass(frozen=True)
 class SimulationRequest:
-    """Either ``config`` or ``like`` with ``model``; the other options are for one of the two.
+    """Arguments of ``omnibench simulate``: either ``config``, or ``like`` with ``model``.
 
-    effects: hidden beside those of the config, each as YAML. noise, seed: whether the calibration's noise is added, and
-    from which seed (default: 0). ConfigError in one line: options that do not go together.
+    effects: to hide besides those of the config, each as YAML. noise: add the calibration's noise (with ``like``).
+    seed: of that noise; default 0. ConfigError in one line: options that exclude each other.
     """
 
     output: Path
@@ -75,11 +75,11 @@ class SimulationRequest:
 
     @property
     def plugins(self) -> tuple[Path, ...]:
-        """Folders of plug-ins that the config names for its effects."""
+        """Folders of plug-ins that the config's effects may come from."""
         return () if self.config is None else self.source.effect_plugins
 
-    def write(self, table_format: TableFormat = "parquet", watch: ProgressCallback = no_progress) -> Made:
-        """Simulate, and write the data set, and the truth to its own folder if one is named.
+    def write(self, table_format: TableFormat = "parquet", watch: ProgressCallback = no_progress) -> WrittenSimulation:
+        """Simulate and write the data set; write the truth to its own folder, if one is named.
 
         OmnibenchError in one line: the config, the recording or the calibration is wrong, or the disk refuses.
         """
@@ -88,15 +88,15 @@ class SimulationRequest:
             assert self.like is not None
             assert self.model is not None
             calibration = read_calibration(self.model)
-            made = simulate_like(load_dataset(self.like), calibration, (self.seed or 0) if self.noise else None)
-            save_dataset(made, self.output, table_format)
-            return Made(made)
+            dataset = simulate_like(load_dataset(self.like), calibration, (self.seed or 0) if self.noise else None)
+            save_dataset(dataset, self.output, table_format)
+            return WrittenSimulation(dataset)
         simulation = self.source.simulate(watch)
         save_dataset(simulation.dataset, self.output, table_format)
         accuracy = slam_accuracy(simulation.dataset, simulation.paths) if simulation.paths else None
         if self.truth is not None:
             self._write_truth(self.truth, simulation, accuracy)
-        return Made(simulation.dataset, simulation, accuracy)
+        return WrittenSimulation(simulation.dataset, simulation, accuracy)
 
     def _write_truth(self, folder: Path, simulation: Simulation, accuracy: SlamAccuracy | None) -> None:
         write_text(folder / TRUTH_FILE, to_yaml(simulation.truth))

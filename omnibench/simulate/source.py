@@ -1,4 +1,4 @@
-"""Simulated data sets in the YAML of a comparison, or of a simulation alone."""
+"""Simulated data sets that the YAML of a comparison, or of a simulation alone, describes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from omnibench.simulate.simulation import Simulation
 
 
 class _Source(Model):
-    """What a config says of one data set; only ``simulate`` is used here."""
+    """Source of one data set in a config; only ``simulate`` is used here."""
 
     path: Any = None
     simulate: SimulatedConfig | None = None
@@ -28,24 +28,24 @@ class _Source(Model):
 
 
 class SimulationConfig(Model):
-    """A config of simulated data sets and nothing else."""
+    """Config of simulated data sets alone."""
 
     name: str = ""
     description: str = ""
-    notes: tuple[str, ...] = Field((), description="what a reader must know")
+    notes: tuple[str, ...] = Field((), description="remarks for readers of the report")
     plugins: tuple[Path, ...] = Field((), description="folders of effects; relative to the config file")
     datasets: dict[Annotated[str, Field(min_length=1, max_length=60)], _Source]
 
 
 class _Comparison(SimulationConfig):
-    """The same of a comparison, the rest of which does not matter here."""
+    """Config of a comparison, of which only the data sets are read here."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
 
 @dataclass(frozen=True)
 class SimulationSource:
-    """A simulated data set of a config. plugins: folders that its effects may come from."""
+    """A simulated data set of a config. plugins: folders of plug-ins that its effects may come from."""
 
     name: str
     config: FlowerConfig | RobotConfig
@@ -54,11 +54,11 @@ class SimulationSource:
 
     @property
     def effect_plugins(self) -> tuple[Path, ...]:
-        """The folders, if there are effects to be found there."""
+        """The folders of plug-ins, if the data set has effects."""
         return self.plugins if self.config.truth.effects else ()
 
     def with_effects(self, given: Sequence[str]) -> SimulationSource:
-        """The same with more effects hidden in it, each as YAML ``name: {parameter: value}``. ConfigError names it."""
+        """A copy with more effects, each as YAML ``name: {parameter: value}``. ConfigError names the wrong one."""
         if not given:
             return self
         truth = self.config.truth
@@ -67,14 +67,14 @@ class SimulationSource:
         return replace(self, config=self.config.model_copy(update={"truth": changed}))
 
     def simulate(self, watch: ProgressCallback = no_progress) -> Simulation:
-        """Simulate it. ConfigError or DataError as for ``simulate_dataset``."""
+        """Simulate the data set. ConfigError or DataError as for ``simulate_dataset``."""
         return simulate_dataset(self.config, self.name, self.description, watch)
 
 
 def read_simulation(path: Path | str, dataset: str | None = None) -> SimulationSource:
-    """The simulated data set of a comparison's YAML, or of one with nothing but data sets.
+    """The simulated data set in the YAML of a comparison or of a simulation.
 
-    dataset: which one, if there are several. ConfigError in one line when there is no such thing.
+    dataset: its name, needed if there are several. ConfigError in one line when there is no such data set.
     """
     path = Path(path)
     content = read_yaml(path)

@@ -1,4 +1,4 @@
-"""The truth behind simulated recordings: what the robot really is, and what is written down of it."""
+"""The truth behind simulated recordings: the true robot, and its record in the truth folder."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from omnibench.simulate.config import EncoderNoise, Truth
 
 @dataclass(frozen=True, eq=False)
 class TrueRobot:
-    """A simulated robot as it really is: its own matrix, and effects of any stage."""
+    """The true robot of a simulation: its matrix, and effects of any stage."""
 
     model: OdometryModel
 
     def driven(self, times: Array, targets: Array) -> Array:
-        """What the motors make of targets (F, N) in samples that end at times (F,): true mean wheel rates (F, N)."""
+        """True mean wheel rates (F, N), rad/s, for targets (F, N) in samples that end at times (F,), s."""
         rates = targets
         for term in self.model.terms:
             if isinstance(term.effect, ActuatorEffect):
@@ -45,13 +45,13 @@ class TrueRobot:
         started_at: float | None,
         session: str | None,
     ) -> WheelLog:
-        """What the true wheels did from a pose (3,) and wheel angles (N,) rad on; rates (F, N): their true ones."""
+        """Log of the true wheel rates (F, N), from a start pose (3,) and start angles of the wheels (N,), rad, on."""
         turned = np.cumsum(rates * np.diff(times, prepend=0.0)[:, None], axis=0)
         return WheelLog(times, rates, start, stamps, angles + turned, started_at, session)
 
 
 class TruthRecord(Model):
-    """What was hidden: goes to its own folder, which fitting and comparing never read."""
+    """Record of the truth; it goes to its own folder, which fitting and comparing never read."""
 
     dataset: str
     robot: Robot
@@ -60,15 +60,15 @@ class TruthRecord(Model):
     integration: Integration
     noise: EncoderNoise
     effects: tuple[EffectTerm, ...] = ()
-    wheels: tuple[Wheel, ...] | None = Field(None, description="as they truly are, if they were drawn about the design")
+    wheels: tuple[Wheel, ...] | None = Field(None, description="the true wheels, if they were drawn about the design")
 
     def true_robot(self, step: float | None = None) -> TrueRobot:
-        """The robot, moving in steps of so many s (default: the sample period).
+        """The true robot. step: of its motion, s; default: the sample period.
 
-        OmnibenchError in one line: an effect of it or a parameter is not known, or one is missing.
+        OmnibenchError in one line: an effect or a parameter is unknown, or a parameter is missing.
         """
         where = _place(self.dataset)
-        terms = tuple(make_term(each.name, each.parameters, self.robot, where) for each in self.effects)
+        terms = tuple(make_term(effect.name, effect.parameters, self.robot, where) for effect in self.effects)
         return TrueRobot(
             OdometryModel(self.robot, np.array(self.matrix), self.integration, terms, step or self.sample_period)
         )
@@ -84,7 +84,7 @@ def true_record(
     integration: Integration = "arc",
     noise: EncoderNoise | None = None,
 ) -> TruthRecord:
-    """What is hidden in a data set. UnknownNameError as for ``complete_effects``."""
+    """The record of a data set's truth. UnknownNameError as for ``complete_effects``."""
     return TruthRecord(
         dataset=dataset,
         robot=robot,
@@ -98,9 +98,10 @@ def true_record(
 
 
 def complete_effects(truth: Truth, robot: Robot, sessions: tuple[str, ...], dataset: str) -> tuple[EffectTerm, ...]:
-    """The effects with 0 for parameters that are not given beside others: one wheel of several may be eccentric.
+    """The effects with parameters that are left out set to 0, so that one wheel of several may be eccentric.
 
-    sessions: that are driven. UnknownNameError: no such effect, or no such parameter for this robot and these sessions.
+    An effect without any parameter is left as it is. sessions: names of those that are driven. UnknownNameError: no
+    such effect, or no such parameter for this robot and these sessions.
     """
     return tuple(_complete(term, robot, sessions, _place(dataset)) for term in truth.effects)
 
@@ -134,14 +135,14 @@ def true_matrix(truth: Truth, robot: Robot) -> Array:
 
 
 def _complete(term: EffectTerm, robot: Robot, sessions: tuple[str, ...], where: str) -> EffectTerm:
-    found = effects.create(term.name, where=where).parameters(robot, sessions)
-    known = {parameter.name for parameter in found}
+    parameters = effects.create(term.name, where=where).parameters(robot, sessions)
+    known = {parameter.name for parameter in parameters}
     for given in term.parameters:
         if given not in known:
             raise UnknownNameError("parameter", given, known, f"{where}: effect {term.name!r}")
-    unchanged = {parameter.name: 0.0 for parameter in found if not parameter.choices}
+    unchanged = {parameter.name: 0.0 for parameter in parameters if not parameter.choices}
     if unchanged.keys().isdisjoint(term.parameters):
-        return term  # and what it lacks is told
+        return term  # whoever uses it refuses it for its missing parameters
     return term.model_copy(update={"parameters": unchanged | term.parameters})
 
 

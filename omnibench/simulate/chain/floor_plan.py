@@ -35,8 +35,8 @@ Pose = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 _LARGEST = 1000.0  # m; a larger plan is one in mm
 _SMALLEST_AREA = 1e-6  # m²
-_STEP = 0.01  # m: a path is looked at in steps of this length
-_OUTSIDE = 0.01  # m: by so much an obstacle may reach into the walls
+_STEP = 0.01  # m between the points at which a path is checked
+_OUTSIDE = 0.01  # m that an obstacle may reach into the walls
 
 
 class RoomPlan(Model):
@@ -63,9 +63,9 @@ class RoomPlan(Model):
 class FloorPlan:
     """A room as the robot meets it, in metres, in the room's frame.
 
-    obstacle_names: what messages call them. start (3,): m, m, rad. segments (S, 4): x, y of both ends of each wall of
-    boundary and obstacles. owners (S,): whose wall that is, the obstacle's index or -1 for the boundary. free: where
-    the boundary is not covered by obstacles.
+    obstacle_names: for messages. start (3,): m, m, rad. segments (S, 4): x, y of both ends of each wall of boundary and
+    obstacles. owners (S,): index of the obstacle that a wall belongs to, -1 for the boundary. free: area inside the
+    boundary without the obstacles.
     """
 
     name: str
@@ -83,10 +83,10 @@ class FloorPlan:
         return [np.array(shape.exterior.coords) for shape in (self.boundary, *self.obstacles)]
 
     def check_path(self, positions: Array, times: Array, radius: float, what: str) -> None:
-        """ConfigError in one line when a robot, a disc of ``radius`` m, does not keep inside the free area.
+        """ConfigError in one line when a robot, a disc of ``radius`` m, leaves the free area.
 
-        positions (K, 2), m, at times (K,), s: those of the robot's centre; ``what``: whose path it is, for the message.
-        What reaches less than 1 cm into a wall between two places looked at may go unseen.
+        positions (K, 2): of the robot's centre, m, at times (K,), s. what: name of the path, for the message. The path
+        is checked every 1 cm, so that a collision less deep than that may be missed.
         """
         way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(positions, axis=0).T))])
         chosen = np.flatnonzero(np.diff(np.floor(way / _STEP), prepend=-1.0))
@@ -98,12 +98,12 @@ class FloorPlan:
         for step in np.flatnonzero(bad)[:1]:
             raise ConfigError(
                 f"{what}: at {times[chosen[step]]:.2f} s the robot at ({_place(places[step])}) m, radius {radius:g} m, "
-                f"{self._met(steps[step], radius)} of the room {self.name}; shorten the way, move the start or choose "
+                f"{self._hit(steps[step], radius)} of the room {self.name}; shorten the way, move the start or choose "
                 "a larger room"
             )
 
     def place_of(self, position: Array) -> str | None:
-        """What a position (2,) lies in, if that is not the free area; a wall belongs to what it is the wall of."""
+        """Obstacle in which a position (2,) lies, or that it is outside, in words; None in the free area."""
         if self.free.contains(Point(position)):
             return None
         for name, obstacle in zip(self.obstacle_names, self.obstacles, strict=True):
@@ -111,8 +111,8 @@ class FloorPlan:
                 return f"in {name}"
         return "outside the boundary"
 
-    def _met(self, step: LineString, radius: float) -> str:
-        """What a robot meets that is not in the free area with all its disc."""
+    def _hit(self, step: LineString, radius: float) -> str:
+        """Collision of the robot in words: what it hits, or where it is."""
         distances = shapely.distance(shapely.linestrings(self.segments.reshape(-1, 2, 2)), step)
         nearest = int(np.argmin(distances))
         if distances[nearest] >= radius:
@@ -123,10 +123,10 @@ class FloorPlan:
 
 
 def make_plan(room: RoomPlan, where: str) -> FloorPlan:
-    """The floor plan of a config's room, ``where`` in the config.
+    """The floor plan of a config's room. where: its place in the config, for messages.
 
-    ConfigError in one line names the polygon and what is wrong with it: fewer than three corners, no area, it crosses
-    itself, it is an obstacle outside the boundary or covers all of it; or the plan is unknown, or the start not free.
+    ConfigError in one line: an unknown plan, a start that is not free, or a polygon with fewer than three corners,
+    without area, that crosses itself, lies outside the boundary or covers all of it.
     """
     drawing, name = _drawing(room, where)
     start = drawing.start
@@ -164,7 +164,7 @@ def make_plan(room: RoomPlan, where: str) -> FloorPlan:
 
 
 def _drawing(room: RoomPlan, where: str) -> tuple[Drawing, str]:
-    """What a config's room looks like, and its name."""
+    """Drawing of a config's room, and its name."""
     if room.plan is None:
         obstacles = {f"obstacles[{index}]": corners for index, corners in enumerate(room.obstacles)}
         return Drawing(room.boundary or (), room.start or (0.0, 0.0, 0.0), obstacles), "drawn in the config"
@@ -186,14 +186,14 @@ def _polygon(corners: Sequence[Corner], where: str) -> Polygon:
     if shapely.MultiPoint(points).convex_hull.area < _SMALLEST_AREA:
         raise ConfigError(f"{where}: has no area, its corners lie on one line from ({_place(points[0])}) m; move one")
     if not polygon.is_valid:
-        found = re.fullmatch(r"(.*)\[(\S+) (\S+)\]", shapely.is_valid_reason(polygon))
-        place = f" at ({_place((float(found[2]), float(found[3])))}) m" if found else ""
+        match = re.fullmatch(r"(.*)\[(\S+) (\S+)\]", shapely.is_valid_reason(polygon))
+        place = f" at ({_place((float(match[2]), float(match[3])))}) m" if match else ""
         raise ConfigError(f"{where}: crosses or touches itself{place}; give its corners in their order along the walls")
     return polygon
 
 
 def _edges(polygon: Polygon) -> Array:
-    """Both ends (E, 4) of each edge, those between repeated corners left out."""
+    """Both ends (E, 4) of each edge, without edges between repeated corners."""
     corners = shapely.get_coordinates(polygon.exterior)
     edges = np.hstack([corners[:-1], corners[1:]])
     return edges[(edges[:, :2] != edges[:, 2:]).any(axis=1)]

@@ -11,7 +11,7 @@ Corners = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Drawing:
-    """A room with what stands in it. start: x (m), y (m), heading (degrees) of the robot at rest."""
+    """A room and its obstacles. start: x (m), y (m), heading (degrees) of the robot at rest."""
 
     boundary: Corners
     start: tuple[float, float, float]
@@ -19,12 +19,12 @@ class Drawing:
 
 
 def box(left: float, bottom: float, right: float, top: float) -> Corners:
-    """An upright rectangle."""
+    """Corners of a rectangle along the axes."""
     return ((left, bottom), (right, bottom), (right, top), (left, top))
 
 
 def turned_box(x: float, y: float, length: float, width: float, degrees: float) -> Corners:
-    """A rectangle about (x, y), its length along a direction."""
+    """Corners of a rectangle about (x, y), its length along a direction in degrees."""
     cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
     halves = [(along * length / 2, across * width / 2) for along, across in signs]
@@ -32,7 +32,7 @@ def turned_box(x: float, y: float, length: float, width: float, degrees: float) 
 
 
 def column(x: float, y: float, radius: float, corners: int = 16) -> Corners:
-    """A round column about (x, y)."""
+    """Corners of a polygon for a round column about (x, y)."""
     turns = [math.tau * index / corners for index in range(corners)]
     return tuple((x + radius * math.cos(turn), y + radius * math.sin(turn)) for turn in turns)
 
@@ -44,7 +44,7 @@ def legs(name: str, x: float, y: float, length: float, width: float, degrees: fl
 
 
 # 7 x 6 m with an alcove in the east, a door's niche in the south, a chimney in the north and a slanted corner. Around
-# the start a disc of 1.9 m is free: a flower of 1.3 m with the robot's radius of 0.25 m and a start put inexactly.
+# the start a disc of 1.9 m is free: a flower of 1.3 m with the robot's radius of 0.25 m and an inexact start.
 _FURNISHED_ROOM = Drawing(
     boundary=(
         *((0, 0), (3.6, 0), (3.6, -0.25), (4.5, -0.25), (4.5, 0), (7, 0)),
@@ -66,7 +66,7 @@ _FURNISHED_ROOM = Drawing(
     },
 )
 
-# Whoever stands near its middle sees no end within 30 m, and nothing that tells one place from the next.
+# Near its middle a LIDAR sees no end within 30 m, and nothing that distinguishes one place from the next.
 _CORRIDOR = Drawing(boundary=box(-40, -1.2, 40, 1.2), start=(0.0, 0.0, 0.0))
 
 _HALL = Drawing(

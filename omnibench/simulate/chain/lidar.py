@@ -1,4 +1,4 @@
-"""A planar LIDAR: ranges from where the robot truly is, ray by ray as the mirror turns."""
+"""A simulated planar LIDAR: ranges from the robot's true poses, ray by ray as the mirror turns."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.chain.floor_plan import FloorPlan
 
-_SHORTEST_PERIOD = 0.001  # s
+_SHORTEST_PERIOD = 0.001  # s between scans; a shorter one is a mistake of units
 
 
 class LidarMount(Model):
-    """Where the LIDAR sits: its pose in the robot's frame."""
+    """Pose of the LIDAR in the robot's frame."""
 
     x: FiniteFloat = Field(0.1, description="m, forward")
     y: FiniteFloat = Field(0.0, description="m, left")
@@ -43,14 +43,16 @@ class Lidar(Model):
     range_min: float = Field(0.1, ge=0, allow_inf_nan=False, description="m; nearer walls are not seen")
     range_max: float = Field(30.0, gt=0, allow_inf_nan=False, description="m; walls farther off are not seen")
     noise: float = Field(0.01, ge=0, le=10, description="standard deviation of a range, m")
-    far_noise: float = Field(0.03, ge=0, le=10, description="the same beyond far, m")
+    far_noise: float = Field(0.03, ge=0, le=10, description="standard deviation of ranges beyond far, m")
     far: float = Field(10.0, gt=0, allow_inf_nan=False, description="m")
     resolution: float = Field(0.001, ge=1e-6, le=1, description="step of the ranges, m")
     mount: LidarMount = LidarMount()
     period: tuple[float, float] = Field((0.2, 0.3), description="shortest and longest time between scans, s")
-    latency: float = Field(0.0, ge=0, le=1, description="a scan's stamp is so much later than its first ray, s")
-    dropouts: float = Field(0.001, ge=0, lt=1, description="chance that a ray returns nothing")
-    distortion: bool = Field(True, description="the robot moves during a scan; false: all rays at the same time")
+    latency: float = Field(0.0, ge=0, le=1, description="from a scan's first ray to its stamp, s")
+    dropouts: float = Field(0.001, ge=0, lt=1, description="probability that a ray returns nothing")
+    distortion: bool = Field(
+        True, description="rays are measured one after another while the robot moves; false: all at once"
+    )
 
     @model_validator(mode="after")
     def _scans_follow_each_other(self) -> Lidar:
@@ -70,12 +72,12 @@ class Lidar(Model):
 
     @property
     def sweep(self) -> float:
-        """How long a scan takes, s."""
+        """Duration of a scan, s."""
         return self.turn_time * self.field_of_view_deg / 360 if self.distortion else 0.0
 
     @property
     def scanner(self) -> Scanner:
-        """What the data set says of it."""
+        """Description of the scanner in the data set."""
         increment = math.radians(self.field_of_view_deg) / self.rays
         rounding = self.resolution / math.sqrt(12)
         return Scanner(
@@ -95,18 +97,18 @@ class Lidar(Model):
 
 @dataclass(frozen=True, eq=False)
 class PoseTrack:
-    """Where the robot truly is. times (M,): increasing, s. poses (M, 3): m, m, rad in the room, headings continuous."""
+    """True poses of the robot. times (M,): increasing, s. poses (M, 3): m, m, rad in the room, headings continuous."""
 
     times: Array
     poses: Array
 
     def at(self, times: Array) -> Array:
-        """Poses at times of any shape, with a last axis of 3: linear between the track's, at rest before and after."""
+        """Poses (..., 3) at times (...), s, interpolated linearly; before and after the track the robot is at rest."""
         return np.stack([np.interp(times, self.times, column) for column in self.poses.T], axis=-1)
 
 
 def scan_stamps(lidar: Lidar, end: float, rng: np.random.Generator) -> Array:
-    """Stamps (S,) of scans, s: the first 0, all of the last one measured by ``end``; the time between them jitters.
+    """Stamps (S,) of scans, s, from 0 on at random intervals; the last scan is complete by ``end``.
 
     DataError in one line: there is no time for a single scan.
     """
@@ -124,10 +126,10 @@ def scan_stamps(lidar: Lidar, end: float, rng: np.random.Generator) -> Array:
 def measure_scans(
     plan: FloorPlan, lidar: Lidar, track: PoseTrack, stamps: Array, rng: np.random.Generator
 ) -> TrajectoryScans:
-    """What the LIDAR sees of a room: a scan for each stamp (S,), s, as recorded, that is, with its latency.
+    """Scans of a room at stamps (S,), s, which include the latency.
 
-    Each ray starts where the scanner is when it is measured. DataError in one line: the scanner is in a wall, or there
-    is a scan in which nothing is seen.
+    Each ray starts at the scanner's pose when it is measured. DataError in one line: the scanner is inside a wall, or a
+    scan sees nothing.
     """
     from omnibench.simulate.chain.ray_casting import cast_rays  # numba takes half a second to load
 

@@ -21,35 +21,35 @@ from omnibench.simulate.chain.set_point import SetPoint, SlewLimits
 from omnibench.simulate.config import Positive
 from omnibench.simulate.flower import Command
 
-_NOTHING = 1e-9  # s; less than this is not worth a command
+_NOTHING = 1e-9  # s; a command of a shorter validity is not sent
 
 
 class MotionProfile(Model):
-    """How fast the set point may change. All parts of the twist change in step: direction and curvature stay.
+    """Limits on the change of the set point. All parts of the twist change in step: direction and curvature stay.
 
-    Accelerations are of the set point in the robot's frame; what a curve adds across the motion is not in them.
+    Accelerations are of the set point in the robot's frame, without the centripetal acceleration of a curve.
     """
 
     shape: Literal["trapezoid", "jerk_limited"] = Field("trapezoid", description="jerk_limited: S-curves")
     acceleration: Positive = Field(0.5, description="m/s2")
     turn_acceleration: Positive = Field(1.0, description="rad/s2")
-    jerk: Positive = Field(2.5, description="m/s3; of jerk_limited")
-    turn_jerk: Positive = Field(5.0, description="rad/s3; of jerk_limited")
+    jerk: Positive = Field(2.5, description="m/s3; for shape jerk_limited")
+    turn_jerk: Positive = Field(5.0, description="rad/s3; for shape jerk_limited")
 
     def limits(self, command: Command) -> SlewLimits:
-        """How fast the share of the command's full twist may change."""
+        """Limits on the share of the command's full twist."""
         slope = _slower(command, self.acceleration, self.turn_acceleration)
         return SlewLimits(slope, math.inf if self.shape == "trapezoid" else _slower(command, self.jerk, self.turn_jerk))
 
 
 class CommandLink(Model):
-    """How commands come to the robot."""
+    """The link by which commands reach the robot."""
 
-    refresh: float = Field(0.3, ge=0.01, allow_inf_nan=False, description="from one command to the next, s")
+    refresh: float = Field(0.3, ge=0.01, allow_inf_nan=False, description="time from one command to the next, s")
     watchdog: Positive = Field(0.5, description="longest validity of a command, s")
-    lost: float = Field(0.0, ge=0, le=0.9, description="chance that a command is lost on the way")
+    lost: float = Field(0.0, ge=0, le=0.9, description="probability that a command is lost")
     stalls_at: float | None = Field(
-        None, ge=0, allow_inf_nan=False, description="from this time of a run on no command is sent, s"
+        None, ge=0, allow_inf_nan=False, description="time of a run from which on no command is sent, s"
     )
 
     @model_validator(mode="after")
@@ -64,7 +64,7 @@ class CommandLink(Model):
 
 @dataclass(frozen=True)
 class SentCommand:
-    """When a command was sent (s), for how long it is valid (t_r, s), and whether it came to the robot."""
+    """A command: time of sending, s, validity t_r, s, and whether it reached the robot."""
 
     time: float
     duration: float
@@ -73,9 +73,9 @@ class SentCommand:
 
 @dataclass(frozen=True, eq=False)
 class CommandedMotion:
-    """The set point of one run. times (F,): ends of the samples, s. twists (F, 3): means over each, m/s and rad/s.
+    """The set point of one run. times (F,): ends of the samples, s. twists (F, 3): mean of each sample, m/s and rad/s.
 
-    stopped_by_watchdog: from when no command was valid to when one came again, or to the end of the run; s.
+    stopped_by_watchdog: begin and end of the times without a valid command, s.
     """
 
     times: Array
@@ -85,7 +85,7 @@ class CommandedMotion:
 
     @property
     def distance(self) -> float:
-        """The way of the set point, m."""
+        """Length of the set point's path, m."""
         return float(np.hypot(self.twists[:, 0], self.twists[:, 1]) @ np.diff(self.times, prepend=0.0))
 
 
@@ -99,16 +99,16 @@ def command_motion(
     settle: float,
     rng: np.random.Generator,
 ) -> CommandedMotion:
-    """The set point of a run over ``way`` (m), or of ``turn_duration`` (s) at full speed where there is no way.
+    """The set point of a run over a distance ``way``, m, or of ``turn_duration``, s, at full speed if way is None.
 
-    The planner knows how far the set point has come. It refreshes the command until the way is covered; the last
-    command is valid for just so long that the robot comes to rest there. Where commands are lost, the planner goes on
-    until the way is covered; where none is sent any more, it is not. ``settle`` s of rest follow.
+    The planner knows how far the set point has come. It refreshes the command until the distance is covered, also when
+    commands are lost; the validity of the last command makes the robot come to rest there. A link that stalls leaves
+    the run incomplete. A rest of ``settle``, s, follows.
 
-    ConfigError: a command that moves nothing.
+    ConfigError: the command does not move the robot.
     """
     if not command.speed and not command.turn_rate:
-        raise ConfigError(f"command {command.name} moves nothing; give it a speed or a rate of turn")
+        raise ConfigError(f"command {command.name} does not move the robot; give it a speed or a rate of turn")
     seconds = way / command.speed if way is not None and command.speed else turn_duration
     set_point, sent, stops = _planned(seconds, SetPoint(profile.limits(command)), link, rng)
     samples = max(1, math.ceil((set_point.end + settle) / sample_period - 1e-9))
@@ -135,7 +135,7 @@ def _slower(command: Command, straight: float, turning: float) -> float:
 def _planned(
     seconds: float, set_point: SetPoint, link: CommandLink, rng: np.random.Generator
 ) -> tuple[SetPoint, tuple[SentCommand, ...], tuple[tuple[float, float], ...]]:
-    """The set point over the whole run, the commands sent and the watchdog's stops; seconds: the way at full speed."""
+    """Set point of a whole run, commands sent, stops by the watchdog. seconds: duration of the run at full speed, s."""
     sent: list[SentCommand] = []
     stops: list[tuple[float, float]] = []
     expires, reached = 0.0, False
@@ -163,7 +163,7 @@ def _planned(
 
 
 def _needed(set_point: SetPoint, now: float, seconds: float, longest: float) -> float | None:
-    """For how long a command sent now must be valid so that the set point comes to rest on its way; None: longer."""
+    """Validity, s, with which a command sent now lets the set point end at its goal; None: longer than ``longest``."""
     driving = set_point.towards(1.0, now)
 
     def missing(duration: float) -> float:
@@ -173,6 +173,6 @@ def _needed(set_point: SetPoint, now: float, seconds: float, longest: float) -> 
         return 0.0
     if missing(longest + _NOTHING) > 0:
         return None
-    from scipy.optimize import brentq  # which loads slowly
+    from scipy.optimize import brentq  # loads slowly
 
     return float(brentq(missing, 0.0, longest + _NOTHING, xtol=1e-14))

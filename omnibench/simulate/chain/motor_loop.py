@@ -18,15 +18,15 @@ from omnibench.simulate.chain.motors import TRUE_STEP
 
 _INNER = 10  # steps of the motor's equations within TRUE_STEP
 _STEP = TRUE_STEP / _INNER
-_STANDING = 1e-6  # ticks a sample; less is the rounding of a wheel across the motion
+_STANDING = 1e-6  # ticks a sample; a lower target rate is rounding and counts as rest
 
 
 class MotorSteps(NamedTuple):
-    """What a step does to the state of a wheel.
+    """Transition of a wheel's state in one step of 0.1 ms.
 
-    moving (3, 4): from current (A), rate (rad/s), voltage (V) and friction (N m) to current, rate and angle turned
-    (rad). held: what is left of the current when the wheel stands. fed: A per V then. torque: N m per A. static and
-    coulomb: N m.
+    moving (3, 4): matrix from current (A), rate (rad/s), voltage (V) and friction (N m) to current, rate and angle
+    turned (rad). For a wheel that stands, the next current is held times the current plus fed (A/V) times the voltage.
+    torque: N m/A. static, coulomb: friction, N m.
     """
 
     moving: Array
@@ -49,7 +49,7 @@ class Pid(NamedTuple):
 def motor_steps(
     resistance: float, inductance: float, torque: float, inertia: float, static: float, coulomb: float, viscous: float
 ) -> MotorSteps:
-    """The steps of a motor: ohm, H, then as seen at the wheel N m/A (= V s/rad), kg m2, N m, N m, N m s/rad."""
+    """Transition of a motor. Units: ohm, H; at the wheel N m/A (= V s/rad), kg m2, N m, N m, N m s/rad."""
     system = np.zeros((5, 5))  # of current, rate, angle, voltage, friction; the last two are constant
     system[0, [0, 1, 3]] = [-resistance / inductance, -torque / inductance, 1 / inductance]
     system[1, [0, 1, 4]] = [torque / inertia, -viscous / inertia, -1 / inertia]
@@ -84,7 +84,10 @@ def _drive(
     current = rate = integral = measured = before = 0.0
     for sample in range(samples):
         if abs(targets[sample]) * period < _STANDING * tick and abs(measured) * period < 1.5 * tick:
-            voltage, integral = 0.0, 0.0  # the motor brakes; steered by single ticks, it would never come to rest
+            voltage, integral = (
+                0.0,
+                0.0,
+            )  # the motor brakes: a controller that answers to single ticks would never let it rest
         else:
             voltage, integral = _controlled(pid, targets[sample], measured, before, integral, period)
         for step in range(sample_steps):
@@ -102,7 +105,7 @@ def _drive(
 def _controlled(
     pid: Pid, target: float, measured: float, before: float, integral: float, period: float
 ) -> tuple[float, float]:
-    """The voltage of the next sample and the integral (rad), which does not grow against the supply's limit."""
+    """Voltage of the next sample, V, and the integral, rad, which does not grow while the voltage is at its limit."""
     error = target - measured
     grown = integral + error * period
     voltage = pid.proportional * error + pid.integral * grown - pid.derivative * (measured - before) / period
@@ -113,7 +116,7 @@ def _controlled(
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _stepped(motor: MotorSteps, current: float, rate: float, voltage: float) -> tuple[float, float, float]:
-    """Current and rate after one step, and how far the wheel turned in it."""
+    """Current, A, and rate, rad/s, after one step, and the angle turned in it, rad."""
     direction = 0.0  # of the motion, against which friction acts
     if rate != 0.0:
         direction = math.copysign(1.0, rate)

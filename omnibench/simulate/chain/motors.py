@@ -15,14 +15,14 @@ from omnibench.simulate.config import Positive
 from omnibench.simulate.flower import Command
 
 TRUE_STEP = 1e-3  # s between the true wheel angles that are kept (chosen: a tenth of the usual sample period)
-_RESERVE = 0.1  # share of the fastest rate that is left to the controller
+_RESERVE = 0.1  # share of the fastest rate that is left to the controller (chosen)
 
 
 class Motor(Model):
-    """A brushed DC motor with its gear and its share of the robot.
+    """A brushed DC motor with its gear and its share of the robot's inertia.
 
-    Palacin et al. give no data sheet of the APR-02's motors; the defaults stand in for one: a 24 V motor with a gear
-    of 50 for a robot of some 30 kg on three wheels of 0.148 m radius. The gear's losses are in the frictions.
+    Palacin et al. give no data sheet of the APR-02's motors. The defaults (chosen) are a 24 V motor with a gear of 50
+    for a robot of some 30 kg on three wheels of 0.148 m radius. Losses of the gear are part of the frictions.
     """
 
     supply_voltage: Positive = Field(24.0, description="V")
@@ -64,10 +64,10 @@ class Motor(Model):
 
 
 class Controller(Model):
-    """PID on the wheel rate once a sample; the output is limited to the supply voltage.
+    """PID controller of the wheel rate, once a sample; its output is limited to the supply voltage.
 
-    The integral does not grow against that limit. The derivative is of the measured rate. A wheel that is to stand and
-    turns by no more than a tick in a sample is braked by its own motor: no voltage, no integral.
+    The integral does not grow at that limit. The derivative is that of the measured rate. A wheel with target 0 that
+    turns by no more than a tick in a sample is braked by its short-circuited motor: no voltage, no integral.
     """
 
     proportional: float = Field(3.0, ge=0, allow_inf_nan=False, description="V per rad/s")
@@ -88,14 +88,14 @@ class Encoder(Model):
 
     @property
     def tick(self) -> float:
-        """Wheel angle of a count, rad."""
+        """Wheel angle of one count, rad."""
         return 2 * math.pi / self.ticks
 
 
 def check_reach(robot: Robot, commands: Sequence[Command], motor: Motor | Sequence[Motor]) -> None:
-    """ConfigError in one line for a command that asks more of a wheel than its motor gives.
+    """ConfigError in one line for a command that needs a higher wheel rate than the motor reaches.
 
-    A tenth of the fastest rate is left to the controller.
+    A tenth of the motor's fastest rate is left to the controller.
     """
     motors = motors_of_wheels(motor, len(robot.wheels))
     limits = (1 - _RESERVE) * np.array([each.fastest_rate for each in motors])
@@ -113,7 +113,7 @@ def check_reach(robot: Robot, commands: Sequence[Command], motor: Motor | Sequen
 
 
 def _way_out(robot: Robot, command: Command, limits: Array) -> str:
-    """The greatest speed that fits with this rate of turn; where none does, the greatest rate of turn, too."""
+    """Advice: the greatest speed at this rate of turn; if there is none, the greatest rate of turn."""
     straight, across, turn = (wheel_equations(robot.wheels) * command.twist).T
     travel = straight + across
     left = limits - np.abs(turn)
@@ -128,7 +128,7 @@ def _way_out(robot: Robot, command: Command, limits: Array) -> str:
 
 
 def _rounded_down(value: float) -> str:
-    """With three digits, not above the value."""
+    """The value with three digits, rounded down."""
     digits = 2 - math.floor(math.log10(value))
     return f"{math.floor(value * 10.0**digits) / 10.0**digits:g}"
 

@@ -18,8 +18,8 @@ _Float = NDArray[np.float64]
 def cast_rays(segments: Array, scanner: Scanner, track_times: Array, track_poses: Array, times: Array) -> Array:
     """True distances (S, R), m, from a moving scanner to the nearest wall along each of its rays; inf: there is none.
 
-    segments (W, 4): x, y of both ends of each wall, m. track_poses (M, 3): the robot's at track_times (M,), linear
-    between them, constant outside. times (S,): of the first ray of each scan, s.
+    segments (W, 4): x, y of both ends of each wall, m. track_poses (M, 3): the robot's poses at track_times
+    (M,), interpolated linearly, constant outside. times (S,): of the first ray of each scan, s.
     """
     mount = scanner.mount
     return _cast(
@@ -45,7 +45,7 @@ def _cast(
     mount_x: float,
     mount_y: float,
 ) -> Any:
-    found = np.empty((len(times), len(angles)))
+    distances = np.empty((len(times), len(angles)))
     for scan in range(len(times)):
         after = np.searchsorted(track_times, times[scan])
         for ray in range(len(angles)):
@@ -55,15 +55,15 @@ def _cast(
             x, y, heading = _pose(track_times, track_poses, after, time)
             cosine, sine = math.cos(heading), math.sin(heading)
             x, y = x + cosine * mount_x - sine * mount_y, y + sine * mount_x + cosine * mount_y
-            found[scan, ray] = _nearest(
+            distances[scan, ray] = _nearest(
                 segments, x, y, math.cos(heading + angles[ray]), math.sin(heading + angles[ray])
             )
-    return found
+    return distances
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _pose(track_times: _Float, track_poses: _Float, after: int, time: float) -> Any:
-    """The pose at a time; ``after``: the first of the track that is not earlier."""
+    """The pose at a time. after: index of the first pose of the track that is not earlier."""
     before = max(after - 1, 0)
     after = min(after, len(track_times) - 1)
     share = (time - track_times[before]) / (track_times[after] - track_times[before]) if after > before else 0.0

@@ -1,4 +1,4 @@
-"""What a config says of a simulated robot: each link of the chain from command to SLAM."""
+"""Configuration of the robot simulator: every link of the chain from motion command to SLAM."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from omnibench.simulate.chain.motors import TRUE_STEP, Controller, Encoder, Moto
 from omnibench.simulate.config import MotionGrid, NamedRobot, Positive, Truth
 from omnibench.slam.slam_options import SlamOptions
 
-_MOST_ANGLES = 1e8  # true wheel angles that are simulated in all
+_MOST_ANGLES = 1e8  # true wheel angles of all runs; more do not fit into memory
 
 
 class Placement(Model):
-    """How well the robot is put back on its mark before each run; standard deviations."""
+    """Standard deviations with which the robot is put back on its mark before each run."""
 
     position: float = Field(0.02, ge=0, le=1, description="m, in x and y")
     heading_deg: float = Field(2.0, ge=0, le=180, description="degrees")
@@ -37,7 +37,7 @@ class RobotConfig(Model):
 
     generator: Literal["robot"]
     robot: NamedRobot
-    sample_period: Positive = Field(0.01, description="of the PID controllers and of the encoders, s")
+    sample_period: Positive = Field(0.01, description="of PID controllers and encoders, s")
     commands: MotionGrid
     profile: MotionProfile = MotionProfile()
     link: CommandLink = CommandLink()
@@ -49,7 +49,7 @@ class RobotConfig(Model):
     controller: Controller = Controller()
     encoder: Encoder = Encoder()
     room: RoomPlan
-    radius: Positive = Field(0.25, description="of the robot, for collisions, m")
+    radius: Positive = Field(0.25, description="of the robot, to check for collisions, m")
     placement: Placement = Placement()
     lidar: Lidar = Lidar()
     slam: SlamOptions = SlamOptions()
@@ -83,7 +83,7 @@ class RobotConfig(Model):
         return self
 
     def _angles(self) -> float:
-        """How many true wheel angles are simulated, roughly."""
+        """Approximate number of true wheel angles that are simulated."""
         chosen, profile = self.commands, self.profile
         sessions = [session for session in (self.train, self.validation) if session is not None]
         seconds = 0.0

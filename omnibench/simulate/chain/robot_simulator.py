@@ -1,4 +1,4 @@
-"""A robot from command to SLAM: target wheel rates, motors, encoders, true motion, LIDAR in a room, reference poses."""
+"""The robot simulator: from motion commands over motors, encoders, true motion and LIDAR scans to poses by SLAM."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.truth import TrueRobot, true_record
 from omnibench.slam.slam_dataset import slam_dataset
 
-_FOLLOWED = 0.1  # of what wheels were told: so much they may miss
-_STEP = 0.05  # m along a way that is checked beforehand
+_FOLLOWED = 0.1  # relative difference of wheel angle from target above which a warning is given (chosen)
+_STEP = 0.05  # m between the points of a path that are checked before the simulation
 _DENSE = 0.01  # s, at most, between true poses that are kept
 
 
@@ -37,8 +37,8 @@ def simulate_robot(
 ) -> Simulation:
     """Simulate the training session and, if there is one, the validation session.
 
-    ConfigError or DataError in one line: an effect of the truth is not known or lacks a parameter, a polygon of the
-    room is none, a command is faster than the motors, or leads out of the room.
+    ConfigError or DataError in one line: an effect of the truth is unknown or lacks a parameter, a polygon of the room
+    is invalid, a command is faster than the motors, or leads out of the room.
     """
     plan = make_plan(config.room, f"data set {name}: room")
     commands = grid_of(config.commands)
@@ -50,10 +50,10 @@ def simulate_robot(
         for session in sessions.values():
             _check_way(config, plan, command, session)
     truth = true_record(config.truth, config.robot, config.sample_period, tuple(sessions), name)
-    chain = _RobotSimulator(config, truth.true_robot(TRUE_STEP), plan, commands)
+    simulator = _RobotSimulator(config, truth.true_robot(TRUE_STEP), plan, commands)
     runs: list[_Recorded] = []
     for split, session in sessions.items():
-        for run in chain.session(split, session):
+        for run in simulator.session(split, session):
             runs.append(run)
             watch("driving and scanning", len(runs), len(sessions) * len(commands) * config.repetitions)
     recorded = make_dataset(
@@ -66,14 +66,14 @@ def simulate_robot(
         simulated=True,
         scans=ScansInMemory(config.lidar.scanner, {run.trajectory.id: run.scans for run in runs}),
     )
-    found = slam_dataset(recorded, config.slam, watch=watch)
-    found = replace(found, warnings=(*found.warnings, *_stopped(runs), *_astray(runs)))
+    dataset = slam_dataset(recorded, config.slam, watch=watch)
+    dataset = replace(dataset, warnings=(*dataset.warnings, *_stopped(runs), *_missed_targets(runs)))
     paths = {run.trajectory.id: run.path for run in runs}
-    return Simulation(found, truth, paths, plan, {run.trajectory.id: run.start for run in runs})
+    return Simulation(dataset, truth, paths, plan, {run.trajectory.id: run.start for run in runs})
 
 
 def _check_way(config: RobotConfig, plan: FloorPlan, command: Command, session: RobotSession) -> None:
-    """ConfigError: the command leads the robot out of the room, were it as designed."""
+    """ConfigError if the command leads the robot, as designed, out of the room."""
     if not command.speed:
         return
     times = np.linspace(0.0, session.distance / command.speed, max(2, math.ceil(session.distance / _STEP)))
@@ -86,7 +86,11 @@ def _check_way(config: RobotConfig, plan: FloorPlan, command: Command, session: 
 
 @dataclass(frozen=True, eq=False)
 class _Recorded:
-    """A run as it was recorded, but for its reference poses, and where the robot truly was, from its start (3,) on."""
+    """A run before SLAM: its poses are the design model's odometry.
+
+    path: the true one, from (0, 0, 0) on. start (3,): its true start in the room, m, m, rad. stops: from and until when
+    the watchdog stopped the robot, s.
+    """
 
     trajectory: Trajectory
     scans: TrajectoryScans
@@ -97,7 +101,7 @@ class _Recorded:
 
 @dataclass(frozen=True, eq=False)
 class _RobotSimulator:
-    """The robot, its room and its commands."""
+    """Drives the commands with the true robot in its room, session by session."""
 
     config: RobotConfig
     robot: TrueRobot
@@ -105,17 +109,17 @@ class _RobotSimulator:
     commands: Sequence[Command]
 
     def session(self, split: Split, session: RobotSession) -> Iterator[_Recorded]:
-        """The runs of a session one after the other; the wheels go on turning from where they were."""
+        """The runs of a session one after the other; wheel angles go on from run to run."""
         config, rng = self.config, np.random.default_rng(session.seed)
         runs = runs_of(self.commands, config.repetitions, config.order, rng)
         motions = [self._motion(command, session, rng) for command, _ in runs]
         targets = [target_rates(config.robot, motion) for motion in motions]
-        told = [self.robot.driven(motion.times, each) for motion, each in zip(motions, targets, strict=True)]
+        rates = [self.robot.driven(motion.times, target) for motion, target in zip(motions, targets, strict=True)]
         driven = drive_session(
             config.motor,
             config.controller,
             config.encoder,
-            told,
+            rates,
             config.sample_period,
             np.zeros(len(config.robot.wheels)),
         )
@@ -156,11 +160,11 @@ class _RobotSimulator:
     def _scanned(
         self, run: Trajectory, wheels: DrivenRun, motion: CommandedMotion, rng: np.random.Generator
     ) -> _Recorded:
-        """The run with its scans; its poses are the design odometry's until SLAM has found better ones."""
+        """The run with its scans; its poses are the design model's odometry until SLAM replaces them."""
         config, plan = self.config, self.plan
         log = _true_log(run, wheels.wheel_angles)
         (path,) = self.robot.model.poses([log])
-        (seen,) = self.robot.model.reported([log])  # the LIDAR sees the room from where the reference is to report
+        (seen,) = self.robot.model.reported([log])  # the LIDAR's poses: with the effects on the reference
         start = _placed(plan.start, config.placement, rng)
         plan.check_path(_in_room(start, path)[:, :2], log.stamps, config.radius, f"run {run.id}")
         stamps = scan_stamps(config.lidar, float(run.times[-1]), rng)
@@ -178,7 +182,7 @@ class _RobotSimulator:
 
 
 def _stopped(runs: Sequence[_Recorded]) -> tuple[str, ...]:
-    """A warning where the watchdog stopped the robot."""
+    """Warning of runs in which the watchdog stopped the robot."""
     stopped = [run for run in runs if run.stops]
     if not stopped:
         return ()
@@ -189,13 +193,13 @@ def _stopped(runs: Sequence[_Recorded]) -> tuple[str, ...]:
     )
 
 
-def _astray(runs: Sequence[_Recorded]) -> tuple[str, ...]:
-    """A warning where wheels turned otherwise than they were told."""
+def _missed_targets(runs: Sequence[_Recorded]) -> tuple[str, ...]:
+    """Warning of runs in which wheels did not follow their targets."""
     missed = {}
     for run in runs:
         rates, targets = run.trajectory.rates, run.trajectory.targets
         assert targets is not None
-        turned, wanted = (np.abs(each.sum(axis=0)).sum() for each in (rates, targets))
+        turned, wanted = (np.abs(wheel_rates.sum(axis=0)).sum() for wheel_rates in (rates, targets))
         if wanted and abs(turned / wanted - 1) > _FOLLOWED:
             missed[run.trajectory.id] = turned / wanted
     if not missed:
@@ -203,24 +207,24 @@ def _astray(runs: Sequence[_Recorded]) -> tuple[str, ...]:
     name, share = next(iter(missed.items()))
     return (
         f"in {len(missed)} of {len(runs)} runs the wheels do not follow their targets: in {name} they turn "
-        f"{share:.0%} of what they were told; check motor and controller",
+        f"{share:.0%} of their target angles; check motor and controller",
     )
 
 
 def _true_log(run: Trajectory, wheel_angles: Array) -> WheelLog:
-    """What the true wheels did, from absolute angles (M + 1, N) every millisecond, with a stamp at each of these."""
+    """Log of the true wheels from absolute angles (M + 1, N), rad, every millisecond, with a stamp at each of them."""
     stamps = TRUE_STEP * np.arange(len(wheel_angles))
     rates = np.diff(wheel_angles, axis=0) / TRUE_STEP
     return WheelLog(stamps[1:], rates, np.zeros(3), stamps, wheel_angles[1:], run.started_at, run.session)
 
 
 def _placed(mark: Array, placement: Placement, rng: np.random.Generator) -> Array:
-    """Where the robot really stands (3,) when it was put on its mark."""
+    """True start pose (3,) of a robot that is put on its mark by hand."""
     spread = [placement.position, placement.position, math.radians(placement.heading_deg)]
     return mark + spread * rng.standard_normal(3)
 
 
 def _in_room(start: Array, poses: Array) -> Array:
-    """Poses (K, 3) of the frame that has the pose ``start`` in the room."""
+    """Poses (K, 3) in the room's frame of a path that starts at ``start`` (3,)."""
     path = (poses[:, 0] + 1j * poses[:, 1]) * np.exp(1j * start[2])
     return np.column_stack([start[0] + path.real, start[1] + path.imag, start[2] + poses[:, 2]])

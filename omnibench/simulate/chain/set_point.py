@@ -1,6 +1,6 @@
-"""How a set point follows on and off: a scale from 0 (rest) to 1 (full speed), its slope limited, its jerk too.
+"""The set point's scale from 0 (rest) to 1 (full speed) over time, with limited slope and jerk.
 
-Every course is a chain of phases of constant jerk, known in closed form: nothing is sampled.
+A course of the scale is a sequence of phases of constant jerk in closed form; nothing is sampled.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class SlewLimits:
 
 @dataclass(frozen=True)
 class Phase:
-    """From ``start`` (s) on the jerk is constant; ``way`` is the integral of the scale so far: s at full speed."""
+    """A phase of constant jerk from ``start``, s, on. way: integral of the scale until then, s at full speed."""
 
     start: float
     way: float
@@ -32,7 +32,7 @@ class Phase:
     jerk: float = 0.0
 
     def at(self, time: float) -> Phase:
-        """The same course, told from ``time`` on."""
+        """The rest of the phase, from ``time``, s, on."""
         s = time - self.start
         way = self.way + s * (self.scale + s * (self.slope / 2 + s * self.jerk / 6))
         scale = self.scale + s * (self.slope + s * self.jerk / 2)
@@ -48,17 +48,17 @@ class SetPoint:
 
     @property
     def target(self) -> float:
-        """What the scale comes to in the end."""
+        """Final value of the scale."""
         return self.phases[-1].scale
 
     @property
     def end(self) -> float:
-        """From when on the scale is constant, s."""
+        """Time from which on the scale is constant, s."""
         return self.phases[-1].start
 
     @property
     def way(self) -> float:
-        """The whole way of a course that ends at rest: s at full speed."""
+        """Integral of the scale over a course that ends at rest, s at full speed."""
         return self.phases[-1].way
 
     def towards(self, target: float, time: float) -> SetPoint:
@@ -73,8 +73,8 @@ class SetPoint:
         return SetPoint(self.limits, (*driven, *_course(now, target, self.limits)))
 
     def ways(self, times: Array) -> Array:
-        """The way covered by each of ``times`` (F,), s."""
-        columns = np.array([[each.start, each.way, each.scale, each.slope, each.jerk] for each in self.phases]).T
+        """Integrals (F,) of the scale until ``times`` (F,), s at full speed."""
+        columns = np.array([[phase.start, phase.way, phase.scale, phase.slope, phase.jerk] for phase in self.phases]).T
         chosen = np.searchsorted(columns[0], times, side="right") - 1
         start, way, scale, slope, jerk = columns[:, chosen]
         s = times - start
@@ -99,8 +99,10 @@ def _course(now: Phase, target: float, limits: SlewLimits) -> tuple[Phase, ...]:
 
 
 def _s_curve(now: Phase, target: float, limits: SlewLimits) -> list[tuple[float, float, float]]:
-    """(duration, slope at its begin, jerk) of the three phases, from any slope to none."""
-    coasting = now.scale + now.slope * abs(now.slope) / (2 * limits.jerk)  # reached when the slope goes to 0 at once
+    """Duration, slope at the begin and jerk of the three phases, from any slope to slope 0."""
+    coasting = now.scale + now.slope * abs(now.slope) / (
+        2 * limits.jerk
+    )  # the scale that is reached if the slope goes to 0 at once
     sign = math.copysign(1.0, target - coasting)
     slope, missing, jerk = sign * now.slope, sign * (target - now.scale), limits.jerk
     peak = max(min(limits.slope, math.sqrt(max(jerk * missing + slope**2 / 2, 0.0))), slope, 0.0)

@@ -249,7 +249,7 @@ def test_target_rates_are_those_of_the_kinematic_matrix(command: Command, way: f
 
 
 def test_a_command_that_moves_nothing_is_refused() -> None:
-    with pytest.raises(ConfigError, match="v0_a0_w0 moves nothing; give it a speed or a rate of turn"):
+    with pytest.raises(ConfigError, match="v0_a0_w0 does not move the robot; give it a speed or a rate of turn"):
         motion(Command(0.0, 0.0, 0.0))
 
 

@@ -212,7 +212,7 @@ class TestTheTruth:
         file = file_of(tmp_path, repetitions=1, commands={"directions_deg": [0], "turn_rates": [0.0]})
         printed = command("simulate", file, "-o", "data", "--truth", "truth")
         assert printed.returncode == 0, printed.stderr
-        assert "simulated trajectories: data" in printed.stdout
+        assert "1 simulated trajectory: data" in printed.stdout
         paths = read_true_poses(tmp_path / "truth")
         assert list(paths) == ["train-001"]
         assert (tmp_path / "truth" / "slam_accuracy.json").is_file()
