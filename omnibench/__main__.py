@@ -1,6 +1,6 @@
 """``omnibench`` and ``python -m omnibench``: every user's mistake is one line on standard error and exit code 2.
 
-Ctrl-C is heard from the first import on, so that nothing is imported before ``main``.
+Ctrl-C is handled from the first import on; therefore nothing of omnibench is imported before ``main`` runs.
 """
 
 import os
@@ -28,7 +28,7 @@ def main() -> None:
 
 
 def _interrupted(number: int, frame: FrameType | None) -> None:
-    """As by default, but out of a command's imports at once: libraries turn Ctrl-C there into errors of their own."""
+    """Raise KeyboardInterrupt; end at once during a command's imports, where libraries make it errors of their own."""
     if _imports_of_a_command(frame):
         os.write(2, b"interrupted\n")
         os._exit(130)
@@ -56,7 +56,7 @@ def _run(app: Any) -> None:
 
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal without a letter shows another, and no traceback
+            stream.reconfigure(errors="replace")  # a letter that the terminal lacks becomes a ?
     command = typer.main.get_command(app)
     usage_error: Any = typer.BadParameter.__mro__[1]  # click's UsageError, wherever this Typer keeps it
     try:
@@ -72,14 +72,14 @@ def _run(app: Any) -> None:
     except typer.Abort:
         _fail("interrupted", 130)
     except BrokenPipeError:
-        sys.stderr.close()  # the reader of our output has gone: nothing more to say
+        sys.stderr.close()  # the program that read our output has ended
         sys.exit(1)
     except MemoryError:
-        _fail("error: this needs more memory than there is; make the data or the budget smaller")
-    except OSError as error:  # a disk or a terminal that refuses where nobody expected it
+        _fail("error: out of memory; make the data or the budget smaller")
+    except OSError as error:  # a disk or a terminal that failed unexpectedly
         _fail(f"error: {error.filename or 'output'}: {error.strerror or error}")
     else:
-        if code == 130:  # Typer's newer versions turn Ctrl-C into this
+        if code == 130:  # newer versions of Typer return this after Ctrl-C
             _fail("interrupted", 130)
         sys.exit(code if isinstance(code, int) else 0)
 
@@ -92,7 +92,7 @@ def _usage(error: Any) -> str:
 
 
 def _fail(message: str, code: int = 2) -> NoReturn:
-    print(message, file=sys.stderr)  # noqa: T201 (the one place where errors are told)
+    print(message, file=sys.stderr)  # noqa: T201 (the one place where errors are printed)
     sys.exit(code)
 
 

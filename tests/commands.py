@@ -1,4 +1,4 @@
-"""omnibench as a user runs it: real processes, small configs."""
+"""Helpers that run omnibench as a user does: in processes of its own, with small configs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from omnibench.registry import Options, calibrators
 def omnibench(
     *arguments: object, cwd: Path | None = None, timeout: float = 120, **others: Any
 ) -> subprocess.CompletedProcess[str]:
-    """One command, run to its end, with what it printed."""
+    """Run one command to its end; what it printed."""
     return subprocess.run(
         [*COMMAND, *map(str, arguments)],
         cwd=cwd,
@@ -50,7 +50,7 @@ def omnibench(
 
 
 def compared(config: Path, output: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    """A comparison that must end well."""
+    """Run a comparison that must succeed."""
     run = omnibench("compare", config, "--output", output, *arguments)
     assert run.returncode == 0, run.stderr
     assert "Traceback" not in run.stderr
@@ -58,12 +58,12 @@ def compared(config: Path, output: Path, *arguments: object) -> subprocess.Compl
 
 
 def compared_here(output: Path, **changes: Any) -> ComparisonResult:
-    """The small comparison, changed, run from this process, which is faster."""
+    """Run the small comparison with ``changes``, in this process, which is faster."""
     return run_comparison(CompareConfig.model_validate(small(**changes)), output)
 
 
 def assert_refused(run: Printed | subprocess.CompletedProcess[str], *parts: str) -> None:
-    """One line on standard error that says all ``parts``, nothing on standard output, exit code 2."""
+    """Assert one line on standard error with all ``parts``, nothing on standard output, and exit code 2."""
     assert run.returncode == 2, run.stdout + run.stderr
     assert run.stdout == ""
     assert run.stderr.startswith("error: ")
@@ -112,7 +112,7 @@ def small(**changes: Any) -> dict[str, Any]:
 
 
 def write_config(folder: Path, **changes: Any) -> Path:
-    """A small comparison's config in ``folder``."""
+    """Write the config of the small comparison into ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "small.yaml"
     file.write_text(yaml.safe_dump(small(**changes)), encoding="utf-8")
@@ -120,20 +120,20 @@ def write_config(folder: Path, **changes: Any) -> Path:
 
 
 def write_plugin(folder: Path, name: str, body: str) -> Path:
-    """A plug-in file with the imports that calibrators need."""
+    """Write a plug-in file, ``body`` after the imports that calibrators need; the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.py").write_text(PLUGIN_IMPORTS + body, encoding="utf-8")
     return folder
 
 
 def summary(output: Path) -> dict[str, Any]:
-    """summary.json of a comparison."""
+    """The content of a comparison's summary.json."""
     content: dict[str, Any] = json.loads((output / "summary.json").read_text(encoding="utf-8"))
     return content
 
 
 def rows(output: Path) -> dict[str, dict[str, Any]]:
-    """The runs of a comparison by label; with several seeds the last."""
+    """The runs of a comparison by label; of several seeds the last one."""
     return {run["label"]: run for run in summary(output)["runs"]}
 
 
@@ -149,7 +149,7 @@ Command = Callable[..., Printed]
 
 
 def commands_of_this_process(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Commands run in this process: the same code as the installed command, a second faster."""
+    """A function that runs commands in this process: the code of the installed command, a second faster."""
 
     def command(*arguments: object) -> Printed:
         monkeypatch.setattr(sys, "argv", ["omnibench", *map(str, arguments)])
@@ -172,7 +172,7 @@ class Prepared(NamedTuple):
 
 
 def prepare(folder: Path) -> Prepared:
-    """What most commands need, made by the commands themselves."""
+    """Make a config, a data set, its truth and a calibration in ``folder``, by the commands themselves."""
     config = write_config(folder)
     data, truth, calibration = folder / "data", folder / "truth", folder / "calibration.yaml"
     for arguments in (("simulate", config, "-o", data, "--truth", truth), ("calibrate", data, "-o", calibration)):

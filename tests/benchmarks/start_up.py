@@ -13,7 +13,8 @@ import sys
 import time
 from statistics import median
 
-HELP = (sys.executable, "-m", "omnibench", "--help")
+# What the installed script does; ``python -m`` would import more of Python's own modules.
+HELP = (sys.executable, "-c", "from omnibench.__main__ import main; main()", "--help")
 BARE = (sys.executable, "-c", "import typer, rich")
 
 
