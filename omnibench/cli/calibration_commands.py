@@ -61,7 +61,7 @@ def calibrate(
     The fit uses the training split of the data set, and never its validation split.
     """
     from omnibench.cli.terminal.calibration_tables import print_calibration
-    from omnibench.cli.terminal.progress import EvaluationsBar
+    from omnibench.cli.terminal.progress_display import EvaluationsBar
     from omnibench.config import parse_settings
     from omnibench.data.storage import load_dataset
     from omnibench.fit.calibrate import calibrate as fit
@@ -157,7 +157,7 @@ def certify(
     Gives a lower bound on the cost of every matrix in the box, on the training split, whatever the optimiser.
     """
     from omnibench.cli.terminal.calibration_tables import print_certificate
-    from omnibench.cli.terminal.progress import ProofLine
+    from omnibench.cli.terminal.progress_display import ProofLine
     from omnibench.data.storage import load_dataset
     from omnibench.fit.certify import certify_optimum
     from omnibench.robot.calibration import read_calibration

@@ -36,7 +36,7 @@ def compare(
     where it was stopped.
     """
     from omnibench.cli.terminal.comparison_tables import print_result
-    from omnibench.cli.terminal.progress import Bars, Lines
+    from omnibench.cli.terminal.progress_display import Bars, Lines
     from omnibench.compare.read_config import read_compare_config
     from omnibench.compare.run import run_comparison
 

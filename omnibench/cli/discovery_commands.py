@@ -38,7 +38,7 @@ def discover(
     tells how much smaller the error becomes on runs that were held out.
     """
     from omnibench.cli.terminal.discovery_summary import print_discovery
-    from omnibench.cli.terminal.progress import Stages
+    from omnibench.cli.terminal.progress_display import Stages
     from omnibench.data.storage import load_dataset
     from omnibench.discover.discover import discover_effects
     from omnibench.discover.document import discovery_document

@@ -88,7 +88,7 @@ def replay(
 ) -> None:
     """Play a recording onto Zenoh, as the robot and its SLAM would."""
     from omnibench.cli.terminal.live_tables import print_played
-    from omnibench.cli.terminal.progress import ReplayBar, Steps
+    from omnibench.cli.terminal.progress_display import ReplayBar, Steps
     from omnibench.config import parse_settings, validate
     from omnibench.live.network.presence import checked_robot
     from omnibench.live.replay.arrivals import ReplayConfig
@@ -230,7 +230,7 @@ def _run(config: "LiveConfig", seconds: float | None) -> None:
 
 def _replay_to_node(config: "LiveConfig", dataset: Path | None, speed: str | None, file: Path) -> None:
     from omnibench.cli.terminal.live_tables import node_log, print_demonstration
-    from omnibench.cli.terminal.progress import ReplayBar, Steps
+    from omnibench.cli.terminal.progress_display import ReplayBar, Steps
     from omnibench.config import validate
     from omnibench.live.network.access_log import log_refused_access
     from omnibench.live.replay.arrivals import ReplayConfig

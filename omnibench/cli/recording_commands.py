@@ -147,7 +147,7 @@ def slam(
 
     Each scan is matched against a map that grows from scan to scan.
     """
-    from omnibench.cli.terminal.progress import Steps
+    from omnibench.cli.terminal.progress_display import Steps
     from omnibench.cli.terminal.slam_summary import print_slam
     from omnibench.config import parse_settings, validate
     from omnibench.report.recording.section import write_recording_report
@@ -212,7 +212,7 @@ def simulate(
 
     The truth stays out of the data set: it is written to another folder with --truth, or else nowhere.
     """
-    from omnibench.cli.terminal.progress import Steps
+    from omnibench.cli.terminal.progress_display import Steps
     from omnibench.cli.terminal.slam_summary import print_slam_accuracy
     from omnibench.report.recording.section import write_recording_report
     from omnibench.simulate.simulation_request import SimulationRequest

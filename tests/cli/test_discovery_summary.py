@@ -11,7 +11,7 @@ from discovery_samples import incomplete, named, nameless, nothing
 from rich.console import Console
 
 from omnibench.cli.terminal.discovery_summary import print_discovery
-from omnibench.cli.terminal.progress import Stages
+from omnibench.cli.terminal.progress_display import Stages
 from omnibench.discover.result import Discovery
 
 
