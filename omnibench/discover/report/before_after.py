@@ -1,4 +1,4 @@
-"""What the pictures of a discovery share: colours before and after, the noise band, panels on one scale."""
+"""Figures that compare the plain with the extended model: their styles, the noise band, panels on a common scale."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from omnibench.robot.kinematics import Array
 BEFORE, AFTER, FLOOR = "#d97706", "#0072b2", "#8a8f98"
 BAND = "rgba(102,114,127,0.20)"
 _NOISE = "#c3c9d0"
-# A line across the plot at 0; given with the layout, which is a good deal faster than adding it.
+# A line across the plot at y = 0, as part of the layout: adding it to a figure is much slower.
 ZERO = {"type": "line", "xref": "x domain", "x0": 0, "x1": 1, "y0": 0, "y1": 0, "line": {"color": QUIET, "width": 1}}
 
 
 @dataclass(frozen=True)
-class Look:
-    """How one of the two models is drawn; index: 0 before, 1 after."""
+class ModelStyle:
+    """The style in which one of the two models is drawn. index: 0 before, 1 after."""
 
     index: int
     key: str
@@ -34,27 +34,27 @@ class Look:
         return LegendItem(self.key, self.label, self.colour)
 
 
-PLAIN = Look(0, "before", "plain matrix (before)", BEFORE)
-ALONE = Look(0, "before", "plain matrix", BEFORE)
-EXTENDED = Look(1, "after", "extended model (after)", AFTER)
+PLAIN = ModelStyle(0, "before", "plain matrix (before)", BEFORE)
+ALONE = ModelStyle(0, "before", "plain matrix", BEFORE)
+EXTENDED = ModelStyle(1, "after", "extended model (after)", AFTER)
 NOISE = LegendItem("noise", "noise alone, 95 %", _NOISE)
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One model's values (n,) over x (n,), NaN where nothing is known; half_width (n,): 95 % of what chance does."""
+    """One model's values (n,) over x (n,), NaN where unknown. half_width (n,): the 95 % band of chance."""
 
-    look: Look
+    style: ModelStyle
     values: Array
     half_width: Array
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """A plot to be: curves over x (n,), with words for the axes.
+    """The content of one plot: curves over x (n,) and the titles of its axes.
 
-    amplitude: values are never below 0. shared: all half-widths are those of the noise alone. ticks: distance of those
-    of x. words: of each point, for the hover.
+    amplitude: values are never below 0. shared: all curves have the band of the noise alone. ticks: distance between
+    ticks of x. words: a text for each point, shown on hovering.
     """
 
     title: str
@@ -74,21 +74,21 @@ class Panel:
         return not any(np.isfinite(curve.half_width).any() for curve in self.curves)
 
 
-def legend(looks: Sequence[Look], noise: bool = True) -> tuple[LegendItem, ...]:
-    """The models that are drawn and, if it has a look of its own, the noise."""
-    models = tuple(look.legend for look in looks)
+def legend(styles: Sequence[ModelStyle], noise: bool = True) -> tuple[LegendItem, ...]:
+    """The legend of the models and, if ``noise``, of the noise band."""
+    models = tuple(style.legend for style in styles)
     return (*models, NOISE) if noise else models
 
 
 def drawn(panels: Sequence[Panel]) -> list[go.Figure]:
-    """The panels as plots, all on one scale."""
+    """The panels as plots, all with the same scale of y."""
     limits = [_reach(panel) for panel in panels]
     reach = 1.1 * max(limits, default=1.0) or 1.0
     return [_plot(panel, reach) for panel in panels]
 
 
 def numbers(values: Array) -> list[float | None]:
-    """Values as JSON has them, to five digits, None for NaN."""
+    """Values rounded to five digits, None for NaN."""
     return [None if np.isnan(value) else float(f"{value:.5g}") for value in np.asarray(values, dtype=float)]
 
 
@@ -100,7 +100,7 @@ def round_down(value: float) -> float:
 
 def _reach(panel: Panel) -> float:
     widest = np.nanmax(np.concatenate([np.abs(curve.values) for curve in panel.curves]), initial=0.0)
-    # A bin that hardly anything falls into must not make all others flat.
+    # The wide band of a bin with few samples must not flatten all curves.
     usual = [np.nanquantile(curve.half_width, 0.75) for curve in panel.curves if np.isfinite(curve.half_width).any()]
     return float(max(widest, 1.3 * max(usual, default=0.0)))
 
@@ -114,12 +114,12 @@ def _plot(panel: Panel, reach: float) -> go.Figure:
             x=numbers(panel.x),
             y=numbers(curve.values),
             mode="lines+markers" if panel.lines else "markers",
-            line={"color": curve.look.colour, "width": 2},
-            marker={"color": curve.look.colour, "size": 6 if panel.lines else 5},
+            line={"color": curve.style.colour, "width": 2},
+            marker={"color": curve.style.colour, "size": 6 if panel.lines else 5},
             opacity=1.0 if panel.lines else 0.75,
-            legendgroup=curve.look.key,
+            legendgroup=curve.style.key,
             text=[text(each) for each in words],
-            hovertemplate=f"{text(curve.look.label)}<br>%{{text}} %{{y:.3g}} {panel.unit}<extra></extra>",
+            hovertemplate=f"{text(curve.style.label)}<br>%{{text}} %{{y:.3g}} {panel.unit}<extra></extra>",
         )
         for curve in panel.curves
     ]
@@ -132,7 +132,7 @@ def _plot(panel: Panel, reach: float) -> go.Figure:
 
 
 def _band(panel: Panel, curve: Curve) -> go.Scatter:
-    """The half-widths about zero, in a pale shade of the curve's colour or as the noise's."""
+    """The band of chance about zero, in a pale shade of the curve's colour or in that of the noise."""
     x: list[float | None] = []
     y: list[float | None] = []
     known = np.isfinite(curve.half_width)
@@ -141,19 +141,19 @@ def _band(panel: Panel, curve: Curve) -> go.Scatter:
     for piece in pieces:
         if known[piece[0]]:
             at, half = panel.x[piece], curve.half_width[piece]
-            if len(piece) == 1:  # alone among bins that are empty
+            if len(piece) == 1:  # a bin between empty ones
                 at, half = at + np.array([-margin, margin]), np.repeat(half, 2)
             low = 0 * half if panel.amplitude else -half
             x += [*numbers(np.concatenate([at, at[::-1]])), None]
             y += [*numbers(np.concatenate([half, low[::-1]])), None]
-    colour = BAND if panel.shared else _pale(curve.look.colour)
+    colour = BAND if panel.shared else _pale(curve.style.colour)
     return go.Scatter(
         x=x,
         y=y,
         fill="toself",
         mode="none",
         fillcolor=colour,
-        legendgroup=NOISE.key if panel.shared else curve.look.key,
+        legendgroup=NOISE.key if panel.shared else curve.style.key,
         hoverinfo="skip",
     )
 

@@ -1,4 +1,4 @@
-"""Final residuals by command: on a map and over the direction where commands are a flower, else in rows."""
+"""Figures of the final residuals by command: on a map and over the direction for a flower of commands, else in rows."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from collections.abc import Sequence
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.discover.report.before_after import BAND, NOISE, Look, legend, numbers
+from omnibench.discover.report.before_after import BAND, NOISE, ModelStyle, legend, numbers
 from omnibench.discover.report.command_map import command_in_words, command_maps, mean_of
 from omnibench.discover.report.residuals import NORMAL_95, CommandResidual, Residuals
 from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem, Paragraph
 from omnibench.report.numbers import fixed
 from omnibench.report.style import INK, QUIET, plot, text
 
-_ROWS = 16  # commands that are listed
+_ROWS = 16  # commands listed at most (chosen)
 _ON_MAP = 200
-# Rates of turn from the most negative to the most positive.
+# Colours for rates of turn from the most negative to the most positive.
 _TURN_COLOURS = ("#0072b2", "#5b6772", "#d97706", "#aa3377", "#4fb0e8", "#7b4b2a", "#8f8f1f")
 
 
-def command_blocks(residuals: Residuals, looks: Sequence[Look]) -> tuple[Block, ...]:
+def command_blocks(residuals: Residuals, styles: Sequence[ModelStyle]) -> tuple[Block, ...]:
     """Final residuals of every command, before and after."""
     commands = residuals.commands
     if _is_flower(commands):
         moving = [each for each in commands if math.hypot(*each.end[:2]) > 0.05]
-        return (command_maps(moving, looks), *_headings_by_direction(commands, looks))
-    return (_rows(commands, looks),)
+        return (command_maps(moving, styles), *_headings_by_direction(commands, styles))
+    return (_rows(commands, styles),)
 
 
 def _is_flower(commands: Sequence[CommandResidual]) -> bool:
-    """Whether the commands' ends lie apart, so that residuals can be drawn there."""
+    """True if the ends of the commands lie so far apart that residuals can be drawn at them."""
     if not 3 <= len(commands) <= _ON_MAP:
         return False
     ends = np.array([each.end[:2] for each in commands])
@@ -40,7 +40,7 @@ def _is_flower(commands: Sequence[CommandResidual]) -> bool:
     return bool(np.quantile(apart.min(axis=1), 0.2) > max(float(residual), 0.02))
 
 
-def _headings_by_direction(commands: Sequence[CommandResidual], looks: Sequence[Look]) -> tuple[Block, ...]:
+def _headings_by_direction(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> tuple[Block, ...]:
     """Mean final heading residuals over the commanded direction, a colour for each rate of turn."""
     known = [each for each in commands if each.run.alpha is not None and each.run.omega is not None]
     moving = [each for each in known if each.run.v is None or each.run.v > 0]
@@ -49,7 +49,7 @@ def _headings_by_direction(commands: Sequence[CommandResidual], looks: Sequence[
     distinct = {(_direction(each), *_motion(each)) for each in moving}
     directions = {_direction(each) for each in moving}
     if len(motions) > len(_TURN_COLOURS) or len(distinct) < len(moving) or len(directions) < 3:
-        return (_rows(commands, looks),)
+        return (_rows(commands, styles),)
     several = len({speed for speed, _ in motions}) > 1
     items = [
         LegendItem(
@@ -63,16 +63,16 @@ def _headings_by_direction(commands: Sequence[CommandResidual], looks: Sequence[
         (item, sorted((each for each in moving if _motion(each) == motion), key=_direction))
         for motion, item in zip(motions, items, strict=True)
     ]
-    panels = [_heading_plot(curves, look, moving) for look in looks]
+    panels = [_heading_plot(curves, style, moving) for style in styles]
     reach = max(panel[1] for panel in panels)
     figures = []
-    for look, (figure, _) in zip(looks, panels, strict=True):
+    for style, (figure, _) in zip(styles, panels, strict=True):
         figure.update_yaxes(range=[-reach, reach])
         figures.append(
             Figure(
-                f"Final heading residuals, {look.label}",
+                f"Final heading residuals, {style.label}",
                 figure,
-                f"Mean final heading residual in degrees over the commanded direction, {look.label}",
+                f"Mean final heading residual in degrees over the commanded direction, {style.label}",
                 300,
             )
         )
@@ -80,11 +80,13 @@ def _headings_by_direction(commands: Sequence[CommandResidual], looks: Sequence[
         tuple(figures), (*items, NOISE), 2,
         "Mean over the runs of each command; the band holds 95 % of what noise alone would do.",
     )  # fmt: skip
-    return (grid, *_turns_on_the_spot(still, looks))
+    return (grid, *_turns_on_the_spot(still, styles))
 
 
 def _heading_plot(
-    curves: Sequence[tuple[LegendItem, Sequence[CommandResidual]]], look: Look, commands: Sequence[CommandResidual]
+    curves: Sequence[tuple[LegendItem, Sequence[CommandResidual]]],
+    style: ModelStyle,
+    commands: Sequence[CommandResidual],
 ) -> tuple[go.Figure, float]:
     half = math.degrees(NORMAL_95 * float(np.median([each.error[2] for each in commands])))
     ends = [_direction(each) for each in commands]
@@ -95,7 +97,7 @@ def _heading_plot(
     ]  # fmt: skip
     reach = 1.4 * half
     for item, own in curves:
-        values = np.degrees([mean_of(each, look)[2] for each in own])
+        values = np.degrees([mean_of(each, style)[2] for each in own])
         reach = max(reach, 1.1 * float(np.abs(values).max()))
         traces.append(
             go.Scatter(
@@ -114,19 +116,19 @@ def _heading_plot(
     return figure, reach
 
 
-def _turns_on_the_spot(still: Sequence[CommandResidual], looks: Sequence[Look]) -> tuple[Block, ...]:
+def _turns_on_the_spot(still: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> tuple[Block, ...]:
     if not still:
         return ()
     parts = []
     for each in sorted(still, key=_motion):
-        values = " → ".join(f"{fixed(math.degrees(mean_of(each, look)[2]), 2, signed=True)}°" for look in looks)
+        values = " → ".join(f"{fixed(math.degrees(mean_of(each, style)[2]), 2, signed=True)}°" for style in styles)
         noise = fixed(math.degrees(NORMAL_95 * each.error[2]), 2)
         parts.append(f"{command_in_words(each)}: {values} (noise ±{noise}°)")
     return (Paragraph(f"Turns on the spot, mean heading residual: {'; '.join(parts)}.", "note"),)
 
 
-def _rows(commands: Sequence[CommandResidual], looks: Sequence[Look]) -> FigureGrid:
-    """One row for each command, those with the largest residuals if there are many."""
+def _rows(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> FigureGrid:
+    """One row for each command; if there are many, the 16 with the largest residuals."""
     shown = sorted(commands, key=lambda each: -float(np.abs(each.means[0] / each.error).max()))[:_ROWS]
     shown = [each for each in commands if each in shown]
     figures = []
@@ -136,7 +138,7 @@ def _rows(commands: Sequence[CommandResidual], looks: Sequence[Look]) -> FigureG
         figures.append(
             Figure(
                 f"Final residual {name}" if axis < 2 else "Final heading residual",
-                _row_plot(shown, looks, axis, factor, unit),
+                _row_plot(shown, styles, axis, factor, unit),
                 f"Mean final residual of each command, {name}, in {unit}",
                 90 + 22 * len(shown),
             )
@@ -146,11 +148,11 @@ def _rows(commands: Sequence[CommandResidual], looks: Sequence[Look]) -> FigureG
         f"{words if len(shown) < len(commands) else ''}Mean over the runs of each command, seen from its start pose; "
         "grey bars hold 95 % of what noise alone would do to that mean."
     )
-    return FigureGrid(tuple(figures), legend(looks), 3 if max(len(each.name) for each in shown) < 14 else 1, caption)
+    return FigureGrid(tuple(figures), legend(styles), 3 if max(len(each.name) for each in shown) < 14 else 1, caption)
 
 
 def _row_plot(
-    commands: Sequence[CommandResidual], looks: Sequence[Look], axis: int, factor: float, unit: str
+    commands: Sequence[CommandResidual], styles: Sequence[ModelStyle], axis: int, factor: float, unit: str
 ) -> go.Figure:
     names = [text(each.name) for each in commands]
     half = [NORMAL_95 * factor * each.error[axis] for each in commands]
@@ -170,13 +172,13 @@ def _row_plot(
     traces += [
         go.Scatter(
             y=names,
-            x=numbers(factor * np.array([mean_of(each, look)[axis] for each in commands])),
+            x=numbers(factor * np.array([mean_of(each, style)[axis] for each in commands])),
             mode="markers",
-            marker={"color": look.colour, "size": 9},
-            legendgroup=look.key,
-            hovertemplate=f"{text(look.label)}: %{{x:.3g}} {unit}<extra></extra>",
+            marker={"color": style.colour, "size": 9},
+            legendgroup=style.key,
+            hovertemplate=f"{text(style.label)}: %{{x:.3g}} {unit}<extra></extra>",
         )
-        for look in looks
+        for style in styles
     ]
     figure = plot(*traces, xaxis_title_text=f"residual ({unit})")
     figure.update_yaxes(autorange="reversed", ticks="", tickfont_color=INK)
@@ -185,7 +187,7 @@ def _row_plot(
 
 
 def _motion(each: CommandResidual) -> tuple[float, float]:
-    """Speed and rate of turn, without the digits that a measured command has."""
+    """Speed and rate of turn of a command, rounded so that repetitions of a measured command agree."""
     return round(each.run.v or 0.0, 2), round(each.run.omega or 0.0, 2)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.discover.report.before_after import BAND, NOISE, Look, legend, numbers, round_down
+from omnibench.discover.report.before_after import BAND, NOISE, ModelStyle, legend, numbers, round_down
 from omnibench.discover.report.residuals import CIRCLE_95, CommandResidual
 from omnibench.report.blocks import Figure, FigureGrid
 from omnibench.report.numbers import fixed, plural
@@ -16,35 +16,35 @@ from omnibench.report.style import INK, QUIET, equal_aspect, plot, text
 from omnibench.robot.kinematics import Array
 
 
-def command_maps(commands: Sequence[CommandResidual], looks: Sequence[Look]) -> FigureGrid:
+def command_maps(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> FigureGrid:
     """The residual of each command as an arrow at its end, enlarged."""
     reach = float(np.median([np.hypot(*each.end[:2]) for each in commands]))
-    sizes = [np.hypot(*mean_of(each, look)[:2]) for each in commands for look in looks]
+    sizes = [np.hypot(*mean_of(each, style)[:2]) for each in commands for style in styles]
     circle = CIRCLE_95 * float(np.median([each.error[0] for each in commands]))
     # A step of 1, 2 or 5: the longest arrow is about a third of the way to the ends.
     factor = round_down(0.35 * reach / max(float(np.quantile(sizes, 0.95)), circle, 1e-6))
-    tips = [each.end[:2] + factor * mean_of(each, look)[:2] for each in commands for look in looks]
+    tips = [each.end[:2] + factor * mean_of(each, style)[:2] for each in commands for style in styles]
     points = np.array([*tips, *(each.end[:2] for each in commands), np.zeros(2)])
     margin = 0.04 * float(np.ptp(points, axis=0).max()) + factor * circle / 2
     window = np.column_stack([points.min(axis=0) - margin, points.max(axis=0) + margin])
     figures = tuple(
         Figure(
-            f"Final position residuals, {look.label}",
-            _map(commands, look, factor, window),
-            f"Mean final position residual of each command at its end, enlarged {factor:g} times, {look.label}",
+            f"Final position residuals, {style.label}",
+            _map(commands, style, factor, window),
+            f"Mean final position residual of each command at its end, enlarged {factor:g} times, {style.label}",
             440,
         )
-        for look in looks
+        for style in styles
     )
     caption = (
         f"Mean over the runs of each command, seen from its start pose (x forward). An arrow goes from where a command "
         f"ends by the reference, and is the residual (reference minus odometry) enlarged {factor:g} times; grey "
         "circles hold 95 % of what noise alone would do to that mean, enlarged alike."
     )
-    return FigureGrid(figures, legend(looks), 2, caption)
+    return FigureGrid(figures, legend(styles), 2, caption)
 
 
-def _map(commands: Sequence[CommandResidual], look: Look, factor: float, window: Array) -> go.Figure:
+def _map(commands: Sequence[CommandResidual], style: ModelStyle, factor: float, window: Array) -> go.Figure:
     traces = []
     circles_x: list[float | None] = []
     circles_y: list[float | None] = []
@@ -57,7 +57,7 @@ def _map(commands: Sequence[CommandResidual], look: Look, factor: float, window:
         radius = factor * CIRCLE_95 * each.error[0]
         circles_x += [*numbers(x + radius * np.cos(turn)), None]
         circles_y += [*numbers(y + radius * np.sin(turn)), None]
-        residual = mean_of(each, look)
+        residual = mean_of(each, style)
         tip = each.end[:2] + factor * residual[:2]
         lines_x += [*numbers(np.array([x, tip[0]])), None]
         lines_y += [*numbers(np.array([y, tip[1]])), None]
@@ -69,12 +69,12 @@ def _map(commands: Sequence[CommandResidual], look: Look, factor: float, window:
                    hoverinfo="skip")
     )  # fmt: skip
     traces.append(
-        go.Scatter(x=lines_x, y=lines_y, mode="lines", line={"color": look.colour, "width": 2.2},
-                   legendgroup=look.key, hoverinfo="skip")
+        go.Scatter(x=lines_x, y=lines_y, mode="lines", line={"color": style.colour, "width": 2.2},
+                   legendgroup=style.key, hoverinfo="skip")
     )  # fmt: skip
-    traces.append(_dots(ends, QUIET, 3, words, look))
-    traces.append(_dots(np.array(tips), look.colour, 6, words, look, _directions(commands, look)))
-    traces.append(_dots(np.zeros((1, 2)), INK, 7, ["start"], look))
+    traces.append(_dots(ends, QUIET, 3, words, style))
+    traces.append(_dots(np.array(tips), style.colour, 6, words, style, _directions(commands, style)))
+    traces.append(_dots(np.zeros((1, 2)), INK, 7, ["start"], style))
     figure = plot(*traces, xaxis_title_text="x (m)", yaxis_title_text="y (m)")
     figure.update_xaxes(range=numbers(window[0]))
     figure.update_yaxes(range=numbers(window[1]))
@@ -82,14 +82,19 @@ def _map(commands: Sequence[CommandResidual], look: Look, factor: float, window:
     return figure
 
 
-def _directions(commands: Sequence[CommandResidual], look: Look) -> list[float]:
-    """Where the arrows point, clockwise from up, deg."""
-    found = [mean_of(each, look)[:2] for each in commands]
+def _directions(commands: Sequence[CommandResidual], style: ModelStyle) -> list[float]:
+    """The direction of each arrow, clockwise from up, deg."""
+    found = [mean_of(each, style)[:2] for each in commands]
     return [90.0 - math.degrees(math.atan2(residual[1], residual[0])) for residual in found]
 
 
 def _dots(
-    points: Array, colour: str, size: int, words: Sequence[str], look: Look, angles: Sequence[float] | None = None
+    points: Array,
+    colour: str,
+    size: int,
+    words: Sequence[str],
+    style: ModelStyle,
+    angles: Sequence[float] | None = None,
 ) -> go.Scatter:
     marker: dict[str, object] = {"color": colour, "size": size}
     if angles is not None:
@@ -101,18 +106,18 @@ def _dots(
         marker=marker,
         text=list(words),
         hovertemplate="%{text}<extra></extra>",
-        legendgroup=look.key if angles is not None else None,
+        legendgroup=style.key if angles is not None else None,
     )
 
 
-def mean_of(each: CommandResidual, look: Look) -> Array:
+def mean_of(each: CommandResidual, style: ModelStyle) -> Array:
     """The mean final residual (3,) of one model."""
-    mean: Array = each.means[look.index]
+    mean: Array = each.means[style.index]
     return mean
 
 
 def command_in_words(each: CommandResidual) -> str:
-    """A command by its speed, direction and rate of turn; by its name where these are not known."""
+    """A command described by speed, direction and rate of turn; by its name if these are unknown."""
     run = each.run
     if run.alpha is None or run.omega is None or run.v is None:
         return each.name

@@ -1,4 +1,4 @@
-"""The report of a discovery: where, what, how sure, how much better. One HTML file that opens offline."""
+"""The report of a discovery as one HTML file: where the model fails, what is missing, how sure, how much better."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 
 from omnibench.discover.document import experiment_file
-from omnibench.discover.report.evidence_figures import candidate_grid, gap_grid, hidden_grid, waterfall_grid
+from omnibench.discover.report.evidence_figures import CANDIDATES, GAPS, drawn, hidden_grid
 from omnibench.discover.report.tables import (
     absorbed_table,
     extrapolation_table,
@@ -54,7 +54,7 @@ from omnibench.report.numbers import count, fixed, listing, plural
 
 
 def discovery_report(discovery: Discovery, options: str) -> Document:
-    """The report as blocks; options: the effective ones, in YAML."""
+    """The report as blocks. options: the effective options, in YAML."""
     dataset = discovery.dataset
     return Document(
         title=f"What the odometry model lacks: {dataset.name}",
@@ -73,7 +73,7 @@ def discovery_report(discovery: Discovery, options: str) -> Document:
 
 
 def answer_section(discovery: Discovery) -> Section:
-    """The answer in words and figures, and what warns of it."""
+    """The section with the answer in words and figures, and its warnings."""
     return Section("answer", "Answer", tuple(_answer(discovery)))
 
 
@@ -109,7 +109,7 @@ def _tiles(discovery: Discovery) -> Iterator[Fact]:
 
 
 def what_section(discovery: Discovery) -> Section:
-    """The effects that were found with their parameters, and those that a matrix absorbs."""
+    """The section on the effects: those found, with their parameters, and those that a matrix absorbs."""
     return Section("what", "What", tuple(_what(discovery)))
 
 
@@ -144,7 +144,7 @@ def _effect_remarks(effect: NamedEffect) -> Iterator[str]:
 
 
 def sure_section(discovery: Discovery) -> Section:
-    """Weights, candidates, what is left, what cannot be told apart, what could still hide."""
+    """The section on certainty: weights, candidates, what is left, look-alikes, effects that may still hide."""
     return Section("sure", "How sure", tuple(_how_sure(discovery)))
 
 
@@ -162,9 +162,7 @@ def _how_sure(discovery: Discovery) -> Iterator[Block]:
             ),
             "tiles",
         )
-    grid = candidate_grid(discovery)
-    if grid is not None:
-        yield grid
+    yield from drawn(CANDIDATES, discovery)
     yield from _left_over(discovery)
     yield from _classes(discovery)
     yield from _hidden(discovery)
@@ -199,17 +197,14 @@ def _hidden(discovery: Discovery) -> Iterator[Block]:
 
 
 def better_section(discovery: Discovery) -> Section:
-    """Errors before and after against the floor, on runs that no fit has seen."""
+    """The section on the gain: errors before and after against the noise floor, on held-out runs."""
     return Section("better", "How much better", tuple(_how_much_better(discovery)))
 
 
 def _how_much_better(discovery: Discovery) -> Iterator[Block]:
     if discovery.held_out:
         yield Paragraph(_better_in_words(discovery))
-    yield gap_grid(discovery)
-    grid = waterfall_grid(discovery)
-    if grid is not None:
-        yield grid
+    yield from drawn(GAPS, discovery)
     yield held_out_table(discovery) if discovery.held_out else gap_table(discovery)
     if len(discovery.steps) > 1:
         yield Details("Every step in numbers", (step_table(discovery),))
@@ -241,7 +236,7 @@ def _better_in_words(discovery: Discovery) -> str:
 
 
 def basis_section(discovery: Discovery, options: str) -> Section:
-    """Data, noise, options and files."""
+    """The section on the basis of it all: data, noise, options and files."""
     return Section("basis", "What this rests on", tuple(_basis(discovery, options)))
 
 

@@ -1,8 +1,8 @@
-"""How sure, and how much better: candidates of each step, the waterfall of steps, gaps, what could still hide."""
+"""Figures of the evidence: candidates of each step, errors after each step, gaps, effects that may still hide."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -26,14 +26,15 @@ from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import fixed
 from omnibench.report.style import INK, QUIET, logarithmic, plot, text
 
-_CANDIDATES = 8  # of each step
+EvidenceFigure = Callable[[Discovery], FigureGrid | None]
+_CANDIDATES = 8  # shown of each step (chosen)
 _UNCHOSEN = "#b9c0c8"
 _GAINED, _LOST = "#7fb8d8", "#e3a3a3"
 _FLOOR_LEGEND = LegendItem("floor", "floor", FLOOR, "dash")
 
 
 def candidate_grid(discovery: Discovery) -> FigureGrid | None:
-    """The gain of every effect that was tried, step by step."""
+    """The chi-square difference of every effect that was tried, for each step."""
     found = {effect.name for effect in discovery.effects}
     figures = []
     for number, tried in enumerate(discovery.candidates, 1):
@@ -46,7 +47,7 @@ def candidate_grid(discovery: Discovery) -> FigureGrid | None:
             Figure(
                 title,
                 _candidate_bars(shown, chosen),
-                "Gain in whitened chi2 of each candidate: "
+                "Fall of the whitened chi2 with each candidate: "
                 + ", ".join(
                     f"{each.name} {each.chi_square:.3g}, weight {weight_in_words(each.weight)}" for each in shown
                 ),
@@ -65,7 +66,7 @@ def candidate_grid(discovery: Discovery) -> FigureGrid | None:
 
 
 def _is_step(discovery: Discovery, number: int, candidate: Candidate) -> bool:
-    """Whether a candidate is the effect that a step added."""
+    """True if a candidate is the effect that the step added."""
     if number < len(discovery.steps):
         return added(discovery.steps[number]) == candidate.name
     return False
@@ -87,7 +88,7 @@ def _candidate_bars(shown: Sequence[Candidate], chosen: str | None) -> go.Figure
 
 @dataclass(frozen=True)
 class _Bar:
-    """A horizontal bar from low to high with its label; key: of the legend."""
+    """A horizontal bar from low to high with its label. key: its entry in the legend."""
 
     name: str
     low: float
@@ -98,7 +99,7 @@ class _Bar:
 
 
 def _bars(bars: Sequence[_Bar], x_title: str, room: float) -> go.Figure:
-    """Bars from the top down; room: how much wider than the longest bar the plot is, for the labels."""
+    """A plot of bars from the top down. room: width of the plot as a multiple of the longest bar, for the labels."""
     traces = [
         go.Bar(
             y=[bar.name for bar in bars if bar.key == key],
@@ -124,7 +125,7 @@ def _bars(bars: Sequence[_Bar], x_title: str, room: float) -> go.Figure:
 
 
 def waterfall_grid(discovery: Discovery) -> FigureGrid | None:
-    """Error after each step, down to the floor."""
+    """The error after each step, down to the noise floor."""
     steps = discovery.steps
     if len(steps) < 2:
         return None
@@ -177,7 +178,7 @@ def _waterfall(steps: Sequence[Step], values: Sequence[float], floor: float | No
 
 
 def gap_grid(discovery: Discovery) -> FigureGrid:
-    """Before, after and floor of every gap, on the training runs and on those held out."""
+    """Errors before and after and the noise floor, on the training runs and on the held-out runs."""
     gaps: list[tuple[str, Gap]] = []
     for held in discovery.held_out:
         where = held_out_in_words(discovery, held)
@@ -216,7 +217,7 @@ def _gap_bars(gap: Gap) -> go.Figure:
 
 
 def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
-    """How large each effect could be unseen, as a share of what is plausible."""
+    """The largest size at which each effect could stay unseen, as a share of its plausible size."""
     shown = [each for each in reversed(worst_of_each(hidden)) if each.plausible > 0 and each.limit > 0]
     if not shown:
         return None
@@ -275,3 +276,13 @@ def _folded(name: str) -> str:
 
 def _exponent(value: float) -> int:
     return int(f"{value:e}".split("e")[1])
+
+
+# Figures of the report, by the part that shows them: a figure that is added here is shown.
+CANDIDATES: tuple[EvidenceFigure, ...] = (candidate_grid,)
+GAPS: tuple[EvidenceFigure, ...] = (gap_grid, waterfall_grid)
+
+
+def drawn(figures: Sequence[EvidenceFigure], discovery: Discovery) -> tuple[FigureGrid, ...]:
+    """Those of the figures for which the discovery has data."""
+    return tuple(grid for figure in figures if (grid := figure(discovery)) is not None)

@@ -1,35 +1,35 @@
-"""Residuals over the floor: mean pose residuals of each cell as arrows, and where the motion goes wrong as a map."""
+"""Figures of the residuals over the floor: mean pose residuals as arrows, the error of the motion as maps."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
 
-from omnibench.discover.report.before_after import Look, numbers, round_down
-from omnibench.discover.report.motion_figures import MODES, fit_modes
+from omnibench.discover.report.before_after import ModelStyle, numbers, round_down
+from omnibench.discover.report.motion_figures import MODES, CovariateFigure, fit_modes
 from omnibench.discover.report.residuals import CIRCLE_95, Residuals
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import plural
 from omnibench.report.style import equal_aspect, plot, text
 from omnibench.robot.kinematics import Array
 
-_CELLS = 8  # along the longer side
-_LEAST = 0.003  # share of the samples that a cell needs
+_CELLS = 8  # along the longer side (chosen)
+_LEAST = 0.003  # share of the samples; a cell with fewer is left out (chosen)
 _INSIDE = "#c3c9d0"
-_SCALE = 6.0  # standard errors at the ends of the colours
+_SCALE = 6.0  # standard errors at the ends of the colour scale (chosen)
 
-# Of each cell the mean residual (3,), the standard error of its x and y (m), and the number of runs.
+# By cell: mean residual (3,) in m, m, rad, standard error of its x and y (m), number of runs.
 _Means = dict[int, tuple[Array, float, int]]
 
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """A grid over the floor. edges: of x and of y, m."""
+    """A grid over the floor. edges: the cells' borders in x and in y, m."""
 
     edges: tuple[Array, Array]
 
@@ -42,7 +42,7 @@ class _Cells:
         return float(self.edges[0][1] - self.edges[0][0])
 
     def number(self, points: Array) -> Array:
-        """The cell (n,) of points (n, 2)."""
+        """The number (n,) of the cell that each of the points (n, 2), m, lies in."""
         column, row = (
             np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
             for edges, values in zip(self.edges, points.T, strict=True)
@@ -50,21 +50,13 @@ class _Cells:
         return column * self.shape[1] + row
 
     def centre(self, number: int) -> Array:
-        """The middle (2,) of a cell."""
+        """The middle (2,) of a cell, m."""
         place = divmod(number, self.shape[1])
         return np.array([(edges[i] + edges[i + 1]) / 2 for edges, i in zip(self.edges, place, strict=True)])
 
 
-def floor_grids(residuals: Residuals, looks: Sequence[Look]) -> tuple[FigureGrid, ...]:
-    """Arrows of the mean pose residuals, and maps of the error of the motion; none where nothing was driven."""
-    cells = _cells(residuals)
-    if cells is None:
-        return ()
-    found = [_arrow_grid(residuals, looks, cells), _motion_grid(residuals, looks, cells)]
-    return tuple(each for each in found if each is not None)
-
-
 def _cells(residuals: Residuals) -> _Cells | None:
+    """A grid over the floor that the robot drove on; None if it stays in its place."""
     points = residuals.paths.middle[:, :2]
     low, high = points.min(axis=0), points.max(axis=0)
     side = float((high - low).max()) / _CELLS
@@ -76,8 +68,12 @@ def _cells(residuals: Residuals) -> _Cells | None:
     return _Cells((edges[0], edges[1]))
 
 
-def _arrow_grid(residuals: Residuals, looks: Sequence[Look], cells: _Cells) -> FigureGrid | None:
-    means = {look.key: _cell_means(residuals, look, cells) for look in looks}
+def arrow_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
+    """Arrows of the mean pose residuals in each cell of the floor; None if the robot stays in its place."""
+    cells = _cells(residuals)
+    if cells is None:
+        return None
+    means = {style.key: _cell_means(residuals, style, cells) for style in styles}
     sizes = [float(np.hypot(*mean[:2])) for each in means.values() for mean, _, _ in each.values()]
     if not sizes:
         return None
@@ -93,26 +89,26 @@ def _arrow_grid(residuals: Residuals, looks: Sequence[Look], cells: _Cells) -> F
     window = np.column_stack([points.min(axis=0) - cells.size / 2, points.max(axis=0) + cells.size / 2])
     figures = tuple(
         Figure(
-            f"Mean position residuals, {look.label}",
-            _arrows(means[look.key], look, cells, factor, window),
-            f"Mean position residual in each cell of the floor, enlarged {factor:g} times, {look.label}",
+            f"Mean position residuals, {style.label}",
+            _arrows(means[style.key], style, cells, factor, window),
+            f"Mean position residual in each cell of the floor, enlarged {factor:g} times, {style.label}",
             420,
         )
-        for look in looks
+        for style in styles
     )
     return FigureGrid(
         figures,
-        (*(look.legend for look in looks), LegendItem("inside", "within the noise", _INSIDE)),
+        (*(style.legend for style in styles), LegendItem("inside", "within the noise", _INSIDE)),
         2,
         f"Mean pose residual of the runs that cross a cell, enlarged {factor:g} times, in the frame of the reference; "
         "grey where noise alone would do as much once in 20 times.",
     )
 
 
-def _cell_means(residuals: Residuals, look: Look, cells: _Cells) -> _Means:
-    """Of each cell with poses: mean residual (3,), standard error of its x and y (m), and the number of runs."""
+def _cell_means(residuals: Residuals, style: ModelStyle, cells: _Cells) -> _Means:
+    """For each cell with poses: mean residual (3,), standard error of its x and y (m), number of runs."""
     gathered: dict[int, list[tuple[Array, float]]] = {}
-    values = residuals.each[look.index]
+    values = residuals.each[style.index]
     noise = residuals.noise
     for run, own in zip(residuals.runs, values, strict=True):
         where = cells.number(run.poses[1:, :2])
@@ -129,7 +125,7 @@ def _cell_means(residuals: Residuals, look: Look, cells: _Cells) -> _Means:
     return found
 
 
-def _arrows(means: _Means, look: Look, cells: _Cells, factor: float, window: Array) -> go.Figure:
+def _arrows(means: _Means, style: ModelStyle, cells: _Cells, factor: float, window: Array) -> go.Figure:
     traces = []
     for outside in (False, True):
         chosen = [
@@ -139,7 +135,7 @@ def _arrows(means: _Means, look: Look, cells: _Cells, factor: float, window: Arr
         ]
         if not chosen:
             continue
-        colour, key = (look.colour, look.key) if outside else (_INSIDE, "inside")
+        colour, key = (style.colour, style.key) if outside else (_INSIDE, "inside")
         starts = np.array([centre for centre, _, _ in chosen])
         tips = starts + factor * np.array([mean[:2] for _, mean, _ in chosen])
         gaps = np.full(len(chosen), np.nan)
@@ -176,7 +172,11 @@ def _arrows(means: _Means, look: Look, cells: _Cells, factor: float, window: Arr
     return figure
 
 
-def _motion_grid(residuals: Residuals, looks: Sequence[Look], cells: _Cells) -> FigureGrid | None:
+def motion_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
+    """Maps of the error of the motion over the floor; None if the robot stays in its place."""
+    cells = _cells(residuals)
+    if cells is None:
+        return None
     paths = residuals.paths
     where = cells.number(paths.middle[:, :2])
     counts = np.bincount(where.astype(int), minlength=cells.shape[0] * cells.shape[1])
@@ -186,16 +186,16 @@ def _motion_grid(residuals: Residuals, looks: Sequence[Look], cells: _Cells) -> 
     bins = (where[:, None] == chosen).astype(float)
     fitted = fit_modes(residuals, bins)
     figures = []
-    for look in looks:
-        values, errors = fitted.values[:, look.index], fitted.errors[:, look.index]
+    for style in styles:
+        values, errors = fitted.values[:, style.index], fitted.errors[:, style.index]
         for index, (name, factor, unit) in enumerate(MODES):
             part = slice(index * len(chosen), (index + 1) * len(chosen))
             if np.isfinite(errors[part]).any():
                 figures.append(
                     Figure(
-                        f"Error {name}, {look.label}",
+                        f"Error {name}, {style.label}",
                         _map(cells, chosen, factor * values[part], factor * errors[part], unit),
-                        f"Error {name} of the motion in each cell of the floor, in standard errors, {look.label}",
+                        f"Error {name} of the motion in each cell of the floor, in standard errors, {style.label}",
                         270,
                     )
                 )
@@ -237,3 +237,9 @@ def _map(cells: _Cells, chosen: NDArray[np.intp], values: Array, errors: Array, 
     figure.update_xaxes(constrain="domain")
     figure.update_yaxes(constrain="domain")
     return figure
+
+
+# Figures over each covariate: a figure that is added here is shown.
+FIGURES: Mapping[str, tuple[CovariateFigure, ...]] = {
+    "place": (arrow_grid, motion_grid),
+}

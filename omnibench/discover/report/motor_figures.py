@@ -1,4 +1,4 @@
-"""What the motors make of their targets: measured wheel rates less what was told, before and after their effects."""
+"""Figures of the motors: measured wheel rates minus their targets, before and after the actuator effects."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.report.before_after import AFTER, BEFORE, Curve, Look, Panel
+from omnibench.discover.report.before_after import AFTER, BEFORE, Curve, ModelStyle, Panel
 from omnibench.discover.report.motion_figures import grid
 from omnibench.discover.report.residuals import NORMAL_95, shares
 from omnibench.discover.result import Discovery, NamedEffect
@@ -17,9 +17,9 @@ from omnibench.robot.effects.effect import ActuatorEffect
 from omnibench.robot.kinematics import Array
 
 _BINS = 12
-_START = 2.0  # s of a run in which motors settle
-_TOLD = Look(0, "before", "measured less told", BEFORE)
-_EXPECTED = Look(1, "after", "measured less expected with the effects", AFTER)
+_START = 2.0  # s from the start of a run in which motors settle (chosen)
+_TOLD = ModelStyle(0, "before", "measured less told", BEFORE)
+_EXPECTED = ModelStyle(1, "after", "measured less expected with the effects", AFTER)
 
 
 def motor_grid(discovery: Discovery, runs: Sequence[Trajectory]) -> FigureGrid | None:
@@ -29,7 +29,7 @@ def motor_grid(discovery: Discovery, runs: Sequence[Trajectory]) -> FigureGrid |
     if not told or max(float(np.abs(each).max()) for each in before) == 0:
         return None
     found = [effect for effect in discovery.effects if effect.stage == "actuator"]
-    errors: list[tuple[Look, list[Array]]] = [(_TOLD, before)]
+    errors: list[tuple[ModelStyle, list[Array]]] = [(_TOLD, before)]
     if found:
         changes = [_changes(run, targets, found) for run, targets in told]
         errors.append((_EXPECTED, [own - change for own, change in zip(before, changes, strict=True)]))
@@ -39,25 +39,25 @@ def motor_grid(discovery: Discovery, runs: Sequence[Trajectory]) -> FigureGrid |
     panels = []
     for index, wheel in enumerate(discovery.dataset.robot.wheels):
         bins = [shares(each[:, index], edges) * (each[:, [index]] != 0) for each in targets]
-        curves = tuple(_curve(look, bins, [each[:, index] for each in own]) for look, own in errors)
+        curves = tuple(_curve(style, bins, [each[:, index] for each in own]) for style, own in errors)
         panels.append(_panel(f"Wheel {wheel.name}, over its target", edges, curves, "target rate (rad/s)"))
     edges = np.linspace(0.0, min(_START, max(float(run.times[-1]) for run, _ in told)), _BINS + 1)
     bins = [shares(run.times, edges) for run, _ in told]
     curves = tuple(
-        _curve(look, bins, [100 * _share(e, t) for e, t in zip(own, targets, strict=True)]) for look, own in errors
+        _curve(style, bins, [100 * _share(e, t) for e, t in zip(own, targets, strict=True)]) for style, own in errors
     )
     panels.append(
         _panel("All wheels, at the start of the runs", edges, curves, "time since the start (s)", "% of told")
     )
     return grid(
         [panel for panel in panels if not panel.empty],
-        [look for look, _ in errors],
+        [style for style, _ in errors],
         "Mean over the runs; the bands hold 95 % of what the scatter of the runs does to the mean.",
     )
 
 
 def _changes(run: Trajectory, targets: Array, found: Sequence[NamedEffect]) -> Array:
-    """By how much the effects change the rates (F, N); several add up."""
+    """The change (F, N) of the wheel rates by the actuator effects, rad/s; those of several effects add up."""
     durations = np.diff(run.times, prepend=0.0)
     total = np.zeros(targets.shape)
     for each in found:
@@ -68,8 +68,8 @@ def _changes(run: Trajectory, targets: Array, found: Sequence[NamedEffect]) -> A
     return total
 
 
-def _curve(look: Look, bins: Sequence[Array], errors: Sequence[Array]) -> Curve:
-    """Means over the runs of their means in each bin, with the scatter of the runs."""
+def _curve(style: ModelStyle, bins: Sequence[Array], errors: Sequence[Array]) -> Curve:
+    """Mean over the runs of each run's mean in a bin, with the scatter of the runs."""
     counts = np.array([each.sum(axis=0) for each in bins])
     sums = np.array([each.T @ own for each, own in zip(bins, errors, strict=True)])
     means = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
@@ -78,11 +78,11 @@ def _curve(look: Look, bins: Sequence[Array], errors: Sequence[Array]) -> Curve:
     value, spread = np.full(len(runs), np.nan), np.full(len(runs), np.nan)
     value[enough] = np.nanmean(means[:, enough], axis=0)
     spread[enough] = np.nanstd(means[:, enough], axis=0, ddof=1) / np.sqrt(runs[enough])
-    return Curve(look, value, NORMAL_95 * spread)
+    return Curve(style, value, NORMAL_95 * spread)
 
 
 def _share(errors: Array, targets: Array) -> Array:
-    """Errors (F, N) in the direction of the targets, as shares (F,) of these."""
+    """Errors (F, N) projected on the targets, as shares (F,) of these."""
     told = np.abs(targets).mean(axis=1)
     share: Array = (np.sign(targets) * errors).mean(axis=1) / np.where(told > 0, told, np.inf)
     return share

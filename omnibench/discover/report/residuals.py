@@ -1,8 +1,8 @@
-"""Residuals before and after, as the pictures need them: by command, and against any covariate of the motion.
+"""Residuals of plain and extended model, by command and over a covariate of the motion, for the figures.
 
-Against a covariate they are not averaged, as a pose holds all that went wrong before it. What is drawn is the change
-of the motion (along the way, across it, in turning, or of a wheel's rate) that, constant within each bin of the
-covariate, explains the residuals best: generalised least squares under the noise model.
+Over a covariate, residuals are not averaged, because the error of a pose accumulates all errors before it. Drawn is the
+change of the motion (along the path, across it, in turning, or of a wheel's rate) that is constant in each bin of the
+covariate and explains the residuals best, by generalised least squares under the noise model.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from omnibench.fit.least_squares.noise import Whitener
 from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.robot.kinematics import Array
 
-# Standard deviations: 95 % of a normal distribution of the line, and of the plane.
+# Standard deviations that hold 95 % of a normal distribution, on a line and in the plane.
 NORMAL_95 = 1.96
 CIRCLE_95 = 2.448
-_STAMPS = 15_000  # of all runs, for the fits
-_DETERMINED = 1e-4  # share of a bin's information that others must leave
-_COMMANDS = 8  # from which on they are flipped whole
+_STAMPS = 15_000  # fitted at most, of all runs (chosen: keeps a report below seconds)
+_DETERMINED = 1e-4  # share of a bin's information that the other bins must leave (chosen)
+_COMMANDS = 8  # with so many or more, random signs are drawn for whole commands (chosen)
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Values (n, 2) before and after with standard errors (n, 2) of what comes out by chance; NaN: not told."""
+    """Fitted values (n, 2), before and after, with their standard errors (n, 2) by chance; NaN: not determined."""
 
     values: Array
     errors: Array
@@ -56,8 +56,9 @@ class CommandResidual:
 class Residuals:
     """The training runs with their residuals, in the order in which they were driven.
 
-    runs: by session and time. each: before and after, (K, 3) of each run, reference minus odometry, m, m, rad.
-    spread: by how much the residuals that are left exceed the noise, at least 1; standard errors are multiplied by it.
+    runs: sorted by session and time. each: for both models the residuals (K, 3) of each run, reference minus
+    odometry, m, m, rad. spread: ratio of the remaining residuals to the noise model, at least 1; it multiplies all
+    standard errors.
     """
 
     def __init__(self, discovery: Discovery) -> None:
@@ -80,8 +81,8 @@ class Residuals:
 
     @cached_property
     def commands(self) -> tuple[CommandResidual, ...]:
-        """Final residuals by command; runs without one stand for themselves."""
-        found = []
+        """Final residuals by command; a run without a command counts as a command of its own."""
+        residuals = []
         for members in grouped([(run.command, run.id if run.command is None else None) for run in self.runs]):
             first = self.runs[members[0]]
             ends, finals, variances = [], [], []
@@ -93,12 +94,12 @@ class Residuals:
             error: Array = np.sqrt(np.sum(variances, axis=0)) / len(members)
             end: Array = np.mean(ends, axis=0)
             means: Array = np.mean(finals, axis=0)
-            found.append(CommandResidual(first.command or first.id, first, len(members), end, means, error))
-        return tuple(found)
+            residuals.append(CommandResidual(first.command or first.id, first, len(members), end, means, error))
+        return tuple(residuals)
 
     @cached_property
     def paths(self) -> Paths:
-        """The paths of the runs by the plain matrix, with thinned stamps."""
+        """The paths of the runs by the plain matrix, at the thinned stamps."""
         logs = [replace(run.reference_log, stamps=run.pose_times[1:][chosen]) for run, chosen in self._thinned]
         return make_paths(
             self._calibration.robot, self._calibration.matrix_array, logs, self._calibration.sample_period
@@ -106,19 +107,19 @@ class Residuals:
 
     @cached_property
     def stamp_numbers(self) -> NDArray[np.intp]:
-        """Of each of the paths' stamps, its number in its run, the first being 0."""
+        """The number (S,) of each of the paths' stamps within its run, from 0 on."""
         return np.concatenate([chosen for _, chosen in self._thinned])
 
     @cached_property
     def _thinned(self) -> list[tuple[Trajectory, NDArray[np.intp]]]:
-        """Of each run the stamps that are fitted; some are enough, and their noise is what it was."""
+        """The runs with the numbers of their stamps that are fitted: at most 15,000 in all."""
         stride = max(1, math.ceil(sum(map(len, self.each[0])) / _STAMPS))
         return [(run, np.arange(len(own))[(len(own) - 1) % stride :: stride])
                 for run, own in zip(self.runs, self.each[0], strict=True)]  # fmt: skip
 
     @cached_property
     def _white(self) -> list[tuple[Whitener, Array]]:
-        """Of each run its whitening and its whitened residuals (3 K, 2) before and after."""
+        """For each run its whitener and its whitened residuals (3 K, 2), before and after."""
         whiteners: dict[bytes, Whitener] = {}
         found = []
         for (run, chosen), before, after in zip(self._thinned, *self.each, strict=True):
@@ -129,10 +130,10 @@ class Residuals:
         return found
 
     def fit(self, columns: Array) -> Fitted:
-        """What changes of the motion explain the residuals; columns (S, 3, n): their slopes at the paths' stamps.
+        """Fit the changes of the motion that explain the residuals best; columns (S, 3, n): their slopes at the stamps.
 
-        By chance: under the noise, or if the residuals of whole commands (of runs, where commands are few) came with
-        random signs, whatever makes them; the larger of both.
+        Standard errors are the larger of two: by the noise model, and by random signs of the residuals of whole
+        commands (of runs, where commands are few).
         """
         size = columns.shape[2]
         information, scores = np.zeros((size, size)), np.empty((len(self.runs), size, 2))
@@ -144,16 +145,16 @@ class Residuals:
         scale[np.diag(information) < 1e-12 * np.diag(information).max(initial=0.0)] = 0.0
         correlation = information * np.outer(scale, scale)
         inverse = np.linalg.pinv(correlation, rcond=_DETERMINED, hermitian=True) * np.outer(scale, scale)
-        told = (scale > 0) & _is_estimable(correlation)
+        determined = (scale > 0) & _is_estimable(correlation)
         noise = self.spread * np.sqrt(np.maximum(np.diag(inverse), 0.0))
-        pulls = np.stack([scores[list(members)].sum(axis=0) for members in self._clusters])
-        flipped = np.sqrt(np.square(np.einsum("ij,cjm->cim", inverse, pulls)).sum(axis=0))
+        cluster_scores = np.stack([scores[list(members)].sum(axis=0) for members in self._clusters])
+        flipped = np.sqrt(np.square(np.einsum("ij,cjm->cim", inverse, cluster_scores)).sum(axis=0))
         values = inverse @ scores.sum(axis=0)
         errors = np.maximum(noise[:, None], flipped)
-        return Fitted(np.where(told[:, None], values, np.nan), np.where(told[:, None], errors, np.nan))
+        return Fitted(np.where(determined[:, None], values, np.nan), np.where(determined[:, None], errors, np.nan))
 
     def fit_runs(self, columns: Array) -> Fitted:
-        """The same for one change (S, 3, 1) and each run by itself: values (Z, 2), by chance under the noise."""
+        """Fit one change of the motion (S, 3, 1) to each run by itself: values (Z, 2), errors by the noise model."""
         values, errors = np.full((len(self.runs), 2), np.nan), np.full((len(self.runs), 2), np.nan)
         for row, (part, (whitener, residuals)) in enumerate(zip(self.paths.parts, self._white, strict=True)):
             white = whitener(columns[part]).reshape(-1)
@@ -170,14 +171,14 @@ class Residuals:
 
 
 def _is_estimable(information: Array) -> NDArray[np.bool_]:
-    """Which parameters have no part in a direction that the data leave open."""
+    """True (n,) for parameters that take no part in a direction that the data leave open."""
     values, vectors = np.linalg.eigh(information)
     open_ones = vectors[:, values < _DETERMINED * max(float(values.max(initial=0.0)), 1e-300)]
     return np.square(open_ones).sum(axis=1) < 0.01
 
 
 def shares(values: Array, edges: Sequence[float] | Array) -> Array:
-    """Which bin (F, B) each of values (F,) is in: 1 there and 0 elsewhere; all 0 outside the edges."""
+    """Membership (F, B) of values (F,) in bins: 1 in its bin and 0 elsewhere; all 0 outside the edges."""
     bins = np.searchsorted(np.asarray(edges), values, side="right") - 1
     bins = np.where(values == edges[-1], len(edges) - 2, bins)
     found: Array = (bins[:, None] == np.arange(len(edges) - 1)).astype(float)

@@ -1,4 +1,4 @@
-"""The tables of a discovery's report."""
+"""Tables of a discovery's report."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from omnibench.robot.effects.effect import Effect
 
 
 def place_table(places: Sequence[CovariateDependence], caption: str) -> Table:
-    """What the residual depends on, with its significance."""
+    """The covariates that the residual depends on, with their significance."""
     rows = tuple(
         Row(
             (
@@ -51,13 +51,13 @@ def place_table(places: Sequence[CovariateDependence], caption: str) -> Table:
             Column("Degrees of freedom"),
         ),
         rows,
-        "Chance: how often noise alone would show as much in any of all the places that were looked at. Excess: "
-        "whitened χ² beyond what the degrees of freedom take by chance.",
+        "Chance: how often noise alone would give as much in any of the covariates that were tried. Excess: whitened "
+        "χ² beyond the degrees of freedom.",
     )
 
 
 def parameter_table(found: Sequence[NamedEffect], dataset: Dataset) -> Table:
-    """Every effect's parameters with their intervals."""
+    """The parameters of every effect with their intervals."""
     rows: list[Row] = []
     for effect in found:
         meanings = _meanings(effect.name, dataset)
@@ -73,14 +73,14 @@ def parameter_table(found: Sequence[NamedEffect], dataset: Dataset) -> Table:
                 Row((Cell(each.name, meanings.get(each.name, "")), Cell(value), Cell(kept), Cell(unit or NOTHING)))
             )
     return Table(
-        "Parameters of what was added",
+        "Parameters of the effects that were added",
         (Column("Parameter", numeric=False), Column("Value"), Column("95 % interval"), Column("Unit", numeric=False)),
         tuple(rows),
     )
 
 
 def _meanings(name: str, dataset: Dataset) -> Mapping[str, str]:
-    """What an effect's parameters mean, in words; nothing of a term that is no effect."""
+    """The meaning of an effect's parameters, by name; empty for a term that is no effect of the catalogue."""
     if name not in {entry.name for entry in effects.entries()}:
         return {}
     sessions = tuple(dict.fromkeys(run.session for run in dataset.trajectories if run.session is not None))
@@ -89,18 +89,18 @@ def _meanings(name: str, dataset: Dataset) -> Mapping[str, str]:
 
 
 def held_out_table(discovery: Discovery) -> Table:
-    """Both gaps and the final errors on the runs that no fit has seen."""
+    """Both gaps and the final errors on the held-out runs."""
     rows: list[Row] = []
     for each in discovery.held_out:
         where = f"{held_out_in_words(discovery, each)}: {plural(each.runs, 'run')}"
         rows += [Row((Cell(where),), "group"), _gap_row(each.eq6), _gap_row(each.chi2)]
         position, heading = final_errors_in_words(each)
         rows += [_plain_row("Final position error, mean", position), _plain_row("Final heading error, mean", heading)]
-    return Table("On runs that no fit has seen", _GAP_COLUMNS, tuple(rows), _gap_note(discovery))
+    return Table("On held-out runs", _GAP_COLUMNS, tuple(rows), _gap_note(discovery))
 
 
 def gap_table(discovery: Discovery) -> Table:
-    """The gap on its own."""
+    """The gap on the training runs."""
     return Table("The gap on the training runs", _GAP_COLUMNS, (_gap_row(discovery.gap),), _gap_note(discovery))
 
 
@@ -137,7 +137,7 @@ def _plain_row(name: str, words: str) -> Row:
 
 
 def step_table(discovery: Discovery) -> Table:
-    """The waterfall in numbers."""
+    """The error after each step."""
     steps = discovery.steps
     rows = tuple(
         Row(
@@ -163,7 +163,7 @@ def step_table(discovery: Discovery) -> Table:
 
 
 def hidden_table(hidden: Sequence[Hidden]) -> Table:
-    """How large every effect could still be, the largest for its kind first."""
+    """The largest size that every effect could still have, the largest share of its plausible size first."""
     rows = []
     for each in sorted(hidden, key=share_of_plausible, reverse=True):
         shown, share = reading(each.unit), share_of_plausible(each)
@@ -186,7 +186,7 @@ def hidden_table(hidden: Sequence[Hidden]) -> Table:
             Column("Effect", numeric=False),
             Column("Parameter", numeric=False),
             Column("At most (95 %)"),
-            Column("Found nearly always from"),
+            Column("Found nearly always above"),
             Column("Plausible"),
             Column("Unit", numeric=False),
             Column("Of the plausible"),
@@ -197,7 +197,7 @@ def hidden_table(hidden: Sequence[Hidden]) -> Table:
 
 
 def absorbed_table(discovery: Discovery) -> Table:
-    """Effects that a matrix reproduces, and what would tell them."""
+    """Effects that a matrix reproduces, and the measurement that would show them."""
     rows = tuple(
         Row((Cell(each.name), Cell(each.stage, STAGES[each.stage]), Cell(each.measurement or NOTHING)))
         for each in discovery.absorbed
@@ -218,7 +218,7 @@ def not_looked_for_table(discovery: Discovery) -> Table:
 
 
 def extrapolation_table(extrapolations: Sequence[Extrapolation]) -> Table:
-    """Motions that the training runs never had, with the bounds that widen."""
+    """Motions that no training run had, with the error bounds there."""
     rows = tuple(
         Row(
             (
@@ -239,5 +239,5 @@ def extrapolation_table(extrapolations: Sequence[Extrapolation]) -> Table:
             Column("Extended model", "mm"),
         ),
         rows,
-        "Bounds (95 %) of the final position error that each model promises there.",
+        "Bounds (95 %) of the final position error by each model.",
     )

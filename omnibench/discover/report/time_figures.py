@@ -1,9 +1,9 @@
-"""Residuals over the time of a run, over the order of the runs, and over the stamps of the reference."""
+"""Figures of the residuals over the time in a run, over the order of the runs, and over the reference's stamps."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -11,23 +11,23 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.paths import Paths
-from omnibench.discover.report.before_after import Curve, Look, Panel
-from omnibench.discover.report.motion_figures import grid, motion_panels
+from omnibench.discover.report.before_after import Curve, ModelStyle, Panel
+from omnibench.discover.report.motion_figures import CovariateFigure, grid, motion_panels
 from omnibench.discover.report.residuals import NORMAL_95, Fitted, Residuals
 from omnibench.report.blocks import FigureGrid
 from omnibench.report.numbers import fixed, plural
 from omnibench.robot.kinematics import Array
 
-_TIMES = 14  # at which the mean residual is drawn
-_BLOCKS = 12  # of runs
-_RUNS = 3  # of a block, at least
-_STAMPS = 30  # bins of a run's stamps
-_MOVING = 0.01  # m/s
-_TURNING = math.radians(2.0)  # rad/s
+_TIMES = 14  # at which the mean residual is drawn (chosen)
+_BLOCKS = 12  # of runs, at most (chosen)
+_RUNS = 3  # in a block, at least (chosen)
+_STAMPS = 30  # bins of the stamps of a run (chosen)
+_MOVING = 0.01  # m/s; slower counts as standing
+_TURNING = math.radians(2.0)  # rad/s; slower counts as straight
 _QUANTITIES = (("along the way", 1e3, "mm"), ("across, to the left", 1e3, "mm"), ("heading", math.degrees(1.0), "°"))
 
 
-def elapsed_grid(residuals: Residuals, looks: Sequence[Look]) -> FigureGrid | None:
+def elapsed_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
     """Mean residuals over the time of a run, for runs that turn left, right or not."""
     groups: dict[str, list[int]] = {}
     for index, run in enumerate(residuals.runs):
@@ -36,11 +36,11 @@ def elapsed_grid(residuals: Residuals, looks: Sequence[Look]) -> FigureGrid | No
     for name in sorted(groups):
         members = groups[name]
         times = _times([residuals.runs[index] for index in members])
-        means = {look.key: _means(residuals, members, look, times) for look in looks}
+        means = {style.key: _means(residuals, members, style, times) for style in styles}
         half = NORMAL_95 * residuals.deviations(times) / np.sqrt(_running(residuals, members, times))[:, None]
         for axis, (quantity, factor, unit) in enumerate(_QUANTITIES):
             band = factor * half[:, axis]
-            curves = tuple(Curve(look, factor * means[look.key][:, axis], band) for look in looks)
+            curves = tuple(Curve(style, factor * means[style.key][:, axis], band) for style in styles)
             panels.append(
                 Panel(
                     f"{name} ({plural(len(members), 'run')}): {quantity}",
@@ -54,14 +54,14 @@ def elapsed_grid(residuals: Residuals, looks: Sequence[Look]) -> FigureGrid | No
             )
     return grid(
         panels,
-        looks,
+        styles,
         "Mean over runs of the pose residuals (reference minus odometry), along and across the direction of travel at "
         "that time; the band holds 95 % of what noise alone would do to the mean.",
     )
 
 
-def order_grid(residuals: Residuals, looks: Sequence[Look]) -> FigureGrid | None:
-    """Over the runs in the order in which they were driven, some runs together."""
+def order_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
+    """The error of the motion over the runs in the order in which they were driven, in blocks of runs."""
     runs = residuals.runs
     if any(run.started_at is None for run in runs) and len({run.session for run in runs}) < 2:
         return None
@@ -69,18 +69,18 @@ def order_grid(residuals: Residuals, looks: Sequence[Look]) -> FigureGrid | None
     if len(blocks) < 2:
         return None
     paths = residuals.paths
-    number = np.repeat(np.arange(len(blocks)), [len(block) for block in blocks])  # of each run
+    number = np.repeat(np.arange(len(blocks)), [len(block) for block in blocks])  # block of each run
     bins = (number[paths.owner][:, None] == np.arange(len(blocks))).astype(float)
     centres = np.array([np.mean(block) + 1 for block in blocks])
     words = tuple(_block_in_words([runs[index] for index in block]) for block in blocks)
-    panels = motion_panels(residuals, looks, bins, centres, "run, in the order driven", "the runs", words)
+    panels = motion_panels(residuals, styles, bins, centres, "run, in the order driven", "the runs", words)
     sessions = len({run.session for run in runs})
     several = f" The runs are of {sessions} sessions, one after another." if sessions > 1 else ""
-    return grid(panels, looks, f"Each point stands for some runs in a row.{several}")
+    return grid(panels, styles, f"Each point stands for some runs in a row.{several}")
 
 
-def stamps_grid(residuals: Residuals, looks: Sequence[Look]) -> FigureGrid | None:
-    """By how much earlier than their stamps the reference's poses seem to be taken."""
+def stamps_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
+    """The time by which reference poses seem to be taken earlier than their stamps say."""
     paths = residuals.paths
     velocity = _velocities(paths)
     if np.abs(velocity).max() < 1e-6:
@@ -94,28 +94,28 @@ def stamps_grid(residuals: Residuals, looks: Sequence[Look]) -> FigureGrid | Non
         columns = -(velocity * part)[:, :, None] * bins[:, None, :]
         x = np.array([paths.stamps[chosen].mean() for chosen in bins.T])
         title = f"Delay of the reference's {name}, over the stamps of a run"
-        panels.append(_delays(title, x, residuals.fit(columns), looks, "stamp (s)"))
+        panels.append(_delays(title, x, residuals.fit(columns), styles, "stamp (s)"))
     title = "Delay of the reference's pose, run by run"
     numbers = np.arange(1.0, len(residuals.runs) + 1)
-    by_run = _delays(title, numbers, residuals.fit_runs(-velocity[:, :, None]), looks, "run, in the order driven")
+    by_run = _delays(title, numbers, residuals.fit_runs(-velocity[:, :, None]), styles, "run, in the order driven")
     panels.append(replace(by_run, lines=False, words=tuple(run.id for run in residuals.runs)))
     return grid(
         [panel for panel in panels if not panel.empty],
-        looks,
+        styles,
         "By how much earlier than its stamp a pose would have to be taken to explain the residuals best.",
     )
 
 
-def _delays(title: str, x: Array, fitted: Fitted, looks: Sequence[Look], x_title: str) -> Panel:
+def _delays(title: str, x: Array, fitted: Fitted, styles: Sequence[ModelStyle], x_title: str) -> Panel:
     curves = tuple(
-        Curve(look, 1e3 * fitted.values[:, look.index], NORMAL_95 * 1e3 * fitted.errors[:, look.index])
-        for look in looks
+        Curve(style, 1e3 * fitted.values[:, style.index], NORMAL_95 * 1e3 * fitted.errors[:, style.index])
+        for style in styles
     )
     return Panel(title, x, curves, x_title, "apparent delay (ms)", "ms")
 
 
 def _turning(run: Trajectory) -> str:
-    """To which side a run turns, by its reference."""
+    """The side to which a run turns, by its reference poses."""
     turned = run.poses[-1, 2] - run.poses[0, 2]
     if abs(turned) < max(_TURNING * float(run.pose_times[-1]), math.radians(3.0)):
         return "Runs that do not turn"
@@ -123,25 +123,25 @@ def _turning(run: Trajectory) -> str:
 
 
 def _times(runs: Sequence[Trajectory]) -> Array:
-    """Times at which at least half of the runs still go on."""
+    """Times until which at least half of the runs last."""
     end = float(np.median([run.pose_times[-1] for run in runs]))
     first = float(np.median([run.pose_times[1] for run in runs]))
     return np.linspace(min(first, end), end, _TIMES)
 
 
 def _running(residuals: Residuals, members: Sequence[int], times: Array) -> Array:
-    """How many of the runs have poses up to each time, at least 1."""
+    """The number of runs that have poses up to each time, at least 1."""
     ends = np.array([residuals.runs[index].pose_times[-1] for index in members])
     return np.maximum((ends[:, None] >= times - 1e-6).sum(axis=0), 1)
 
 
-def _means(residuals: Residuals, members: Sequence[int], look: Look, times: Array) -> Array:
-    """Mean residuals (T, 3) along, across and of the heading, at the stamps nearest to some times."""
+def _means(residuals: Residuals, members: Sequence[int], style: ModelStyle, times: Array) -> Array:
+    """Mean residuals (T, 3) along the path, across it and of the heading, at the stamps nearest to each time."""
     total = np.zeros((len(times), 3))
     for index in members:
         run = residuals.runs[index]
         stamps = run.pose_times[1:]
-        own = residuals.each[look.index][index]
+        own = residuals.each[style.index][index]
         course = _courses(run)
         cosine, sine = np.cos(course), np.sin(course)
         turned = np.column_stack(
@@ -153,7 +153,7 @@ def _means(residuals: Residuals, members: Sequence[int], look: Look, times: Arra
 
 
 def _courses(run: Trajectory) -> Array:
-    """Direction of travel (K,) at the stamps after the start, rad; the heading where the robot stays in its place."""
+    """Direction of travel (K,) at the stamps after the start, rad; the heading while the robot stays in its place."""
     times, poses = run.pose_times, run.poses
     window = max(1, round(0.5 / max(float(np.median(np.diff(times))), 1e-6)))
     low = np.maximum(np.arange(1, len(times)) - window, 0)
@@ -168,7 +168,7 @@ def _courses(run: Trajectory) -> Array:
 
 
 def _blocks(runs: Sequence[Trajectory]) -> list[range]:
-    """Runs in a row, of one session each."""
+    """Blocks of successive runs, each within one session."""
     sessions: list[range] = []
     for index, run in enumerate(runs):
         if sessions and runs[sessions[-1].start].session == run.session:
@@ -203,3 +203,11 @@ def _velocities(paths: Paths) -> Array:
         )
         found.append((late - early) / 0.1)
     return np.concatenate(found)
+
+
+# Figures over each covariate: a figure that is added here is shown.
+FIGURES: Mapping[str, tuple[CovariateFigure, ...]] = {
+    "elapsed time": (elapsed_grid,),
+    "order of runs": (order_grid,),
+    "stamps": (stamps_grid,),
+}

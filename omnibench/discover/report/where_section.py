@@ -1,35 +1,22 @@
-"""The part of the report that says where: what the residuals depend on, and pictures of it, the telling ones first."""
+"""The section on where the plain model fails: covariates that the residuals depend on, and their figures."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from omnibench.discover.report.before_after import ALONE, EXTENDED, PLAIN, Look
+from omnibench.discover.report import floor_figures, motion_figures, time_figures
+from omnibench.discover.report.before_after import ALONE, EXTENDED, PLAIN, ModelStyle
 from omnibench.discover.report.command_figures import command_blocks
-from omnibench.discover.report.floor_figures import floor_grids
-from omnibench.discover.report.motion_figures import acceleration_grid, heading_grid, wheel_angle_grid, wheel_rate_grid
 from omnibench.discover.report.motor_figures import motor_grid
 from omnibench.discover.report.residuals import Residuals
 from omnibench.discover.report.tables import place_table
-from omnibench.discover.report.time_figures import elapsed_grid, order_grid, stamps_grid
 from omnibench.discover.result import Discovery
 from omnibench.report.blocks import Block, Details, Paragraph, Section
 from omnibench.report.numbers import listing
 
-_Grids = Callable[[Residuals, Sequence[Look]], Sequence[Block | None]]
-# Pictures of each covariate, in the order of the catalogue of places.
-_PICTURES: Mapping[str, _Grids] = {
-    "elapsed time": lambda residuals, looks: [elapsed_grid(residuals, looks)],
-    "heading": lambda residuals, looks: [heading_grid(residuals, looks)],
-    "place": floor_grids,
-    "order of runs": lambda residuals, looks: [order_grid(residuals, looks)],
-    "wheel rate": lambda residuals, looks: [wheel_rate_grid(residuals, looks)],
-    "wheel angle": lambda residuals, looks: [wheel_angle_grid(residuals, looks)],
-    "acceleration": lambda residuals, looks: [acceleration_grid(residuals, looks)],
-    "stamps": lambda residuals, looks: [stamps_grid(residuals, looks)],
-}
+_FIGURES = {**time_figures.FIGURES, **motion_figures.FIGURES, **floor_figures.FIGURES}
 _HOW = (
     "In the pictures over a covariate a point is the error of the motion that, constant in its bin, explains the "
     "residuals best together with those of the other bins (generalised least squares under the noise model); what the "
@@ -38,6 +25,7 @@ _HOW = (
     "on something else does not stand out."
 )
 _OVER = {"elapsed time": "the time of a run", "place": "the floor", "order of runs": "the order of the runs"}
+# Why a covariate has no figure, in the order in which covariates are shown.
 _NOT_DRAWN = {
     "elapsed time": "no run has a pose after its start",
     "heading": "the robot keeps its heading and its direction",
@@ -52,28 +40,37 @@ _NOT_DRAWN = {
 
 
 def where_section(discovery: Discovery) -> Section:
-    """What the residuals depend on, by covariate, before and after."""
+    """The section on where: residuals by command, then over each covariate, the significant ones first."""
     residuals = Residuals(discovery)
-    looks = _looks(discovery)
+    styles = _styles(discovery)
     motors = motor_grid(discovery, residuals.runs)
-    drawn = {name: tuple(block for block in make(residuals, looks) if block) for name, make in _PICTURES.items()}
+    drawn: dict[str, tuple[Block, ...]] = {
+        covariate: tuple(grid for figure in _FIGURES[covariate] if (grid := figure(residuals, styles)) is not None)
+        for covariate in _in_order(_FIGURES)
+    }
     drawn["motors"] = () if motors is None else (motors,)
     places = ["motors" if place.stage == "actuator" else place.covariate for place in discovery.where]
     named = [name for name in dict.fromkeys(places) if name in drawn]
-    sections = [Section("where-command", "Residuals by command", command_blocks(residuals, looks))]
+    sections = [Section("where-command", "Residuals by command", command_blocks(residuals, styles))]
     for number, name in enumerate(named, 1):
         if drawn[name]:
             sections.append(Section(f"where-{number}", _title(name), drawn[name]))
     others: list[Block] = [
         Details(_title(name), blocks) for name, blocks in drawn.items() if name not in named and blocks
     ]
-    not_drawn = [f"{name} ({_NOT_DRAWN[name]})" for name, blocks in drawn.items() if not blocks]
+    not_drawn = [f"{name} ({_NOT_DRAWN.get(name, 'not recorded')})" for name, blocks in drawn.items() if not blocks]
     if not_drawn:
         others.append(Paragraph(f"Not drawn: {'; '.join(not_drawn)}.", "note"))
     if others:
         title = "Residuals over other things" if named else "Residuals over all that was looked at"
         sections.append(Section("where-others", title, tuple(others)))
     return Section("where", "Where", (*_places(discovery), Paragraph(_HOW, "note")), tuple(sections))
+
+
+def _in_order(covariates: Iterable[str]) -> list[str]:
+    """The covariates in the order of the report; new ones last."""
+    order = list(_NOT_DRAWN)
+    return sorted(covariates, key=lambda name: order.index(name) if name in order else len(order))
 
 
 def _title(name: str) -> str:
@@ -102,7 +99,7 @@ def _places(discovery: Discovery) -> Iterator[Block]:
     yield place_table(discovery.where, "Where the plain matrix fails")
 
 
-def _looks(discovery: Discovery) -> tuple[Look, ...]:
-    """Both models, or the plain one alone where nothing was added."""
+def _styles(discovery: Discovery) -> tuple[ModelStyle, ...]:
+    """The styles of both models, or of the plain one alone if nothing was added."""
     pairs = zip(discovery.before, discovery.after, strict=True)
     return (ALONE,) if all(np.array_equal(*pair) for pair in pairs) else (PLAIN, EXTENDED)

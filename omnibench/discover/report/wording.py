@@ -1,4 +1,4 @@
-"""A discovery in words: parameters in units that people read, verdicts, places and gaps."""
+"""A discovery in words: parameters in units that people read, verdicts, covariates and gaps."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ STAGES: Mapping[Stage, str] = {
 }
 METRICS: Mapping[Literal["eq6", "chi2"], str] = {"eq6": "Eq. (6), final poses", "chi2": "whitened χ² per residual"}
 
-_COUNTS = ("", "1")  # units of shares, and of numbers that shape an effect
+_COUNTS = ("", "1")  # units of parameters without a dimension
 _DEGREES = math.degrees(1.0)
-# Where the SI unit is not what a person reads: factor and unit.
+# Units that people read in place of SI units: factor and unit.
 _READ_AS: Mapping[str, tuple[float, str]] = {
     **dict.fromkeys(_COUNTS, (100.0, "%")),
     "m": (1e3, "mm"),
@@ -63,32 +63,32 @@ _READ_AS: Mapping[str, tuple[float, str]] = {
 
 @dataclass(frozen=True)
 class Reading:
-    """How a quantity of an SI unit is shown: multiplied by ``factor``, with ``unit``."""
+    """The way in which a quantity in an SI unit is shown: multiplied by ``factor``, with ``unit``."""
 
     factor: float
     unit: str
 
     def number(self, value: float, digits: int = 3, signed: bool = False) -> str:
-        """A value to so many digits, without its unit."""
+        """A value to ``digits`` significant digits, without its unit."""
         return significant(self.factor * value, digits, signed)
 
     def words(self, value: float, digits: int = 3, signed: bool = False) -> str:
-        """A value to so many digits, with its unit."""
+        """A value to ``digits`` significant digits, with its unit."""
         return with_unit(self.number(value, digits, signed), self.unit)
 
 
 def reading(unit: str) -> Reading:
-    """How a quantity in an SI unit (of the effects' parameters) is read."""
+    """The way in which a parameter in an SI unit is shown."""
     return Reading(*_READ_AS.get(unit, (1.0, unit.replace("s2", "s²"))))
 
 
 def with_unit(number: str, unit: str) -> str:
-    """A number and its unit, degrees without a space."""
+    """A number with its unit; the degree sign follows without a space."""
     return f"{number}{unit}" if unit.startswith("°") else f"{number} {unit}".rstrip()
 
 
 def value_and_interval(parameter: EstimatedParameter) -> tuple[str, str, str]:
-    """A parameter as value, 95 % interval (empty where there is none) and unit, with shared decimals."""
+    """A parameter's value, 95 % interval (empty if it has none) and unit, with the same decimals."""
     shown = Reading(1.0, "") if parameter.shape and parameter.unit in _COUNTS else reading(parameter.unit)
     value = shown.factor * parameter.value
     low, high = shown.factor * parameter.low, shown.factor * parameter.high
@@ -108,25 +108,25 @@ def parameter_in_words(parameter: EstimatedParameter) -> str:
 
 
 def effect_in_words(effect: NamedEffect) -> str:
-    """An effect's name, with the others of its class."""
+    """An effect's name with those that it cannot be told apart from."""
     others = [name for name in effect.confusable_with if name != effect.name]
     return effect.name if not others else f"{effect.name}, or {' or '.join(others)}"
 
 
 def added(step: Step) -> str:
-    """The effect that a step added."""
+    """The name of the effect that a step added."""
     return step.name.removeprefix("+ ")
 
 
 def weight_in_words(weight: float) -> str:
-    """A weight as per cent, neither rounded up to certainty nor down to nothing."""
+    """A weight as per cent, rounded neither up to 100 % nor down to 0."""
     if weight > 0.999:
         return "> 99.9 %"
     return "< 0.1 %" if weight < 0.001 else percent(weight)
 
 
 def worst_of_each(hidden: Sequence[Hidden]) -> tuple[Hidden, ...]:
-    """Of each effect the parameter that could be largest for what is plausible of it; the largest first."""
+    """For each effect the parameter that could be largest as a share of its plausible size; the largest share first."""
     ordered = sorted(hidden, key=share_of_plausible, reverse=True)
     first: dict[str, Hidden] = {}
     for each in ordered:
@@ -135,26 +135,26 @@ def worst_of_each(hidden: Sequence[Hidden]) -> tuple[Hidden, ...]:
 
 
 def share_of_plausible(hidden: Hidden) -> float:
-    """How large it could be, as a share of what is plausible."""
+    """The largest size that it could have, as a share of its plausible size."""
     return hidden.limit / hidden.plausible if hidden.plausible else math.inf
 
 
 def chance(p_value: float) -> str:
-    """A p-value."""
+    """A p-value in words."""
     if p_value < 1e-99:
         return "< 10⁻⁹⁹"
     return significant(p_value, 2) if p_value >= 1e-3 else significant(p_value, 1)
 
 
 def closed_in_words(gap: Gap) -> str:
-    """Which share of a gap is gone, or why there is none to close."""
+    """The share of a gap that is closed, or that there is no gap."""
     if gap.closed is None:
         return "no gap to close"
     return percent(gap.closed)
 
 
 def gap_decimals(*gaps: Gap) -> int:
-    """Decimals in which before, after and floor of these gaps are best read."""
+    """The decimals that show before, after and floor of these gaps to three significant digits."""
     smallest = min((value for gap in gaps for value in (gap.before, gap.after, gap.floor) if value > 0), default=0.0)
     return min(6, max(2, decimals_for(smallest, 3)))
 
@@ -175,26 +175,26 @@ def final_errors_in_words(held: HeldOut) -> tuple[str, str]:
 
 
 def held_out_in_words(discovery: Discovery, held: HeldOut) -> str:
-    """On which runs no fit has seen: ``held-out repetitions``."""
+    """The kind of held-out runs, such as ``held-out repetitions``."""
     if held.data == "session":
         return "held-out session"
     return "held-out repetitions" if discovery.noise.source == "repetitions" else "held-out runs"
 
 
 def floor_in_words(discovery: Discovery) -> str:
-    """What the floor of a gap is."""
+    """The meaning of the floor of a gap, in a sentence."""
     if discovery.noise.source == "repetitions":
         return "The floor is what the scatter between repetitions of a command leaves to any model."
     return "No command is repeated: the floor is what the residuals within the runs say of the noise."
 
 
 def decisive(discovery: Discovery) -> HeldOut | None:
-    """The held-out data that say most: another session if there is one, else repetitions."""
+    """The held-out data that are the hardest test: another session if there is one, else repetitions."""
     return max(discovery.held_out, key=lambda held: held.data == "session", default=None)
 
 
 def extrapolations_in_words(extrapolations: tuple[Extrapolation, ...]) -> tuple[str, ...]:
-    """Where the extended model leaves the motions that it was fitted to."""
+    """Motions of held-out runs on which the extended model extrapolates, a sentence each."""
     return tuple(
         f"{each.command}: {each.description}. Final position within {_millimetres(each.before_m)} by the plain matrix, "
         f"within {_millimetres(each.after_m)} by the extended model (95 %)."
@@ -209,14 +209,14 @@ def _millimetres(metres: float) -> str:
 
 
 def data_in_words(discovery: Discovery) -> str:
-    """Of what the discovery is: ``flower (simulated data): 180 training runs, 4,320 poses``."""
+    """The data in words: ``flower (simulated data): 180 training runs, 4,320 poses``."""
     kind = "simulated data" if discovery.dataset.simulated else "recorded data"
     runs = plural(len(discovery.trajectories), "training run")
     return f"{discovery.dataset.name} ({kind}): {runs}, {plural(discovery.poses, 'reference pose')}"
 
 
 def noise_in_words(noise: Noise) -> tuple[str, str]:
-    """The noise of positions and of headings, without what is zero."""
+    """The noise of positions and of headings in words, without components that are zero."""
     kinds = (("white", ""), ("walk", "/√s"), ("bias of a run", ""))
     position = (noise.pose_position, noise.walk_position, noise.bias_position)
     heading = (noise.pose_heading, noise.walk_heading, noise.bias_heading)

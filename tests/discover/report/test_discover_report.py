@@ -127,7 +127,7 @@ def test_every_place_stands_in_a_table_with_its_significance(report: Page) -> No
 
 
 def test_parameters_have_intervals_and_units(report: Page) -> None:
-    rows = report.tables["Parameters of what was added"]
+    rows = report.tables["Parameters of the effects that were added"]
     assert "rotation_translation_coupling (body), weight > 99.9 %" in rows[1][0]
     for row, name, true in zip(rows[2:], ("kx", "ky"), COUPLING[0]["parameters"].values(), strict=True):
         assert row[0].startswith(f"{name} | relative change of the rate of turn")
@@ -139,7 +139,7 @@ def test_parameters_have_intervals_and_units(report: Page) -> None:
 
 def test_a_shape_was_chosen_and_has_no_interval() -> None:
     effect = replace(named().effects[0], parameters=(EstimatedParameter("rollers", 10.0, "1", 10.0, 10.0, shape=True),))
-    rows = part(what_section(replace(named(), effects=(effect,)))).tables["Parameters of what was added"]
+    rows = part(what_section(replace(named(), effects=(effect,)))).tables["Parameters of the effects that were added"]
     assert rows[2][:3] == ["rollers", "10", "chosen among a few"]
 
 
@@ -157,7 +157,7 @@ def test_a_class_names_its_members_and_the_experiment_that_separates_them() -> N
 def test_without_an_effect_the_report_says_how_large_each_could_still_be() -> None:
     found = nothing()
     told = whole(nothing)
-    assert "Parameters of what was added" not in told.tables
+    assert "Parameters of the effects that were added" not in told.tables
     rows = told.tables["How large an effect of each kind could still hide"][1:]
     assert len(rows) == len(found.hidden) > 5
     shares = [float(re.sub(r"[>,% ]", "", row[6])) for row in rows]
@@ -184,7 +184,7 @@ def test_new_motions_are_a_warning_with_both_bounds() -> None:
 
 
 def test_errors_before_and_after_stand_beside_the_floor(report: Page) -> None:
-    rows = report.tables["On runs that no fit has seen"]
+    rows = report.tables["On held-out runs"]
     session = held_out(named(), "session")
     start = next(index for index, row in enumerate(rows) if row[0].startswith("held-out session"))
     before, after, floor = (float(value) for value in rows[start + 1][1:4])
