@@ -50,7 +50,7 @@ class CostChoice(Model):
 
 
 class CalibratorEntry(Model):
-    """One line of the comparison."""
+    """One entry of the comparison: a calibrator with its options."""
 
     name: str = Field(description="a calibrator, see omnibench list")
     label: Annotated[str, Field(min_length=1, max_length=60)] | None = Field(
@@ -59,25 +59,25 @@ class CalibratorEntry(Model):
     options: dict[str, Any] = {}
     parameterisation: ParameterisationName | None = Field(None, description="default: the calibrator's own")
     box: Box | None = Field(None, description="default: the config's box")
-    limits: GeometryLimits | None = Field(None, description="of the geometry parameterisation")
+    limits: GeometryLimits | None = Field(None, description="limits of the geometry parameterisation; default: its own")
 
 
 class Bootstrap(Model):
-    """Resampling of trajectories behind the intervals."""
+    """Bootstrap over trajectories, from which the intervals come."""
 
     resamples: int = Field(2000, ge=100, le=100_000)
     seed: int = Field(0, ge=0)
 
 
 class CertificateChoice(Model):
-    """How far the optimum of each box is proven, by ``closed_form`` or anything else."""
+    """How closely the lowest possible cost in each box is to be proven."""
 
     gap: float = Field(1e-3, gt=0, lt=1, description="share of the lowest cost that may stay unproven")
     seconds: float = Field(10.0, gt=0, description="time for each box; what is proven by then is reported")
 
 
 class PublishedResult(Model):
-    """A result from the literature, shown beside ours and said to be on other data."""
+    """A result from the literature, on other data, that tables show beside ours."""
 
     label: str
     source: str

@@ -1,4 +1,4 @@
-"""Running a plan in processes: a run that raises, hangs or dies becomes a row, Ctrl-C loses nothing that had ended."""
+"""The runs of a plan, each in a process. One that raises, hangs or dies is a failed run; Ctrl-C keeps those done."""
 
 from __future__ import annotations
 
@@ -19,15 +19,14 @@ from omnibench.fit.calibrator import Outcome, RunResult, describe_error, run_cal
 from omnibench.processes import end_with_parent, main_module_hidden, one_thread_processes
 from omnibench.registry import calibrators
 
-# A run that does not look at its budget is ended this long after its seconds are spent.
-_GRACE = 10.0
-# A process that has answered may take this long to go by itself.
-_PATIENCE = 2.0
+_GRACE = 10.0  # s after the budget's time: a run that has not stopped by then is killed (chosen)
+_PATIENCE = 2.0  # s that a process may take to exit after its answer (chosen)
+# Modules that the processes share, so that they need not be imported for every run.
 PRELOAD = ("omnibench.compare.execute", "omnibench.fit.sum_of_norms", "nlopt")
 
 
 class Progress(Protocol):
-    """Told how a comparison gets on."""
+    """Callbacks during a comparison: stages of its data sets, then its runs."""
 
     def prepared(self, what: str, done: int, total: int) -> None: ...
     def planned(self, runs: int) -> None: ...
@@ -45,7 +44,7 @@ class _Active:
     evaluations: int = 0
 
     def end(self, patience: float = _PATIENCE) -> str:
-        """See to it that the process is gone; how it went, in words."""
+        """Kill the process if it does not exit within ``patience`` s; how it ended, in words."""
         self.process.join(patience)
         self.process.kill()
         self.process.join()
@@ -54,12 +53,13 @@ class _Active:
         return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
 
     def without_answer(self, outcome: Outcome, reason: str) -> RunResult:
+        """The result of a run whose process gave none."""
         seconds = time.monotonic() - self.began
         return RunResult(outcome, reason, None, None, None, self.evaluations, seconds, ())
 
 
 def execute(plan: Sequence[PlannedRun], store: RunStore, progress: Progress, workers: int) -> list[RunResult]:
-    """The result of every run, in the plan's order; results that the store has are taken from there.
+    """Execute the runs, except those whose results are stored: the result of every run, in the plan's order.
 
     Failed runs are not stored: what made them fail (a missing package, too little memory) may be gone next time.
     KeyboardInterrupt passes through after the running processes are ended; what had ended is in the store.
@@ -105,7 +105,7 @@ def _start(context: Any, run: PlannedRun) -> _Active:
 
 
 def _work(connection: Connection, task: RunTask) -> None:
-    """The worker process: solve one problem and send the result."""
+    """Solve one run's problem in a worker process and send the result."""
     threading.Thread(target=end_with_parent, daemon=True).start()
     try:
         answer = StoredRun.of(_solve(task, lambda evaluations, best: connection.send((evaluations, best))))
@@ -122,7 +122,7 @@ def _solve(task: RunTask, watch: Callable[[int, float], None]) -> RunResult:
 
 
 def _collect(active: dict[int, _Active], progress: Progress) -> Iterator[tuple[int, RunResult]]:
-    """The runs that have ended, after a moment's wait."""
+    """Wait up to 0.2 s; yield the runs that have ended, and those that are killed because their time is over."""
     ready = wait([item.connection for item in active.values()], timeout=0.2)
     for index, item in list(active.items()):
         seconds = item.run.config.budget.seconds

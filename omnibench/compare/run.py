@@ -1,4 +1,4 @@
-"""A comparison from config to report."""
+"""A comparison, from the config to the report: each step is a line of ``run_comparison``."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ class Silent:
 def run_comparison(
     config: CompareConfig, output: Path | None = None, progress: Progress | None = None
 ) -> ComparisonResult:
-    """Run every calibrator of the config on every data set, score, and write the report.
+    """Run every calibrator of the config on every data set, score the answers, and write results and report.
 
-    ``output``: a folder; runs that are there already are not run again. Raises ConfigError or DataError for what the
-    user can put right, and Interrupted on Ctrl-C, when everything that had ended is kept.
+    output: the folder of results; runs whose results are there are not repeated. ConfigError or DataError: something
+    that the user can correct. Interrupted: Ctrl-C; the results of all runs that had ended are kept.
     """
     progress = progress or Silent()
     failures = load_calibrators(config)
-    with _with_failures(failures):
+    with _naming_failed_plugins(failures):
         config = effective_config(config)
         with one_thread_processes(PRELOAD):  # processes started for simulation serve the calibrators, too
             datasets = load_datasets(config, progress.prepared)
@@ -60,6 +60,7 @@ def run_comparison(
         scored = score(plan, results, datasets)
         runs, certificates = certify(plan, scored)
         statistics = entry_statistics(runs, config.bootstrap)
+        uncertainties = typical_uncertainties(plan, results, runs, statistics)
         result = ComparisonResult(
             config=config,
             output=folder,
@@ -68,7 +69,7 @@ def run_comparison(
             statistics=statistics,
             design_costs=design_costs(runs, config.bootstrap),
             certificates=certificates,
-            uncertainties=typical_uncertainties(plan, results, runs, statistics),
+            uncertainties=uncertainties,
             environment=environment(),
             warnings=tuple(_warnings(failures, datasets, runs)),
         )
@@ -78,7 +79,7 @@ def run_comparison(
 
 
 @contextmanager
-def _with_failures(failures: Sequence[PluginFailure]) -> Iterator[None]:
+def _naming_failed_plugins(failures: Sequence[PluginFailure]) -> Iterator[None]:
     """Add the plug-ins that failed to import to an error of an unknown name, which may be one of theirs."""
     try:
         yield

@@ -12,7 +12,7 @@ from omnibench.compare.result import EntryStatistics, Interval, ScoredRun, Split
 from omnibench.data.dataset import Split
 from omnibench.robot.kinematics import Array
 
-# A difference below this share of the best cost's own standard error is of no practical interest.
+# Share of the standard error of the best cost: a smaller difference is of no practical interest (chosen).
 NEGLIGIBLE_SHARE = 0.1
 
 

@@ -1,4 +1,4 @@
-"""The results of runs on disk, one file a run, so that a run that is there is not run again."""
+"""Results of runs on disk, one file a run, so that a comparison can be continued."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from omnibench.robot.kinematics import Array
 
 
 class StoredRun(Model):
-    """The file of one run."""
+    """Content of a run's file."""
 
     outcome: Outcome
     reason: str
@@ -33,7 +33,7 @@ class StoredRun(Model):
 
     @classmethod
     def of(cls, result: RunResult) -> StoredRun:
-        """The file's content for a result."""
+        """The content for a result."""
         return cls(
             outcome=result.outcome,
             reason=result.reason,
@@ -70,20 +70,20 @@ class StoredRun(Model):
 
 
 class RunStore:
-    """Results by key in ``folder``. DataError when one cannot be written."""
+    """Results of runs by key, each in a JSON file in ``folder``. DataError when one cannot be written."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def get(self, key: str) -> RunResult | None:
-        """The result of a run that has ended before; a damaged file counts as none."""
+        """The stored result; None where there is none, or its file is damaged."""
         try:
             return StoredRun.model_validate_json(self._file(key).read_text(encoding="utf-8")).result()
-        except (OSError, ValueError):  # pydantic's and Unicode's errors among them
+        except (OSError, ValueError):  # ValueError: pydantic's and Unicode's errors, too
             return None
 
     def put(self, key: str, result: RunResult) -> None:
-        """Keep a result."""
+        """Store a result."""
         write_text(self._file(key), StoredRun.of(result).model_dump_json(indent=1))
 
     def _file(self, key: str) -> Path:

@@ -82,7 +82,7 @@ def _about(result: ComparisonResult) -> tuple[Section, ...]:
 
 
 def _sections(view: DatasetView, prefix: str) -> tuple[Section, ...]:
-    """What the report says of one data set; ``prefix`` makes the keys unique in the document."""
+    """The sections on one data set; ``prefix`` makes their keys unique in the document."""
     sections = (
         result_section(view),
         cost_section(view),

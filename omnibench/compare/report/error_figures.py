@@ -31,9 +31,9 @@ from omnibench.report.numbers import fixed
 from omnibench.report.style import INK, plot, text
 from omnibench.robot.kinematics import Array
 
-# Rates of turn from the most negative to the most positive: blue, grey, orange and steps between.
+# Colours of turn rates, from the most negative to the most positive.
 _TURN_COLOURS = ("#0072b2", "#5b6772", "#d97706", "#aa3377", "#4fb0e8", "#7b4b2a", "#8f8f1f")
-_MANY_GROUPS = 12
+_MANY_GROUPS = 12  # commands or sessions: with more, all trajectories of a split share one box plot (chosen)
 _Motion = tuple[float, float]  # speed, m/s, and rate of turn, rad/s
 
 
@@ -49,7 +49,7 @@ def error_section(view: DatasetView) -> Section:
 
 
 def final_error_table(view: DatasetView, split: Split) -> Table:
-    """Mean and worst final errors in position and heading, design values first."""
+    """A table of mean and worst final errors in position and heading, design values first."""
     errors: list[tuple[EntryStatistics | None, Array]] = [(None, view.design_errors[split])]
     for entry, run in view.calibrated:
         after = view.errors(run, split)
@@ -96,7 +96,7 @@ def _figures(view: DatasetView) -> tuple[Block, ...]:
 
 @dataclass(frozen=True)
 class _Quantity:
-    """What is drawn: an error of each trajectory, in a unit."""
+    """One kind of error (Z,), before and after calibration, in the unit in which it is drawn."""
 
     name: str
     unit: str

@@ -32,7 +32,7 @@ def outcome_section(view: DatasetView) -> Section:
 
 
 def entry_table(view: DatasetView) -> Table:
-    """How each entry did over its seeds and against the best."""
+    """A table of the entries: costs over their seeds, and the difference from the best."""
     rows = []
     for entry in view.statistics:
         digits = decimals_for(entry.train_median, 5)
@@ -72,7 +72,7 @@ def entry_table(view: DatasetView) -> Table:
 
 
 def run_table(view: DatasetView) -> Table:
-    """Every run, those without an answer too."""
+    """A table of every run, including those without an answer."""
     return Table(
         caption="Every run",
         columns=(
@@ -119,14 +119,14 @@ def certificate_table(certificates: Sequence[BoxCertificate]) -> Table:
 
 
 def gap(value: float | None) -> str:
-    """A relative gap; below what arithmetic can tell it is zero."""
+    """A relative gap; 0 where it is smaller than rounding."""
     if value is not None and abs(value) < 5e-13:
         return "0"
     return significant(value, 2)
 
 
 def proven(value: float | None) -> str:
-    """What share of a cost could be saved at most, as a note; nothing where nothing is proven."""
+    """The share of the cost that could be saved at most, as a note; empty where no bound is proven."""
     return "" if value is None else f"proven: ≤ {percent(max(value, 0.0), 2)}"
 
 
@@ -157,7 +157,7 @@ def _verdict(view: DatasetView, entry: EntryStatistics) -> Cell:
 
 
 def _held_in_words(view: DatasetView) -> str:
-    """Elements without width, and the entries whose box holds them."""
+    """A sentence on elements that a box holds, and on the entries concerned; empty where there are none."""
     held: dict[tuple[str, ...], list[str]] = {}
     for entry, run in view.calibrated:
         if run.record.held:

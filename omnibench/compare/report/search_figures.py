@@ -70,9 +70,9 @@ def search_section(view: DatasetView) -> Section:
 
 @dataclass(frozen=True, eq=False)
 class _Searches:
-    """What the figures show.
+    """The data of the figures.
 
-    points: how many a course is drawn with, about. runs: their number by label, those without a course among them.
+    points: roughly how many a course is drawn with. runs: number of runs by label, with those that have no course.
     theoretical: the training cost of the design values.
     """
 

@@ -43,7 +43,7 @@ def on_bounds(record: RunRecord) -> list[str]:
 
 
 def cost_in_words(view: DatasetView) -> str:
-    """The cost's name and what it is."""
+    """The cost's name and its summary."""
     return f"{view.config.cost.name}: {costs.entry(view.config.cost.name).summary.rstrip('.')}."
 
 
@@ -59,7 +59,7 @@ def position_unit(*errors: float) -> tuple[float, str, int]:
 
 
 def difference_in_words(difference: Interval) -> tuple[str, str]:
-    """A difference and its interval, to two digits of the larger end."""
+    """A difference and its interval, with decimals that show two digits of the larger end."""
     largest = max(abs(difference.low), abs(difference.high))
     if 0 < largest < 1e-5:
         value, low, high = (significant(v, 2, signed=True) for v in (difference.value, difference.low, difference.high))
