@@ -16,7 +16,7 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array
 
-# The search has narrowed down; any other of pycma's criteria is a search that stopped for trouble.
+# Criteria of pycma that mean convergence; all others mean that the search was stopped.
 _CONVERGED = {"tolx", "tolfun", "tolfunhist", "tolfunrel", "tolxstagnation", "tolflatfitness"}
 
 
@@ -51,7 +51,7 @@ class Cmaes(Calibrator):
         if free < 2:
             raise PluginError(f"calibrator 'cmaes' needs two free elements or more, the box leaves {free}; widen it")
         start = np.clip(problem.to_unit(problem.start)[0], 0.0, 1.0)
-        problem.cost(problem.start[None])  # so that the answer is never worse
+        problem.cost(problem.start[None])  # so that the answer is never worse than the start
         strategy = CMAEvolutionStrategy(start, self.options.step, self._settings(problem))
         while not (stop := strategy.stop()):
             points = strategy.ask()
@@ -62,10 +62,10 @@ class Cmaes(Calibrator):
     def _settings(self, problem: CalibrationProblem) -> dict[str, Any]:
         settings: dict[str, Any] = {
             "bounds": [0.0, 1.0],
-            # All random numbers come from the problem; a seed would go to NumPy's global generator.
+            # All random numbers come from problem.rng; pycma would pass a seed to NumPy's global generator.
             "randn": lambda *shape: problem.rng.standard_normal(shape),
             "seed": np.nan,
-            "maxiter": np.inf,  # the budget is the problem's
+            "maxiter": np.inf,  # the problem limits the evaluations
             "tolfun": self.options.tolfun,
             "tolx": self.options.tolx,
             "verbose": -10,  # prints nothing, reads and writes no files
@@ -76,6 +76,6 @@ class Cmaes(Calibrator):
 
 
 def _finite(values: Array) -> Array:
-    """Costs with NaN and infinity above everything else; pycma ranks, so how far above does not matter."""
+    """Costs (P,) with NaN and infinity replaced by a value above all others; pycma uses their ranks only."""
     ok = np.isfinite(values)
     return np.where(ok, values, 2 * values[ok].max() + 1 if ok.any() else 1.0)

@@ -19,7 +19,7 @@ Strategy = Literal["best1bin", "rand1bin", "currenttobest1bin", "best2bin", "ran
 class DifferentialEvolutionOptions(Options):
     """Population, variation and stopping rule, named as SciPy names them."""
 
-    strategy: Strategy = Field("best1bin", description="how a candidate is made of others")
+    strategy: Strategy = Field("best1bin", description="how a candidate is made from others")
     popsize: int = Field(5, gt=0, description="candidates of a generation, for each free element")
     mutation: tuple[float, float] = Field((0.4, 0.9), description="range of the differential weight F")
     recombination: float = Field(0.9, ge=0, le=1, description="probability of crossover CR")
@@ -37,13 +37,13 @@ class DifferentialEvolutionOptions(Options):
 
 @calibrators.register("differential_evolution")
 class DifferentialEvolution(Calibrator):
-    """SciPy's differential evolution in the unit cube of the free elements, whole generations at once."""
+    """SciPy's differential evolution in the unit cube of the free elements, evaluated by whole generations."""
 
     Options = DifferentialEvolutionOptions
     options: DifferentialEvolutionOptions
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
-        """Evolve until the generation has drawn together; without the polish, which takes one candidate at a time."""
+        """Evolve until the costs of a generation agree; SciPy's final polish is off, since it evaluates one by one."""
         free = int(np.count_nonzero(problem.free))
         if free == 0:
             return Solution(problem.start, "the box leaves no element free")
@@ -61,7 +61,7 @@ class DifferentialEvolution(Calibrator):
             mutation=self.options.mutation,
             recombination=self.options.recombination,
             tol=self.options.tol,
-            maxiter=problem.budget.evaluations,  # never reached: the budget is the problem's
+            maxiter=problem.budget.evaluations,  # never reached: the problem limits the evaluations
             rng=problem.rng,
             polish=False,
             updating="deferred",

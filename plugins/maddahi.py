@@ -2,9 +2,9 @@
 
 Y. Maddahi, A. Maddahi, N. Sepehri, "Calibration of omnidirectional wheeled mobile robots: method and experiments",
 Robotica 31:969-980 (2013). The article itself was not at hand. What is known of it here is what Palacin et al. 2023
-say in their introduction: two corrective indices are applied to the inverse kinematic matrix; in effect they correct
-the angular velocities of the wheels, which is equivalent to a parametric calibration of the wheels' radii; errors go
-down more on straight trajectories than on curved ones.
+say in their introduction: two corrective indices are applied to the inverse kinematic matrix; they correct the angular
+velocities of the wheels, which is equivalent to a parametric calibration of the wheels' radii; they reduce errors more
+on straight trajectories than on curved ones.
 
 Reconstructed here, and not the article's own:
 
@@ -31,8 +31,8 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array
 
-_LARGE = 1e300  # stands for a cost that is not finite; finite, since the simplex takes differences
-_REACH = 0.5  # of a wheel's factor, where the box does not limit it
+_LARGE = 1e300  # replaces a cost that is not finite, of which the simplex could not take differences
+_REACH = 0.5  # largest change of a wheel's factor where the box does not limit it; chosen
 
 
 class MaddahiOptions(Options):
@@ -50,13 +50,13 @@ class Maddahi(Calibrator):
     stochastic = False
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
-        """Find the wheel factors of least cost by a simplex, restarted until it gains nothing, and split them."""
+        """Find the wheel factors of least cost by a simplex, restarted while the cost falls, and split them."""
         scaled = _scaled_by_wheel(problem)
         low, high = _factor_limits(problem, scaled)
         factors = np.ones(len(scaled))
         best = start = _cost(problem, _vector(problem, scaled, factors))
         while np.any(high > low):
-            found = minimize(
+            result = minimize(
                 lambda x: _cost(problem, _vector(problem, scaled, x)),
                 factors,
                 method="Nelder-Mead",
@@ -65,13 +65,13 @@ class Maddahi(Calibrator):
                     "initial_simplex": _simplex(factors, low, high),
                     "xatol": self.options.tolerance,
                     "fatol": self.options.tolerance * min(start, 1.0),
-                    "maxiter": problem.budget.evaluations,  # never reached: the budget is the problem's
+                    "maxiter": problem.budget.evaluations,  # never reached: the problem limits the evaluations
                 },
             )
-            gain = best - found.fun
-            if gain > 0:
-                factors, best = np.clip(found.x, low, high), float(found.fun)
-            if gain <= self.options.tolerance * min(start, 1.0):
+            decrease = best - result.fun
+            if decrease > 0:
+                factors, best = np.clip(result.x, low, high), float(result.fun)
+            if decrease <= self.options.tolerance * min(start, 1.0):
                 break
         longitudinal = factors.mean()
         lateral = ", ".join(
@@ -84,7 +84,7 @@ class Maddahi(Calibrator):
 
 
 def _scaled_by_wheel(problem: CalibrationProblem) -> NDArray[np.bool_]:
-    """Which elements of the vector a wheel's factor multiplies, (N, n): its column of the matrix, or its radius."""
+    """True (N, n) for elements of the vector that a wheel's factor multiplies: its matrix column, or its radius."""
     wheels = len(problem.robot.wheels)
     element = np.arange(problem.size)
     wheel = element % wheels
@@ -97,11 +97,11 @@ def _scaled_by_wheel(problem: CalibrationProblem) -> NDArray[np.bool_]:
 def _vector(problem: CalibrationProblem, scaled: NDArray[np.bool_], factors: Array) -> Array:
     """The start vector (n,) with the factors (N,) of the wheels applied."""
     vector: Array = problem.start * np.where(scaled, np.asarray(factors)[:, None], 1.0).prod(axis=0)
-    return np.clip(vector, problem.lower, problem.upper)  # rounding on a bound
+    return np.clip(vector, problem.lower, problem.upper)  # rounding may leave the box
 
 
 def _factor_limits(problem: CalibrationProblem, scaled: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """The factors (N,) between which every scaled element stays in the box; both 1 for one that the box holds fixed."""
+    """Lowest and highest factor (N,) that keep every scaled element in the box; both 1 where the box fixes one."""
     moving = problem.start != 0
     start = np.where(moving, problem.start, 1.0)
     ends = np.sort([problem.lower / start, problem.upper / start], axis=0)
@@ -117,5 +117,6 @@ def _simplex(factors: Array, low: Array, high: Array) -> Array:
 
 
 def _cost(problem: CalibrationProblem, vector: Array) -> float:
+    """The cost of one vector, finite in any case."""
     value = float(problem.cost(vector[None])[0])
     return value if np.isfinite(value) else _LARGE

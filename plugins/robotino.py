@@ -1,6 +1,6 @@
 """Importer plug-in: the Festo Robotino v2 recordings of the research-wheel-slippage project.
 
-An importer in one file: put it into a folder that the config or ``--plugins`` names.
+It is loaded from any folder that the config or ``--plugins`` names.
 
 How wheel order and signs were found. Every run starts with a commanded motion: motor set speeds of (-34.64, 0, 34.64)
 rad/s for 0.1 m/s along x and (20, -40, 20) along y are the wheel equation (-sin d, cos d, R) / r at d = 60, 180, 300
@@ -29,7 +29,7 @@ from omnibench.robot.kinematics import Robot, Wheel
 
 GEAR = 16
 TICKS_PER_MOTOR_TURN = 2000
-METRES_PER_PIXEL = (1.84046e-3, 1.83716e-3)  # along the camera's x and y
+METRES_PER_PIXEL = (1.84046e-3, 1.83716e-3)  # m, along the camera's x and y
 
 ROBOT = Robot(
     name="festo_robotino_v2",
@@ -45,7 +45,7 @@ _CAMERA = ("xpos", "ypos", "ang")
 
 
 class RobotinoOptions(Options):
-    """Which runs train and which validate."""
+    """Split and name of the data set."""
 
     train: Names = Field((), description="patterns of run names (table_surface/exp0*) that train")
     validation: Names = Field((), description="patterns of run names that validate; default: every second direction")
@@ -58,16 +58,16 @@ class Robotino(Importer):
 
     The source is any folder above ``exp*.csv`` (separator ``;``, three header lines). Wheel angles come from cumulative
     motor ticks (2000 a turn, gear 16); world frame X = -y, Y = -x of the camera's pixels, heading = its angle (deg).
-    The camera's scale cannot be told from the wheel radius, and commands without rotation say nothing about the lever
-    arm. A run's repetitions are those of the same speed and direction within one folder (surface). Splits: every second
-    direction validates, unless ``train`` or ``validation`` say otherwise.
+    The camera's scale cannot be distinguished from the wheel radius, and without commanded rotation the lever arm is
+    not identified. Repetitions are runs of the same speed and direction within one folder (surface). Every second
+    direction validates, unless ``train`` or ``validation`` name runs.
     """
 
     Options = RobotinoOptions
     options: RobotinoOptions
 
     def read(self, source: Path) -> Dataset:
-        """All runs under ``source``; DataError names the file and the row of what is wrong."""
+        """All runs under ``source``. DataError names the file, the row and the mistake."""
         files = sorted(source.resolve().rglob("exp*.csv"))
         if not files:
             raise DataError(f"{source}: no exp*.csv below it; name a folder of the research-wheel-slippage data sets")

@@ -1,4 +1,4 @@
-"""For plug-in authors: conformance cases, to subclass in pytest or to run by ``omnibench plugin check``.
+"""Conformance cases for authors of plug-ins: subclass them in pytest, or run ``omnibench plugin check``.
 
 In a test file, with the plug-in beside it::
 

@@ -25,9 +25,10 @@ from omnibench.testing.synthetic import ObservedProblem, Runaway, synthetic_prob
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """One run of a calibrator: its result, the problem as the run left it, and what ``calibrate`` did.
+    """One run of a calibrator: its result, and the problem after the run.
 
-    solution, error: what it returned or raised. uncounted: candidates that it evaluated past the budget's count.
+    solution, error: returned or raised by ``calibrate``. uncounted: candidates that it evaluated without counting them
+    against the budget.
     """
 
     result: RunResult
@@ -38,11 +39,11 @@ class Attempt:
 
 
 class CalibratorConformance(Conformance):
-    """What every calibrator must keep to, whatever it does.
+    """Requirements on every calibrator.
 
-    solved: the largest share of the start's cost at which a claim of convergence is believed on a problem that can be
-    solved to zero. By default it need only not be worse than the start; set it to 1e-3, say, for an optimiser.
-    evaluations: the budget of that problem.
+    solved: on a problem whose least cost is zero, largest share of the start's cost at which it may claim convergence.
+    The default only demands an answer no worse than the start; set it to, say, 1e-3 for an optimiser.
+    evaluations: budget of that problem.
     """
 
     registry = calibrators
@@ -54,7 +55,7 @@ class CalibratorConformance(Conformance):
         return synthetic_problem(parameterisation or self.make().parameterisation, **changes)
 
     def attempt(self, problem: ObservedProblem, calibrator: Calibrator | None = None) -> Attempt:
-        """Run the calibrator to its end; Nonconformance when it raises what it may not, or does not end."""
+        """Run the calibrator; Nonconformance if it raises a forbidden exception or does not end."""
         calibrator = calibrator or self.make()
         watched = _watching(calibrator)
         try:
@@ -70,7 +71,7 @@ class CalibratorConformance(Conformance):
         return Attempt(result, problem, answer, watched.error, watched.uncounted)
 
     def test_same_seed_twice_gives_the_same_answer(self) -> None:
-        """Bit for bit, whatever the global generators are at; the second time by an instance that has run before."""
+        """Bit for bit, independent of the global generators; the second run reuses the instance."""
         for seed in (0, 1):
             calibrator = self.make()
             with global_random_state(1):
@@ -93,14 +94,14 @@ class CalibratorConformance(Conformance):
         require(len(answers) == 1, "it says stochastic = False, but its answer depends on the seed")
 
     def test_global_random_state_is_left_alone(self) -> None:
-        """What a plug-in does to the generators of ``random`` and NumPy would change the runs after it."""
+        """A plug-in that uses the global generators of ``random`` and NumPy would change the runs after it."""
         with global_random_state(1):
             before = global_random_fingerprint()
             self.attempt(self.problem())
             require(before == global_random_fingerprint(), "it used or seeded a global generator; use problem.rng")
 
     def test_bounds_are_kept(self) -> None:
-        """Every candidate and the answer lie in the box, also where the box holds an element fixed."""
+        """Every candidate and the answer lie in the box, also if the box fixes an element."""
         if not self.make().bounded:
             raise SkipTest("its answer does not depend on the box")
         for fixed in (False, True):
@@ -111,7 +112,7 @@ class CalibratorConformance(Conformance):
             require(attempt.result.outcome is not Outcome.INVALID, attempt.result.reason)
 
     def test_budget_is_kept(self) -> None:
-        """The run ends when the evaluations are spent, and it does not claim then to have converged."""
+        """The run ends when the evaluations are spent, and does not claim to have converged."""
         for evaluations in (1, 7, 150):
             attempt = self.attempt(self.problem(evaluations=evaluations))
             spent = attempt.result.evaluations + attempt.uncounted
@@ -123,11 +124,11 @@ class CalibratorConformance(Conformance):
             _require_honest_end(attempt)
 
     def test_spent_time_ends_the_run(self) -> None:
-        """The same for the seconds."""
+        """The run ends when the seconds are spent, and does not claim to have converged."""
         _require_honest_end(self.attempt(self.problem(seconds=1e-9)))
 
     def test_inputs_are_left_unchanged(self) -> None:
-        """Trajectories, start, box and reference are the same after a run, for those that share them."""
+        """Trajectories, start, box and reference are shared with other runs, and the same after a run."""
         problem = self.problem()
         before, cost = _contents(problem), problem.values(problem.start[None])
         self.attempt(problem)
@@ -137,7 +138,7 @@ class CalibratorConformance(Conformance):
         require(_bytes(cost) == _bytes(problem.values(problem.start[None])), "it changed what the problem computes")
 
     def test_nan_cost_is_survived(self) -> None:
-        """The cost is NaN in most of the box, but neither at the start nor at the optimum."""
+        """The cost is NaN in most of the box, except near the start and the optimum."""
         attempt = self.attempt(self.problem(undefined=_outer_shell))
         if self.make().bounded:
             require(attempt.result.outcome is not Outcome.INVALID, f"beside NaN costs: {attempt.result.reason}")
@@ -148,7 +149,7 @@ class CalibratorConformance(Conformance):
         require(attempt.result.outcome is not Outcome.CONVERGED, "it claims to have converged where no cost is finite")
 
     def test_synthetic_problem_is_solved_or_honestly_reported(self) -> None:
-        """A claim of convergence comes with an answer that is no worse than the start, and a good one if it must be."""
+        """If it claims convergence, the answer costs at most the share ``solved`` of the start."""
         if not self.make().bounded:
             raise SkipTest("its answer does not depend on the problem")
         problem = self.problem(evaluations=self.evaluations)
@@ -165,28 +166,28 @@ class CalibratorConformance(Conformance):
             )
 
     def test_other_parameterisation_is_searched_or_refused(self) -> None:
-        """A config may ask for either; OmnibenchError says that one is impossible."""
+        """A config may ask for either parameterisation; OmnibenchError refuses one."""
         for parameterisation in ("matrix", "geometry"):
             self.attempt(self.problem(parameterisation))
 
-    def test_four_wheels_are_met(self) -> None:
-        """Nothing may count on nine elements."""
+    def test_four_wheels_work(self) -> None:
+        """The number of elements may differ from nine."""
         attempt = self.attempt(self.problem(wheels=4))
         if self.make().bounded:
             require(attempt.result.outcome is not Outcome.INVALID, f"with four wheels: {attempt.result.reason}")
 
     def test_it_works_in_silence(self) -> None:
-        """Standard output belongs to ``--json``, and a run leaves no files."""
+        """It prints nothing, since standard output belongs to ``--json``, and leaves no files."""
         printed, folder = io.StringIO(), tempfile.TemporaryDirectory()
-        with folder as place, chdir(place), redirect_stdout(printed), redirect_stderr(printed):
+        with folder as path, chdir(path), redirect_stdout(printed), redirect_stderr(printed):
             self.attempt(self.problem(evaluations=300))
-            left = sorted(path.name for path in Path(place).iterdir())
+            left = sorted(file.name for file in Path(path).iterdir())
         require(not printed.getvalue(), f"it printed {printed.getvalue()[:60]!r}; put what matters into the reason")
         require(not left, f"it left files in the working folder: {', '.join(left)}")
 
 
 class _Watching(Calibrator):
-    """Passes a run through to a calibrator and keeps what came of it."""
+    """A wrapper around a calibrator that records its solution or exception."""
 
     def __init__(self, inner: Calibrator) -> None:
         super().__init__(inner.options)
@@ -218,12 +219,12 @@ def _watching(calibrator: Calibrator) -> _Watching:
 
 
 def _outer_shell(points: Array) -> NDArray[np.bool_]:
-    """Where any free element is in the upper tenth of its range: 61 % of a box of nine."""
+    """True for points (P,) with any free element in the upper tenth of its range: 61 % of a box of nine."""
     return np.asarray((points > 0.9).any(axis=1), dtype=bool)
 
 
 def _require_honest_end(attempt: Attempt) -> None:
-    # A wrapped library may ask a few times more until its stop takes effect; the claim is what counts.
+    # A wrapped library may ask for a few more costs until its stop takes effect; only the claim is checked.
     require(
         attempt.result.outcome is not Outcome.CONVERGED or not attempt.problem.refusals,
         "it swallowed BudgetSpent and claims to have converged; let that exception through",

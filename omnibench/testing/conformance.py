@@ -1,4 +1,4 @@
-"""What all conformance cases share: a base class for pytest and a runner that does without."""
+"""Base class of all conformance cases, and a runner that works without pytest."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from omnibench.registry import Options, Registry, load_plugin_file
 
 
 class Nonconformance(AssertionError):  # noqa: N818 (reads as what it is in a test report)
-    """What a class does against its contract, in one line."""
+    """A class violates its contract; the message says how, in one line."""
 
 
 class Conformance:
     """Cases that a registered class must pass; each method ``test_*`` is one.
 
-    name: what the class is registered as. options: what it is made with.
+    name: registered name of the class. options: options of the instance under test.
     """
 
     registry: ClassVar[Registry[Any]]
@@ -50,12 +50,12 @@ class CaseOutcome(StrEnum):
 
     PASSED = "passed"
     FAILED = "failed"
-    SKIPPED = "skipped"  # it does not apply, the message says why
+    SKIPPED = "skipped"  # it does not apply; the message says why
 
 
 @dataclass(frozen=True)
 class CaseResult:
-    """One case on one registered class. ``case`` is in words; ``message`` says what is wrong, or why it was skipped."""
+    """Result of one case on one registered class. case: in words. message: the violation, or why it was skipped."""
 
     kind: str
     name: str
@@ -65,12 +65,12 @@ class CaseResult:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing speaks against the class."""
+        """True unless the case failed."""
         return self.outcome is not CaseOutcome.FAILED
 
 
 def run_cases(suite: Conformance) -> list[CaseResult]:
-    """Run every case of ``suite``, in the order of their definition; whatever a case raises is its result."""
+    """Run every case of ``suite``, in the order of definition; an exception becomes the case's result."""
     defined = [name for cls in reversed(type(suite).__mro__) for name in vars(cls) if name.startswith("test_")]
     return [_run_case(suite, method) for method in dict.fromkeys(defined)]
 
@@ -106,7 +106,7 @@ def require(condition: bool, message: str) -> None:
 
 @contextmanager
 def global_random_state(seed: int) -> Iterator[None]:
-    """Seed the global generators of ``random`` and NumPy within the block, and put them back after it."""
+    """Seed the global generators of ``random`` and NumPy within the block, and restore them after it."""
     kept, kept_numpy = random.getstate(), np.random.get_state()  # noqa: NPY002 (what a plug-in must not use)
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002
@@ -118,5 +118,5 @@ def global_random_state(seed: int) -> Iterator[None]:
 
 
 def global_random_fingerprint() -> str:
-    """A text that changes when a global generator of ``random`` or NumPy has been used."""
+    """The state of the global generators of ``random`` and NumPy, as text."""
     return f"{random.getstate()!r} {[np.asarray(part).tobytes() for part in np.random.get_state()]!r}"  # noqa: NPY002

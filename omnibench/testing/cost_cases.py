@@ -13,42 +13,42 @@ from omnibench.testing.synthetic import synthetic_robot, synthetic_trajectories,
 
 
 class CostConformance(Conformance):
-    """What every cost must keep to."""
+    """Requirements on every cost."""
 
     registry = costs
 
     def errors(self, candidates: int) -> tuple[Array, NDArray[np.intp]]:
-        """Pose errors (P, S, 3) of so many candidates, some small and some large, and whose stamp each is (S,)."""
+        """Pose errors (P, S, 3) of P candidates, from small to large, and the trajectory (S,) of each stamp."""
         trajectory = np.repeat(np.arange(4), 1 if self.make().stamps == "final" else 5)
         rng = np.random.default_rng(0)
         size = np.logspace(-4, 1, candidates)[:, None, None]
         return size * rng.normal(size=(candidates, len(trajectory), 3)), trajectory
 
-    def test_one_cost_a_candidate(self) -> None:
-        """Shape (P,), for one candidate too."""
+    def test_every_candidate_has_one_cost(self) -> None:
+        """Shape (P,), also for one candidate."""
         for candidates in (1, 6):
-            found = np.shape(self.make().combine(*self.errors(candidates)))
-            require(found == (candidates,), f"combine gave shape {found} for {candidates} candidates, not (P,)")
+            shape = np.shape(self.make().combine(*self.errors(candidates)))
+            require(shape == (candidates,), f"combine gave shape {shape} for {candidates} candidates, not (P,)")
 
     def test_costs_are_finite_and_not_negative(self) -> None:
-        """For errors that are finite."""
+        """Finite errors have finite costs >= 0."""
         values = self.make().combine(*self.errors(20))
         require(bool(np.isfinite(values).all()), "a cost of finite errors is not finite")
         require(bool((values >= 0).all()), f"a cost is negative: {values.min():.4g}")
 
     def test_no_error_costs_nothing(self) -> None:
-        """Zero for poses that agree with the reference."""
+        """Poses equal to the reference cost 0."""
         errors, trajectory = self.errors(2)
         values = self.make().combine(np.zeros_like(errors), trajectory)
         require(bool((values == 0).all()), f"errors of zero cost {values.max():.4g}")
 
     def test_errors_cost_something(self) -> None:
-        """Errors in all of x, y and heading."""
+        """Errors in x, y and heading cost more than 0."""
         values = self.make().combine(*self.errors(6))
         require(bool((values > 0).all()), "errors in x, y and heading cost nothing")
 
     def test_nan_stays_with_its_candidate(self) -> None:
-        """NaN in gives NaN out, without an exception, and for that candidate only."""
+        """NaN errors give a NaN cost, for that candidate only, without an exception."""
         errors, trajectory = self.errors(3)
         clean = self.make().combine(errors.copy(), trajectory)
         errors[1, -1] = np.nan
@@ -59,7 +59,7 @@ class CostConformance(Conformance):
         )
 
     def test_costs_do_not_depend_on_the_batch(self) -> None:
-        """A candidate costs the same alone and among others, in any order, up to rounding."""
+        """A candidate costs the same alone and in a batch of any order, up to rounding."""
         errors, trajectory = self.errors(7)
         together = self.make().combine(errors, trajectory)
         alone = np.concatenate([self.make().combine(errors[[index]], trajectory) for index in range(7)])
@@ -70,7 +70,7 @@ class CostConformance(Conformance):
             )
 
     def test_inputs_are_left_unchanged(self) -> None:
-        """The errors belong to the problem."""
+        """The errors are not overwritten."""
         errors, trajectory = self.errors(3)
         kept, kept_trajectory = errors.copy(), trajectory.copy()
         self.make().combine(errors, trajectory)
@@ -80,7 +80,7 @@ class CostConformance(Conformance):
         )
 
     def test_exact_recordings_cost_nothing(self) -> None:
-        """The true matrix on recordings without noise, through the whole chain; the design matrix costs more."""
+        """The true matrix costs 0 on recordings without noise, the design matrix more."""
         cost: Cost = self.make()
         robot = synthetic_robot()
         runs = synthetic_trajectories(robot)

@@ -35,16 +35,16 @@ _KINDS = {
     "ReferenceEffect": (ReferenceEffect, ("reference",)),
     "ActuatorEffect": (ActuatorEffect, ("actuator",)),
 }
-_ROUNDING = 1e-9  # share of the largest value
-_NOTHING = 1e-12  # m, rad, rad/s
+_ROUNDING = 1e-9  # relative to the largest value
+_NOTHING = 1e-12  # m, rad, rad/s: a smaller change is rounding
 
 
 class EffectConformance(Conformance):
-    """What every effect must keep to. Cases that are not for its kind are skipped."""
+    """Requirements on every effect. Cases for another kind of effect are skipped."""
 
     registry = effects
 
-    def test_physics_and_source_are_told(self) -> None:
+    def test_physics_and_source_are_given(self) -> None:
         """Reports print them beside the name."""
         effect = self.make()
         for item in ("physics", "source", "shows_in"):
@@ -57,45 +57,47 @@ class EffectConformance(Conformance):
         kinds = [name for name, (kind, _) in _KINDS.items() if isinstance(effect, kind)]
         require(len(kinds) == 1, f"it must derive from one of {', '.join(_KINDS)}")
         _, stages = _KINDS[kinds[0]]
-        found = getattr(effect, "stage", None)
-        require(found in stages, f"stage is {found!r}; of a {kinds[0]} it is one of {', '.join(stages)}")
+        stage = getattr(effect, "stage", None)
+        require(stage in stages, f"stage is {stage!r}; of a {kinds[0]} it is one of {', '.join(stages)}")
 
     def test_needs_are_known(self) -> None:
-        """What must have been recorded, by the names of the contract."""
+        """``needs`` holds names of the contract only."""
         unknown = set(self.make().needs) - set(get_args(Need))
         require(not unknown, f"needs holds {sorted(map(str, unknown))}; known are {', '.join(get_args(Need))}")
 
     def test_parameters_have_units_and_plausible_ranges(self) -> None:
-        """Every parameter can be told to a reader, and drawn."""
+        """Every parameter has a unit, a description and a finite range."""
         for robot in robots():
-            found = self.make().parameters(robot, SESSIONS)
-            parameters = isinstance(found, tuple) and all(isinstance(each, Parameter) for each in found)
-            require(parameters, "parameters must give a tuple of Parameter")
-            require(any(not each.choices for each in found), "it has no parameter that is 0 where it does not act")
-            for each in found:
-                _check_parameter(each)
+            parameters = self.make().parameters(robot, SESSIONS)
+            valid = isinstance(parameters, tuple) and all(isinstance(item, Parameter) for item in parameters)
+            require(valid, "parameters must give a tuple of Parameter")
+            require(
+                any(not item.choices for item in parameters), "it needs a parameter without choices, 0 for no effect"
+            )
+            for parameter in parameters:
+                _check_parameter(parameter)
 
     def test_parameters_have_names_of_their_own(self) -> None:
-        """They are keys of the calibration file, the same every time."""
+        """Names are keys of the calibration file: unique, and the same in every call."""
         for robot in robots():
             first, again = (self.make().parameters(robot, SESSIONS) for _ in range(2))
             names = [each.name for each in first]
             require(len(set(names)) == len(names), f"two parameters have one name: {', '.join(names)}")
-            require(first == again, "parameters gives others the second time")
+            require(first == again, "parameters gives other parameters in a second call")
 
     def test_shapes_are_those_of_the_contract(self) -> None:
-        """For one sample and for many, on three wheels and on four."""
+        """Results have the right shape for one sample and many, three wheels and four."""
         effect = self.make()
         for robot in robots():
             for values in trial_values(effect, robot):
                 for samples in (1, SAMPLES):
                     given = trial_input(effect, robot, samples=samples)
                     for name, result in results(effect, given, values).items():
-                        found, expected = np.shape(result), _shape(name, effect.stage, given, len(robot.wheels))
-                        require(found == expected, f"{name} has shape {found}, expected {expected}")
+                        shape, expected = np.shape(result), _shape(name, effect.stage, given, len(robot.wheels))
+                        require(shape == expected, f"{name} has shape {shape}, expected {expected}")
 
     def test_zero_parameters_change_nothing(self) -> None:
-        """An effect whose parameters are 0 is not there."""
+        """An effect whose parameters are 0 changes nothing."""
         effect = self.make()
         for robot in robots():
             given = trial_input(effect, robot)
@@ -104,7 +106,7 @@ class EffectConformance(Conformance):
                 require(largest <= _NOTHING, f"parameters of 0 change something, by {largest:.3g}")
 
     def test_parameters_change_something(self) -> None:
-        """Somewhere in a varied drive it can be seen."""
+        """It changes something in a varied drive."""
         effect = self.make()
         for robot in robots():
             given = trial_input(effect, robot)
@@ -112,7 +114,7 @@ class EffectConformance(Conformance):
             require(seen, f"no parameters change anything on {len(robot.wheels)} wheels")
 
     def test_results_are_finite(self) -> None:
-        """While it drives, drives fast and stands."""
+        """Results are finite while the robot drives, drives fast and stands."""
         effect = self.make()
         for robot in robots():
             for values in trial_values(effect, robot):
@@ -121,11 +123,11 @@ class EffectConformance(Conformance):
                     require(bool(finite), f"a result is not finite where the robot {'drives' if speed else 'stands'}")
 
     def test_it_is_linear_in_its_parameters(self) -> None:
-        """Fits and the search for effects rely on it; a parameter with choices may shape the correction freely."""
+        """Fits and ``discover`` rely on it; parameters with choices are exempt."""
         effect = self.make()
         if isinstance(effect, ActuatorEffect):
-            raise SkipTest("is for effects that a fit looks for")
-        # what is reported need be linear for small parameters only: a map turns by sine and cosine
+            raise SkipTest("only for effects that are fitted")
+        # reported poses need be linear for small parameters only: rotations are not linear in their angle
         size, tolerance = (1.0, _ROUNDING) if isinstance(effect, MotionEffect) else (1e-5, 1e-3)
         for robot in robots():
             given = trial_input(effect, robot)
@@ -139,7 +141,7 @@ class EffectConformance(Conformance):
                 require(error <= tolerance * scale, f"it is not linear in its parameters: off by {error:.3g}")
 
     def test_inputs_are_left_unchanged(self) -> None:
-        """Signals and poses belong to the model, values to the calibration."""
+        """Signals, poses and values are not overwritten."""
         effect = self.make()
         for robot in robots():
             given = trial_input(effect, robot)
@@ -151,38 +153,43 @@ class EffectConformance(Conformance):
                 require(same and values == kept, "it changed its arguments; work on copies")
 
     def test_each_sample_is_corrected_by_itself(self) -> None:
-        """No memory: a stream has one sample at a time, and gives the same."""
+        """A sample is corrected the same alone, as in a stream, and in a batch."""
         effect = self.make()
         for robot in robots():
             given = trial_input(effect, robot)
             if not isinstance(given, Signals) and len(given) == 2:
-                raise SkipTest("is for effects that act in a stream")
+                raise SkipTest("only for effects that act in a stream")
             for values in trial_values(effect, robot):
                 together = changes(effect, given, values)
                 for row in (0, 7, SAMPLES - 1, 3):
                     alone = changes(effect, one_row(given, row), values)
                     same = len(alone) == 1 and np.allclose(alone[0], together[row], rtol=1e-9, atol=_NOTHING)
-                    require(same, f"row {row} of a batch is not what it is alone; it must not look at other samples")
+                    require(
+                        same, f"row {row} differs between a batch and a stream; it must not depend on other samples"
+                    )
 
-    def test_it_says_the_same_again(self) -> None:
-        """Another instance too; and the global random generators are left alone."""
+    def test_results_are_reproducible(self) -> None:
+        """Results are equal in every call and instance, and no global random generator is used."""
         for robot in robots():
             given = trial_input(self.make(), robot)
             for values in trial_values(self.make(), robot):
-                found = []
+                repeated = []
                 for seed in (1, 2):
                     with global_random_state(seed):
                         before = global_random_fingerprint()
                         effect = self.make()
-                        found += [changes(effect, given, values) for _ in range(2)]
+                        repeated += [changes(effect, given, values) for _ in range(2)]
                         require(global_random_fingerprint() == before, "it draws random numbers")
-                require(all(np.array_equal(found[0], each) for each in found[1:]), "it says something else each time")
+                require(
+                    all(np.array_equal(repeated[0], result) for result in repeated[1:]),
+                    "its results differ from call to call",
+                )
 
-    def test_it_does_with_what_it_needs(self) -> None:
-        """Recordings without what ``needs`` does not name must do."""
+    def test_needs_names_all_that_is_used(self) -> None:
+        """It works on recordings that lack everything which ``needs`` does not name."""
         effect = self.make()
         if not isinstance(effect, MotionEffect):
-            raise SkipTest("is for effects of motion")
+            raise SkipTest("only for effects of motion")
         unused = {"wheel_angles", "session_time", "session", "poses"} - set(effect.needs)
         bare: dict[str, Any] = dict.fromkeys(unused)
         for robot in robots():
@@ -195,10 +202,10 @@ class EffectConformance(Conformance):
                     require(False, f"without {missing} it raises {type(error).__name__}: {error}; name it in needs")
 
     def test_corrected_poses_are_the_true_ones(self) -> None:
-        """``corrected`` undoes ``reported``."""
+        """``corrected`` is the inverse of ``reported``."""
         effect = self.make()
         if not isinstance(effect, ReferenceEffect):
-            raise SkipTest("is for effects of the reference")
+            raise SkipTest("only for effects of the reference")
         poses = trial_poses()
         for robot in robots():
             for values in trial_values(effect, robot):
@@ -206,11 +213,11 @@ class EffectConformance(Conformance):
                 error = float(np.abs(back - poses).max())
                 require(error <= _ROUNDING, f"corrected(reported(poses)) is off by {error:.3g}")
 
-    def test_motors_know_nothing_of_what_comes(self) -> None:
-        """What they do depends on earlier targets only, and they stand until the first."""
+    def test_motors_are_causal(self) -> None:
+        """Wheel rates depend on earlier targets only, and are 0 until the first target."""
         effect = self.make()
         if not isinstance(effect, ActuatorEffect):
-            raise SkipTest("is for effects of the motors")
+            raise SkipTest("only for effects of the motors")
         for robot in robots():
             durations, targets = motor_input(robot)
             for values in trial_values(effect, robot):
@@ -218,10 +225,11 @@ class EffectConformance(Conformance):
                 same = np.allclose(early, effect.driven(durations, targets, values)[:50], rtol=1e-9, atol=_NOTHING)
                 require(same, "later targets change earlier wheel rates")
                 still = effect.driven(durations, np.zeros_like(targets), values)
-                require(not np.any(still), "the wheels turn though no target ever said so")
+                require(not np.any(still), "the wheels turn though all targets are 0")
 
 
 def _check_parameter(parameter: Parameter) -> None:
+    """Nonconformance unless name, unit, description and range are valid."""
     place = f"parameter {parameter.name!r}"
     low, high = parameter.low, parameter.high
     require(bool(parameter.name) and parameter.name.isprintable(), f"{place}: its name is empty, or cannot be printed")

@@ -1,4 +1,4 @@
-"""What effects are tried on: robots, parameters within their ranges, and the inputs of each kind of effect."""
+"""Inputs for the conformance cases of effects: robots, parameters within their ranges, signals and poses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals
 from omnibench.testing.synthetic import synthetic_robot
 
-PERIOD: Final = 0.01  # s
+PERIOD: Final = 0.01  # s, of the wheel samples
 SAMPLES: Final = 200
 SESSIONS: Final = ("morning", "evening")
 Poses = tuple[Array, Array, Array]  # stamps (K,), poses (K, 3), start (3,)
@@ -23,7 +23,7 @@ Input = Signals | Poses | Motors
 
 
 def driven_signals(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> Signals:
-    """Signals of a varied drive: so many samples, with rates of about 5 ``speed`` rad/s; 0: the robot stands."""
+    """Signals (F = samples) of a varied drive with rates of about 5 ``speed`` rad/s; speed 0: the robot stands."""
     rng = np.random.default_rng(0)
     ends = PERIOD * np.arange(1, samples + 1)
     phases = rng.uniform(0, 2 * math.pi, (2, len(robot.wheels)))
@@ -46,34 +46,34 @@ def driven_signals(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> 
 
 
 def _poses(twists: Array, elapsed: Array) -> Array:
-    """A path (F, 3) that turns as the twists do, in a loop about a place beside the origin."""
+    """Poses (F, 3): headings of the twists, positions on a loop beside the origin."""
     heading = 0.3 + PERIOD * np.cumsum(twists[:, 2])
     return np.column_stack([0.5 + 0.8 * np.sin(elapsed), -0.4 + 0.8 * np.cos(1.3 * elapsed), heading])
 
 
 def robots() -> tuple[Robot, Robot]:
-    """Three wheels, and four."""
+    """A robot on three wheels, and one on four."""
     return synthetic_robot(3), synthetic_robot(4)
 
 
 def trial_values(effect: Effect, robot: Robot, seed: int = 0) -> Iterator[Values]:
     """Parameters within their ranges, once for each choice of those that have choices."""
     rng = np.random.default_rng(seed)
-    found = effect.parameters(robot, SESSIONS)
-    free = {each.name: float(rng.uniform(each.low, each.high)) for each in found if not each.choices}
-    shapes = [each for each in found if each.choices]
-    for number in range(max((len(each.choices) for each in shapes), default=1)):
-        yield {each.name: _choice(each, number) if each.choices else free[each.name] for each in found}
+    parameters = effect.parameters(robot, SESSIONS)
+    free = {item.name: float(rng.uniform(item.low, item.high)) for item in parameters if not item.choices}
+    shapes = [item for item in parameters if item.choices]
+    for number in range(max((len(item.choices) for item in shapes), default=1)):
+        yield {item.name: _choice(item, number) if item.choices else free[item.name] for item in parameters}
 
 
 def without(effect: Effect, robot: Robot, values: Values) -> Values:
-    """The same with 0 for all that has no choices."""
-    shapes = {each.name for each in effect.parameters(robot, SESSIONS) if each.choices}
+    """The values, with 0 for parameters without choices: no effect."""
+    shapes = {item.name for item in effect.parameters(robot, SESSIONS) if item.choices}
     return {name: value if name in shapes else 0.0 for name, value in values.items()}
 
 
 def trial_input(effect: Effect, robot: Robot, speed: float = 1.0, samples: int = SAMPLES) -> Input:
-    """What an effect of this kind is called with; speed as for ``driven_signals``."""
+    """Input for an effect of this kind; speed as for ``driven_signals``."""
     if isinstance(effect, MotionEffect):
         return driven_signals(robot, samples, speed)
     if isinstance(effect, ActuatorEffect):
@@ -83,18 +83,18 @@ def trial_input(effect: Effect, robot: Robot, speed: float = 1.0, samples: int =
 
 
 def trial_poses(count: int = SAMPLES) -> Array:
-    """A path (K, 3) that curves, away from the origin."""
+    """Poses (K, 3) on a curved path away from the origin."""
     angle = np.linspace(0.4, 2.4, count)
     return np.column_stack([1.0 + np.cos(angle), -2.0 + np.sin(2 * angle), 0.3 + angle])
 
 
 def motor_input(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> Motors:
-    """Durations and targets of a varied drive."""
+    """Durations (F,), s, and target rates (F, N), rad/s, of a varied drive."""
     return np.full(samples, PERIOD), driven_signals(robot, samples, speed).rates
 
 
 def results(effect: Effect, given: Input, values: Values) -> dict[str, Array]:
-    """What each method of the effect says, by name."""
+    """Results of the effect's methods, by name."""
     if isinstance(given, Signals):
         assert isinstance(effect, MotionEffect)
         return {"correction": effect.correction(given, values)}
@@ -113,22 +113,22 @@ def results(effect: Effect, given: Input, values: Values) -> dict[str, Array]:
 
 
 def changes(effect: Effect, given: Input, values: Values) -> Array:
-    """By how much each row is changed: corrections, wheel rates (F, N), or delays and poses, there and back (K, 8)."""
-    found = results(effect, given, values)
+    """Changes by the effect: of wheel rates or twists (F, n), or of delays and poses, reported and corrected (K, 8)."""
+    outputs = results(effect, given, values)
     changed = {"driven": given[1], "reported": given[1], "corrected": given[1]} if isinstance(given, tuple) else {}
-    return np.column_stack([np.asarray(value) - changed.get(name, 0.0) for name, value in found.items()])
+    return np.column_stack([np.asarray(value) - changed.get(name, 0.0) for name, value in outputs.items()])
 
 
 def arrays(given: Input) -> dict[str, Array]:
     """The arrays of an input by name."""
     if isinstance(given, tuple):
         return {str(number): array for number, array in enumerate(given)}
-    found = {name: getattr(given, name) for name in type(given).__dataclass_fields__}
-    return {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
+    values = {name: getattr(given, name) for name in type(given).__dataclass_fields__}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
 def one_row(given: Signals | Poses, row: int) -> Signals | Poses:
-    """One sample, or one pose, alone."""
+    """The input reduced to one sample or pose."""
     if isinstance(given, Signals):
         alone: dict[str, Any] = {name: value[row : row + 1] for name, value in arrays(given).items()}
         return replace(given, **alone)
@@ -137,4 +137,5 @@ def one_row(given: Signals | Poses, row: int) -> Signals | Poses:
 
 
 def _choice(parameter: Parameter, number: int) -> float:
+    """The choice of that number, counted cyclically."""
     return parameter.choices[number % len(parameter.choices)]

@@ -20,16 +20,16 @@ from omnibench.testing.conformance import Conformance, require
 
 
 class ImporterConformance(Conformance):
-    """What every importer must keep to.
+    """Requirements on every importer.
 
-    source: a sample of what it reads; without one, only its refusals are tried.
+    source: sample recordings; without them, only refusals are tested.
     """
 
     registry = importers
     source: ClassVar[Path | None] = None
 
     def read_sample(self) -> Dataset:
-        """The sample, read; skips the case when there is none."""
+        """The data set read from the sample; skips the case if there is none."""
         if self.source is None:
             raise SkipTest("no sample; set source in a subclass of ImporterConformance")
         dataset = self.make().read(self.source)
@@ -38,23 +38,23 @@ class ImporterConformance(Conformance):
         return dataset
 
     def test_missing_source_is_refused(self) -> None:
-        """DataError, which is one line."""
+        """DataError, in one line."""
         self._require_refusal("a missing source", lambda _: None)
 
     def test_empty_folder_is_refused(self) -> None:
-        """DataError says what was looked for."""
+        """DataError says which files are missing."""
         self._require_refusal("an empty folder", Path.mkdir)
 
     def test_empty_file_is_refused(self) -> None:
-        """DataError names it."""
+        """DataError names the file."""
         self._require_refusal("an empty file", Path.touch)
 
     def test_foreign_file_is_refused(self) -> None:
-        """DataError for bytes that are nobody's recording."""
+        """DataError for bytes that are no recording."""
         self._require_refusal("a file of other content", lambda path: path.write_bytes(_FOREIGN))
 
     def test_folder_of_foreign_files_is_refused(self) -> None:
-        """DataError for a folder that holds only such files."""
+        """DataError for a folder that holds only files of other content."""
 
         def fill(path: Path) -> None:
             path.mkdir()
@@ -64,7 +64,7 @@ class ImporterConformance(Conformance):
         self._require_refusal("a folder of other files", fill)
 
     def test_sample_is_a_valid_data_set(self) -> None:
-        """Shapes, times and splits are those that the reading of a data set folder demands."""
+        """Shapes, times and splits are as in a data set folder."""
         dataset = self.read_sample()
         wheels = len(dataset.robot.wheels)
         require(len(dataset.trajectories) > 0, "the data set has no trajectory; make it with make_dataset")
@@ -82,26 +82,26 @@ class ImporterConformance(Conformance):
             require(bool((steps > 0).all()), f"{place}: times must increase")
 
     def test_sample_raises_no_warning(self) -> None:
-        """``make_dataset`` warns of units and wheels that cannot be right."""
+        """``make_dataset`` does not warn of implausible units or wheels."""
         warnings = self.read_sample().warnings
         require(not warnings, f"the data set warns: {'; '.join(warnings)}")
 
     def test_sample_saves_and_loads_back_equal(self) -> None:
-        """The data set folder holds everything that the importer found."""
+        """Saving to a data set folder loses nothing."""
         dataset = self.read_sample()
         with tempfile.TemporaryDirectory() as folder:
             save_dataset(dataset, Path(folder) / "dataset")
             loaded = load_dataset(Path(folder) / "dataset")
         difference = _difference(dataset, loaded)
         require(not difference, f"saving and loading changes {difference}")
-        require(dataset.hash == loaded.hash, "the data set is another one after saving and loading")
+        require(dataset.hash == loaded.hash, "the hash of the data set changes by saving and loading")
 
     def test_sample_reads_the_same_twice(self) -> None:
-        """Nothing depends on the order of files on the disk, on the time or on chance."""
+        """The result does not depend on the order of files on the disk, the time or chance."""
         require(self.read_sample().hash == self.read_sample().hash, "two readings gave different data sets")
 
     def test_sample_is_left_unchanged(self) -> None:
-        """An importer only reads."""
+        """The files of the sample are not changed."""
         before = _fingerprint(self.source)
         self.read_sample()
         require(before == _fingerprint(self.source), f"it changed the files of {self.source}")
@@ -124,7 +124,7 @@ _FOREIGN = b"\x89PNG\r\n\x1a\n not a recording; \xff\xfe\x00 1,2,3\n"
 
 
 def _difference(made: Dataset, loaded: Dataset) -> str:
-    """The first value that is another one, or of another type, in the second data set."""
+    """The first difference in value or type between two data sets, in words; empty if there is none."""
     if (made.robot, made.sample_period) != (loaded.robot, loaded.sample_period):
         return "the robot or the sample period"
     for before, after in zip(made.trajectories, loaded.trajectories, strict=True):

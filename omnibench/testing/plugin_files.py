@@ -1,4 +1,4 @@
-"""Plug-ins from their authors' side: writing the first version of one, and checking one."""
+"""Scaffolding a plug-in file, and running the conformance cases on one."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ _SUITES: dict[Registry[Any], type[Conformance]] = {
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What the conformance cases say of one plug-in file."""
+    """Results of the conformance cases on one plug-in file."""
 
     path: Path
     results: tuple[CaseResult, ...]
 
     @property
     def passed(self) -> bool:
-        """Whether no case failed."""
+        """True if no case failed."""
         return all(result.passed for result in self.results)
 
     @property
@@ -51,10 +51,10 @@ class CheckReport:
 
 
 def new_plugin(name: str, kind: str = "calibrator", folder: Path | str = "plugins") -> list[Path]:
-    """Write a working plug-in ``<name>.py`` and its test ``test_<name>.py`` into ``folder``; the files written.
+    """Write a working plug-in ``<name>.py`` and its test ``test_<name>.py`` into ``folder``; return the files written.
 
-    ConfigError: ``kind`` is unknown, ``name`` is no identifier in lower case or is taken, or a file is there already.
-    DataError: the disk refuses.
+    ConfigError: ``kind`` is unknown, ``name`` is no identifier in lower case or is taken, or a file exists already.
+    DataError: a file cannot be written.
     """
     if kind not in PLUGIN_KINDS:
         raise UnknownNameError("kind of plug-in", kind, PLUGIN_KINDS)
@@ -77,18 +77,20 @@ def new_plugin(name: str, kind: str = "calibrator", folder: Path | str = "plugin
 
 
 def check_plugin(path: Path | str, sample: Path | str | None = None) -> CheckReport:
-    """Load a plug-in file and run the conformance cases on everything that it registers.
+    """Load a plug-in file and run the conformance cases on every class that it registers.
 
-    sample: recordings that an importer among them reads; without it an importer's refusals alone are tried.
+    sample: recordings for an importer; without them only its refusals are tested.
     PluginError, in one line: there is no such file, it cannot be imported, or it registers nothing.
     """
     path = Path(path)
     load_plugin(path)
-    found = registered_from(path)
-    if not found:
+    registered = registered_from(path)
+    if not registered:
         raise PluginError(f"{path} registers nothing; decorate a class with @calibrators.register(...), for example")
     source = None if sample is None else Path(sample)
-    return CheckReport(path, tuple(result for registry, entry in found for result in _check(registry, entry, source)))
+    return CheckReport(
+        path, tuple(result for registry, entry in registered for result in _check(registry, entry, source))
+    )
 
 
 def _check(registry: Registry[Any], entry: Entry[Any], source: Path | None) -> list[CaseResult]:

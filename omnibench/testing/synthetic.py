@@ -1,4 +1,4 @@
-"""A small calibration problem whose answer is known: recordings without noise of a robot that is not as designed."""
+"""A small calibration problem with a known answer: noise-free recordings of a robot that differs from its design."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, WheelLog
 
-PERIOD = 0.2  # s
-_SAMPLES = 20
+PERIOD = 0.2  # s, of wheel samples
+_SAMPLES = 20  # of a run
 _SPEED = 0.25  # m/s
-# What the robot really is, as a share of the design. One factor for all distances keeps zeros of the matrix zero, so
-# that the answer lies in every box that omnibench knows.
+# True radii and distances as shares of the design values. One factor for all distances keeps zeros of the matrix zero,
+# so that the answer lies in every box that omnibench offers.
 _RADII = (1.04, 0.97, 1.02, 0.99)
 _DISTANCE = 1.06
-_PATIENCE = 100  # calls after BudgetSpent that are refused before the run is broken off
+_PATIENCE = 100  # calls after BudgetSpent that are refused before the run is stopped
 
 
-class Runaway(BaseException):  # not an Exception: whoever swallows BudgetSpent would swallow it too
-    """Ends a run that goes on asking for costs when nothing is left."""
+class Runaway(BaseException):  # no Exception: a calibrator that swallows BudgetSpent would swallow it, too
+    """Ends a run that keeps asking for costs after the budget is spent."""
 
 
 def synthetic_robot(wheels: Literal[3, 4] = 3) -> Robot:
@@ -48,7 +48,7 @@ def synthetic_robot(wheels: Literal[3, 4] = 3) -> Robot:
 
 
 def true_robot(robot: Robot) -> Robot:
-    """The robot as it really is: radii 3 % less to 4 % more than designed, distances 6 % more."""
+    """The true robot: radii 3 % below to 4 % above the design, distances 6 % above."""
     wheels = (
         wheel.model_copy(update={"radius": wheel.radius * share, "distance": wheel.distance * _DISTANCE})
         for wheel, share in zip(robot.wheels, _RADII, strict=False)
@@ -77,11 +77,11 @@ def synthetic_dataset(wheels: Literal[3, 4] = 3) -> Dataset:
 
 
 class ObservedProblem(CalibrationProblem):
-    """A calibration problem that takes down how it is used.
+    """A calibration problem that records how it is used.
 
-    strays: candidates outside the box. uncounted: candidates evaluated past the budget's count, by ``values``.
-    refusals: calls of ``cost`` that BudgetSpent answered. ``undefined`` says where in the unit cube of the free
-    elements the cost is NaN: points (P, free) to (P,) of bool.
+    strays: candidates outside the box. uncounted: candidates evaluated by ``values``, which the budget does not count.
+    refusals: calls of ``cost`` that raised BudgetSpent. undefined: maps points (P, f) of the unit cube of the f free
+    elements to (P,) of bool, True where the cost is NaN.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class ObservedProblem(CalibrationProblem):
         self._counting = False
 
     def cost(self, candidates: Array) -> Array:
-        """As every problem, taking down what is asked for."""
+        """Costs (P,) as in every problem; records candidates outside the box and refused calls."""
         vectors = np.array(candidates, dtype=float, ndmin=2)
         if vectors.shape[1:] == self.start.shape:
             self.strays.extend(vectors[np.logical_not(self.inside(vectors))])
@@ -114,7 +114,7 @@ class ObservedProblem(CalibrationProblem):
             self._counting = False
 
     def values(self, candidates: Array) -> Array:
-        """As every problem, but NaN where the cost is undefined."""
+        """Costs (P,) as in every problem, but NaN where the cost is undefined."""
         if not self._counting:
             self.uncounted += len(candidates)
         values = super().values(candidates)
@@ -136,7 +136,7 @@ def synthetic_problem(
 ) -> ObservedProblem:
     """The problem of Eq. (6) on the recordings; its least cost is 0, up to rounding.
 
-    fixed: with a box that holds some elements at their start (zeros of the matrix, or the wheels' angles).
+    fixed: use a box that fixes some elements (zeros of the matrix, or the wheels' angles).
     """
     robot = synthetic_robot(wheels)
     runs = synthetic_trajectories(robot) if trajectories is None else tuple(trajectories)

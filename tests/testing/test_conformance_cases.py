@@ -285,7 +285,7 @@ CASES_OF_CALIBRATORS = [
     (SwallowsBudgetSpent, "budget is kept", "swallowed BudgetSpent"),
     (DiesOnNan, "nan cost is survived", "calibrate raised ValueError: NaN in costs"),
     (PrefersNan, "nan cost is survived", "the answer's cost is not finite"),
-    (CountsOnNine, "four wheels are met", "calibrate raised ValueError"),
+    (CountsOnNine, "four wheels work", "calibrate raised ValueError"),
     (Prints, "it works in silence", "it printed 'generation"),
     (LeavesFiles, "it works in silence", "search.log"),
     (ReturnsVector, "bounds are kept", "calibrate returned ndarray, expected a Solution"),
@@ -419,7 +419,7 @@ class InPlaceCost(GoodCost):
 
 
 CASES_OF_COSTS = [
-    (ScalarCost, "one cost a candidate", "shape ()"),
+    (ScalarCost, "every candidate has one cost", "shape ()"),
     (NegativeCost, "costs are finite and not negative", "negative"),
     (OffsetCost, "no error costs nothing", "errors of zero cost 1"),
     (OffsetCost, "exact recordings cost nothing", "the true matrix costs 1"),

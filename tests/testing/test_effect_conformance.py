@@ -134,9 +134,9 @@ CALLS = count()
 
 BROKEN: dict[str, tuple[type[Effect], str, str]] = {
     "no docstring": (honest(__doc__=None), "class and options are documented", "has no docstring"),
-    "no physics": (honest(physics=" "), "physics and source are told", "physics is missing"),
-    "no source": (honest(source=""), "physics and source are told", "source is missing"),
-    "no covariate": (honest(shows_in=""), "physics and source are told", "shows_in is missing"),
+    "no physics": (honest(physics=" "), "physics and source are given", "physics is missing"),
+    "no source": (honest(source=""), "physics and source are given", "source is missing"),
+    "no covariate": (honest(shows_in=""), "physics and source are given", "shows_in is missing"),
     "an unknown stage": (honest(stage="tyre"), "stage is one of its kind", "stage is 'tyre'; of a MotionEffect"),
     "another kind's stage": (honest(stage="reference"), "stage is one of its kind", "one of wheel, clock, body, world"),
     "a reference effect on wheels": (
@@ -145,12 +145,16 @@ BROKEN: dict[str, tuple[type[Effect], str, str]] = {
         "stage is 'wheel'; of a ReferenceEffect it is one of reference",
     ),
     "an unknown need": (honest(needs=frozenset({"weather"})), "needs are known", "['weather']; known are wheel_angles"),
-    "no parameter": (honest(given=()), "parameters have units and plausible ranges", "no parameter that is 0"),
+    "no parameter": (
+        honest(given=()),
+        "parameters have units and plausible ranges",
+        "a parameter without choices",
+    ),
     "a list of parameters": (honest(given=[GAIN]), "parameters have units and plausible ranges", "tuple of Parameter"),
     "only a shape": (
         with_parameter(choices=(0.05,)),
         "parameters have units and plausible ranges",
-        "no parameter that is 0",
+        "a parameter without choices",
     ),
     "no unit": (with_parameter(unit=""), "parameters have units and plausible ranges", "'k' has no unit"),
     "no description": (
@@ -182,7 +186,7 @@ BROKEN: dict[str, tuple[type[Effect], str, str]] = {
     "names that change": (
         honest(parameters=lambda *_: (replace(GAIN, description=f"{next(CALLS)}"),)),
         "parameters have names of their own",
-        "gives others the second time",
+        "gives other parameters in a second call",
     ),
     "three wheels only": (
         correcting(lambda signals, values: values["k"] * signals.rates[:, :3]),
@@ -221,13 +225,21 @@ BROKEN: dict[str, tuple[type[Effect], str, str]] = {
         "not linear in its parameters",
     ),
     "work in place": (correcting(scales_in_place), "inputs are left unchanged", "it changed its arguments"),
-    "a sum over samples": (correcting(smooths), "each sample is corrected by itself", "row 7 of a batch is not what"),
-    "a mean over samples": (correcting(takes_the_mean), "each sample is corrected by itself", "must not look at other"),
-    "the global generator": (correcting(trembles), "it says the same again", "it draws random numbers"),
-    "a generator of its own": (correcting(trembles_by_itself), "it says the same again", "says something else"),
+    "a sum over samples": (
+        correcting(smooths),
+        "each sample is corrected by itself",
+        "row 7 differs",
+    ),
+    "a mean over samples": (
+        correcting(takes_the_mean),
+        "each sample is corrected by itself",
+        "must not depend on other",
+    ),
+    "the global generator": (correcting(trembles), "results are reproducible", "it draws random numbers"),
+    "a generator of its own": (correcting(trembles_by_itself), "results are reproducible", "results differ"),
     "angles it did not ask for": (
         correcting(lambda signals, values: values["k"] * np.cos(signals.wheel_angles)),
-        "it does with what it needs",
+        "needs names all that is used",
         "name it in needs",
     ),
     "a correction the wrong way": (
@@ -252,13 +264,13 @@ BROKEN: dict[str, tuple[type[Effect], str, str]] = {
     ),
     "motors that foresee": (
         type("Wrong", (HonestActuator,), {"__doc__": "Wrong.", "driven": lambda _, __, t, v: t + v["k"] * t[-1]}),
-        "motors know nothing of what comes",
+        "motors are causal",
         "later targets change earlier wheel rates",
     ),
     "motors that creep": (
         type("Wrong", (HonestActuator,), {"__doc__": "Wrong.", "driven": lambda _, __, t, v: t + v["k"]}),
-        "motors know nothing of what comes",
-        "the wheels turn though no target ever said so",
+        "motors are causal",
+        "the wheels turn though all targets are 0",
     ),
 }
 
@@ -304,7 +316,7 @@ class TestOnTheCommandLine:
     def test_an_effect_is_listed_with_where_it_comes_from(self, command: Command) -> None:
         command("plugin", "new", "listed_slip", "--effect")
         rows = [line for line in command("list").stdout.splitlines() if "listed_slip" in line]
-        assert "The robot falls behind its wheels" in rows[0]
+        assert "The faster the robot drives" in rows[0]
         assert "listed_slip.py" in "".join(rows)
         assert "built in" in next(line for line in command("list").stdout.splitlines() if "heading_drift" in line)
 
