@@ -65,8 +65,12 @@ def test_a_replay_can_name_another_recording(workplace: Path) -> None:
 
 
 def test_ctrl_c_ends_a_replay_with_what_it_has_shown(workplace: Path) -> None:
-    with Command("live", workplace / "node.yaml", "--replay", "--speed", "1") as demonstration:
-        time.sleep(4)
+    config = workplace / "node.yaml"
+    with Command("live", config, "--replay", "--speed", "1") as demonstration:
+        session, samples = wait_for(endpoint(config)), list[zenoh.Sample]()
+        _subscriber = session.declare_subscriber("apr/odom", samples.append)
+        until(lambda: samples, "odometry of the replay", 20.0)
+        session.close()
         out, said = demonstration.stop(signal.SIGINT)
     assert demonstration.process.returncode == 130
     assert "stopped after" in out
@@ -101,7 +105,7 @@ def test_a_recording_goes_out_and_comes_back_as_a_calibration_that_is_swapped_in
         swapped = omnibench("swap", "apr", workplace / "again.yaml", "--connect", endpoint(config))
         assert swapped.returncode == 0, swapped.stderr
         assert swapped.stdout == f"apr: {again.name} runs\n"
-        assert "begins with the old one" in swapped.stderr  # the config has no state
+        assert "begins with the old calibration" in swapped.stderr  # the config has no state
         assert ask(session, "omnibench/apr/info")["calibration"] == again.name
         for name, file, reason in (
             ("apr", CONFIGS / "live.yaml", "is this a calibration file?"),
@@ -217,17 +221,17 @@ def test_joints_for_other_wheels_are_refused_in_one_line(command: InProcess, tmp
 
 def wait_for(address: str) -> zenoh.Session:
     """A client, once the node is up."""
-    found: list[zenoh.Session] = []
+    sessions: list[zenoh.Session] = []
 
     def connected() -> bool:
         try:
-            found.append(raw_session("client", connect=[address]))
+            sessions.append(raw_session("client", connect=[address]))
         except zenoh.ZError:
             return False
         return True
 
     until(connected, "a node", 20.0)
-    return found[0]
+    return sessions[0]
 
 
 def ask(session: zenoh.Session, key: str) -> dict[str, object]:
