@@ -1,1 +1,1 @@
-"""Where simulation and measurement disagree, what is missing, and how much better the model is with it."""
+"""Discovery of effects that the model of a robot lacks: where they show, which they are, how much better it gets."""

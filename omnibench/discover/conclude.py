@@ -118,7 +118,7 @@ def _warnings(held_out: Sequence[HeldOut]) -> Iterator[str]:
 
 
 def _notes(findings: Findings) -> Iterator[str]:
-    """What a reader must know of the runs, the noise, the encoders, the nuisances, and imitations of effects."""
+    """Notes on the runs, the noise, the encoders, the nuisances, and effects that others could imitate."""
     fit = findings.extended.fit
     commands = len({run.command for run in fit.runs if run.command is not None})
     if len(fit.runs) < _FEW_RUNS or 0 < commands < _FEW_COMMANDS:

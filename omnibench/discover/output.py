@@ -53,7 +53,7 @@ def write_discovery(discovery: Discovery, options: DiscoverOptions, folder: Path
     written to or holds other files; it is then left as it was.
     """
     check_output(folder)
-    chosen = folder or new_results_folder(RESULTS / _plain(discovery.dataset.name))
+    chosen = folder or new_results_folder(RESULTS / _folder_name(discovery.dataset.name))
     try:
         write_files(_contents(discovery, options, chosen))
     except BaseException:
@@ -108,6 +108,6 @@ def residual_table(discovery: Discovery) -> pl.DataFrame:
     return pl.DataFrame(columns, schema_overrides={"command": pl.String})
 
 
-def _plain(name: str) -> str:
+def _folder_name(name: str) -> str:
     """A name as one that a folder can have."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("_.") or "dataset"

@@ -87,7 +87,7 @@ class Absorbed:
 
 @dataclass(frozen=True)
 class Hidden:
-    """How large an effect could still be without having been found.
+    """Sizes of an effect that was not found: how large it could still be, and from where on it is found.
 
     limit: its parameter lies within +-limit with 95 %. detectable: size from which on it is found nearly always.
     plausible: the largest size that its catalogue entry expects.

@@ -86,7 +86,7 @@ def incomplete() -> Discovery:
 
 
 def poor(found: Discovery) -> Discovery:
-    """The same of recordings of which little is known: no wheel angles, no order, no commands, no held-out runs."""
+    """The discovery as of recordings that lack wheel angles, order, commands and held-out runs."""
     dataset = shorn(
         found.dataset, angles=None, session=None, started_at=None, command=None, v=None, alpha=None, omega=None,
         distance=None, duration=None, repetition=None, targets=None,

@@ -1,4 +1,4 @@
-"""What real recordings lack or have too much of, and what is said then."""
+"""Recordings that lack something or have too much of it, and what discover says of them."""
 
 from __future__ import annotations
 

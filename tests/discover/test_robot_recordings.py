@@ -1,4 +1,4 @@
-"""What discover says of recordings that hold a real chain's artefacts: late motors, encoder ticks, a late reference."""
+"""Recordings with a real chain's artefacts (late motors, encoder ticks, a late reference) do not mislead discover."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""How well models predict runs that they were not fitted to: folds of the training runs, and the validation split."""
+"""Runs that a model was not fitted to, and its errors on them: folds of the training runs, and the validation split."""

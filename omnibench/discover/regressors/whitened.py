@@ -130,7 +130,7 @@ class Given:
 
 
 def given(data: Whitened, index: Sequence[int]) -> Given:
-    """What all columns add once the columns ``index`` are fitted."""
+    """Schur complement of all columns once the columns ``index`` are fitted."""
     return _beyond(data.information, data.scores, np.diag(data.information).copy(), index)
 
 

@@ -21,7 +21,7 @@ _FEW = 6  # shapes of an effect: with more of them, one comes near enough to any
 
 
 class Missing(Enum):
-    """What recordings lack, so that an effect cannot be looked for; the value is the reason in words."""
+    """Data that recordings lack, so that an effect cannot be looked for; each value is the reason in words."""
 
     WHEEL_ANGLES = "the wheels' absolute angles were not recorded (columns phi_*)"
     START_TIMES = "when the runs were driven was not recorded (column started_at)"

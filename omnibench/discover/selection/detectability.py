@@ -1,4 +1,4 @@
-"""Detectability: what these recordings can tell at all.
+"""Detectability: limits of what recordings can tell of effects.
 
 Absorbed effects, classes of effects that look alike, sums of effects that imitate another, and how large an effect
 could still hide.
@@ -30,7 +30,7 @@ _DETECTED = 5.5  # standard errors from which on an effect is found nearly alway
 
 @dataclass(frozen=True)
 class Detectability:
-    """What recordings can tell.
+    """Limits of what recordings can tell of effects.
 
     absorbed: effects that the matrix reproduces. not_looked_for: effects with what the recordings lack for them.
     classes: names of effects that look alike. sums: effects, and the others that imitate each together. hidden: sizes
@@ -45,7 +45,7 @@ class Detectability:
 
 
 def detectability_of(screening: Screening, selection: Selection) -> Detectability:
-    """What the screened recordings can tell beyond the matrix, and what could hide beside the selected effects."""
+    """Detectability of effects beyond the matrix, and sizes that could hide beside the selected effects."""
     start, visible = screening.beyond_matrix(), _visible(screening)
     return Detectability(
         absorbed=_absorbed(screening, start),
@@ -122,7 +122,7 @@ def _made_by(start: Given, group: Group, *others: Group) -> float:
 
 
 def _hidden(screening: Screening, selection: Selection, visible: Sequence[Group]) -> tuple[Hidden, ...]:
-    """How large effects could still be that were neither selected nor are confusable with one that was."""
+    """Sizes of effects that were neither selected nor are confusable with one that was."""
     excluded = {group.name for group in selection.chosen} | {name for names in selection.confusable for name in names}
     spread = float(np.median(selection.left.spread))  # by how much chance exceeds the noise model
     now = given(screening.data, screening.index_with(selection.chosen))

@@ -1,4 +1,4 @@
-"""Evidence of sets of effects, and how likely their names are right; their idealised forms are allowed for.
+"""Evidence of sets of effects, and credibility of their names; their idealised forms are allowed for.
 
 Every set A of at most m effects lowers the whitened chi-square by Q(A) and costs what its parameters (a g-prior, as
 wide as the data say: Liang et al. 2008) and its choice among the catalogue are worth. The form that the catalogue gives
@@ -80,7 +80,7 @@ def effect_sets(start: Given, pool: Sequence[Group], most: int) -> EffectSets:
 
 @dataclass(frozen=True)
 class Credibility:
-    """How likely chosen names are right. left_share: share of the chi-square that generic bases still find."""
+    """Probability that chosen names are right. left_share: share of the chi-square that generic bases still find."""
 
     left_share: float
     probability: float
@@ -89,7 +89,7 @@ class Credibility:
 def credibility_of(
     sets: EffectSets, start: Given, chosen: Sequence[Group], left: Significance, beyond: Significance
 ) -> Credibility:
-    """How likely the names of chosen effects are right, by what generic bases still find.
+    """Probability that the names of chosen effects are right, by what generic bases still find.
 
     left: significance of the bases after the effects. beyond: after the effects in slightly different forms, too.
     """

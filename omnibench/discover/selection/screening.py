@@ -33,7 +33,7 @@ class Screening:
     quantisation: EncoderQuantisation | None = None
 
     def beyond_matrix(self) -> Given:
-        """What all columns add once the matrix is fitted."""
+        """Schur complement of all columns once the matrix is fitted."""
         return given(self.data, self.groups.matrix.index)
 
     def index_with(self, chosen: Sequence[Group]) -> list[int]:

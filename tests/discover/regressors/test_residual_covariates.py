@@ -18,7 +18,7 @@ from omnibench.discover.report.residuals import NORMAL_95, Residuals, shares
 
 @pytest.fixture(scope="module")
 def eccentric() -> Residuals:
-    """Of a robot with an eccentric wheel a and a late reference."""
+    """Residuals of a robot with an eccentric wheel a and a late reference."""
     return Residuals(discover_effects(simulated(ECCENTRICITY + DELAY)))
 
 

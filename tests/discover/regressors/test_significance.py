@@ -1,4 +1,4 @@
-"""Chance, with all that was looked at counted."""
+"""Significance, corrected for all groups that were tried."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What columns say about residuals, against plain least squares."""
+"""Chi-square differences and estimates of whitened columns, against plain least squares."""
 
 from __future__ import annotations
 
