@@ -1,4 +1,4 @@
-"""How fast candidates are evaluated, as ratios against direct NumPy in the same run.
+"""Speed of evaluating candidates, as ratios against direct NumPy in the same run.
 
     pytest --dist no tests/benchmarks/bench_evaluator.py
 
@@ -29,7 +29,7 @@ BATCH = 200
 
 @cache
 def flower_problem(sample_period: float = 0.01, cost: str = "final_pose") -> CalibrationProblem:
-    """The problem of the config, at one sampling rate or another."""
+    """The problem of the config at a given sampling rate."""
     config = read_compare_config(CONFIG)
     ((name, source),) = config.datasets.items()
     simulated = source.simulate.model_copy(update={"sample_period": sample_period, "validation": None})
@@ -47,7 +47,7 @@ def flower_problem(sample_period: float = 0.01, cost: str = "final_pose") -> Cal
 
 
 def candidates(problem: CalibrationProblem, count: int = BATCH) -> Array:
-    """Candidates all over the box."""
+    """Uniform random candidates in the box."""
     return problem.from_unit(np.random.default_rng(0).uniform(size=(count, int(problem.free.sum()))))
 
 
@@ -136,7 +136,7 @@ def test_ten_times_the_sampling_rate(benchmark) -> None:
         problem.cost(candidates(problem))
     population = candidates(fast)
     benchmark.pedantic(fast.cost, (population,), rounds=300, warmup_rounds=20)
-    # Turn by turn, so that whatever else the machine does meets both.
+    # In turns, so that other load on the machine slows both down.
     pairs = [
         (median_seconds(lambda: fast.cost(population), 5), median_seconds(lambda: slow.cost(population), 5))
         for _ in range(40)

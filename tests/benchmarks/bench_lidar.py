@@ -1,4 +1,4 @@
-"""How fast a room is scanned, as a ratio against plain NumPy in the same run.
+"""Speed of scanning a room, as a ratio against plain NumPy in the same run.
 
     pytest --dist no tests/benchmarks/bench_lidar.py
 

@@ -1,4 +1,4 @@
-"""How much faster than real time a session drives, and than the same loop in plain Python.
+"""Speed of driving a session, against real time and against the same loop in plain Python.
 
     pytest --dist no tests/benchmarks/bench_motors.py
 
@@ -53,7 +53,7 @@ def drive(told: list[Array]) -> list[DrivenRun]:
 
 
 def timed_short_run() -> tuple[float, str]:
-    """Seconds for the first half second of a run, and a hash of what came out."""
+    """Seconds that the first half second of a run takes, and a hash of its result."""
     told = [targets()[0][:50]]
     drive([told[0][:1]])
     started = time.perf_counter()
@@ -77,7 +77,7 @@ def test_planning_a_session(benchmark: BenchmarkFixture) -> None:
 
 
 def test_the_loop_against_plain_python(benchmark: BenchmarkFixture) -> None:
-    """The same source, once compiled and once interpreted, in a process of its own; the results are the same bits."""
+    """The loop compiled and interpreted, the latter in a process of its own, gives the same bits."""
     seconds, bits = benchmark.pedantic(timed_short_run, rounds=1)
     code = "from bench_motors import timed_short_run; print(*timed_short_run())"
     here = os.path.dirname(__file__)

@@ -1,4 +1,4 @@
-"""How often closed_form's 95 % bootstrap intervals hold the hidden matrix, over many seeds of the simulated flower.
+"""Coverage of closed_form's 95 % bootstrap intervals, over many seeds of the simulated flower.
 
     python tests/benchmarks/bootstrap_coverage.py --seeds 100
 

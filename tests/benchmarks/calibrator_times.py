@@ -1,4 +1,4 @@
-"""How long the calibrators take on the simulated flower, in seconds and in direct evaluations of Eq. (6).
+"""Time of the calibrators on the simulated flower, in seconds and in direct evaluations of Eq. (6).
 
     python tests/benchmarks/calibrator_times.py [NAME ...]
 

@@ -1,4 +1,4 @@
-"""What discover says of a robot that is simulated from command to SLAM, with nothing hidden in it.
+"""Verdicts of discover on a robot that is simulated from command to SLAM, without any hidden effect.
 
     python tests/benchmarks/chain_study.py --seeds 3 --variants plain latency coarse
 
@@ -44,7 +44,7 @@ def config_of(variant: str, seed: int, **changes: Any) -> RobotConfig:
 
 
 def false_names(found: Discovery) -> list[str]:
-    """Names of what is not there."""
+    """Names of effects that are not there."""
     return [effect.name for effect in found.effects if effect.name not in ARTEFACTS]
 
 

@@ -1,4 +1,4 @@
-"""Prints what a benchmark found beside its times: ratios, differences, sizes."""
+"""Prints the figures of a benchmark beside its times: ratios, differences, sizes."""
 
 from __future__ import annotations
 

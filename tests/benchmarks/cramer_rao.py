@@ -1,4 +1,4 @@
-"""Whether trajectory_ml reaches the Cramer-Rao bound, and its 95 % intervals hold the truth 95 times in 100.
+"""Efficiency of trajectory_ml against the Cramer-Rao bound, and coverage of its 95 % intervals.
 
     python tests/benchmarks/cramer_rao.py --sets 1000 --workers 2
 
@@ -76,7 +76,7 @@ def flower(noise: EncoderNoise, seed: int = 1) -> FlowerConfig:
 
 
 def cramer_rao_bound(config: FlowerConfig) -> Array:
-    """The least covariance (9, 9) of the matrix elements that an unbiased estimator can have on such a data set.
+    """Cramer-Rao bound (9, 9) on the covariance of the matrix elements on such a data set.
 
     The poses less the odometry scatter by the reference's noise and, through the derivatives of the poses by every
     wheel rate, by the encoders'. That the rates in the derivatives are noisy themselves is of second order.
@@ -119,7 +119,7 @@ def _derivative(function: object, point: Array, step: float) -> Array:
 
 @dataclass(frozen=True)
 class Fitted:
-    """What came of one data set: errors (9,) of the elements, whether the intervals hold them, and the robust way."""
+    """Result on one data set: errors, covered (9,): of the elements. robust: True if the covariance is from scatter."""
 
     errors: Array
     covered: Array

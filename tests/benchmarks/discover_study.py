@@ -1,4 +1,4 @@
-"""How well ``omnibench discover`` finds what is hidden: the table of issue 5, from sets that it has never met.
+"""Study of ``omnibench discover``: how often it names a hidden effect, on sets made without its code.
 
     python tests/benchmarks/discover_study.py --out study.jsonl [--seeds 20] [--only single --only null] [--quick]
 
@@ -53,7 +53,7 @@ def carry_out_all(missing: Sequence[Task], path: Path, jobs: int) -> list[Result
 
 
 def _end_at_a_whole_line(path: Path) -> None:
-    """What was being written when a study was stopped goes."""
+    """Remove a last line that was cut off when a study was stopped."""
     if path.exists():
         written = path.read_bytes()
         with path.open("r+b") as file:
@@ -61,7 +61,7 @@ def _end_at_a_whole_line(path: Path) -> None:
 
 
 def print_tables(results: Sequence[Result]) -> None:
-    """What was answered for every effect, then the issue's table, then what it does not ask for."""
+    """Print the answers for every effect, then the main table, then further figures."""
     print("Simulated recordings, 180 + 180 runs each. Rates with their 95 % intervals (Wilson).\n")
     print("\n".join(effect_lines(results)), "\n")
     _print_rows("issue 5", issue_table(results))

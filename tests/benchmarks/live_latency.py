@@ -1,4 +1,4 @@
-"""How quick the live node is, between processes on loopback, as ratios to a bare Zenoh echo measured in the same run.
+"""Latency of the live node between processes on loopback, relative to a bare Zenoh echo in the same run.
 
     python tests/benchmarks/live_latency.py [--seconds 20] [--robots 50]
 

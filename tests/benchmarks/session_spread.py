@@ -1,4 +1,4 @@
-"""Whether intervals are honest against the spread between sessions of a real robot.
+"""Calibration intervals of single sessions of a real robot against the spread between sessions.
 
     python tests/benchmarks/session_spread.py DATASET      # for example omni3, imported: its training split
 

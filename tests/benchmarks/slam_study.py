@@ -1,4 +1,4 @@
-"""How accurate SLAM is in each room, and whether its covariances are honest.
+"""Accuracy of SLAM in each room, and consistency of its covariances.
 
     python tests/benchmarks/slam_study.py --runs 36 --rooms furnished_room hall corridor --starts odometry last_pose
 

@@ -1,4 +1,4 @@
-"""How often the 95 % intervals of a calibration hold the hidden matrix and geometry, over many simulated flowers.
+"""Coverage of the 95 % intervals of a calibration for matrix and geometry, over many simulated flowers.
 
     python tests/benchmarks/uncertainty_coverage.py --seeds 200
 

@@ -1,1 +1,1 @@
-"""Recordings in which something is hidden: the exam of ``omnibench discover``, made without any of the model's code."""
+"""Recordings with hidden effects, made without the model's code, to test ``omnibench discover``."""

@@ -1,4 +1,4 @@
-"""What must never be the answer: absorbed effects and nuisances; and effects between targets and wheels."""
+"""Effects that must never be the answer: absorbed effects and nuisances; and effects between targets and wheels."""
 
 from __future__ import annotations
 

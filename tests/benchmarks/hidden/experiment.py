@@ -1,4 +1,4 @@
-"""Which runs a robot drives in a blind experiment: commands, order, sessions, start poses; nothing of the truth."""
+"""Plan of a blind experiment: commands, order, sessions and start poses of the runs, without the truth."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Run:
 
     @property
     def stamps(self) -> Array:
-        """Of the reference poses, the first at 0, the last at the end; s."""
+        """Stamps of the reference poses, the first at 0, the last at the end; s."""
         end = self.command.samples * SAMPLE
         between = POSE * np.arange(math.ceil(round(end / POSE, 9)))
         return np.append(between, end)

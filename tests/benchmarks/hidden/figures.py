@@ -1,4 +1,4 @@
-"""The figures of the issue's table, with their intervals, from the results of a study."""
+"""Figures of the main table, with their intervals, from the results of a study."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _outside(judged: Judgement) -> bool:
 
 
 def issue_table(results: Sequence[Result]) -> list[Row]:
-    """The table of issue 5."""
+    """The main table."""
     strong, medium = of_group(results, "single", level=STRONG), of_group(results, "single", level=MEDIUM)
     outside = of_group(results, "outside", level=STRONG)
     judged = [each.judgement for each in strong if each.judgement]
@@ -86,7 +86,7 @@ def issue_table(results: Sequence[Result]) -> list[Row]:
 
 
 def further_table(results: Sequence[Result]) -> list[Row]:
-    """What the issue does not ask for, or wants apart."""
+    """Further figures, which the main table does not contain."""
     strong, weak = (of_group(results, "single", level=level) for level in (STRONG, WEAK))
     null, every = of_group(results, "null"), of_group(results, "single", "null", "pair", "outside", "matched")
     noises = sorted({each.noise for each in null})

@@ -1,4 +1,4 @@
-"""What a hidden effect is: the catalogue's form (matched), another as nature may have it (blind), and its size.
+"""Forms of a hidden effect: the catalogue's (matched), another as nature may have it (blind), and its size.
 
 A form turns the steps of a grid, values and a source of chance into a correction. The chance holds what the catalogue
 has no parameter for: saturation, second harmonics, jitter. It is drawn anew, and alike, at every call.

@@ -1,4 +1,4 @@
-"""What a discovery got right, against a truth that it never saw."""
+"""Judging a discovery against the truth, which it never saw."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Judgement(Model):
 
     @property
     def outcome(self) -> Outcome:
-        """Of the first name. A name without confidence under the verdict "unknown" is no answer."""
+        """Verdict on the first name. A name without confidence under the verdict "unknown" is no answer."""
         if not self.names or self.verdict in ("none", "unknown"):
             return "none" if self.verdict == "none" else "unknown"
         first = self.names[0]

@@ -1,4 +1,4 @@
-"""How a robot of known truth moves: midpoint steps of a millisecond, of all runs at once.
+"""Motion of a robot of known truth: midpoint steps of a millisecond, of all runs at once.
 
 Nothing here is shared with the odometry that the exam is about: other signals, another step, another rule.
 """
@@ -118,7 +118,7 @@ class Grid:
 
     @cached_property
     def travelled(self) -> Array:
-        """Way since the start of the run (n,), m."""
+        """Distance since the start of the run (n,), m."""
         return self._until_middle(self.speed[:, None])[:, 0]
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What no catalogue has, and over which covariate it shows."""
+"""Effects outside the catalogue, and the covariates on which they show."""
 
 from __future__ import annotations
 

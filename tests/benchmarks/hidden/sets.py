@@ -43,7 +43,7 @@ class Hidden:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a data set hides. clean: the runs without noise, as in the data set. covariates: of effects outside only."""
+    """Truth of a data set. clean: its runs without noise. covariates: of effects outside the catalogue only."""
 
     kind: Kind
     hidden: tuple[Hidden, ...]
@@ -123,7 +123,7 @@ def form_of(kind: Kind, name: str) -> Form:
 
 
 def make_of(kind: Kind, name: str, form: str) -> Make:
-    """What turns values into a correction."""
+    """The function that turns values into a correction."""
     if kind == "outside":
         return OUTSIDE[name].make
     found = form_of(kind, name)
@@ -184,7 +184,7 @@ def _square(values: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Wheels:
-    """Of all samples of all runs (F, N): mean rates and what had been asked, rad/s; how far the wheels turned, rad."""
+    """Mean and target rates, rad/s, and wheel angles, rad, of all samples of all runs (F, N)."""
 
     rates: Array
     asked: Array
@@ -200,7 +200,7 @@ class _Wheels:
 def _recorded(
     grid: Grid, correction: Correction, disturbance: Disturbance, rng: np.random.Generator
 ) -> tuple[Trajectory, ...]:
-    """What wheels and reference would have recorded."""
+    """The recordings of wheels and reference."""
     if correction.chance is not None:
         correction += correction.chance
     if disturbance.slip:

@@ -1,4 +1,4 @@
-"""What an effect does to the training poses, beyond what a matrix could do, in units of the noise."""
+"""Signature of an effect: its changes of the training poses that no matrix can make, in units of the noise."""
 
 from __future__ import annotations
 

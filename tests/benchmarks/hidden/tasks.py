@@ -1,4 +1,4 @@
-"""The sets of the study: which there are, and what comes of one."""
+"""The data sets of the study, and the result on each."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Task(Model):
 
     @property
     def kind(self) -> Kind:
-        """Of the set: matched forms, and sets for which the name is taken away, hold single effects."""
+        """Group of the set: matched forms, and sets for which the name is taken away, hold single effects."""
         return "single" if self.group == "matched" or self.group == "removed" else self.group
 
 
