@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from omnibench.config import Model
 from omnibench.data.dataset import Split
@@ -14,32 +14,7 @@ from omnibench.fit.problem import Budget
 from omnibench.fit.span import Unidentified
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.config import Positive
-from omnibench.simulate.simulate import SimulatedConfig
-
-
-class ImportSource(Model):
-    """Recordings that an importer reads."""
-
-    format: str = Field(description="an importer, see omnibench list")
-    source: Path = Field(description="file or folder; relative to the config file")
-    options: dict[str, Any] = {}
-
-
-class DatasetSource(Model):
-    """Where a data set comes from: exactly one of the three."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_by_name=True, validate_by_alias=True)
-
-    path: Path | None = Field(None, description="a data set folder; relative to the config file")
-    simulate: SimulatedConfig | None = None
-    import_: ImportSource | None = Field(default=None, alias="import")
-
-    @model_validator(mode="after")
-    def _one_is_given(self) -> DatasetSource:
-        given = [n for n, v in (("path", self.path), ("simulate", self.simulate), ("import", self.import_)) if v]
-        if len(given) != 1:
-            raise ValueError(f"give one of path, simulate, import (given: {', '.join(given) or 'none'})")
-        return self
+from omnibench.simulate.dataset_source import DatasetSource
 
 
 class CostChoice(Model):

@@ -8,13 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from omnibench.compare.config import CompareConfig, DatasetSource
-from omnibench.compare.data_sources import load_source
-from omnibench.compare.read_config import read_compare_config
-from omnibench.config import read_model, read_yaml
+from omnibench.config import read_yaml, validate
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.storage import load_dataset
-from omnibench.design.config import DesignConfig, TimedCommand
+from omnibench.design.config import ComparedData, DesignConfig, TimedCommand
 from omnibench.design.d_optimality import Counts
 from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError
 from omnibench.fit.problem import training_split
@@ -92,9 +89,10 @@ def read_candidates(
         return candidates_of_dataset(load_dataset(path), integration or "arc", str(path))
     content = read_yaml(path)
     if isinstance(content, Mapping) and "datasets" in content:
-        return _candidates_of_comparison(read_compare_config(path), dataset, integration, str(path))
+        compared = validate(ComparedData, content, str(path))
+        return _candidates_of_comparison(compared, path.resolve().parent, dataset, integration, str(path))
     _no_choice(dataset, path)
-    config = read_model(DesignConfig, path)
+    config = validate(DesignConfig, content, str(path))
     return candidates_of_config(
         config if integration is None else config.model_copy(update={"integration": integration}), str(path)
     )
@@ -212,14 +210,14 @@ def candidates_of_simulation(
 
 
 def _candidates_of_comparison(
-    config: CompareConfig, name: str | None, integration: Integration | None, place: str
+    config: ComparedData, folder: Path, name: str | None, integration: Integration | None, place: str
 ) -> CandidatePool:
     if name is not None and name not in config.datasets:
         raise UnknownNameError("data set", name, config.datasets, place)
     if name is None and len(config.datasets) > 1:
         raise ConfigError(f"{place}: it has several data sets; choose one with --dataset: {', '.join(config.datasets)}")
     name = name or next(iter(config.datasets))
-    source: DatasetSource = config.datasets[name]
+    source = config.datasets[name].relative_to(folder)
     chosen = integration or config.integration
     if isinstance(source.simulate, RobotConfig):
         raise ConfigError(
@@ -227,7 +225,7 @@ def _candidates_of_comparison(
             "`omnibench simulate`, and design from its folder"
         )
     if source.simulate is None:
-        return candidates_of_dataset(load_source(name, source), chosen, f"{place}: data set {name}")
+        return candidates_of_dataset(source.load(name), chosen, f"{place}: data set {name}")
     return candidates_of_simulation(name, source.simulate, chosen, place, config.notes)
 
 

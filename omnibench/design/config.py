@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, FiniteFloat, Tag, field_validator, model_validator
+from pydantic import ConfigDict, Discriminator, Field, FiniteFloat, Tag, field_validator, model_validator
 
 from omnibench.config import Model
 from omnibench.data.importers.robot_option import RobotOption
@@ -15,6 +15,7 @@ from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import Noise
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.config import MotionGrid, Positive
+from omnibench.simulate.dataset_source import DatasetSource
 from omnibench.simulate.flower import Command, grid_of
 
 _MOST_COMMANDS = 5000  # of a set (chosen)
@@ -155,3 +156,13 @@ Use = Literal["final", "trajectory"]
 """Reference poses that a calibration uses: the final one alone, as Eq. (6), or all of them under the noise model."""
 Per = Literal["run", "second", "metre"]
 """Cost of a run: 1, its duration, or the distance that its wheels roll (mean of the wheels)."""
+
+
+class ComparedData(Model):
+    """What a design takes from the config of a comparison: its data sets, and how their odometry is integrated."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    notes: tuple[str, ...] = ()
+    datasets: dict[Name, DatasetSource] = Field(min_length=1)
+    integration: Integration = "arc"

@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from omnibench.compare.data_sources import load_source
 from omnibench.compare.read_config import read_compare_config
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.registry import costs
@@ -33,7 +32,7 @@ def flower_problem(sample_period: float = 0.01, cost: str = "final_pose") -> Cal
     config = read_compare_config(CONFIG)
     ((name, source),) = config.datasets.items()
     simulated = source.simulate.model_copy(update={"sample_period": sample_period, "validation": None})
-    dataset = load_source(name, source.model_copy(update={"simulate": simulated}))
+    dataset = source.model_copy(update={"simulate": simulated}).load(name)
     training = dataset.split("train")
     return CalibrationProblem(
         dataset.robot,

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from omnibench.compare.data_sources import load_source
 from omnibench.compare.read_config import read_compare_config
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import CalibrationProblem, make_parameterisation
@@ -27,7 +26,7 @@ def main() -> None:
     """Print a line for every calibrator."""
     config = read_compare_config(CONFIG)
     ((name, source),) = config.datasets.items()
-    dataset = load_source(name, source)
+    dataset = source.load(name)
     training = dataset.split("train")
     for chosen in sys.argv[1:] or ["closed_form", "crs", "genetic", "isres", "parametric"]:
         calibrator = calibrators.create(chosen)

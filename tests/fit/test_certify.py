@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from omnibench.compare.data_sources import load_source
 from omnibench.compare.read_config import read_compare_config
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import ConfigError, DataError
@@ -145,7 +144,7 @@ def least_cost_of_the_rest(problem: CalibrationProblem, place: int, value: float
 def flower() -> Dataset:
     config = read_compare_config(CONFIGS / "apr02.yaml")
     ((name, source),) = config.datasets.items()
-    return load_source(name, source)
+    return source.load(name)
 
 
 @pytest.mark.parametrize("box", ["paper", "row"])

@@ -1,0 +1,74 @@
+"""The source of a data set in a config: a folder, recordings to import, or a simulation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import ConfigDict, Field, model_validator
+
+from omnibench.config import Model
+from omnibench.data.dataset import Dataset
+from omnibench.data.progress import ProgressCallback, no_progress
+from omnibench.data.storage import load_dataset
+from omnibench.simulate.simulate import SimulatedConfig, simulate_dataset
+from omnibench.slam.import_dataset import import_dataset
+
+
+class ImportSource(Model):
+    """Recordings that an importer reads."""
+
+    format: str = Field(description="an importer, see omnibench list")
+    source: Path = Field(description="file or folder; relative to the config file")
+    options: dict[str, Any] = {}
+
+
+class DatasetSource(Model):
+    """Where a data set comes from: exactly one of the three."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_by_name=True, validate_by_alias=True)
+
+    path: Path | None = Field(None, description="a data set folder; relative to the config file")
+    simulate: SimulatedConfig | None = None
+    import_: ImportSource | None = Field(default=None, alias="import")
+
+    @model_validator(mode="after")
+    def _one_is_given(self) -> DatasetSource:
+        given = [n for n, v in (("path", self.path), ("simulate", self.simulate), ("import", self.import_)) if v]
+        if len(given) != 1:
+            raise ValueError(f"give one of path, simulate, import (given: {', '.join(given) or 'none'})")
+        return self
+
+    def at(self, location: Path) -> DatasetSource:
+        """The source with its data at ``location``: a data set folder, or recordings for the same importer."""
+        if self.import_ is not None and not (location / "dataset.yaml").is_file():
+            return self.model_copy(update={"import_": self.import_.model_copy(update={"source": location})})
+        return DatasetSource(path=location)
+
+    def relative_to(self, folder: Path) -> DatasetSource:
+        """The source with its paths, which start from ``folder``, made absolute."""
+        if self.path is not None:
+            return self.model_copy(update={"path": (folder / self.path).resolve()})
+        if self.import_ is not None:
+            update = {
+                "source": (folder / self.import_.source).resolve(),
+                "options": {key: _absolute_option(value, folder) for key, value in self.import_.options.items()},
+            }
+            return self.model_copy(update={"import_": self.import_.model_copy(update=update)})
+        return self
+
+    def load(self, name: str, description: str = "", progress: ProgressCallback = no_progress) -> Dataset:
+        """Read, import or simulate the data set. name, description: of a simulated one. OmnibenchError in one line."""
+        if self.simulate is not None:
+            return simulate_dataset(self.simulate, name, description, progress).dataset
+        if self.import_ is not None:
+            return import_dataset(self.import_.format, self.import_.source, self.import_.options)
+        assert self.path is not None  # one of the three is given
+        return load_dataset(self.path)
+
+
+def _absolute_option(value: Any, folder: Path) -> Any:
+    """An importer's option; a text that names an existing file beside the config becomes that file's absolute path."""
+    if isinstance(value, str) and value and not value.isnumeric() and (folder / value).is_file():
+        return str((folder / value).resolve())
+    return value
