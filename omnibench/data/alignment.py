@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array
 
-TURN = 2 * np.pi
+TURN = 2 * np.pi  # rad
 _SAME_TIME = 1e-6  # s; unix time in a double has steps of 0.2 us
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """``zero``: the recording's time that becomes t = 0, s. kept (F,): which wheel rows lie after it.
+    """Wheel samples and poses from a common t = 0 on.
 
-    pose_times (K,) and poses (K, 3) start with the pose at t = 0 and end with the wheels.
+    zero: time of the recording that becomes t = 0, s. kept (F,): True for wheel samples after it. pose_times (K,) and
+    poses (K, 3) start with the pose at t = 0 and end with the wheels.
     """
 
     zero: float
@@ -28,12 +29,12 @@ class Alignment:
 
 
 def align(begin: float, wheel_times: Array, pose_times: Array, poses: Array) -> Alignment | None:
-    """Re-zero both streams of a recording at the first instant that both know; None when they share no stretch.
+    """Set t = 0 of a recording to the first instant with both wheels and poses; None when they do not overlap.
 
-    ``begin``: when the first wheel sample began, s. ``wheel_times`` (F,): when each ended. All times by one clock, in
-    any epoch. t = 0 is the first pose after ``begin``, or ``begin`` itself where poses reach back before it: the start
+    begin: when the first wheel sample began, s. wheel_times (F,): when each ended, s. All times by one clock, in any
+    epoch. t = 0 is the first pose after ``begin``, or ``begin`` itself where poses reach back before it: the start
     pose is then interpolated (heading the shortest way). The sample during which t = 0 falls keeps its mean rate.
-    Poses after the last wheel sample are left out: nothing predicts them.
+    Poses after the last wheel sample are left out, since no odometry predicts them.
     """
     zero = float(pose_times[0])
     if zero < begin - _SAME_TIME:

@@ -1,4 +1,4 @@
-"""Values that are numbers but cannot be right: units and wheels with which the recordings would make more sense."""
+"""Warnings of wrong units and swapped wheels, with which the recordings would make more sense."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import OdometryBatch, WheelLog
 
 _DEGREE = math.pi / 180
-# What a column may have been recorded in: the factor to the SI unit, and the warning.
+# Units that a column may have been recorded in: factor to the SI unit, and warning.
 _RATES = (
     (1.0, ""),
     (2 * math.pi / 60, "wheel rates look like rpm; omega_* must be rad/s"),
@@ -26,10 +26,10 @@ _POSITIONS = (
     (1e-3, "positions look like mm; x and y must be m"),
     (1e-2, "positions look like cm; x and y must be m"),
 )
-_MOST_TRAJECTORIES = 24
-# Calibration errors, slip and noise stay below this misfit of the design model; wrong units and wheels do not.
+_MOST_TRAJECTORIES = 24  # that are looked at
+# Misfit of the design model (chosen): errors of calibration, slip and noise stay below, wrong units and wheels do not.
 _SUSPICIOUS = 0.15
-_EXPLAINED = 0.35  # share of the misfit that an explanation may leave
+_EXPLAINED = 0.35  # share of the misfit that may remain with an explanation (chosen)
 
 
 def implausible(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array]) -> list[str]:
@@ -45,23 +45,23 @@ def implausible(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array]) 
     misfit = recording.misfits(design[None])[0]
     if misfit < _SUSPICIOUS:
         return []
-    units = [each for each in _odd_units(recording, design) if each.misfit < _EXPLAINED * misfit]
-    single = [each for each in units if len(each.warnings) == 1]  # the simplest explanation first
-    found = single or [*units, *_odd_wheels(recording, design)]
-    best = min(found, key=lambda each: each.misfit, default=None)
+    units = [unit for unit in _odd_units(recording, design) if unit.misfit < _EXPLAINED * misfit]
+    single = [unit for unit in units if len(unit.warnings) == 1]  # the simplest explanation first
+    explanations = single or [*units, *_odd_wheels(recording, design)]
+    best = min(explanations, key=lambda explanation: explanation.misfit, default=None)
     return list(best.warnings) if best and best.misfit < _EXPLAINED * misfit else []
 
 
 @dataclass(frozen=True)
 class _Explanation:
-    """What may be wrong, and the misfit that would be left."""
+    """Warnings of what may be wrong, and the misfit that remains if they are right."""
 
     warnings: tuple[str, ...]
     misfit: float
 
 
 class _Recording:
-    """Some moments of some runs: the path since the start of the run, and the turn since the moment before."""
+    """Moments of some runs: path since the start of the run, and turn since the moment before."""
 
     def __init__(self, robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array]) -> None:
         moments = [_moments(log, robot.inverse_kinematic_matrix[2]) for log in logs]
@@ -77,25 +77,25 @@ class _Recording:
         self.wheels = robot.wheel_names
 
     def misfits(self, matrices: Array, metre: float = 1.0, radian: float = 1.0) -> Array:
-        """How badly matrices (P, 3, N) explain the reference: (P,), 0 exactly, 1 not at all.
+        """Misfit (P,) of matrices (P, 3, N) to the reference, from 0 (exact) to 1 (unrelated).
 
-        metre, radian: what a unit of the recorded positions and headings is.
+        metre, radian: units of the recorded positions, in m, and headings, in rad.
         """
         odometry = self._odometry.poses(matrices)
         moved = (self._poses - self._starts) * [metre, metre, radian]
         path = (moved[:, 0] + 1j * moved[:, 1]) * np.exp(-1j * radian * self._starts[:, 2])
         driven = odometry[..., 0] + 1j * odometry[..., 1]
         turned = self._turns(odometry[..., 2])
-        # Whole turns between two moments leave no trace in the headings.
+        # Whole turns between two moments do not show in the headings.
         missed = np.remainder(turned - self._turns(moved[:, 2]) + math.pi, 2 * math.pi) - math.pi
         lengths = (np.abs(driven) + np.abs(path)).sum(axis=1)
         angles = (np.abs(turned) + np.abs(turned - missed)).sum(axis=1)
-        # At every moment noise and slip alone may make out a radian and the robot's size, and more while it turns.
+        # Noise and slip may amount to a radian and the robot's size at every moment, and to more while it turns.
         count, rims = len(self._poses), np.abs(turned).sum(axis=1)
         position = np.abs(driven - path).sum(axis=1) / (lengths + self._length * (rims + count))
         heading = np.abs(missed).sum(axis=1) / (angles + count)
         runs = np.count_nonzero(self._first)
-        still = (lengths < runs * self._length) & (angles < runs)  # that nothing moves explains nothing
+        still = (lengths < runs * self._length) & (angles < runs)  # a robot at rest fits any matrix
         return np.where(still, 1.0, np.maximum(position, heading))
 
     def _turns(self, headings: Array) -> Array:
@@ -105,7 +105,7 @@ class _Recording:
 
 
 def _moments(log: WheelLog, row_3: Array) -> NDArray[np.intp]:
-    """Indices of the stamps of a log between which the odometry turns by a radian or more, and of the last."""
+    """Indices of a log's stamps between which the odometry turns by a radian or more, and the last index."""
     turned = np.cumsum((log.rates @ row_3) * np.diff(log.times, prepend=0.0))
     headings = np.interp(log.stamps, np.append(0.0, log.times), np.append(0.0, turned))
     chosen, last = [], headings[0]
@@ -118,11 +118,11 @@ def _moments(log: WheelLog, row_3: Array) -> NDArray[np.intp]:
 
 def _odd_units(recording: _Recording, design: Array) -> list[_Explanation]:
     matrices = np.array([factor * design for factor, _ in _RATES])
-    found = []
+    explanations = []
     for (metre, position), (radian, heading) in product(_POSITIONS, _HEADINGS):
         for misfit, (_, rate) in zip(recording.misfits(matrices, metre, radian), _RATES, strict=True):
-            found.append(_Explanation(tuple(text for text in (rate, heading, position) if text), float(misfit)))
-    return found
+            explanations.append(_Explanation(tuple(text for text in (rate, heading, position) if text), float(misfit)))
+    return explanations
 
 
 def _odd_wheels(recording: _Recording, design: Array) -> list[_Explanation]:
@@ -143,7 +143,7 @@ def _odd_wheels(recording: _Recording, design: Array) -> list[_Explanation]:
 
 
 def _rearranged(matrix: Array, order: Sequence[int], signs: Sequence[int]) -> Array:
-    """The matrix that acts on the recorded columns as ``matrix`` does on wheel i = signs[i] * column order[i]."""
+    """The columns of ``matrix`` for recordings whose wheel i is signs[i] times column order[i]."""
     result = np.empty_like(matrix)
     for wheel, (column, sign) in enumerate(zip(order, signs, strict=True)):
         result[:, column] = sign * matrix[:, wheel]

@@ -27,7 +27,7 @@ class Trajectory:
 
     times (F,): end of each wheel sample, s, > 0. rates (F, N): mean wheel rates over each sample, rad/s.
     pose_times (K,): s, the first is 0. poses (K, 3): reference poses x, y (m) and heading (rad).
-    Everything that follows may be unknown (None).
+    The fields from ``command`` on may be unknown (None).
     """
 
     id: str
@@ -46,7 +46,7 @@ class Trajectory:
     duration: float | None = None  # s
     distance: float | None = None  # commanded length, m
     angles: Array | None = None  # phi, absolute wheel angles at ``times`` (F, N), rad
-    targets: Array | None = None  # what the motor controllers were told (F, N), rad/s
+    targets: Array | None = None  # target rates of the motor controllers (F, N), rad/s
     pose_covariances: Array | None = None  # (K, 3, 3)
 
     @property
@@ -128,7 +128,7 @@ def make_dataset(
 ) -> Dataset:
     """A data set with unwrapped headings and with warnings about values that cannot be right.
 
-    DataError when there is no trajectory, two have the same id, or an array has not the shape that Trajectory says.
+    DataError: there is no trajectory, two have the same id, or an array has another shape than Trajectory says.
     """
     raw = tuple(trajectories)
     if not raw:
@@ -140,11 +140,13 @@ def make_dataset(
         seen.add(trajectory.id)
         _check_shapes(name, robot, trajectory)
     logs = [trajectory.log(trajectory.pose_times) for trajectory in raw]
-    headings, doubts = unwrap(robot, logs, [trajectory.poses[:, 2] for trajectory in raw])
+    headings, ambiguous = unwrap(robot, logs, [trajectory.poses[:, 2] for trajectory in raw])
     warnings = implausible(robot, logs, [trajectory.poses for trajectory in raw])
-    if doubts and not warnings:
-        shown = ", ".join(raw[index].id for index in doubts[:5])
-        warnings = [f"headings of {len(doubts)} trajectories may be unwrapped wrongly (reference too sparse): {shown}"]
+    if ambiguous and not warnings:
+        shown = ", ".join(raw[index].id for index in ambiguous[:5])
+        warnings = [
+            f"headings of {len(ambiguous)} trajectories may be unwrapped wrongly (reference too sparse): {shown}"
+        ]
     warnings += _late_references(raw) + _other_periods(raw, sample_period)
     unwrapped = (
         replace(trajectory, poses=np.column_stack([trajectory.poses[:, :2], heading]))
@@ -156,7 +158,7 @@ def make_dataset(
 
 
 def _other_periods(trajectories: Sequence[Trajectory], sample_period: float) -> list[str]:
-    """A sample period that the stamps contradict; jitter and gaps do not move their median."""
+    """Warning of a sample period that the stamps contradict; their median is robust to jitter and gaps."""
     periods = np.concatenate([np.diff(trajectory.times, prepend=0.0) for trajectory in trajectories])
     median = float(np.median(periods))
     if 0.5 < median / sample_period < 2:
@@ -171,8 +173,8 @@ def _check_shapes(name: str, robot: Robot, trajectory: Trajectory) -> None:
     for item, shape in expected.items():
         array = getattr(trajectory, item)
         if len(samples) != 1 or len(poses) != 1 or (array is not None and array.shape != shape):
-            found = None if array is None else array.shape
-            raise DataError(f"data set {name}: trajectory {trajectory.id}: {item} has shape {found}, expected {shape}")
+            given = None if array is None else array.shape
+            raise DataError(f"data set {name}: trajectory {trajectory.id}: {item} has shape {given}, expected {shape}")
 
 
 def _late_references(trajectories: Sequence[Trajectory]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Reading columns of numbers from delimited text, so that every flaw is told with its file and row."""
+"""Reading of number columns from delimited text; every flaw is reported with its file and row."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from omnibench.robot.kinematics import Array
 
 @dataclass(frozen=True, eq=False)
 class NumberTable:
-    """Named columns of finite numbers: ``values`` (rows, n), and the line of the file that each row came from."""
+    """Named columns of finite numbers. values (rows, n). lines (rows,): the line of the file that a row came from."""
 
     file: Path
     names: tuple[str, ...]

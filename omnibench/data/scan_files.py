@@ -20,9 +20,9 @@ from omnibench.robot.kinematics import Array
 
 _COLUMNS = ("trajectory", "t", "ranges")
 _SCHEMA = {"trajectory": pl.String(), "t": pl.Float64(), "ranges": pl.List(pl.Float32)}
-_ROW_GROUP = 256  # rows of a Parquet file that are read at once; about 1 MB
-_MOST_ROWS = 4096  # that are held besides the result of reading, about 20 MB
-_ROWS_OF_CSV = 65536  # reading them begins at the file's first line every time
+_ROW_GROUP = 256  # rows of a Parquet row group; about 1 MB
+_MOST_ROWS = 4096  # rows of a Parquet file that are read at a time; about 20 MB
+_ROWS_OF_CSV = 65536  # the same for CSV: more, since every reading begins at the file's first line
 
 Rows = NDArray[np.intp]
 
@@ -36,7 +36,7 @@ def scans_file(folder: Path) -> Path | None:
 
 
 class ScansOnDisk(Scans):
-    """A table of scans. Making it checks stamps and names; ranges are checked when a trajectory's scans are read.
+    """A table of scans. Stamps and names are checked at once, ranges when a trajectory's scans are read.
 
     DataError in one line names the file, the row (1 is the first) and what is wrong.
     """
@@ -83,20 +83,22 @@ class ScansOnDisk(Scans):
     def _lazy(self) -> pl.LazyFrame:
         if self.file.suffix == ".parquet":
             return pl.scan_parquet(self.file)
-        return pl.scan_csv(self.file, infer_schema=False)  # texts: what is a number is told with the row
+        return pl.scan_csv(
+            self.file, infer_schema=False
+        )  # as text, so that a cell that is no number is reported with its row
 
     def _read(self, rows: Rows, whose: str, times: Array) -> Ranges:
-        """The ranges of some rows (n, R), checked."""
+        """The checked ranges (n, R) of some rows."""
         first, last = int(rows[0]), int(rows[-1])
         column = self._collect(self._lazy().select("ranges").slice(first, last - first + 1))["ranges"]
         column = self._numbers(column[rows - first] if len(rows) < len(column) else column, rows)
         lengths = column.list.len().fill_null(0).to_numpy()
         for index in np.flatnonzero(lengths != self.scanner.rays)[:1]:
-            told = f"the scan has {lengths[index]} ranges, but scanner.rays is {self.scanner.rays}"
-            raise self._fail(int(rows[index]), told)
+            problem = f"the scan has {lengths[index]} ranges, but scanner.rays is {self.scanner.rays}"
+            raise self._fail(int(rows[index]), problem)
         ranges = column.explode().cast(pl.Float32).fill_null(np.nan).to_numpy().reshape(len(rows), -1)
         for index in np.flatnonzero(np.isnan(ranges).any(axis=1))[:1]:
-            raise self._fail(int(rows[index]), "a range is missing or NaN; inf says that nothing was seen")
+            raise self._fail(int(rows[index]), "a range is missing or NaN; write inf where nothing was seen")
         for index in np.flatnonzero(~self.scanner.valid(ranges).any(axis=1))[:1]:
             seen = ranges[index][np.isfinite(ranges[index])]
             in_millimetres = len(seen) > 0 and self.scanner.valid(seen / 1000).mean() > 0.5
@@ -109,7 +111,7 @@ class ScansOnDisk(Scans):
         return ranges
 
     def _numbers(self, column: pl.Series, rows: Rows) -> pl.Series:
-        """The ranges as lists of numbers; in CSV they are a text with blanks between them."""
+        """The column of ranges as lists of numbers; in CSV a cell is text with blanks between the numbers."""
         if isinstance(column.dtype, pl.Array):
             column = column.arr.to_list()
         if column.dtype == pl.String:
@@ -132,27 +134,27 @@ class ScansOnDisk(Scans):
         index = {}
         grouped = table.frame.with_row_index("row").group_by("trajectory", maintain_order=True).agg(pl.col("row"))
         for trajectory, rows in zip(grouped["trajectory"], grouped["row"], strict=True):
-            found: Rows = rows.to_numpy().astype(np.intp)
+            run_rows: Rows = rows.to_numpy().astype(np.intp)
             if trajectory not in known:
-                told = f"trajectory {trajectory} is not in the table of trajectories; {nearest(trajectory, known)}"
-                raise table.fail(int(found[0]), told.rstrip("; "))
-            stamps = times[found]
+                problem = f"trajectory {trajectory} is not in the table of trajectories; {nearest(trajectory, known)}"
+                raise table.fail(int(run_rows[0]), problem.rstrip("; "))
+            stamps = times[run_rows]
             for bad in np.flatnonzero(np.diff(stamps) <= 0)[:1]:
                 what = "goes backwards" if stamps[bad + 1] < stamps[bad] else "is repeated"
-                raise table.fail(int(found[bad + 1]), f"t {what}: {stamps[bad + 1]:g} after {stamps[bad]:g}")
-            index[str(trajectory)] = found, stamps
+                raise table.fail(int(run_rows[bad + 1]), f"t {what}: {stamps[bad + 1]:g} after {stamps[bad]:g}")
+            index[str(trajectory)] = run_rows, stamps
         return index
 
     def _names_and_stamps(self) -> Table:
-        """The two small columns; their names and types checked."""
+        """The checked columns of trajectories and stamps."""
         try:
             schema = self._lazy().collect_schema()
         except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
             raise DataError(f"{self.file}: cannot be read: {error}") from None
         for column in _COLUMNS:
             if column not in schema:
-                found = ", ".join(schema)
-                raise DataError(f"{self.file}: column {column!r} is missing; {nearest(column, schema)}found: {found}")
+                known = ", ".join(schema)
+                raise DataError(f"{self.file}: column {column!r} is missing; {nearest(column, schema)}found: {known}")
         if schema["trajectory"].is_nested():
             raise DataError(f"{self.file}: column 'trajectory' holds {schema['trajectory']}, expected names or numbers")
         frame = self._collect(self._lazy().select(pl.col("trajectory").cast(pl.String), pl.col("t")))
@@ -168,9 +170,9 @@ class ScansOnDisk(Scans):
 
 
 def write_scans(scans: Scans, table_format: TableFormat, trajectories: Iterable[str], file: Path) -> None:
-    """Write the table of those of ``trajectories`` that have scans; no more than one's are in memory at a time.
+    """Write the scans of ``trajectories``, of those that have some; one trajectory's are in memory at a time.
 
-    Ranges are written to the float's precision. DataError: scans that cannot be read. OSError: a disk that refuses.
+    Ranges are written in single precision. DataError: scans cannot be read. OSError: the disk refuses.
     """
     recorded = set(scans.trajectories)
     chosen = [trajectory for trajectory in trajectories if trajectory in recorded]
@@ -203,7 +205,7 @@ def _frames(trajectory: str, scans: TrajectoryScans, as_text: bool) -> Iterator[
 
 
 def _parts(rows: Rows, most: int) -> Iterator[slice]:
-    """Parts of increasing ``rows`` that span no more than ``most`` rows of the file each."""
+    """Slices of increasing row numbers, each of which spans at most ``most`` rows of the file."""
     begin = 0
     while begin < len(rows):
         end = int(np.searchsorted(rows, rows[begin] + most))

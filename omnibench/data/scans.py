@@ -1,4 +1,4 @@
-"""Scans of a planar laser scanner: what the scanner is, and the scans of one trajectory at a time."""
+"""A planar laser scanner and its scans, one trajectory at a time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Ranges = NDArray[np.float32]
 
 
 class Mount(Model):
-    """Where the scanner sits: its pose in the robot's frame."""
+    """Pose of the scanner in the robot's frame."""
 
     x: FiniteFloat = Field(0.0, description="m, forward")
     y: FiniteFloat = Field(0.0, description="m, left")
@@ -34,10 +34,10 @@ class Scanner(Model):
     angle_min: FiniteFloat = Field(description="rad, in the scanner's frame, counter-clockwise")
     angle_increment: FiniteFloat = Field(description="rad from ray to ray; negative for clockwise")
     time_increment: float = Field(0.0, ge=0, allow_inf_nan=False, description="s from ray to ray")
-    range_min: float = Field(0.0, ge=0, allow_inf_nan=False, description="m; shorter ranges are none")
-    range_max: float = Field(gt=0, allow_inf_nan=False, description="m; longer ranges are none")
+    range_min: float = Field(0.0, ge=0, allow_inf_nan=False, description="m; shorter ranges are no measurements")
+    range_max: float = Field(gt=0, allow_inf_nan=False, description="m; longer ranges are no measurements")
     noise: float = Field(0.01, gt=0, allow_inf_nan=False, description="standard deviation of a range, m")
-    far_noise: float = Field(0.03, gt=0, allow_inf_nan=False, description="the same beyond far, m")
+    far_noise: float = Field(0.03, gt=0, allow_inf_nan=False, description="standard deviation of ranges beyond far, m")
     far: float = Field(10.0, gt=0, allow_inf_nan=False, description="m")
     mount: Mount = Mount()
 
@@ -58,15 +58,15 @@ class Scanner(Model):
 
     @property
     def delays(self) -> Array:
-        """By how much later than the scan's stamp each ray is measured (R,), s."""
+        """Delays (R,) of the rays after the scan's stamp, s."""
         return self.time_increment * np.arange(self.rays)
 
     def valid(self, ranges: Ranges) -> NDArray[np.bool_]:
-        """Which ranges, of any shape, are measurements."""
+        """True for ranges, of any shape, that are measurements."""
         return np.isfinite(ranges) & (ranges >= self.range_min) & (ranges <= self.range_max)
 
     def deviations(self, ranges: Ranges | Array) -> Array:
-        """Standard deviations of ranges, m, of their shape."""
+        """Standard deviations of ranges of any shape, m."""
         return np.where(np.asarray(ranges) > self.far, self.far_noise, self.noise)
 
 
@@ -101,7 +101,7 @@ class Scans(ABC):
 
 
 class ScansInMemory(Scans):
-    """Scans that were just made."""
+    """Scans in memory."""
 
     def __init__(self, scanner: Scanner, scans: Mapping[str, TrajectoryScans]) -> None:
         self.scanner = scanner

@@ -1,4 +1,4 @@
-"""Which imported runs train and which validate."""
+"""Division of imported runs into training and validation."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _split_of(
 
 
 def every_second(groups: Sequence[Hashable]) -> list[Split]:
-    """Within each group every second member validates, in the order given; the first one trains."""
+    """Splits by turns within each group, in the order given; the first member trains."""
     seen: Counter[Hashable] = Counter()
     splits: list[Split] = []
     for group in groups:
@@ -62,7 +62,7 @@ def every_second(groups: Sequence[Hashable]) -> list[Split]:
 
 
 def repetitions(commands: Sequence[Hashable]) -> list[int]:
-    """How many-eth run of its command each run is, from 1, in the order given."""
+    """Number of each run among the runs of its command, from 1, in the order given."""
     seen: Counter[Hashable] = Counter()
     numbers = []
     for command in commands:

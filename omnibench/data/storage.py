@@ -34,11 +34,11 @@ class Header(Model):
     description: str = ""
     source: str = ""
     licence: str = ""
-    simulated: bool = Field(False, description="true for data that no robot drove")
+    simulated: bool = Field(False, description="true for simulated data")
     robot: Robot
     sample_period: float = Field(gt=0, allow_inf_nan=False, description="s")
     wheels: tuple[str, ...] = Field(description="column names: omega_<wheel>")
-    scanner: Scanner | None = Field(None, description="what measured the scans, if there are any")
+    scanner: Scanner | None = Field(None, description="the scanner, if there are scans")
 
     @model_validator(mode="after")
     def _wheels_are_the_robots(self) -> Header:
@@ -135,7 +135,7 @@ def check_dataset_folder(folder: Path) -> None:
 
 
 def header_of(dataset: Dataset) -> Header:
-    """What dataset.yaml says of a data set."""
+    """The content of a data set's dataset.yaml."""
     scans = _recorded_scans(dataset)
     return Header(
         name=dataset.name,
@@ -151,7 +151,7 @@ def header_of(dataset: Dataset) -> Header:
 
 
 def _recorded_scans(dataset: Dataset) -> Scans | None:
-    """The scans, if any trajectory has some: the data set may be a part of the one that they were recorded for."""
+    """The scans, if any trajectory has some; the data set may be a part of the one that was recorded."""
     if dataset.scans is None:
         return None
     recorded = set(dataset.scans.trajectories)
@@ -182,9 +182,9 @@ def _read_header(folder: Path) -> Header:
     file = folder / "dataset.yaml"
     try:
         content = read_yaml(file)
-        found = content.get("format") if isinstance(content, dict) else None
-        if found != FORMAT:
-            raise DataError(f"{file}: format is {found!r}, expected {FORMAT!r}")
+        given = content.get("format") if isinstance(content, dict) else None
+        if given != FORMAT:
+            raise DataError(f"{file}: format is {given!r}, expected {FORMAT!r}")
         return validate(Header, content, str(file))
     except ConfigError as error:
         raise DataError(str(error)) from None

@@ -1,4 +1,4 @@
-"""A table of a data set, Parquet or CSV: what is wrong with it is said with the file and the row."""
+"""A table of a data set, Parquet or CSV; every flaw is reported with its file and row."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ from omnibench.robot.kinematics import Array
 
 # Names may consist of digits: 007 is not 7.
 _TEXTS = dict.fromkeys(("trajectory", "command", "split", "session"), pl.String)
-
-
-_LARGEST = 1e9
+_LARGEST = 1e9  # a larger number is no measurement in SI units
 
 
 class Table:
@@ -43,14 +41,14 @@ class Table:
         return values
 
     def numbers(self, column: str) -> Array:
-        """A column as finite floats (rows,). DataError names the first that is not."""
+        """A column as finite floats (rows,). DataError names the first value that is missing or not finite."""
         series = self.floats(column)
         values = series.fill_null(np.nan).to_numpy()
         bad = np.flatnonzero(~np.isfinite(values))
         if len(bad):
-            found = series[int(bad[0])]
+            value = series[int(bad[0])]
             raise self.fail(
-                int(bad[0]), f"{column} is {'missing' if found is None else found}; remove or repair the row"
+                int(bad[0]), f"{column} is {'missing' if value is None else value}; remove or repair the row"
             )
         huge = np.flatnonzero(np.abs(values) > _LARGEST)
         if len(huge):

@@ -1,4 +1,4 @@
-"""The truth's folder of simulated data: true poses of the runs, read only to judge reference poses."""
+"""True poses of simulated runs, in the truth folder; read only to judge reference poses."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _NAME = "poses"
 
 @dataclass(frozen=True, eq=False)
 class TruePath:
-    """Where a run's robot truly was, from its start on. times (M,): s, from 0 on, dense. poses (M, 3): m, m, rad."""
+    """True poses of a run from its start on. times (M,): s, from 0 on, dense. poses (M, 3): m, m, rad."""
 
     times: Array
     poses: Array
 
     def at(self, stamps: Array) -> Array:
-        """Poses (K, 3) at stamps (K,), s, between the times by straight lines; after the last the robot stays."""
+        """Poses (K, 3) at stamps (K,), s, interpolated by straight lines; the last pose holds after its time."""
         return np.column_stack([np.interp(stamps, self.times, column) for column in self.poses.T])
 
 
 def write_true_poses(folder: Path, paths: Mapping[str, TruePath]) -> None:
-    """Write ``poses.parquet`` of the truth. DataError when the disk refuses."""
+    """Write ``poses.parquet`` into the truth folder. DataError when the disk refuses."""
     frames = [
         pl.DataFrame(
             {"trajectory": [name] * len(path.times), "t": path.times}
@@ -59,7 +59,7 @@ def read_true_poses(folder: Path | str) -> dict[str, TruePath]:
 
 
 def robot_of_truth(folder: Path | str) -> Robot | None:
-    """The robot, as designed, that ``truth.yaml`` of a truth folder names; None without that file. ConfigError."""
+    """The design robot in ``truth.yaml`` of a truth folder; None without that file. ConfigError in one line."""
     file = Path(folder) / TRUTH_FILE
     if not file.is_file():
         return None

@@ -210,7 +210,7 @@ BROKEN: dict[str, tuple[Callable[[pl.DataFrame], pl.DataFrame], str]] = {
     "too few ranges": (with_cell(6, "ranges", RANGES[1:]), r"row 6: the scan has 6 ranges, but scanner\.rays is 7"),
     "too many ranges": (with_cell(2, "ranges", [*RANGES, 1.0]), "row 2: the scan has 8 ranges, but"),
     "no ranges": (with_cell(7, "ranges", None), "row 7: the scan has 0 ranges, but"),
-    "NaN": (with_cell(6, "ranges", [*RANGES[1:], math.nan]), "row 6: a range is missing or NaN; inf says that"),
+    "NaN": (with_cell(6, "ranges", [*RANGES[1:], math.nan]), "row 6: a range is missing or NaN; write inf where"),
     "empty scan": (
         with_cell(6, "ranges", [math.inf] * 6 + [0.01]),
         r"row 6: the scan of trajectory run-2 at 0\.15 s is empty: no range from 0\.1 to 30 m; remove the row",

@@ -118,8 +118,8 @@ class Csv(Importer):
     files have ``timestamp tx ty tz qx qy qz qw``. CSV columns are named in a header, in any order and among others.
 
     wheels: with rates a row holds the mean rates since the row before (its first one: since a sample period before).
-    With angles or ticks the first row only says where counting begins; they must count on, or ``wheel_wrap`` says
-    after how much they start again (65536 ticks, 360 deg). A positive rate drives the robot counter-clockwise;
+    With angles or ticks the first row only gives the start of counting. They must count on, or ``wheel_wrap`` gives the
+    value after which they start again (65536 ticks, 360 deg). A positive rate drives the robot counter-clockwise;
     ``wheel_signs: [-1, 1, 1]`` turns a wheel round.
 
     times: both files of a run by one clock, in any epoch (unix time, say). t = 0 becomes the first pose, or, where
@@ -188,7 +188,7 @@ class Csv(Importer):
 
 @dataclass(frozen=True, eq=False)
 class _Wheels:
-    """begin: when the first sample began, s; times (F,) when each ended; rates (F, N) rad/s; angles (F, N) rad."""
+    """Wheel samples. begin: of the first sample, s. times (F,): ends, s. rates (F, N): rad/s. angles (F, N): rad."""
 
     begin: float
     times: Array

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array
 
-_LARGEST_TILT = np.radians(20)
-_LENGTH_TOLERANCE = 0.01
+_LARGEST_TILT = np.radians(20)  # rad; a larger tilt is that of another frame than the robot's body (chosen)
+_LENGTH_TOLERANCE = 0.01  # of a quaternion's length 1 (chosen)
 
 
 @dataclass(frozen=True, eq=False)
 class PlanarHeadings:
-    """Yaw of K orientations, and what tells whether it means anything.
+    """Yaw of K orientations, and whether they are those of a robot on the floor.
 
     headings (K,): rad, within a turn. lengths (K,): of the quaternions, 1 for a rotation. tilts (K,): rad, between the
     z axes of body and world. flawed (K,): the length is not 1 (to 1 %), or the tilt above 20 degrees: then it is
@@ -28,7 +28,7 @@ class PlanarHeadings:
     flawed: NDArray[np.bool_]
 
     def flaw(self, index: int) -> str:
-        """What is wrong with a flawed orientation, for a message."""
+        """The flaw of an orientation in words."""
         if not abs(self.lengths[index] - 1) <= _LENGTH_TOLERANCE:
             return f"quaternion has length {self.lengths[index]:.3g}, expected 1"
         return f"pose is tilted by {np.degrees(self.tilts[index]):.0f} degrees; give poses of the robot's body (z up)"

@@ -1,4 +1,4 @@
-"""Importer of what Table 1 of Palacin et al. 2023 lists, as files: rpm, degrees, metres or millimetres."""
+"""Importer of files with the quantities of Table 1 of Palacin et al. 2023: rpm, degrees, m or mm."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Table1Options(Options):
 
 @importers.register("table1")
 class Table1(Importer):
-    """What Table 1 of Palacin et al. 2023 lists, one folder a trajectory: rpm, degrees, m or mm.
+    """Quantities of Table 1 of Palacin et al. 2023, one folder a trajectory: rpm, degrees, m or mm.
 
     The source is any folder above trajectory folders, or one of them; each is found by its ``command.csv``:
 
@@ -166,8 +166,8 @@ def _read_command(file: Path, wheels: Sequence[str]) -> _Command:
     if len(table.values) != 1:
         raise DataError(f"{file}: it has {len(table.values)} rows, expected one: the command of this trajectory")
     v, alpha, omega, distance = (float(value) for value in table.columns(_COMMAND)[0])
-    told = table.columns(targets)[0] * RPM if all(name in table for name in targets) else None
-    return _Command(v, math.radians(alpha), omega, distance, told)
+    target_rates = table.columns(targets)[0] * RPM if all(name in table for name in targets) else None
+    return _Command(v, math.radians(alpha), omega, distance, target_rates)
 
 
 def _times(table: NumberTable) -> Array:

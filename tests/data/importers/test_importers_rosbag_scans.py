@@ -220,7 +220,7 @@ def test_a_scan_that_takes_time_but_does_not_say_from_ray_to_ray_is_told(tmp_pat
 def test_a_mount_that_nothing_tells_is_said_and_can_be_given(tmp_path: Path) -> None:
     source = write_mcap(tmp_path / "drive", with_scans(extra=()))
     data = read(source)
-    assert "nothing tells where the scanner (laser) is mounted" in data.warnings[0]
+    assert "it is unknown where the scanner (laser) is mounted" in data.warnings[0]
     assert "set scanner_mount={x: 0.1, y: 0, yaw: 0}" in data.warnings[0]
     assert scanner_of(data).mount.model_dump() == {"x": 0, "y": 0, "yaw": 0}
     given = read(source, scanner_mount={"x": 0.1, "yaw": 3.0})
@@ -250,7 +250,7 @@ def _stamp(sent: Sent) -> int:
 
 def test_a_ring_of_fixed_transforms_ends(tmp_path: Path) -> None:
     ring = tf_static(transform("a", "laser", 0, 0, 0), transform("laser", "a", 0, 0, 0))
-    assert "nothing tells where" in read(write_mcap(tmp_path / "drive", with_scans(extra=[ring]))).warnings[0]
+    assert "it is unknown where" in read(write_mcap(tmp_path / "drive", with_scans(extra=[ring]))).warnings[0]
 
 
 def test_a_scanner_that_hangs_upside_down_counts_its_rays_the_other_way(tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ class Optiodom(Importer):
 
 @dataclass(frozen=True)
 class _Command:
-    """What a session's log says was asked of the robot during a run."""
+    """The command of a run by the session's log: m/s, rad, rad/s, m."""
 
     name: str
     v: float

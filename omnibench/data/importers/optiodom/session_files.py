@@ -21,7 +21,7 @@ _LOG_FIELDS = 10  # time, three tick increments, x, y, theta, v, vn, omega; more
 
 @dataclass(frozen=True)
 class SessionMetadata:
-    """What ``<session>_metadata.csv`` says, and the run files beside it.
+    """Content of ``<session>_metadata.csv``, and the run files beside it.
 
     diameters of the wheels and distance to the centre in m; gear and resolution (ticks per turn of the motor);
     starts: when each run's file begins in the session's log, s after the run's begin there.
@@ -39,7 +39,7 @@ class SessionMetadata:
 
     @property
     def geometry(self) -> tuple[object, ...]:
-        """What the robot of every session must share."""
+        """Dimensions of the robot, which must be the same in every session."""
         return self.diameters, self.distance, self.gear, self.resolution
 
     @property
@@ -60,7 +60,7 @@ class LogStretch:
 
 @dataclass(frozen=True, eq=False)
 class SessionLog:
-    """The robot's own log of a session. runs (F,): which run each row belongs to. path: what it says of the path."""
+    """The robot's own log of a session. runs (F,): number of the run of each row. path: radius and shrinkage."""
 
     file: Path
     path: str

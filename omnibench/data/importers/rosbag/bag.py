@@ -1,4 +1,4 @@
-"""Bags as the library rosbags reads them: MCAP, rosbag2 and ROS 1, with whatever is wrong as one line."""
+"""Reading of bags (MCAP, rosbag2 and ROS 1) with the library rosbags; every fault is one line."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Record:
-    """A recorded message: its number in the topic, from 1; when it was recorded, ns; None when it is garbage."""
+    """A recorded message. number: in its topic, from 1. logged: time of recording, ns. message: None if undecodable."""
 
     number: int
     logged: int
@@ -68,15 +68,16 @@ class Bag:
     def records(self, topic: Topic, first: int | None = None, last: int | None = None) -> Iterator[Record]:
         """The messages of a topic in the order in which they were recorded. DataError: the bag is damaged.
 
-        first, last: only those that were recorded from then to then, ns; numbers then count from the first of these.
+        first, last: times of recording, ns, between which messages are read; numbers then count from the first of
+        these.
         """
         connections = [
-            each
-            for each in self._reader.connections
-            if (each.topic, _full_type(each.msgtype)) == (topic.name, topic.type)
+            connection
+            for connection in self._reader.connections
+            if (connection.topic, _full_type(connection.msgtype)) == (topic.name, topic.type)
         ]
         number = 0
-        with _damage_told(self.path):
+        with _damage_as_error(self.path):
             stop = None if last is None else last + 1
             for number, (connection, logged, data) in enumerate(self._reader.messages(connections, first, stop), 1):
                 yield Record(number, logged, self._decoded(data, _full_type(connection.msgtype)))
@@ -89,18 +90,18 @@ class Bag:
     def _decoded(self, data: bytes, kind: str) -> Any | None:
         try:
             return self._reader.deserialize(data, kind)
-        except Exception:  # recorded rubbish fails in many ways
+        except Exception:  # garbage fails in many ways
             return None
 
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a bag for reading. DataError in one line: it is none, it is cut off, or it is damaged."""
-    # Imported here, so that `omnibench list` starts at once.
+    """Open a bag for reading. DataError in one line: it is no bag, it is cut off, or it is damaged."""
+    # Imported here, since they load slowly and `omnibench list` does without.
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    with _damage_told(path):
+    with _damage_as_error(path):
         # Bags before ROS 2 Iron do not hold the definitions of their types; those used here never changed.
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
@@ -111,17 +112,17 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
 
 def find_bags(source: Path) -> dict[str, Path]:
-    """The bags at or below ``source`` by name: a file, a rosbag2 folder, or a folder that holds such. DataError."""
+    """Bags by name: the file or rosbag2 folder ``source``, or all bags below the folder ``source``. DataError."""
     if source.is_file() or (source / _METADATA).is_file():
         return {source.resolve().stem if source.is_file() else source.resolve().name: source}
     if not source.is_dir():
         raise DataError(f"{source}: no such file or folder")
     folders = [file.parent for file in source.rglob(_METADATA)]
     files = [file for file in source.rglob("*") if file.suffix in _SUFFIXES and file.is_file()]
-    found = [*folders, *(file for file in files if not any(file.is_relative_to(folder) for folder in folders))]
-    if not found:
+    bags = [*folders, *(file for file in files if not any(file.is_relative_to(folder) for folder in folders))]
+    if not bags:
         raise DataError(f"{source}: no bag below it; name an .mcap or .bag file, or the folder of a rosbag2 recording")
-    return {_name(path, source): path for path in sorted(found)}
+    return {_name(path, source): path for path in sorted(bags)}
 
 
 def _name(path: Path, source: Path) -> str:
@@ -139,12 +140,12 @@ def _repair(path: Path) -> str:
 
 
 @contextmanager
-def _damage_told(path: Path) -> Iterator[None]:
-    """Whatever rosbags raises on a file that is no bag, or a damaged one, as one DataError."""
+def _damage_as_error(path: Path) -> Iterator[None]:
+    """Turn any error of rosbags on a file that is no bag, or a damaged one, into a DataError."""
     try:
         yield
     except PermissionError:
         raise DataError(f"{path}: cannot be read: permission denied") from None
     except Exception as error:  # struct.error, TypeError, KeyError, ...: rosbags trusts what it reads
-        said = str(error) if type(error).__module__.startswith("rosbags.") else f"{type(error).__name__}: {error}"
-        raise DataError(f"{path}: cannot be read as a bag: {said.rstrip('.')}; {_repair(path)}") from None
+        reason = str(error) if type(error).__module__.startswith("rosbags.") else f"{type(error).__name__}: {error}"
+        raise DataError(f"{path}: cannot be read as a bag: {reason.rstrip('.')}; {_repair(path)}") from None

@@ -1,4 +1,4 @@
-"""One bag as a recording of wheels, poses and commands, and its runs."""
+"""A bag as a recording of wheels, poses, scans and commands, and its runs."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from omnibench.data.importers.rosbag.wheel_samples import FASTEST, Losses, Wheel
 from omnibench.errors import DataError, one_line
 from omnibench.robot.kinematics import Array
 
-_SAME_TIME = 1e-9  # s, that of the stamps
+_SAME_TIME = 1e-9  # s, the resolution of the stamps
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What a bag holds, in s since the first wheel message. place: bag and wheel topic, for messages.
+    """Content of a bag, in s since the first wheel message. place: bag and wheel topic, for messages.
 
-    referenced: it holds reference poses; without, the poses are zeros at the stamps of the scans.
+    referenced: the bag holds reference poses; else poses are zeros at the stamps of the scans.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Run:
 
 
 def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list[str]) -> Recording:
-    """Read one bag; ``warnings`` is told what had to be left out. DataError, ConfigError."""
+    """Read one bag; what is left out is added to ``warnings``. DataError, ConfigError."""
     with open_bag(path) as bag:
         topic = wheel_topic(bag, options.wheel_topic)
         scan = scan_topic(bag, options.scan_topic, topic) if options.scans else None
@@ -76,7 +76,7 @@ def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list
     place = f"{path}: topic {topic.name}"
     signs = np.array(options.joint_signs or [1] * len(options.robot.wheels), dtype=float)
     samples, losses = wheel_samples(wheels, signs, options.wheel_wrap, options.still, place)
-    warnings.extend(f"{place}: {told}; runs end there" for told in _told(losses, options))
+    warnings.extend(f"{place}: {loss}; runs end there" for loss in _losses_in_words(losses, options))
     pose_times = seconds(poses.stamps, samples.origin)
     return Recording(
         name, place, samples, pose_times, poses.poses, poses.covariances, tuple(cuts), scans, reference is not None
@@ -84,9 +84,9 @@ def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list
 
 
 def cut_into_runs(recording: Recording, options: RosbagOptions, *, alone: bool = True) -> tuple[list[Run], list[str]]:
-    """The runs of a recording, named by their number, all of them training; and warnings of what is left out.
+    """The runs of a recording, named by their number, all of split train; and warnings of what is left out.
 
-    alone: it is the only one, so that a recording without any rest deserves a warning, too.
+    alone: the recording is the only one; then one without any rest is warned of, too.
     """
     runs: list[Run] = []
     pieces = short = bare = uncut = 0
@@ -113,8 +113,8 @@ def cut_into_runs(recording: Recording, options: RosbagOptions, *, alone: bool =
     if not runs:
         return runs, [f"{recording.place}: {_nothing(options)}"]
     if alone and options.cut == "rests" and uncut == len(runs):
-        told = f"no rest of {options.least_rest:g} s cuts it; set cut=topic or cut=windows for more runs"
-        return runs, [f"{recording.place}: {told}"]
+        advice = f"no rest of {options.least_rest:g} s cuts it; set cut=topic or cut=windows for more runs"
+        return runs, [f"{recording.place}: {advice}"]
     return runs, []
 
 
@@ -169,9 +169,10 @@ def _run(recording: Recording, part: slice, piece: Piece, number: str, session: 
 
 
 def _read_cuts(bag: Bag, topic: Topic, wheels: WheelStream) -> list[Cut]:
-    """When each message of a topic was sent, and the text of a String.
+    """Times of a topic's messages, with the text of a String.
 
-    Messages without a header have only the recorder's clock; the wheels, which have both, tell what it is by theirs.
+    Messages without a header have only the recorder's clock, which is converted by the wheels, whose messages have
+    both.
     """
     order = np.argsort(wheels.logged, kind="stable")
     logged, stamps = wheels.logged[order], np.maximum.accumulate(wheels.stamps[order])
@@ -192,21 +193,21 @@ def _check_clocks(path: Path, topic: Topic, wheels: WheelStream, what: str, othe
     inside = (stamps >= wheels.stamps[0]) & (stamps <= wheels.stamps[-1])
     if inside.sum() >= 2:
         return
-    spans = (f"{each[0] / 1e9:.3f} to {each[-1] / 1e9:.3f} s" for each in (stamps, wheels.stamps))
-    shown = " and ".join(f"{each.name} {span}" for each, span in zip((other, topic), spans, strict=True))
+    spans = (f"{times[0] / 1e9:.3f} to {times[-1] / 1e9:.3f} s" for times in (stamps, wheels.stamps))
+    shown = " and ".join(f"{named.name} {span}" for named, span in zip((other, topic), spans, strict=True))
     raise DataError(
         f"{path}: no two {what} while the wheels were recorded, by the stamps of their headers ({shown}); both must be "
         "stamped by one clock"
     )
 
 
-def _told(losses: Losses, options: RosbagOptions) -> list[str]:
-    told = []
+def _losses_in_words(losses: Losses, options: RosbagOptions) -> list[str]:
+    words = []
     if losses.gaps:
-        told.append(
+        words.append(
             f"wheel samples are missing {losses.gaps} times while the wheels turned, up to {losses.longest:.3g} s"
         )
     if losses.restarts:
         hint = "" if options.wheel_wrap else " (if that is a counter that wraps, set wheel_wrap)"
-        told.append(f"the positions begin anew {losses.restarts} times, by more than {FASTEST:g} rad/s{hint}")
-    return told
+        words.append(f"the positions begin anew {losses.restarts} times, by more than {FASTEST:g} rad/s{hint}")
+    return words

@@ -1,4 +1,4 @@
-"""Cutting an unbroken stretch of a recording into runs."""
+"""Cutting of an unbroken stretch of a recording into runs."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 
 from omnibench.robot.kinematics import Array
 
-_KEPT_REST = 0.5  # s of the rest before and after a run
+_KEPT_REST = 0.5  # s of rest that are kept before and after a run (chosen)
 
 
 @dataclass(frozen=True)
 class Piece:
-    """What becomes a run, from begin to end, s; ``moving``: how long it drives or may drive, s."""
+    """Time span of a run, begin and end in s. moving: how long the robot drives or may drive, s."""
 
     begin: float
     end: float
@@ -32,19 +32,19 @@ class Cut:
 
 
 def find_rests(times: Array, angles: Array, least: float, turned: float) -> list[tuple[float, float]]:
-    """When the wheels rest, as (begin, end) in s: no wheel's angle leaves a range of ``turned`` rad for ``least`` s.
+    """Rests as (begin, end), s: no wheel's angle leaves a range of ``turned`` rad for at least ``least`` s.
 
-    times (F + 1,): s. angles (F + 1, N): rad, at these times. The range, and not the rate from sample to sample, tells
-    a rest, because one tick of an encoder within a short sample is a high rate.
+    times (F + 1,): s. angles (F + 1, N): rad, at these times. The range is used and not the rate from sample to sample,
+    because one encoder tick within a short sample is a high rate.
     """
-    # The shortest spans of that length from each time on, and up to each time: (first, last) indices.
+    # (first, last) indices of the shortest spans of that length from each time on, and up to each time.
     every, enough = np.arange(len(times)), least * (1 - 1e-9)
     on = np.column_stack([every, np.searchsorted(times, times + enough)])
     back = np.column_stack([np.searchsorted(times, times - enough, side="right") - 1, every])
     spans = np.vstack([on[on[:, 1] < len(times)], back[back[:, 0] >= 0]])
     if not len(spans):
         return []
-    # reduceat takes pairs (first, behind the last); what is between two pairs comes out too.
+    # reduceat takes pairs (first, behind the last); every second result is that between two pairs.
     pairs = (spans + np.array([0, 1])).ravel()
     padded = np.vstack([angles, angles[-1:]])
     ranges = np.maximum.reduceat(padded, pairs)[::2] - np.minimum.reduceat(padded, pairs)[::2]
@@ -52,7 +52,7 @@ def find_rests(times: Array, angles: Array, least: float, turned: float) -> list
     balance = np.zeros(len(times) + 1, dtype=int)
     np.add.at(balance, quiet[:, 0], 1)
     np.add.at(balance, quiet[:, 1], -1)
-    resting = np.cumsum(balance)[:-1] > 0  # the sample that begins here
+    resting = np.cumsum(balance)[:-1] > 0  # of the sample that begins at each time
     steps = np.flatnonzero(np.diff(resting.astype(int), prepend=0, append=0))
     return [(float(times[begin]), float(times[end])) for begin, end in zip(steps[::2], steps[1::2], strict=True)]
 
@@ -76,7 +76,7 @@ def between_rests(span: tuple[float, float], rests: Sequence[tuple[float, float]
 
 
 def windows(span: tuple[float, float], length: float) -> list[Piece]:
-    """Pieces of ``length`` s one after the other; what is left at the end is one, too."""
+    """Pieces of ``length`` s one after the other; the last may be shorter."""
     begins = np.arange(span[0], span[1], length)
     ends = np.append(begins[1:], span[1])
     return [Piece(float(begin), float(end), float(end - begin)) for begin, end in zip(begins, ends, strict=True)]
@@ -85,8 +85,8 @@ def windows(span: tuple[float, float], length: float) -> list[Piece]:
 def from_cuts(times: Array, angles: Array, cuts: Sequence[Cut], stamps: Array, turned: float) -> list[Piece]:
     """The pieces of a stretch (times and angles as for ``find_rests``) from each cut to the next.
 
-    A piece reaches back to the last reference pose (``stamps``, s) before its cut when the wheels stood since then,
-    so that nothing of the drive is lost. A command that the stretch does not hold from its begin is not named.
+    A piece begins at the last reference pose (``stamps``, s) before its cut if the wheels stood since then, so that
+    nothing of the drive is lost. It has the command's name only if the stretch holds the command from its begin.
     """
     pieces = []
     for cut, following in zip(cuts, [*cuts[1:], None], strict=True):
@@ -101,7 +101,7 @@ def from_cuts(times: Array, angles: Array, cuts: Sequence[Cut], stamps: Array, t
 
 
 def _departure(rest: tuple[float, float], shared: bool, stamps: Array) -> float:
-    """When a run that follows a rest begins: at a reference pose of the rest, where it has one."""
+    """Begin of the run after a rest, s: at a reference pose of the rest, if it has one."""
     begin, end = rest
     target = max(end - _KEPT_REST, (begin + end) / 2 if shared else begin)
     inside = stamps[(stamps >= begin) & (stamps <= end)]
@@ -112,7 +112,7 @@ def _departure(rest: tuple[float, float], shared: bool, stamps: Array) -> float:
 
 
 def _arrival(rest: tuple[float, float], shared: bool, stamps: Array) -> float:
-    """When a run that a rest follows ends: at a reference pose of the rest, where it has one."""
+    """End of the run before a rest, s: at a reference pose of the rest, if it has one."""
     begin, end = rest
     return -_departure((-end, -begin), shared, -stamps[::-1])
 

@@ -21,16 +21,16 @@ Stamps = NDArray[np.int64]
 
 _SECOND = 1_000_000_000  # ns
 _NO_STAMP = "have no header stamp (it is 0)"
-_MOST_SET_BACK = 20  # messages that come a second late; more of them were stamped by a clock that was set back
-_LARGEST = 1e9
+_MOST_SET_BACK = 20  # messages that may come over a second late; more mean a clock that was set back (chosen)
+_LARGEST = 1e9  # rad, rad/s or m; a larger value is garbage
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))  # x, y and yaw of a covariance of x, y, z, roll, pitch, yaw
 
 
 @dataclass(frozen=True, eq=False)
 class WheelStream:
-    """stamps (F,): ns, increasing. values (F, N): positions (rad) or, not ``absolute``, velocities (rad/s).
+    """Wheel messages. stamps (F,): ns, increasing. logged (F,): times of recording, ns.
 
-    logged (F,): when each was recorded, ns.
+    values (F, N): positions (rad) if ``absolute``, else velocities (rad/s).
     """
 
     stamps: Stamps
@@ -41,7 +41,7 @@ class WheelStream:
 
 @dataclass(frozen=True, eq=False)
 class PoseStream:
-    """stamps (K,): ns, increasing. poses (K, 3): m, m, rad. covariances (K, 3, 3), where all messages have one."""
+    """Pose messages. stamps (K,): ns, increasing. poses (K, 3): m, m, rad. covariances (K, 3, 3), if all have one."""
 
     stamps: Stamps
     poses: Array
@@ -51,53 +51,53 @@ class PoseStream:
 def read_wheels(
     bag: Bag, topic: Topic, robot: Robot, joints: Sequence[str], use: Use, warnings: list[str]
 ) -> WheelStream:
-    """The wheels in the robot's order; ``warnings`` is told what is left out. DataError, ConfigError."""
-    sieve = Sieve(bag, topic)
+    """The wheels in the robot's order; what is left out is added to ``warnings``. DataError, ConfigError."""
+    messages = MessageFilter(bag, topic)
     places: dict[tuple[str, ...], tuple[int, ...] | None] = {}
     rows: list[tuple[Any, ...]] = []
-    for record, stamp, (names, position, velocity) in sieve.sifted(_joint_state):
+    for record, stamp, (names, position, velocity) in messages.decoded(_joint_state):
         if names not in places:
             places[names] = wheel_joints(robot, joints, names)
         chosen = places[names]
         if chosen is not None:  # other joints may come by the same topic
-            picked = (_picked(each, chosen, len(names)) for each in (position, velocity))
+            picked = (_picked(values, chosen, len(names)) for values in (position, velocity))
             rows.append((record.number, stamp, record.logged, *picked))
     if not rows:
         if not places:
-            sieve.require(0)
+            messages.require(0)
         raise no_joints(bag, topic, robot, joints, list(dict.fromkeys(name for names in places for name in names)))
     numbers, stamps, logged = (np.array([row[column] for row in rows], dtype=np.int64) for column in range(3))
     positions, velocities = (np.array([row[column] for row in rows]) for column in (3, 4))
     absolute = _uses_positions(positions, velocities, use)
     values = positions if absolute else velocities
     kind = "position" if absolute else "velocity"
-    good = sieve.keep(_possible(values), numbers, f"have no finite {kind} of every wheel")
-    order = good[sieve.in_order(stamps[good], numbers[good])]
-    sieve.require(len(order))
-    warnings.extend(sieve.told())
+    good = messages.keep(_possible(values), numbers, f"have no finite {kind} of every wheel")
+    order = good[messages.in_order(stamps[good], numbers[good])]
+    messages.require(len(order))
+    warnings.extend(messages.warnings())
     return WheelStream(stamps[order], logged[order], values[order], absolute)
 
 
 def read_poses(bag: Bag, topic: Topic, warnings: list[str]) -> PoseStream:
-    """Planar reference poses; ``warnings`` is told what is left out. DataError."""
-    sieve = Sieve(bag, topic)
+    """Planar reference poses; what is left out is added to ``warnings``. DataError."""
+    messages = MessageFilter(bag, topic)
     rows, covariances, numbers, stamps = [], [], [], []
-    for record, stamp, (pose, covariance) in sieve.sifted(_pose):
+    for record, stamp, (pose, covariance) in messages.decoded(_pose):
         rows.append(pose)
         covariances.append(covariance)
         numbers.append(record.number)
         stamps.append(stamp)
     table = np.array(rows, dtype=float).reshape(-1, 6)
     number, stamp_array = np.array(numbers, dtype=np.int64), np.array(stamps, dtype=np.int64)
-    good = sieve.keep(_possible(table[:, :2]), number, "have no finite position")
+    good = messages.keep(_possible(table[:, :2]), number, "have no finite position")
     headings = planar_headings(table[:, 2:])
     flawed = good[headings.flawed[good]]
     if len(flawed):
         detail = headings.flaw(int(flawed[0]))
-        good = good[sieve.keep(~headings.flawed[good], number[good], f"have a wrong orientation, as {detail}")]
-    order = good[sieve.in_order(stamp_array[good], number[good])]
-    sieve.require(len(order))
-    warnings.extend(sieve.told())
+        good = good[messages.keep(~headings.flawed[good], number[good], f"have a wrong orientation, as {detail}")]
+    order = good[messages.in_order(stamp_array[good], number[good])]
+    messages.require(len(order))
+    warnings.extend(messages.warnings())
     poses = np.column_stack([table[:, :2], headings.headings])[order]
     return PoseStream(stamp_array[order], poses, _known([covariances[index] for index in order]))
 
@@ -108,8 +108,8 @@ def header_stamp(message: Any) -> int:
     return 0 if stamp is None else int(stamp.sec) * _SECOND + int(stamp.nanosec)
 
 
-class Sieve:
-    """Leaves out the messages of a topic that are of no use, and remembers how many and why."""
+class MessageFilter:
+    """Filter of a topic's messages: drops the useless ones, and counts them by reason."""
 
     def __init__(self, bag: Bag, topic: Topic) -> None:
         self._bag = bag
@@ -118,8 +118,8 @@ class Sieve:
         self._reasons: dict[str, tuple[int, int]] = {}  # how many, and the first one's number
         self._sorted = 0
 
-    def sifted(self, unpack: Callable[[Any], T]) -> Iterator[tuple[Record, int, T]]:
-        """The messages that can be decoded and have a stamp (ns), with what ``unpack`` makes of them."""
+    def decoded(self, unpack: Callable[[Any], T]) -> Iterator[tuple[Record, int, T]]:
+        """The messages that can be decoded and have a stamp (ns), each with the result of ``unpack``."""
         for record in self._bag.records(self._topic):
             try:
                 stamp, content = header_stamp(record.message), unpack(record.message)
@@ -132,7 +132,7 @@ class Sieve:
                 yield record, stamp, content
 
     def keep(self, good: NDArray[np.bool_], numbers: Stamps, reason: str) -> NDArray[np.intp]:
-        """Indices of the good ones; the others are left out for ``reason``."""
+        """Indices of the good messages; the others are dropped for ``reason``."""
         for number in numbers[~good]:
             self._drop(reason, int(number))
         return np.flatnonzero(good)
@@ -155,24 +155,24 @@ class Sieve:
         return order[fresh]
 
     def require(self, kept: int) -> None:
-        """DataError when more messages were left out than kept, or fewer than two kept."""
+        """DataError when more messages were dropped than kept, or fewer than two kept."""
         if kept < max(2, sum(count for count, _ in self._reasons.values())):
-            told = self._reasons_told() or f"it has {self._topic.messages} messages, too few"
+            problem = self._dropped_in_words() or f"it has {self._topic.messages} messages, too few"
             way_out = "; the publisher must fill header.stamp" if _NO_STAMP in self._reasons else ""
-            raise DataError(f"{self._place}: {told}{way_out}")
+            raise DataError(f"{self._place}: {problem}{way_out}")
 
-    def told(self) -> list[str]:
-        """What was left out and put in order, as warnings."""
-        told = [f"{self._place}: {self._reasons_told()}"] if self._reasons else []
+    def warnings(self) -> list[str]:
+        """Warnings of messages that were dropped or put in order."""
+        warnings = [f"{self._place}: {self._dropped_in_words()}"] if self._reasons else []
         if self._sorted:
-            told.append(f"{self._place}: {self._sorted} messages were recorded late and sorted by their stamps")
-        return told
+            warnings.append(f"{self._place}: {self._sorted} messages were recorded late and sorted by their stamps")
+        return warnings
 
     def _drop(self, reason: str, number: int) -> None:
         count, first = self._reasons.get(reason, (0, number))
         self._reasons[reason] = (count + 1, first)
 
-    def _reasons_told(self) -> str:
+    def _dropped_in_words(self) -> str:
         if not self._reasons:
             return ""
         lost = sum(count for count, _ in self._reasons.values())
@@ -196,7 +196,7 @@ def _uses_positions(positions: Array, velocities: Array, use: Use) -> bool:
 
 
 def _possible(values: Array) -> NDArray[np.bool_]:
-    """Rows whose values are finite, and below what any robot reaches."""
+    """True for rows whose values are finite, and smaller than any robot reaches."""
     small: NDArray[np.bool_] = np.abs(values) < _LARGEST
     return np.asarray(small.all(axis=1))
 

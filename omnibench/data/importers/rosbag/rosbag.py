@@ -29,10 +29,10 @@ class Rosbag(Importer):
     those called like the wheels (``a``, ``wheel_a``, ``a_wheel_joint``), or ``joints`` names them in the robot's order;
     ``joint_signs: [-1, 1, 1]`` turns a wheel round: a positive rate drives the robot counter-clockwise.
 
-    scans: of a sensor_msgs/LaserScan (``scan_topic``; ``scans: false`` leaves them out) go into the data set, where the
-    scanner is mounted is told by /tf_static or ``scanner_mount: {x, y, yaw}`` (m, rad). A bag with scans and without
-    reference poses (odometry does not count as one) gets them from its scans by SLAM, with the options in ``slam``;
-    each run then begins at (0, 0, 0).
+    scans: those of a sensor_msgs/LaserScan (``scan_topic``; ``scans: false`` leaves them out) go into the data set.
+    Where the scanner is mounted comes from /tf_static or from ``scanner_mount: {x, y, yaw}`` (m, rad). A bag with scans
+    and without reference poses (odometry does not count as one) gets them from its scans by SLAM, with the options in
+    ``slam``; each run then begins at (0, 0, 0).
 
     times: the stamps of the headers, of all topics by one clock; when a message was recorded does not matter.
     Messages recorded late are sorted; those without a stamp, with a stamp that was there or with values that are not

@@ -1,4 +1,4 @@
-"""The options of the importer of ROS recordings."""
+"""Options of the importer of ROS recordings."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ class RosbagOptions(Options):
     )
     scans: bool = Field(True, description="false: leave the scans out")
     scanner_mount: Mount | None = Field(
-        None, description="x, y, yaw of the scanner on the robot; default: what /tf_static says, else the middle"
+        None,
+        description="x, y (m), yaw (rad) of the scanner on the robot; default: by /tf_static, else the robot's middle",
     )
     slam: dict[str, Any] = Field(
         {}, description="options of omnibench slam, for bags whose reference poses are made from their scans"
@@ -41,7 +42,7 @@ class RosbagOptions(Options):
     joints: Names = Field((), description="in the robot's wheel order; default: those called like the wheels")
     joint_signs: tuple[Literal[1, -1], ...] = Field((), description="-1 for joints that count the other way round")
     wheel_wrap: float | None = Field(
-        None, gt=0, allow_inf_nan=False, description="positions begin again after this many rad"
+        None, gt=0, allow_inf_nan=False, description="positions start again after this many rad"
     )
     use: Use = Field("auto", description="positions or velocities of the joints; auto: positions, if they are there")
     cut: Literal["rests", "topic", "windows", "none"] = Field(
@@ -62,9 +63,9 @@ class RosbagOptions(Options):
         None, gt=0, allow_inf_nan=False, description="s; default: the median of the wheel samples"
     )
     name: str = Field("rosbag", min_length=1, description="name of the data set")
-    description: str = Field("", description="of the data set")
-    source: str = Field("", description="where the recording comes from")
-    licence: str = Field("", description="of the recording")
+    description: str = Field("", description="description of the data set")
+    source: str = Field("", description="origin of the recording")
+    licence: str = Field("", description="licence of the recording")
 
     @model_validator(mode="after")
     def _fits_together(self) -> RosbagOptions:
@@ -86,5 +87,5 @@ class RosbagOptions(Options):
 
     @property
     def still(self) -> float:
-        """Angle that resting wheels stay within for ``least_rest`` s, rad."""
+        """Largest angle, rad, by which a resting wheel moves within ``least_rest`` s."""
         return self.rest_rate * self.least_rest

@@ -1,4 +1,4 @@
-"""Scans of a bag: what the scanner is, which scans are of use, and reading those of a run when they are wanted."""
+"""Scans of a bag: the scanner, the usable scans, and the reading of a run's scans on demand."""
 
 from __future__ import annotations
 
@@ -11,23 +11,22 @@ import numpy as np
 
 from omnibench.config import validate
 from omnibench.data.importers.rosbag.bag import Bag, Topic, open_bag
-from omnibench.data.importers.rosbag.message_streams import Sieve, Stamps, header_stamp
+from omnibench.data.importers.rosbag.message_streams import MessageFilter, Stamps, header_stamp
 from omnibench.data.importers.rosbag.scanner_frames import ScannerMounting, scanner_mounting
 from omnibench.data.scans import Mount, Ranges, Scanner, Scans, TrajectoryScans
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import Array
 
-# By how much the geometry of two scans of one scanner may differ; it comes in single precision.
-_SAME = 1e-5  # rad over the whole scan, m
-_SAME_PACE = 0.1  # of the time between rays, which some drivers measure anew for every scan
+_SAME = 1e-5  # rad over the whole scan, m; differences of geometry within one scanner: messages are in single precision
+_SAME_INCREMENT = 0.1  # relative difference of the time between rays, which some drivers measure anew for every scan
 _WAY_OUT = "scans=false leaves the scans out"
 
 
 @dataclass(frozen=True, eq=False)
 class ScanStream:
-    """Those scans of a bag's topic that are of use.
+    """Usable scans of a bag's topic.
 
-    stamps (S,): of the first rays, ns, increasing. logged (S,): when each was recorded, ns.
+    stamps (S,): of the first rays, ns, increasing. logged (S,): times of recording, ns.
     """
 
     path: Path
@@ -59,7 +58,7 @@ class RunScans:
     times: Array
 
     def read(self) -> TrajectoryScans:
-        """Read them. DataError: the bag is not what it was."""
+        """Read the scans. DataError: the bag has changed since it was opened."""
         stream = self.stream
         keys = zip(stream.logged.tolist(), stream.stamps.tolist(), strict=True)
         places = {key: index for index, key in enumerate(keys)}
@@ -76,7 +75,7 @@ class RunScans:
 
 
 class BagScans(Scans):
-    """The scans of a data set that is being imported: one run's are read from its bag at a time."""
+    """Scans of a data set that is being imported; they are read from their bag one run at a time."""
 
     def __init__(self, scanner: Scanner, runs: Mapping[str, RunScans]) -> None:
         self.scanner = scanner
@@ -99,56 +98,56 @@ class BagScans(Scans):
 
 
 def gather_scans(runs: Mapping[str, RunScans]) -> BagScans | None:
-    """The scans of all runs, if there are any. DataError: the bags' scanners differ."""
+    """The scans of all runs, None without any. DataError: the bags have different scanners."""
     if not runs:
         return None
     first, *others = {id(run.stream.scanner): run.stream for run in runs.values()}.values()
     for other in others:
-        told = _difference(_Shape.of_scanner(first.scanner), _Shape.of_scanner(other.scanner))
-        if not told and first.scanner.mount != other.scanner.mount:
-            told = f"the mount is {other.scanner.mount}, expected {first.scanner.mount}"
-        if told:
-            raise DataError(f"{other.place}: {told} as in {first.path}; import the bags apart; {_WAY_OUT}")
+        difference = _difference(_Shape.of_scanner(first.scanner), _Shape.of_scanner(other.scanner))
+        if not difference and first.scanner.mount != other.scanner.mount:
+            difference = f"the mount is {other.scanner.mount}, expected {first.scanner.mount}"
+        if difference:
+            raise DataError(f"{other.place}: {difference} as in {first.path}; import the bags apart; {_WAY_OUT}")
     return BagScans(first.scanner, runs)
 
 
 def read_scans(bag: Bag, topic: Topic, mount: Mount | None, warnings: list[str]) -> ScanStream:
-    """Look every scan of a topic through; ``warnings`` is told what is left out. DataError.
+    """Check every scan of a topic; what is left out is added to ``warnings``. DataError.
 
-    mount: where the scanner sits; None: where /tf_static says, else in the middle of the robot, with a warning.
+    mount: of the scanner; None: that of /tf_static, or else the middle of the robot, with a warning.
     """
-    sieve, place = Sieve(bag, topic), f"{bag.path}: topic {topic.name}"
+    messages, place = MessageFilter(bag, topic), f"{bag.path}: topic {topic.name}"
     shape, frame, scan_time = None, "", 0.0
     rows: list[tuple[int, int, int, bool, float]] = []
-    for record, stamp, (found, pace, seen) in sieve.sifted(_laser_scan):
+    for record, stamp, (scan_shape, increment, seen) in messages.decoded(_laser_scan):
         if shape is None:
-            shape, frame, scan_time = found, record.message.header.frame_id, float(record.message.scan_time)
-        told = _difference(shape, found)
-        if told:
+            shape, frame, scan_time = scan_shape, record.message.header.frame_id, float(record.message.scan_time)
+        difference = _difference(shape, scan_shape)
+        if difference:
             raise DataError(
-                f"{place}, message {record.number}: {told} as in the messages before; the scans must be those of one "
+                f"{place}, message {record.number}: {difference} as in the messages before; all scans must be of one "
                 f"scanner, of one number of rays; {_WAY_OUT}"
             )
-        rows.append((record.number, stamp, record.logged, seen, pace))
+        rows.append((record.number, stamp, record.logged, seen, increment))
     numbers, stamps, logged = (np.array([row[column] for row in rows], dtype=np.int64) for column in range(3))
     if shape is not None:
         empty = f"are empty (no range from {shape.range_min:g} to {shape.range_max:g} m)"
-        good = sieve.keep(np.array([row[3] for row in rows]), numbers, empty)
-        order = good[sieve.in_order(stamps[good], numbers[good])]
+        good = messages.keep(np.array([row[3] for row in rows]), numbers, empty)
+        order = good[messages.in_order(stamps[good], numbers[good])]
     try:
-        sieve.require(len(order) if shape else 0)
+        messages.require(len(order) if shape else 0)
     except DataError as error:
         raise DataError(f"{error}; {_WAY_OUT}") from None
     assert shape is not None  # else nothing is left
-    warnings.extend(sieve.told())
-    pace = _pace([row[4] for row in rows], scan_time, place, warnings)
-    scanner = _scanner(shape, pace, _seat(bag, frame, mount, place, warnings), topic, place)
+    warnings.extend(messages.warnings())
+    increment = _time_increment([row[4] for row in rows], scan_time, place, warnings)
+    scanner = _scanner(shape, increment, _mounting(bag, frame, mount, place, warnings), topic, place)
     return ScanStream(bag.path, topic, scanner, stamps[order], logged[order])
 
 
 @dataclass(frozen=True)
 class _Shape:
-    """What the scans of one scanner have in common."""
+    """Geometry that the scans of one scanner share: rays, rad, m."""
 
     rays: int
     angle_min: float
@@ -162,9 +161,9 @@ class _Shape:
 
 
 def _laser_scan(message: Any) -> tuple[_Shape, float, bool]:
-    """The shape of a scan, the time between its rays (s), and whether it saw anything."""
+    """The shape of a scan, the time between its rays (s), and True if any range is a measurement."""
     ranges, range_max = message.ranges, float(message.range_max)
-    if not np.isfinite(range_max):  # some drivers know no limit
+    if not np.isfinite(range_max):  # some drivers give no limit
         range_max = float(np.finfo(np.float32).max)
     shape = _Shape(
         len(ranges), float(message.angle_min), float(message.angle_increment), float(message.range_min), range_max
@@ -173,58 +172,58 @@ def _laser_scan(message: Any) -> tuple[_Shape, float, bool]:
 
 
 def _measured(message: Any) -> Ranges:
-    """The ranges of a scan (R,), m; inf for all that are no measurement: NaN, 0, and out of the scanner's range."""
+    """The ranges of a scan (R,), m; inf for NaN, 0 and values out of the scanner's range, which are no measurements."""
     ranges = np.asarray(message.ranges, dtype=np.float32)
     good = (ranges >= message.range_min) & (ranges <= message.range_max) & (ranges > 0)  # False for NaN
     return np.where(good, ranges, np.float32(np.inf))
 
 
-def _difference(expected: _Shape, found: _Shape) -> str:
-    """The first thing in which two scans differ, as ``rays is 720, expected 1080``; else an empty text."""
-    if found.rays != expected.rays:
-        return f"a scan has {found.rays} ranges, expected {expected.rays}"
+def _difference(expected: _Shape, given: _Shape) -> str:
+    """The first difference between two scans, as ``range_max is 12, expected 30``; empty if there is none."""
+    if given.rays != expected.rays:
+        return f"a scan has {given.rays} ranges, expected {expected.rays}"
     for name, tolerance in (
         ("angle_min", _SAME),
         ("angle_increment", _SAME / max(expected.rays, 1)),
         ("range_min", _SAME),
         ("range_max", _SAME * max(1.0, abs(expected.range_max))),
     ):
-        ours, theirs = getattr(expected, name), getattr(found, name)
+        ours, theirs = getattr(expected, name), getattr(given, name)
         if not abs(ours - theirs) <= tolerance:
             return f"{name} is {theirs:g}, expected {ours:g}"
     return ""
 
 
-def _pace(paces: list[float], scan_time: float, place: str, warnings: list[str]) -> float:
-    """The time between rays, s, of the scanner."""
-    pace = float(np.median(paces))
-    if np.abs(np.array(paces) - pace).max() > _SAME_PACE * abs(pace):
-        low, high = min(paces), max(paces)
+def _time_increment(increments: list[float], scan_time: float, place: str, warnings: list[str]) -> float:
+    """The scanner's time between rays, s: the median of its scans."""
+    increment = float(np.median(increments))
+    if np.abs(np.array(increments) - increment).max() > _SAME_INCREMENT * abs(increment):
+        low, high = min(increments), max(increments)
         warnings.append(
-            f"{place}: time_increment varies from {low:.3g} to {high:.3g} s; its median, {pace:.3g} s, is taken"
+            f"{place}: time_increment varies from {low:.3g} to {high:.3g} s; its median, {increment:.3g} s, is taken"
         )
-    if pace == 0 and scan_time > 0:
+    if increment == 0 and scan_time > 0:
         warnings.append(
             f"{place}: time_increment is 0, so that each scan counts as taken at one instant, though scan_time is "
             f"{scan_time:.3g} s"
         )
-    return pace
+    return increment
 
 
-def _seat(bag: Bag, frame: str, mount: Mount | None, place: str, warnings: list[str]) -> ScannerMounting:
+def _mounting(bag: Bag, frame: str, mount: Mount | None, place: str, warnings: list[str]) -> ScannerMounting:
     if mount is not None:
         return ScannerMounting(mount)
-    seat = scanner_mounting(bag, frame)
-    if seat is None:
+    mounting = scanner_mounting(bag, frame)
+    if mounting is None:
         warnings.append(
-            f"{place}: nothing tells where the scanner ({frame or 'a frame without a name'}) is mounted (no /tf_static "
+            f"{place}: it is unknown where the scanner ({frame or 'a frame without a name'}) is mounted (no /tf_static "
             "from base_link); the robot's middle is taken; set scanner_mount={x: 0.1, y: 0, yaw: 0} (m, rad)"
         )
-    return seat or ScannerMounting(Mount())
+    return mounting or ScannerMounting(Mount())
 
 
-def _scanner(shape: _Shape, pace: float, seat: ScannerMounting, topic: Topic, place: str) -> Scanner:
-    sign = -1.0 if seat.upside_down else 1.0
+def _scanner(shape: _Shape, increment: float, mounting: ScannerMounting, topic: Topic, place: str) -> Scanner:
+    sign = -1.0 if mounting.upside_down else 1.0
     try:
         return validate(
             Scanner,
@@ -233,10 +232,10 @@ def _scanner(shape: _Shape, pace: float, seat: ScannerMounting, topic: Topic, pl
                 "rays": shape.rays,
                 "angle_min": sign * shape.angle_min,
                 "angle_increment": sign * shape.angle_increment,
-                "time_increment": pace,
+                "time_increment": increment,
                 "range_min": shape.range_min,
                 "range_max": shape.range_max,
-                "mount": seat.mount,
+                "mount": mounting.mount,
             },
             place,
         )

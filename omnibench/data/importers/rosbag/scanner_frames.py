@@ -1,4 +1,4 @@
-"""Where a scanner sits on its robot, by the fixed transforms of a bag (``/tf_static``)."""
+"""Mounting of a scanner on its robot by the fixed transforms of a bag (``/tf_static``)."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
 _BASES = ("base_link", "base_footprint", "base")  # REP-105; with or without the robot's namespace
-_LARGEST_TILT = math.radians(20)
+_LARGEST_TILT = math.radians(20)  # rad; a scanner with a larger tilt does not scan parallel to the floor (chosen)
 
 
 @dataclass(frozen=True)
 class ScannerMounting:
-    """A mount. upside_down: rays that count counter-clockwise for the scanner run clockwise for the robot."""
+    """A scanner's mount. upside_down: its counter-clockwise rays run clockwise in the robot's frame."""
 
     mount: Mount
     upside_down: bool = False
 
 
 def scanner_mounting(bag: Bag, frame: str) -> ScannerMounting | None:
-    """Where the frame of a scanner is in the robot's; None when the bag does not tell. DataError: it is tilted."""
+    """Mounting of the scanner with a frame; None if the bag has no transform to it. DataError: it is tilted."""
     parents = _fixed_transforms(bag)
     child, whole = frame.strip("/"), np.eye(4)
     for _ in range(len(parents) + 1):
@@ -40,14 +40,14 @@ def scanner_mounting(bag: Bag, frame: str) -> ScannerMounting | None:
 
 
 def _fixed_transforms(bag: Bag) -> dict[str, tuple[str, Array]]:
-    """Of every frame its parent, and the transform (4, 4) from the frame to the parent."""
-    found: dict[str, tuple[str, Array]] = {}
+    """Parent of every frame, and the transform (4, 4) from the frame to its parent."""
+    parents: dict[str, tuple[str, Array]] = {}
     for topic in bag.topics:
         if topic.type != "tf2_msgs/msg/TFMessage" or not topic.name.endswith("tf_static"):
             continue
         for record in bag.records(topic):
-            for each in getattr(record.message, "transforms", ()):
-                turn, place = each.transform.rotation, each.transform.translation
+            for stamped in getattr(record.message, "transforms", ()):
+                turn, place = stamped.transform.rotation, stamped.transform.translation
                 matrix = np.eye(4)
                 try:
                     matrix[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
@@ -55,8 +55,8 @@ def _fixed_transforms(bag: Bag) -> dict[str, tuple[str, Array]]:
                     continue
                 matrix[:3, 3] = place.x, place.y, place.z
                 if np.isfinite(matrix).all():
-                    found[each.child_frame_id.strip("/")] = each.header.frame_id.strip("/"), matrix
-    return found
+                    parents[stamped.child_frame_id.strip("/")] = stamped.header.frame_id.strip("/"), matrix
+    return parents
 
 
 def _planar(transform: Array, bag: Bag, frame: str) -> ScannerMounting:

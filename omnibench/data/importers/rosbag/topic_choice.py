@@ -1,4 +1,4 @@
-"""Which topics of a bag hold wheels, reference poses and scans, and which joints are the robot's wheels."""
+"""Choice of a bag's topics for wheels, reference poses and scans, and of the joints that are the robot's wheels."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ POSE_TYPES = (
     "nav_msgs/msg/Odometry",
 )
 SCAN_TYPES = ("sensor_msgs/msg/LaserScan",)
-# What a joint is called besides the wheel that it turns: front_left_wheel_joint, drive/wheel_a.
+# Words in the names of joints besides the wheel's own name: front_left_wheel_joint, drive/wheel_a.
 _USUAL = {"wheel", "wheels", "joint", "motor", "drive", "link", "axle", "hub"}
 
 
@@ -45,8 +45,9 @@ def scan_topic(bag: Bag, name: str | None, wheels: Topic) -> Topic | None:
 def pose_topic(bag: Bag, name: str | None, wheels: Topic, scans: Topic | None = None) -> Topic | None:
     """The topic of the reference poses: the one named, the only one, or the only one that ends in slam_pose.
 
-    Among several that do, the one of the wheels' namespace. Odometry is never taken unasked: a calibration against
-    the robot's own odometry would find nothing wrong. None: there is none, but ``scans``, from which they can be made.
+    Among several that do, the one of the wheels' namespace. Odometry is never taken unasked: a calibration against the
+    robot's own odometry would find nothing wrong. None: there is none, but there are ``scans``, from which poses can be
+    made.
     """
     if name is not None:
         return _named(bag, name, "pose_topic", POSE_TYPES)
@@ -66,10 +67,10 @@ def pose_topic(bag: Bag, name: str | None, wheels: Topic, scans: Topic | None = 
 
 
 def wheel_joints(robot: Robot, asked: Sequence[str], found: Sequence[str]) -> tuple[int, ...] | None:
-    """Where in a JointState with the names ``found`` the robot's wheels are; None when not all of them are there.
+    """Indices of the robot's wheels in a JointState with the names ``found``; None when not all of them are there.
 
-    asked: joints in the robot's wheel order, or none; then those called like the wheels, at first to the letter, else
-    but for words such as ``wheel`` and ``joint``, for case, and for what stands before a slash.
+    asked: joints in the robot's wheel order. Without them joints are chosen by the wheels' names: equal ones, else
+    those that are equal but for words such as ``wheel`` and ``joint``, case, and text before a slash.
     """
     wanted = asked or robot.wheel_names
     if all(found.count(name) == 1 for name in wanted):

@@ -1,4 +1,4 @@
-"""Wheel samples of a bag: mean rates between stamps, and the stretches in which none is missing."""
+"""Wheel samples of a bag: mean rates between stamps, in stretches without missing samples."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from omnibench.data.importers.rosbag.message_streams import Stamps, WheelStream
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
-# A robot that drove on for so long without a sample is lost to odometry by constant twist.
-_LONGEST_GAP = 0.5  # s
-_LONGEST_GAP_PERIODS = 10
-_MOST_RESTARTS = 0.05  # of all samples
-FASTEST = 100.0  # rad/s; a position that changes faster was begun anew
+# A longer gap while the robot drives ends a stretch, since a constant twist does not describe it (chosen):
+_LONGEST_GAP = 0.5  # s, and
+_LONGEST_GAP_PERIODS = 10  # sample periods
+_MOST_RESTARTS = 0.05  # share of restarts among all samples; more mean a wrong unit
+FASTEST = 100.0  # rad/s; a position that changes faster has started again (chosen)
 
 
 @dataclass(frozen=True, eq=False)
 class WheelSamples:
-    """Sample k reaches from begins[k] to ends[k], s since ``origin`` (ns); none reaches over a hole.
+    """Wheel samples from begins (F,) to ends (F,), s since ``origin`` (ns); none spans a gap.
 
-    rates (F, N): rad/s. angles (F, N) at the ends, rad, or None. stretch (F,): counts up where a sample does not begin
-    at the end of the one before; angles go on within a stretch only.
+    rates (F, N): rad/s. angles (F, N): at the ends, rad, or None. stretch (F,): number of the unbroken stretch that a
+    sample belongs to; angles are continuous within a stretch only.
     """
 
     origin: int
@@ -50,7 +50,7 @@ class WheelSamples:
 
 @dataclass(frozen=True)
 class Losses:
-    """Samples that count for nothing: gaps in the stream, and restarts of the counters."""
+    """Samples that were dropped: gaps in the stream, and restarts of the counters."""
 
     gaps: int
     longest: float  # gap, s
@@ -58,7 +58,7 @@ class Losses:
 
 
 def seconds(stamps: Stamps, origin: int) -> Array:
-    """Stamps (ns) in seconds since ``origin``: to the nanosecond, which unix time in a double does not hold."""
+    """Stamps (ns) in s since ``origin``, exact to the nanosecond, which a double of unix time is not."""
     since: Array = (stamps - origin) / 1e9
     return since
 
@@ -68,8 +68,8 @@ def wheel_samples(
 ) -> tuple[WheelSamples, Losses]:
     """Samples from recorded positions or velocities.
 
-    signs (N,). wrap: after how many rad positions begin again. still: wheels that turned by less (rad) in a gap stood.
-    DataError: positions that begin again, though ``wrap`` is not given, or that are not in rad.
+    signs (N,): 1 or -1. wrap: value, rad, after which positions start again. still: rad; wheels that turned by less in
+    a gap stood. DataError: positions start again without ``wrap``, or are not in rad.
     """
     origin = int(wheels.stamps[0])
     times, values = seconds(wheels.stamps, origin), wheels.values
@@ -105,7 +105,7 @@ def wheel_samples(
 
 
 def _counted(values: Array, wrap: float | None, place: str) -> tuple[Array, Array]:
-    """Angles (F, N) and the steps between them (F - 1, N), whole turns of ``wrap`` put right."""
+    """Angles (F, N) and the steps between them (F - 1, N), unwrapped by multiples of ``wrap``."""
     steps = np.diff(values, axis=0)
     if wrap is not None:
         steps = steps - wrap * np.round(steps / wrap)
