@@ -101,7 +101,7 @@ def read_candidates(
 def candidates_of_dataset(dataset: Dataset, integration: Integration = "arc", source: str = "") -> CandidatePool:
     """The commands of the training runs, as recorded; the noise is estimated from their repetitions.
 
-    DataError: no command is named, or only one; the commands leave part of the matrix open; there is no noise at all.
+    DataError: no command is named, or only one; the commands leave part of the matrix undetermined; there is no noise.
     """
     place = source or f"data set {dataset.name}"
     training = training_split(dataset)
@@ -143,7 +143,7 @@ def candidates_of_dataset(dataset: Dataset, integration: Integration = "arc", so
 def candidates_of_config(config: DesignConfig, source: str = "") -> CandidatePool:
     """The commands of a design config, driven as designed.
 
-    ConfigError: a set leaves part of the matrix open, or has one command; the noise is zero.
+    ConfigError: a set leaves part of the matrix undetermined, or has one command; the noise is zero.
     """
     place = source or f"config {config.name}"
     periods = (config.sample_period, config.pose_period)
@@ -178,7 +178,7 @@ def candidates_of_simulation(
 ) -> CandidatePool:
     """The commands that a simulated data set's training session drives, as designed, with the noise that is simulated.
 
-    ConfigError: the commands leave part of the matrix open, there is one only, or the noise is zero.
+    ConfigError: the commands leave part of the matrix undetermined, there is one only, or the noise is zero.
     """
     ramp = config.commands.ramp
     commands = tuple(

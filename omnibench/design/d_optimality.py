@@ -59,7 +59,7 @@ class Candidates:
         scale = 1 / np.sqrt(np.maximum(np.diagonal(mean), np.finfo(float).tiny))
         values, vectors = np.linalg.eigh(mean * scale * scale[:, None])
         if not (np.isfinite(values).all() and values[0] > 1e-9 * values[-1]):
-            raise ValueError("the candidates together leave a direction of the parameters open")
+            raise ValueError("the candidates together leave a direction of the parameters undetermined")
         self.basis: Array = scale[:, None] * vectors / np.sqrt(values)
         standard = self.basis.T @ information @ self.basis
         self.information: Array = (standard + np.swapaxes(standard, 1, 2)) / 2

@@ -75,8 +75,8 @@ class DesignProblem:
         row = int(np.argmax(np.linalg.norm(elements, axis=1))) + 1
         poses = "the final poses" if use == "final" else "the poses"
         return (
-            f"{self.pool.source}: {poses} of {name or 'all commands'} leave row {row} of the matrix open along "
-            f"{direction_in_words(direction, self.pool.robot.wheel_names)}; add commands that tell it"
+            f"{self.pool.source}: {poses} of {name or 'all commands'} leave row {row} of the matrix undetermined along "
+            f"{direction_in_words(direction, self.pool.robot.wheel_names)}; add commands that determine it"
         )
 
     def of_all(self, name: str, counts: Counts) -> Counts:

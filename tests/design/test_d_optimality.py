@@ -215,7 +215,7 @@ def test_an_equal_design_that_is_not_allowed_is_none() -> None:
 def test_candidates_that_leave_a_direction_open_are_refused() -> None:
     own = information(4)
     own[:, 2] = own[:, :, 2] = 0.0
-    with pytest.raises(ValueError, match="open"):
+    with pytest.raises(ValueError, match="undetermined"):
         Candidates(own)
 
 

@@ -99,7 +99,9 @@ def _equal_table(design: Design) -> Table:
         for equal in of_set.equivalents:
             effort = equal.effort
             reason = (
-                "they leave part of the matrix open" if equal.least is None else "not within the repetitions allowed"
+                "they leave part of the matrix undetermined"
+                if equal.least is None
+                else "not within the repetitions allowed"
             )
             cells = [Cell(NOTHING, reason), Cell(NOTHING), Cell(NOTHING)]
             if effort is not None:

@@ -60,7 +60,7 @@ def equal_in_words(design: Design, of_set: SetDesign, use: Use) -> str:
     """How many runs of a set give as much information as the baseline."""
     equal = next(equal for equal in of_set.equivalents if equal.use == use)
     if equal.least is None:
-        return "none: they leave part of the matrix open"
+        return "none: they leave part of the matrix undetermined"
     least = f"{least_in_words(equal.least)} {UNIT_OF_COST[design.per]}"
     if equal.effort is None:
         return f"none within the repetitions allowed (no design does it below {least})"
@@ -74,13 +74,15 @@ def headline(design: Design) -> str:
 
 def _verdict(design: Design, of_set: SetDesign) -> str:
     equal = next(equal for equal in of_set.equivalents if equal.use == design.use)
-    words = f"{of_set.name}: {plural(of_set.step.effort.runs, 'run')} of {plural(len(of_set.chosen), 'command')} tell "
+    words = f"{of_set.name}: {plural(of_set.step.effort.runs, 'run')} of {plural(len(of_set.chosen), 'command')} give "
     if of_set.reached:
-        words += f"as much per {design.per} as the best design from {len(of_set.commands)} commands, within 1 %"
+        words += (
+            f"as much information per {design.per} as the best design from {len(of_set.commands)} commands, within 1 %"
+        )
     else:
-        words += f"{percent(of_set.step.efficiency)} of what the best design may per {design.per}"
+        words += f"{percent(of_set.step.efficiency)} of the best design's information per {design.per}"
     if equal.effort is not None:
-        words += f"; {count(equal.effort.runs)} of the best runs tell as much as the baseline's {baseline_runs(design)}"
+        words += f"; {count(equal.effort.runs)} of the best runs give as much as the baseline's {baseline_runs(design)}"
     return words + "."
 
 
