@@ -17,7 +17,7 @@ from omnibench.cli.options import (
 )
 from omnibench.cli.terminal.console import make_console, print_json, warn
 from omnibench.errors import ConfigError
-from omnibench.report.numbers import plural
+from omnibench.words import plural
 
 recording_app = typer.Typer()
 

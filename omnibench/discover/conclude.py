@@ -22,8 +22,8 @@ from omnibench.discover.selection.named_effects import candidates_of
 from omnibench.discover.selection.screening import Screening
 from omnibench.discover.verdict import headline_of
 from omnibench.fit.least_squares.noise import Whitener
-from omnibench.report.numbers import plural
 from omnibench.robot.kinematics import Array
+from omnibench.words import plural
 
 _FEW_RUNS, _FEW_COMMANDS = 10, 4  # with fewer a note says that these show hardly anything; chosen
 _WORSE = 1.05  # times the plain matrix's error: more than chance makes of it; chosen

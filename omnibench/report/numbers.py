@@ -75,9 +75,3 @@ def listing(names: list[str], limit: int = 8) -> str:
     """Names as ``a, b and c``; those beyond ``limit`` are counted."""
     shown = names[:limit] + ([f"{len(names) - limit} more"] if len(names) > limit else [])
     return " and ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)
-
-
-def plural(number: int, noun: str) -> str:
-    """A number with its noun: ``1 run``, ``2 runs``."""
-    several = f"{noun[:-1]}ies" if noun[-1] == "y" and noun[-2] not in "aeo" else f"{noun}s"
-    return f"{count(number)} {noun if number == 1 else several}"

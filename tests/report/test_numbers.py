@@ -8,17 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omnibench.report.numbers import (
-    NOTHING,
-    decimals_for,
-    fixed,
-    listing,
-    percent,
-    plural,
-    power_of_ten,
-    seconds,
-    significant,
-)
+from omnibench.report.numbers import NOTHING, decimals_for, fixed, listing, percent, power_of_ten, seconds, significant
+from omnibench.words import plural
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,9 @@ from omnibench.fit.evaluate import Evaluation
 from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals
 from omnibench.fit.uncertainty.physical import ParameterEstimate
-from omnibench.report.numbers import plural
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
+from omnibench.words import plural
 
 
 def print_certificate(console: Console, certified: CertifiedCalibration) -> None:

@@ -11,7 +11,7 @@ from rich.table import Table
 from omnibench.cli.terminal.tables import folding_table
 from omnibench.compare.result import ComparisonResult, EntryStatistics, Interval
 from omnibench.data.dataset import SPLITS, Split
-from omnibench.report.numbers import plural
+from omnibench.words import plural
 
 _TITLES: dict[Split, str] = {"train": "Training", "validation": "Validation"}
 _MATRIX = "M^-1"  # heading of the column with the entries' labels, as in the paper's tables

@@ -26,7 +26,8 @@ from omnibench.discover.report.wording import (
     worst_of_each,
 )
 from omnibench.discover.result import Discovery, Gap, NamedEffect
-from omnibench.report.numbers import fixed, listing, plural
+from omnibench.report.numbers import fixed, listing
+from omnibench.words import plural
 
 # So much is shown that the answer fits into a screen; the report has the rest.
 _WIDTH = 80  # columns

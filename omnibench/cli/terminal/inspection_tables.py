@@ -9,7 +9,7 @@ from rich.table import Table
 
 from omnibench.fit.inspect import Inspection, ScansContent
 from omnibench.fit.uncertainty.identifiability import ROWS, Identifiability
-from omnibench.report.numbers import plural
+from omnibench.words import plural
 
 
 def print_inspection(console: Console, inspection: Inspection) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
-from omnibench.report.numbers import plural
+from omnibench.words import plural
 
 if TYPE_CHECKING:
     from omnibench.live.replay.demonstration import Demonstration, Deviation

@@ -16,7 +16,7 @@ from rich.progress import (
 )
 
 from omnibench.cli.terminal.console import make_console
-from omnibench.report.numbers import plural
+from omnibench.words import plural
 
 if TYPE_CHECKING:
     from omnibench.compare.plan import PlannedRun

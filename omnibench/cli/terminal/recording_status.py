@@ -18,7 +18,7 @@ from omnibench.live.network.presence import alive_robots, nothing_received
 from omnibench.live.stopping import ticks
 from omnibench.live.wire.recorder import Recorder
 from omnibench.live.wire.topics import TOPICS, KeySpace
-from omnibench.report.numbers import plural
+from omnibench.words import plural
 
 _PERIOD: Final = 0.25  # s between two updates of the line on a terminal; chosen
 _PIPED_PERIOD: Final = 10.0  # s between two lines when the output is piped

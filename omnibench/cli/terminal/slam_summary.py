@@ -9,9 +9,9 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from omnibench.report.numbers import plural
 from omnibench.slam.accuracy import SlamAccuracy
 from omnibench.slam.summary import SlamSummary
+from omnibench.words import plural
 
 
 def print_slam(console: Console, summary: SlamSummary) -> None:

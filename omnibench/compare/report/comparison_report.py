@@ -35,9 +35,10 @@ from omnibench.report.blocks import (
     Section,
     Table,
 )
-from omnibench.report.numbers import NOTHING, count, fixed, listing, plural
+from omnibench.report.numbers import NOTHING, count, fixed, listing
 from omnibench.report.recording.section import has_recording, recording_section
 from omnibench.report.render import write_document
+from omnibench.words import plural
 
 _SIMULATED = Badge("SIMULATED DATA", "warning")
 

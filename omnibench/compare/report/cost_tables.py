@@ -8,7 +8,8 @@ from omnibench.compare.report.wording import cost_decimals, cost_in_words, entry
 from omnibench.compare.result import EntryStatistics, Interval
 from omnibench.data.dataset import Split
 from omnibench.report.blocks import Cell, Column, Row, Section, Table
-from omnibench.report.numbers import NOTHING, fixed, percent, plural, span
+from omnibench.report.numbers import NOTHING, fixed, percent, span
+from omnibench.words import plural
 
 
 def cost_section(view: DatasetView) -> Section:

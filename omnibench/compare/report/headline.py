@@ -15,7 +15,8 @@ from omnibench.compare.report.wording import (
 from omnibench.compare.result import EntryStatistics
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.report.blocks import Block, Callout, Fact, Facts, Paragraph, Section
-from omnibench.report.numbers import fixed, listing, percent, plural, span
+from omnibench.report.numbers import fixed, listing, percent, span
+from omnibench.words import plural
 
 _ARRIVED = 0.01  # relative: a search whose training cost is further above the lowest one missed the minimum (chosen)
 # Share of the interval's width: seeds whose costs differ by more are worth a remark (chosen).

@@ -11,9 +11,10 @@ import plotly.graph_objects as go
 from omnibench.design.report.design_wording import baseline_runs, command_in_words
 from omnibench.design.result import Candidate, Design, Precision, SetDesign, Step
 from omnibench.report.blocks import Dash, Figure, FigureGrid, LegendItem
-from omnibench.report.numbers import percent, plural
+from omnibench.report.numbers import percent
 from omnibench.report.style import INK, PALETTE, QUIET, equal_aspect, logarithmic, plot, text
 from omnibench.robot.kinematics import Array
+from omnibench.words import plural
 
 _LEFT, _STRAIGHT, _RIGHT = PALETTE[0], "#5b6772", PALETTE[1]
 _UNUSED = "#d4d9df"

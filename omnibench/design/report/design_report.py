@@ -36,8 +36,9 @@ from omnibench.report.blocks import (
     Section,
     Table,
 )
-from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, plural, significant
+from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, significant
 from omnibench.report.render import write_document
+from omnibench.words import plural
 
 
 def write_design_report(design: Design, path: Path) -> None:

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 
 from omnibench.design.config import Per, Use
 from omnibench.design.result import Candidate, Design, Effort, SetDesign
-from omnibench.report.numbers import count, fixed, percent, plural, significant
+from omnibench.report.numbers import count, fixed, percent, significant
+from omnibench.words import plural
 
 USE_IN_WORDS: Mapping[Use, str] = {"final": "final poses", "trajectory": "whole trajectories"}
 UNIT_OF_COST: Mapping[Per, str] = {"run": "runs", "second": "s", "metre": "m of wheel"}

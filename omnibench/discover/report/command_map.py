@@ -11,9 +11,10 @@ import plotly.graph_objects as go
 from omnibench.discover.report.before_after import BAND, NOISE, ModelStyle, legend, numbers, round_down
 from omnibench.discover.report.residuals import CIRCLE_95, CommandResidual
 from omnibench.report.blocks import Figure, FigureGrid
-from omnibench.report.numbers import fixed, plural
+from omnibench.report.numbers import fixed
 from omnibench.report.style import INK, QUIET, equal_aspect, plot, text
 from omnibench.robot.kinematics import Array
+from omnibench.words import plural
 
 
 def command_maps(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> FigureGrid:

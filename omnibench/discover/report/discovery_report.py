@@ -50,7 +50,8 @@ from omnibench.report.blocks import (
     Paragraph,
     Section,
 )
-from omnibench.report.numbers import count, fixed, listing, plural
+from omnibench.report.numbers import count, fixed, listing
+from omnibench.words import plural
 
 
 def discovery_report(discovery: Discovery, options: str) -> Document:

@@ -14,9 +14,9 @@ from omnibench.discover.report.before_after import ModelStyle, numbers, round_do
 from omnibench.discover.report.motion_figures import MODES, CovariateFigure, fit_modes
 from omnibench.discover.report.residuals import CIRCLE_95, Residuals
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
-from omnibench.report.numbers import plural
 from omnibench.report.style import equal_aspect, plot, text
 from omnibench.robot.kinematics import Array
+from omnibench.words import plural
 
 _CELLS = 8  # along the longer side (chosen)
 _LEAST = 0.003  # share of the samples; a cell with fewer is left out (chosen)

@@ -23,8 +23,9 @@ from omnibench.discover.report.wording import (
 from omnibench.discover.result import CovariateDependence, Discovery, Extrapolation, Gap, Hidden, NamedEffect
 from omnibench.registry import effects
 from omnibench.report.blocks import Cell, Column, Row, Table
-from omnibench.report.numbers import NOTHING, count, fixed, percent, plural, significant
+from omnibench.report.numbers import NOTHING, count, fixed, percent, significant
 from omnibench.robot.effects.effect import Effect
+from omnibench.words import plural
 
 
 def place_table(places: Sequence[CovariateDependence], caption: str) -> Table:

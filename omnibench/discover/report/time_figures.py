@@ -15,8 +15,9 @@ from omnibench.discover.report.before_after import Curve, ModelStyle, Panel
 from omnibench.discover.report.motion_figures import CovariateFigure, grid, motion_panels
 from omnibench.discover.report.residuals import NORMAL_95, Fitted, Residuals
 from omnibench.report.blocks import FigureGrid
-from omnibench.report.numbers import fixed, plural
+from omnibench.report.numbers import fixed
 from omnibench.robot.kinematics import Array
+from omnibench.words import plural
 
 _TIMES = 14  # at which the mean residual is drawn (chosen)
 _BLOCKS = 12  # of runs, at most (chosen)

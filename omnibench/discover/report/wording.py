@@ -18,9 +18,10 @@ from omnibench.discover.result import (
     Step,
     Verdict,
 )
-from omnibench.report.numbers import NOTHING, decimals_for, fixed, percent, plural, significant, span
+from omnibench.report.numbers import NOTHING, decimals_for, fixed, percent, significant, span
 from omnibench.robot.calibration import Noise
 from omnibench.robot.effects.effect import Stage
+from omnibench.words import plural
 
 VERDICTS: Mapping[Verdict, str] = {
     "none": "nothing is missing",

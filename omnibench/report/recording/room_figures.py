@@ -12,7 +12,7 @@ import plotly.graph_objects as go
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.true_poses import TruePath
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
-from omnibench.report.numbers import count, plural
+from omnibench.report.numbers import count
 from omnibench.report.recording.drawing import (
     COVARIANCE_ITEM,
     ODOMETRY_ITEM,
@@ -28,6 +28,7 @@ from omnibench.report.recording.scan_points import evenly, scan_points, thinned
 from omnibench.report.style import INK, equal_aspect, plot
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
+from omnibench.words import plural
 
 # How much one figure draws (chosen: more cannot be told apart on a screen).
 _POINTS = 3500  # scan points

@@ -10,12 +10,13 @@ import plotly.graph_objects as go
 from omnibench.data.dataset import Dataset
 from omnibench.data.true_poses import TruePath
 from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem
-from omnibench.report.numbers import count, plural, significant
+from omnibench.report.numbers import count, significant
 from omnibench.report.recording.drawing import joined, short
 from omnibench.report.recording.scan_points import evenly
 from omnibench.report.style import INK, PALETTE, QUIET, plot
 from omnibench.robot.kinematics import Array
 from omnibench.slam.accuracy import RunErrors, run_errors
+from omnibench.words import plural
 
 _RUNS = 150  # runs drawn as thin lines (chosen)
 _BINS = 16  # bins of time or distance (chosen)

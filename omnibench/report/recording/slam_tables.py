@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 from omnibench.report.blocks import Block, Cell, Column, Fact, Facts, Row, Table
-from omnibench.report.numbers import NOTHING, count, plural, significant
+from omnibench.report.numbers import NOTHING, count, significant
 from omnibench.slam.accuracy import ErrorSummary, SlamAccuracy
+from omnibench.words import plural
 
 
 def accuracy_blocks(accuracy: SlamAccuracy) -> tuple[Block, ...]:

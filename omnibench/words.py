@@ -1,0 +1,9 @@
+"""Words that agree with numbers, for messages of every room."""
+
+from __future__ import annotations
+
+
+def plural(number: int, noun: str) -> str:
+    """A number with its noun: ``1 run``, ``2 runs``, ``2,000 trajectories``."""
+    several = f"{noun[:-1]}ies" if noun[-1] == "y" and noun[-2] not in "aeo" else f"{noun}s"
+    return f"{number:,} {noun if number == 1 else several}"
