@@ -1,4 +1,4 @@
-"""Reading YAML into pydantic models: one-line errors with the place and the nearest key, and effective copies."""
+"""Reading of YAML into pydantic models with one-line errors, and writing of effective copies."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from omnibench.errors import ConfigError, nearest
 M = TypeVar("M", bound=BaseModel)
 
 
-CHOSEN = "@"  # before the class of a union's member, in the tag of one that the data choose: no key of theirs
+CHOSEN = "@"  # marks a union member's tag in a pydantic location; what follows it is no key of the document
 
 
 class Model(BaseModel):
-    """Base of every document that omnibench reads: unknown keys are refused, values do not change."""
+    """Base of every document that omnibench reads: unknown keys are refused, instances are immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -78,7 +78,7 @@ def parse_yaml(text: str, where: str) -> Any:
         return yaml.load(text, Loader=_Loader)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: a date or number that cannot be, as 2023-99-99
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: an impossible date or number such as 2023-99-99
         raise ConfigError(f"{where}: not valid YAML: {error}") from None
     except RecursionError:
         raise ConfigError(f"{where}: not valid YAML: nested too deeply") from None
@@ -101,7 +101,7 @@ def read_model(model: type[M], path: Path) -> M:
 
 
 def validate(model: type[M], data: Any, where: str) -> M:
-    """``data`` as ``model``; ConfigError with ``where`` in front of the first thing that is wrong."""
+    """``data`` as ``model``; ConfigError with ``where`` in front names the first fault."""
     if data is None:
         data = {}
     if not isinstance(data, Mapping | BaseModel):
@@ -114,7 +114,7 @@ def validate(model: type[M], data: Any, where: str) -> M:
 
 def _describe(model: type[BaseModel], error: ValidationError) -> str:
     details = error.errors(include_url=False)
-    # An unknown key explains a missing one, so it is told first.
+    # An unknown key explains a missing one, so it comes first.
     details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
     rest = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
     return _describe_one(model, details[0]) + rest
@@ -145,19 +145,19 @@ def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[st
             nodes = [definitions[str(part).removeprefix(CHOSEN)]]
             continue
         reached = [child for node in _expand(nodes, definitions) for child in _children(node, part)]
-        if reached:  # names of union members in the location are not keys: stay where we are
+        if reached:  # a union member's name in the location is no key, and is skipped
             nodes = reached
     return sorted({key for node in _expand(nodes, definitions) for key in node.get("properties", {})})
 
 
 def _expand(nodes: list[dict[str, Any]], definitions: dict[str, Any]) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = []
+    expanded: list[dict[str, Any]] = []
     for node in nodes:
         if "$ref" in node:
             node = definitions[node["$ref"].rsplit("/", 1)[-1]]
-        found.append(node)
-        found.extend(_expand(node.get("anyOf", []) + node.get("oneOf", []) + node.get("allOf", []), definitions))
-    return found
+        expanded.append(node)
+        expanded.extend(_expand(node.get("anyOf", []) + node.get("oneOf", []) + node.get("allOf", []), definitions))
+    return expanded
 
 
 def _children(node: dict[str, Any], part: int | str) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""What results come from: versions and hardware."""
+"""The environment that results come from: versions of software, and hardware."""
 
 from __future__ import annotations
 

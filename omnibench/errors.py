@@ -7,13 +7,13 @@ from difflib import get_close_matches
 
 
 def one_line(text: str) -> str:
-    """A text from anywhere as one line that any terminal and any file can hold."""
+    """A text as one line of printable characters, which any terminal and any file can hold."""
     line = " ".join(text.split())
-    return line if line.isprintable() else "".join(each if each.isprintable() else "?" for each in line)
+    return line if line.isprintable() else "".join(letter if letter.isprintable() else "?" for letter in line)
 
 
 class OmnibenchError(Exception):
-    """Something the user can put right. The message is one line: the thing, the place, the way out."""
+    """A mistake that the user can correct. The message is one line: what, where, and what to do."""
 
     def __init__(self, message: str) -> None:
         super().__init__(one_line(message))

@@ -28,11 +28,11 @@ C = TypeVar("C", bound=type)
 
 
 class Options(Model):
-    """Base of every ``Options`` model: unknown keys are refused, values do not change."""
+    """Base of every ``Options`` model: unknown keys are refused, instances are immutable."""
 
 
 class AnyOptions(BaseModel):
-    """Options of a class that could not be loaded: kept as they are."""
+    """Options of a class that could not be loaded; any key is kept."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -67,7 +67,7 @@ class PluginFailure:
 
 
 class Registry(Generic[T]):
-    """Names of one kind and the classes behind them.
+    """Registered classes of one kind by name.
 
     ``builtin`` is the package whose modules register the built-in ones; it is imported on the first look-up.
     """
@@ -75,7 +75,7 @@ class Registry(Generic[T]):
     def __init__(self, kind: str, builtin: str) -> None:
         self.kind = kind
         self.group = f"omnibench.{kind}s"
-        self.contract: type = object  # what its classes derive from; set by the module that defines it
+        self.contract: type = object  # base class of all its classes; set by the module that defines it
         self._builtin = builtin
         self._entries: dict[str, Entry[T]] = {}
         self._complete = False
@@ -153,7 +153,7 @@ def load_plugins(folders: Iterable[Path | str] = (), installed: bool = True) -> 
 
 
 def load_plugin_file(path: Path) -> PluginFailure | None:
-    """Import one plug-in file, once a process; the failure, if it fails."""
+    """Import one plug-in file, once a process; returns the failure, None if it was imported."""
     path = path.resolve()
     if path not in _loaded:
         _loaded[path] = _attempt(str(path), lambda: _import_file(path))
@@ -161,7 +161,7 @@ def load_plugin_file(path: Path) -> PluginFailure | None:
 
 
 def registered_from(path: Path) -> list[tuple[Registry[Any], Entry[Any]]]:
-    """What the file at ``path`` registered, with the registry of each."""
+    """Entries that the file at ``path`` registered, each with its registry."""
     origin = str(path.resolve())
     return [(registry, entry) for registry in REGISTRIES for entry in registry.entries() if entry.origin == origin]
 
@@ -174,13 +174,13 @@ def _load_folder(folder: Path) -> list[PluginFailure]:
 
 
 def _load_entry_points() -> list[PluginFailure]:
-    found = [point for registry in REGISTRIES for point in entry_points(group=registry.group)]
-    attempts = (_attempt(f"{point.group}: {point.value}", point.load) for point in found)
+    points = [point for registry in REGISTRIES for point in entry_points(group=registry.group)]
+    attempts = (_attempt(f"{point.group}: {point.value}", point.load) for point in points)
     return [failure for failure in attempts if failure is not None]
 
 
 def _attempt(origin: str, load: Callable[[], object]) -> PluginFailure | None:
-    for registry in REGISTRIES:  # so that a plug-in cannot take a built-in name unnoticed, nor take it away by failing
+    for registry in REGISTRIES:  # first, so that no plug-in takes a built-in name unnoticed
         registry._load_builtin()
     before = [dict(registry._entries) for registry in REGISTRIES]
     try:
