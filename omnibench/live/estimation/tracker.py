@@ -59,30 +59,33 @@ class RobotTracker:
         self.name = name
         self.frames = frames or Frames()
         self._state = new_state(name, calibration, wheels or WheelSettings(), fusion)
-        self._decode_wheels = JointStateDecoder().decode
+        self._decoder = JointStateDecoder()
         self._pose_input = PoseInput(self.frames.map, self.counts)
         self._state_writer = StateWriter(memory)
         self._health = HealthReporter(stale_after)
-        self._order = threading.Lock()  # samples may come over several links: one after another is published
+        self._publishing = threading.Lock()  # samples may come over several links: one is published after another
         self._lock = threading.Lock()  # held while the state is read or changed, but not while updates are published
         self._closed = False
 
     def take_wheels(
-        self, payload: bytes, arrival: float, publish: Callable[[Update], object] | None = None
+        self, payload: bytes, arrival: float, publish: Callable[[Update], object] = lambda _: None
     ) -> list[Update]:
         """Take a sensor_msgs/JointState in CDR; its updates, after they were published in order.
 
         Mostly there is one; none while a sample is refused or has to be confirmed. arrival: s, monotonic.
         """
-        with self._order:
+        with self._publishing:
             with self._lock:
-                message = self._decoded(payload)
-                steps = self._ordered_and_repaired(message, arrival)
-                updates = [self._updated(self._fused(self._integrated(step))) for step in steps]
+                message = self._decode(payload)
+                steps = self._order_and_repair(message, arrival)
+                updates = []
+                for step in steps:
+                    motion = self._integrate(step)
+                    self._fuse(motion)
+                    updates.append(self._update(motion.stamp))
                 self._state_writer.save_if_due(self._state)
-            if publish is not None:
-                for update in updates:
-                    publish(update)
+            for update in updates:
+                publish(update)
             return updates
 
     def take_pose(self, payload: bytes, arrival: float) -> Outcome | None:
@@ -98,18 +101,18 @@ class RobotTracker:
                 return None
             return fusion.correct(self._state.reference.corrected(measurement))
 
-    def _decoded(self, payload: bytes) -> JointState | None:
+    def _decode(self, payload: bytes) -> JointState | None:
         """Step 1: the wheel message in a payload; None if it is not one, or the tracker is closed."""
         if self._closed:  # a subscriber's call that was on its way
             return None
         try:
-            return self._decode_wheels(payload)
+            return self._decoder.decode(payload)
         except MessageError as error:
             self.counts.undecodable += 1
             self._state.last_refusal = str(error)
             return None
 
-    def _ordered_and_repaired(self, message: JointState | None, arrival: float) -> list[WheelStep]:
+    def _order_and_repair(self, message: JointState | None, arrival: float) -> list[WheelStep]:
         """Step 2: how the wheels turned since the last sample; late, doubled and impossible samples are refused."""
         if message is None:
             return []
@@ -121,7 +124,7 @@ class RobotTracker:
             state.arrival = arrival
         return steps
 
-    def _integrated(self, step: WheelStep) -> Motion:
+    def _integrate(self, step: WheelStep) -> Motion:
         """Step 3: odometry and its covariance after the step; the motion that the step made."""
         state = self._state
         self._warn_of_guessed_angles(step)
@@ -131,7 +134,7 @@ class RobotTracker:
         state.monitor.take(step)
         return motion
 
-    def _fused(self, motion: Motion) -> Motion:
+    def _fuse(self, motion: Motion) -> None:
         """Step 4: the motion joins the timeline, and poses that were waiting for its time are fused."""
         state = self._state
         if motion.restarted and state.timeline.entries:
@@ -140,13 +143,12 @@ class RobotTracker:
             if state.fusion is not None:
                 state.fusion.restart()
         self._add_to_timeline(motion)
-        return motion
 
-    def _updated(self, motion: Motion) -> Update:
-        """Step 5: the estimates after the motion, as they are published."""
+    def _update(self, stamp: int) -> Update:
+        """Step 5: the estimates at the stamp of the sample (ns), as they are published."""
         odometry, fusion = self._state.odometry, self._state.fusion
         return Update(
-            self._state.stamps.unique(motion.stamp),
+            self._state.stamps.unique(stamp),
             odometry.pose,
             odometry.covariance,
             odometry.twist,
@@ -230,7 +232,7 @@ class RobotTracker:
 
     def close(self) -> None:
         """Take no more wheel samples, and write the state."""
-        with self._order, self._lock:
+        with self._publishing, self._lock:
             self._closed = True
             self._state_writer.close(self._state)
 
