@@ -21,7 +21,8 @@ class StateWriter:
 
     def __init__(self, memory: RobotMemory | None) -> None:
         self._memory = memory
-        self._due = -math.inf  # arrival of a wheel sample, s, monotonic
+        # arrival (s, monotonic) of the wheel sample after which the state is to be written; never without a memory
+        self._due = -math.inf if memory is not None else math.inf
 
     def save_if_due(self, state: RobotState) -> None:
         """Write the state unless that was done less than 0.1 s ago."""
