@@ -42,7 +42,7 @@ from omnibench.robot.kinematics import Array
 _EXPLAINED = 0.5  # share of what names left that may remain once they are fitted in full; otherwise they are wrong
 
 
-class Watch(Protocol):
+class StageCallback(Protocol):
     """Progress of a discovery."""
 
     def stage(self, text: str) -> None:
@@ -60,7 +60,7 @@ def discover_effects(
     without: Sequence[str] = (),
     unknown_term: bool = False,
     seed: int = 0,
-    watch: Watch | None = None,
+    watch: StageCallback | None = None,
     calibration: Calibration | None = None,
 ) -> Discovery:
     """Find where the odometry of a data set's training split disagrees with its reference, and which effect is missing.

@@ -32,7 +32,7 @@ from omnibench.words import plural
 # So much is shown that the answer fits into a screen; the report has the rest.
 _WIDTH = 80  # columns
 _HIDDEN = 4  # lines of effects that could still hide
-_PLACES = 4  # lines of covariates that the residuals depend on
+_MOST_DEPENDENCES = 4  # lines of covariates that the residuals depend on
 _PARAMETERS = 9  # lines for an effect
 _LINES = 3  # notes, and as many warnings
 
@@ -58,7 +58,7 @@ def print_discovery(console: Console, discovery: Discovery, folder: Path) -> Non
 
 def _tables(discovery: Discovery) -> Iterator[Table]:
     if discovery.where:
-        yield _place_table(discovery)
+        yield _dependence_table(discovery)
     yield _gap_table(discovery)
     if discovery.hidden:
         yield _hidden_table(discovery)
@@ -81,11 +81,12 @@ def _effect_table(effect: NamedEffect) -> Table:
     return table
 
 
-def _place_table(discovery: Discovery) -> Table:
+def _dependence_table(discovery: Discovery) -> Table:
     table = _discovery_table("where the plain matrix fails", ("residual over", "in words"), ("chance",))
-    strongest = {place.covariate: place for place in reversed(discovery.where)}  # the first of each
-    for place in [place for place in discovery.where if strongest[place.covariate] is place][:_PLACES]:
-        table.add_row(place.covariate, place.description, chance(place.p_value))
+    strongest = {found.covariate: found for found in reversed(discovery.where)}  # the first of each covariate
+    shown = [found for found in discovery.where if strongest[found.covariate] is found][:_MOST_DEPENDENCES]
+    for dependence in shown:
+        table.add_row(dependence.covariate, dependence.description, chance(dependence.p_value))
     return table
 
 
@@ -127,7 +128,7 @@ def _hidden_table(discovery: Discovery) -> Table:
 def _remarks(discovery: Discovery) -> Iterator[str]:
     yield ""
     if discovery.left:
-        first = {place.covariate: place for place in reversed(discovery.left)}
+        first = {dependence.covariate: dependence for dependence in reversed(discovery.left)}
         left = listing([f"{p.covariate} ({chance(p.p_value)})" for p in discovery.left if first[p.covariate] is p])
         yield f"Left over: the residuals still depend on {left}."
     for effect in discovery.effects:

@@ -10,13 +10,13 @@ from omnibench.discover.document import experiment_file
 from omnibench.discover.report.evidence_figures import CANDIDATES, GAPS, drawn, hidden_grid
 from omnibench.discover.report.tables import (
     absorbed_table,
+    dependence_table,
     extrapolation_table,
     gap_table,
     held_out_table,
     hidden_table,
     not_looked_for_table,
     parameter_table,
-    place_table,
     step_table,
 )
 from omnibench.discover.report.where_section import where_section
@@ -172,9 +172,11 @@ def _how_sure(discovery: Discovery) -> Iterator[Block]:
 def _left_over(discovery: Discovery) -> Iterator[Block]:
     if discovery.left:
         caption = "What the residuals still depend on, after all that was added"
-        yield place_table(discovery.left, caption)
+        yield dependence_table(discovery.left, caption)
     elif discovery.effects:
-        yield Paragraph("After what was added, the residuals depend on nothing that was looked at: noise is left.")
+        yield Paragraph(
+            "With the effects that were added, the residuals depend on nothing that was tried: noise is left."
+        )
 
 
 def _classes(discovery: Discovery) -> Iterator[Block]:

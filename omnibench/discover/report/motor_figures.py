@@ -18,22 +18,22 @@ from omnibench.robot.kinematics import Array
 
 _BINS = 12
 _START = 2.0  # s from the start of a run in which motors settle (chosen)
-_TOLD = ModelStyle(0, "before", "measured less told", BEFORE)
-_EXPECTED = ModelStyle(1, "after", "measured less expected with the effects", AFTER)
+_MEASURED = ModelStyle(0, "before", "measured − target", BEFORE)
+_EXPECTED = ModelStyle(1, "after", "measured − expected with the effects", AFTER)
 
 
 def motor_grid(discovery: Discovery, runs: Sequence[Trajectory]) -> FigureGrid | None:
     """Errors of the wheel rates over the target rate and at the start of the runs; None without targets."""
-    told = [(run, run.targets) for run in runs if run.targets is not None]
-    before: list[Array] = [run.rates - targets for run, targets in told]
-    if not told or max(float(np.abs(each).max()) for each in before) == 0:
+    driven = [(run, run.targets) for run in runs if run.targets is not None]
+    before: list[Array] = [run.rates - targets for run, targets in driven]
+    if not driven or max(float(np.abs(each).max()) for each in before) == 0:
         return None
-    found = [effect for effect in discovery.effects if effect.stage == "actuator"]
-    errors: list[tuple[ModelStyle, list[Array]]] = [(_TOLD, before)]
-    if found:
-        changes = [_changes(run, targets, found) for run, targets in told]
+    motor_effects = [effect for effect in discovery.effects if effect.stage == "actuator"]
+    errors: list[tuple[ModelStyle, list[Array]]] = [(_MEASURED, before)]
+    if motor_effects:
+        changes = [_changes(run, targets, motor_effects) for run, targets in driven]
         errors.append((_EXPECTED, [own - change for own, change in zip(before, changes, strict=True)]))
-    targets = [each for _, each in told]
+    targets = [each for _, each in driven]
     top = max(float(np.quantile(np.abs(each), 0.999)) for each in targets)
     edges = np.linspace(-top, top, _BINS + 1) * (1 + 1e-9)
     panels = []
@@ -41,13 +41,13 @@ def motor_grid(discovery: Discovery, runs: Sequence[Trajectory]) -> FigureGrid |
         bins = [shares(each[:, index], edges) * (each[:, [index]] != 0) for each in targets]
         curves = tuple(_curve(style, bins, [each[:, index] for each in own]) for style, own in errors)
         panels.append(_panel(f"Wheel {wheel.name}, over its target", edges, curves, "target rate (rad/s)"))
-    edges = np.linspace(0.0, min(_START, max(float(run.times[-1]) for run, _ in told)), _BINS + 1)
-    bins = [shares(run.times, edges) for run, _ in told]
+    edges = np.linspace(0.0, min(_START, max(float(run.times[-1]) for run, _ in driven)), _BINS + 1)
+    bins = [shares(run.times, edges) for run, _ in driven]
     curves = tuple(
         _curve(style, bins, [100 * _share(e, t) for e, t in zip(own, targets, strict=True)]) for style, own in errors
     )
     panels.append(
-        _panel("All wheels, at the start of the runs", edges, curves, "time since the start (s)", "% of told")
+        _panel("All wheels, at the start of the runs", edges, curves, "time since the start (s)", "% of the target")
     )
     return grid(
         [panel for panel in panels if not panel.empty],
@@ -56,14 +56,14 @@ def motor_grid(discovery: Discovery, runs: Sequence[Trajectory]) -> FigureGrid |
     )
 
 
-def _changes(run: Trajectory, targets: Array, found: Sequence[NamedEffect]) -> Array:
+def _changes(run: Trajectory, targets: Array, motor_effects: Sequence[NamedEffect]) -> Array:
     """The change (F, N) of the wheel rates by the actuator effects, rad/s; those of several effects add up."""
     durations = np.diff(run.times, prepend=0.0)
     total = np.zeros(targets.shape)
-    for each in found:
-        effect = effects.create(each.name)
+    for named in motor_effects:
+        effect = effects.create(named.name)
         assert isinstance(effect, ActuatorEffect)
-        values: Mapping[str, float] = {parameter.name: parameter.value for parameter in each.parameters}
+        values: Mapping[str, float] = {parameter.name: parameter.value for parameter in named.parameters}
         total += effect.driven(durations, targets, values) - targets
     return total
 
@@ -83,8 +83,8 @@ def _curve(style: ModelStyle, bins: Sequence[Array], errors: Sequence[Array]) ->
 
 def _share(errors: Array, targets: Array) -> Array:
     """Errors (F, N) projected on the targets, as shares (F,) of these."""
-    told = np.abs(targets).mean(axis=1)
-    share: Array = (np.sign(targets) * errors).mean(axis=1) / np.where(told > 0, told, np.inf)
+    size = np.abs(targets).mean(axis=1)
+    share: Array = (np.sign(targets) * errors).mean(axis=1) / np.where(size > 0, size, np.inf)
     return share
 
 

@@ -28,7 +28,7 @@ from omnibench.robot.effects.effect import Effect
 from omnibench.words import plural
 
 
-def place_table(places: Sequence[CovariateDependence], caption: str) -> Table:
+def dependence_table(dependences: Sequence[CovariateDependence], caption: str) -> Table:
     """The covariates that the residual depends on, with their significance."""
     rows = tuple(
         Row(
@@ -40,7 +40,7 @@ def place_table(places: Sequence[CovariateDependence], caption: str) -> Table:
                 Cell(count(each.degrees_of_freedom)),
             )
         )
-        for each in places
+        for each in dependences
     )
     return Table(
         caption,

@@ -11,7 +11,7 @@ from omnibench.discover.report.before_after import ALONE, EXTENDED, PLAIN, Model
 from omnibench.discover.report.command_figures import command_blocks
 from omnibench.discover.report.motor_figures import motor_grid
 from omnibench.discover.report.residuals import Residuals
-from omnibench.discover.report.tables import place_table
+from omnibench.discover.report.tables import dependence_table
 from omnibench.discover.result import Discovery
 from omnibench.report.blocks import Block, Details, Paragraph, Section
 from omnibench.report.numbers import listing
@@ -49,8 +49,10 @@ def where_section(discovery: Discovery) -> Section:
         for covariate in _in_order(_FIGURES)
     }
     drawn["motors"] = () if motors is None else (motors,)
-    places = ["motors" if place.stage == "actuator" else place.covariate for place in discovery.where]
-    named = [name for name in dict.fromkeys(places) if name in drawn]
+    covariates = [
+        "motors" if dependence.stage == "actuator" else dependence.covariate for dependence in discovery.where
+    ]
+    named = [name for name in dict.fromkeys(covariates) if name in drawn]
     sections = [Section("where-command", "Residuals by command", command_blocks(residuals, styles))]
     for number, name in enumerate(named, 1):
         if drawn[name]:
@@ -62,9 +64,9 @@ def where_section(discovery: Discovery) -> Section:
     if not_drawn:
         others.append(Paragraph(f"Not drawn: {'; '.join(not_drawn)}.", "note"))
     if others:
-        title = "Residuals over other things" if named else "Residuals over all that was looked at"
+        title = "Residuals over other covariates" if named else "Residuals over all covariates"
         sections.append(Section("where-others", title, tuple(others)))
-    return Section("where", "Where", (*_places(discovery), Paragraph(_HOW, "note")), tuple(sections))
+    return Section("where", "Where", (*_dependences(discovery), Paragraph(_HOW, "note")), tuple(sections))
 
 
 def _in_order(covariates: Iterable[str]) -> list[str]:
@@ -79,24 +81,26 @@ def _title(name: str) -> str:
     )
 
 
-def _places(discovery: Discovery) -> Iterator[Block]:
+def _dependences(discovery: Discovery) -> Iterator[Block]:
     if not discovery.where:
         yield Paragraph(
-            "The residuals of the plain matrix depend on nothing that was looked at by more than noise explains."
+            "The residuals of the plain matrix depend on nothing that was tried by more than noise explains."
         )
         return
-    words = listing(list(dict.fromkeys(place.covariate for place in discovery.where if place.stage != "actuator")), 9)
+    words = listing(
+        list(dict.fromkeys(dependence.covariate for dependence in discovery.where if dependence.stage != "actuator")), 9
+    )
     if words:
         yield Paragraph(
             f"The residuals of the plain matrix depend on {words}. What makes them may show in several of these; the "
             "first stands out most."
         )
-    if any(place.stage == "actuator" for place in discovery.where):
+    if any(dependence.stage == "actuator" for dependence in discovery.where):
         yield Paragraph(
-            "The wheels do not turn as their motors were told. Odometry sees the wheels themselves and is not worse "
-            "for it; a simulation is."
+            "The wheels do not follow the targets of their motors. Odometry measures the wheels themselves and is not "
+            "worse for it; a simulation from targets is."
         )
-    yield place_table(discovery.where, "Where the plain matrix fails")
+    yield dependence_table(discovery.where, "Where the plain matrix fails")
 
 
 def _styles(discovery: Discovery) -> tuple[ModelStyle, ...]:

@@ -116,7 +116,7 @@ def test_what_the_residuals_depend_on_comes_first_in_pictures_and_the_rest_is_fo
     headings = [f"Residuals over {words.get(each, each)}" for each in covariates if each != "command"]
     positions = [report.text.rindex(heading) for heading in headings]
     assert positions == sorted(positions)
-    assert "Residuals over other things" in report.text
+    assert "Residuals over other covariates" in report.text
     assert "<summary>Residuals over acceleration</summary>" in report.html
 
 
