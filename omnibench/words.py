@@ -5,5 +5,10 @@ from __future__ import annotations
 
 def plural(number: int, noun: str) -> str:
     """A number with its noun: ``1 run``, ``2 runs``, ``2,000 trajectories``."""
+    return f"{number:,} {noun_for(number, noun)}"
+
+
+def noun_for(number: int, noun: str) -> str:
+    """The noun alone, for numbers written without groups of digits: ``run``, ``runs``, ``trajectories``."""
     several = f"{noun[:-1]}ies" if noun[-1] == "y" and noun[-2] not in "aeo" else f"{noun}s"
-    return f"{number:,} {noun if number == 1 else several}"
+    return noun if number == 1 else several

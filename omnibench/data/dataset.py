@@ -16,6 +16,7 @@ from omnibench.data.scans import Scans
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
+from omnibench.words import plural
 
 Split = Literal["train", "validation"]
 SPLITS: tuple[Split, ...] = ("train", "validation")
@@ -145,7 +146,8 @@ def make_dataset(
     if ambiguous and not warnings:
         shown = ", ".join(raw[index].id for index in ambiguous[:5])
         warnings = [
-            f"headings of {len(ambiguous)} trajectories may be unwrapped wrongly (reference too sparse): {shown}"
+            f"headings of {plural(len(ambiguous), 'trajectory')} may be unwrapped wrongly (reference too sparse): "
+            f"{shown}"
         ]
     warnings += _late_references(raw) + _other_periods(raw, sample_period)
     unwrapped = (
@@ -187,4 +189,5 @@ def _late_references(trajectories: Sequence[Trajectory]) -> list[str]:
     if not late:
         return []
     shown = ", ".join(late[:5])
-    return [f"{len(late)} trajectories have reference poses after their last wheel sample, e.g. {shown}"]
+    have = "has reference poses after its" if len(late) == 1 else "have reference poses after their"
+    return [f"{plural(len(late), 'trajectory')} {have} last wheel sample, e.g. {shown}"]

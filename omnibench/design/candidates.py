@@ -24,6 +24,7 @@ from omnibench.robot.odometry import Integration
 from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.flower import commanded_rates, commands_of, duration_of, stamps_of_run
+from omnibench.words import noun_for
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +120,8 @@ def candidates_of_dataset(dataset: Dataset, integration: Integration = "arc", so
     if _noiseless(identified.noise):
         raise DataError(f"{place}: repetitions agree without any noise, so that runs cannot be weighed by it")
     unnamed = len(training) - len(named)
-    notes = [f"{unnamed} of {len(training)} training runs have no command or one pose: left out"] if unnamed else []
+    have = "has" if unnamed == 1 else "have"
+    notes = [f"{unnamed} of {len(training)} training runs {have} no command or one pose: left out"] if unnamed else []
     if dataset.simulated:
         notes.append("The recordings are simulated, and so is the noise that was estimated from them.")
     return CandidatePool(
@@ -131,7 +133,7 @@ def candidates_of_dataset(dataset: Dataset, integration: Integration = "arc", so
         candidates=tuple(CandidateRun(name, tuple(runs)) for name, runs in commands.items()),
         sets={dataset.name: tuple(range(len(commands)))},
         baseline=np.array([len(runs) for runs in commands.values()]),
-        baseline_name=f"the {len(named)} training runs of {dataset.name}",
+        baseline_name=f"the {len(named)} {noun_for(len(named), 'training run')} of {dataset.name}",
         noise=identified.noise,
         noise_source=f"estimated from {identified.noise_source}",
         simulated=dataset.simulated,
@@ -163,7 +165,9 @@ def candidates_of_config(config: DesignConfig, source: str = "") -> CandidatePoo
             candidates=candidates,
             sets=sets,
             baseline=baseline,
-            baseline_name=f"{count} commands of {config.baseline.set} x {config.baseline.repetitions}",
+            baseline_name=(
+                f"{count} {noun_for(count, 'command')} of {config.baseline.set} x {config.baseline.repetitions}"
+            ),
             noise=config.noise,
             noise_source="assumed: as the config says",
             simulated=True,
@@ -199,7 +203,7 @@ def candidates_of_simulation(
             candidates=candidates,
             sets={name: tuple(range(len(candidates)))},
             baseline=np.full(len(candidates), config.repetitions),
-            baseline_name=f"{len(candidates)} commands of {name} x {config.repetitions}",
+            baseline_name=f"{len(candidates)} {noun_for(len(candidates), 'command')} of {name} x {config.repetitions}",
             noise=noise,
             noise_source="assumed: what the config simulates for training",
             simulated=True,

@@ -17,6 +17,7 @@ from omnibench.robot.odometry import Integration
 from omnibench.simulate.config import MotionGrid, Positive
 from omnibench.simulate.dataset_source import DatasetSource
 from omnibench.simulate.flower import Command, grid_of
+from omnibench.words import plural
 
 _MOST_COMMANDS = 5000  # of a set (chosen)
 _MOST_SAMPLES = 2e7  # wheel samples and poses of a set's commands together (chosen)
@@ -131,7 +132,7 @@ class DesignConfig(Model):
             samples = sum(command.duration for command in commands) * (1 / self.sample_period + 1 / self.pose_period)
             if len(commands) > _MOST_COMMANDS or samples > _MOST_SAMPLES:
                 raise ValueError(
-                    f"sets.{name}: {len(commands)} commands with {samples:.1g} wheel samples and poses, more "
+                    f"sets.{name}: {plural(len(commands), 'command')} with {samples:.1g} wheel samples and poses, more "
                     f"than {_MOST_COMMANDS} or {_MOST_SAMPLES:.0e}; check the grids, durations and periods"
                 )
         return self

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array
+from omnibench.words import plural
 
 Counts = NDArray[np.intp]
 
@@ -181,7 +182,10 @@ def rounded(candidates: Candidates, shares: Array, runs: int, enough: float = ma
     """
     limit = runs if candidates.most is None else candidates.most
     if limit * len(candidates) < runs:
-        raise ValueError(f"{len(candidates)} candidates, each driven at most {limit} times, make no {runs} runs")
+        raise ValueError(
+            f"{plural(len(candidates), 'candidate')}, each driven at most {plural(limit, 'time')}, cannot make "
+            f"{plural(runs, 'run')}"
+        )
     wanted = shares / candidates.costs
     wanted = runs * wanted / wanted.sum()
     counts: Counts = np.minimum(np.floor(wanted + 1e-9).astype(np.intp), limit)

@@ -13,6 +13,7 @@ from omnibench.design.result import Baseline, Design, Equivalent, Optimum, SetDe
 from omnibench.design.run_information import USES, DesignProblem
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.robot.odometry import Integration
+from omnibench.words import plural
 
 GOOD_EFFICIENCY = 0.99  # share of the bound: the recommended design is the smallest that reaches it (chosen)
 _MOST_STEPS = 400  # runs: designs are listed up to the baseline's number, but no further than this
@@ -120,7 +121,7 @@ def _wanted(steps: Sequence[Step], runs: int | None, place: str) -> int:
             return index
     possible = [step.effort.runs for step in steps]
     span = f"from {possible[0]} to {possible[-1]} can" if possible else "none can"
-    raise ConfigError(f"{place}: {runs} runs cannot be chosen so that they identify the matrix; {span}")
+    raise ConfigError(f"{place}: {plural(runs, 'run')} cannot be chosen so that they identify the matrix; {span}")
 
 
 def _equal_otherwise(problem: DesignProblem, name: str, use: Use) -> Equivalent:

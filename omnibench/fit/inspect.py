@@ -9,6 +9,7 @@ from omnibench.data.dataset import SPLITS, Dataset, Split
 from omnibench.data.scans import Scans
 from omnibench.fit.span import direction_in_words, driven_span
 from omnibench.fit.uncertainty.identifiability import Identifiability, identifiability
+from omnibench.words import plural
 
 
 class SplitContent(Model):
@@ -154,5 +155,7 @@ def _findings(dataset: Dataset, identifiable: Identifiability) -> list[str]:
         recorded = set(dataset.scans.trajectories)
         bare = [run.id for run in dataset.trajectories if run.id not in recorded]
         if bare:
-            findings.append(f"{len(bare)} trajectories have no scans, e.g. {', '.join(bare[:3])}: SLAM needs them")
+            have = "has" if len(bare) == 1 else "have"
+            shown = ", ".join(bare[:3])
+            findings.append(f"{plural(len(bare), 'trajectory')} {have} no scans, e.g. {shown}: SLAM needs them")
     return findings

@@ -16,6 +16,7 @@ from omnibench.robot.effects.term import make_term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
+from omnibench.words import plural
 
 FORMAT: Final = "omnibench-calibration/1"
 _LARGEST_ELEMENT = 1e3  # of the matrix, m or rad per rad of wheel; no wheel is so large
@@ -84,7 +85,10 @@ class Calibration(Model):
         wheels = len(self.robot.wheels)
         for index, row in enumerate(self.matrix, 1):
             if len(row) != wheels:
-                raise ValueError(f"row {index} of the matrix has {len(row)} values, the robot has {wheels} wheels")
+                raise ValueError(
+                    f"row {index} of the matrix has {plural(len(row), 'value')}, "
+                    f"the robot has {plural(wheels, 'wheel')}"
+                )
         if np.abs(self.matrix).max() > _LARGEST_ELEMENT:
             raise ValueError(
                 f"matrix holds {np.abs(self.matrix).max():g}, which no wheel can drive in m or rad per rad"

@@ -21,6 +21,7 @@ from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Array
 from omnibench.testing.conformance import Conformance, global_random_fingerprint, global_random_state, require
 from omnibench.testing.synthetic import ObservedProblem, Runaway, synthetic_problem
+from omnibench.words import plural
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +109,10 @@ class CalibratorConformance(Conformance):
             attempt = self.attempt(self.problem(fixed=fixed))
             strays = attempt.problem.strays
             if strays:
-                require(False, f"{len(strays)} candidates outside the box, e.g. {_shown(attempt.problem, strays[0])}")
+                require(
+                    False,
+                    f"{plural(len(strays), 'candidate')} outside the box, e.g. {_shown(attempt.problem, strays[0])}",
+                )
             require(attempt.result.outcome is not Outcome.INVALID, attempt.result.reason)
 
     def test_budget_is_kept(self) -> None:
@@ -118,8 +122,8 @@ class CalibratorConformance(Conformance):
             spent = attempt.result.evaluations + attempt.uncounted
             require(
                 spent <= evaluations,
-                f"{spent} candidates evaluated of {evaluations}: {attempt.uncounted} by problem.values, which is not "
-                "for searching; use problem.cost",
+                f"{plural(spent, 'candidate')} evaluated of {evaluations}: {attempt.uncounted} by problem.values, "
+                "which is not for searching; use problem.cost",
             )
             _require_honest_end(attempt)
 

@@ -115,4 +115,4 @@ def test_a_data_set_holds_unwrapped_headings_and_warns_of_doubtful_ones() -> Non
     odd = replace(sound, id="odd", poses=np.column_stack([poses[:, :2], wrapped(truth * [1.0, 1.12])]))
     dataset = make_dataset("turns", ROBOT, 0.1, [sound, odd])
     np.testing.assert_allclose(dataset.trajectories[0].poses[:, 2], truth, atol=1e-9)
-    assert dataset.warnings == ("headings of 1 trajectories may be unwrapped wrongly (reference too sparse): odd",)
+    assert dataset.warnings == ("headings of 1 trajectory may be unwrapped wrongly (reference too sparse): odd",)

@@ -498,4 +498,4 @@ def test_poses_after_the_last_wheel_sample_are_warned_of() -> None:
     run = a_trajectory("late", 0.3)
     late = replace(run, pose_times=np.array([0.0, 0.2, 1.0]))
     (warning,) = make_dataset("late", ROBOT, 0.1, [run, late][1:]).warnings[-1:]
-    assert warning == "1 trajectories have reference poses after their last wheel sample, e.g. late"
+    assert warning == "1 trajectory has reference poses after its last wheel sample, e.g. late"

@@ -192,7 +192,7 @@ def test_no_candidate_is_driven_more_often_than_allowed(seed: int, most: int, ru
 
 
 def test_more_runs_than_allowed_are_refused() -> None:
-    with pytest.raises(ValueError, match="make no 11 runs"):
+    with pytest.raises(ValueError, match="cannot make 11 runs"):
         rounded(Candidates(information(1), most=2), np.full(5, 0.2), 11)
 
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.report.numbers import NOTHING, decimals_for, fixed, listing, percent, power_of_ten, seconds, significant
-from omnibench.words import plural
+from omnibench.words import noun_for, plural
 
 
 @pytest.mark.parametrize(
@@ -76,6 +76,7 @@ def test_a_listing_ends_with_and_and_counts_what_it_leaves_out() -> None:
 
 def test_plurals_are_english() -> None:
     assert [plural(1, "run"), plural(2, "run"), plural(180, "trajectory")] == ["1 run", "2 runs", "180 trajectories"]
+    assert [noun_for(1, "run"), noun_for(2000, "run")] == ["run", "runs"]
     assert [plural(1, "simulated trajectory"), plural(0, "ray")] == ["1 simulated trajectory", "0 rays"]
 
 

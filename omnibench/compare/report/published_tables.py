@@ -15,6 +15,7 @@ from omnibench.data.dataset import SPLITS, Split, Trajectory
 from omnibench.report.blocks import Block, Callout
 from omnibench.report.numbers import fixed, listing, percent, span
 from omnibench.robot.kinematics import Array
+from omnibench.words import plural
 
 _PUBLISHED_COST = "final_pose"  # published costs are those of Eq. (6)
 _SCATTER = 0.75  # share of the calibrated cost: above it the cost is called "mostly" scatter (chosen)
@@ -142,7 +143,7 @@ def _reasons(view: DatasetView) -> list[str]:
     config, dataset, split = view.config, view.dataset, view.scored
     runs = dataset.split(split)
     origin = "simulated" if dataset.simulated else "recorded by another robot, or at another time"
-    reasons = [f"The data are others: these are {origin}, {len(runs)} runs for {SPLIT_NAMES[split]}."]
+    reasons = [f"The data are others: these are {origin}, {plural(len(runs), 'run')} for {SPLIT_NAMES[split]}."]
     distance = float(np.mean([_length(run) for run in runs]))
     systematic, _ = _parts(view.design_errors[split], runs)
     theoretical = (

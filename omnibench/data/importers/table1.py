@@ -20,6 +20,7 @@ from omnibench.data.splits import Names, every_second, repetitions, split_by_nam
 from omnibench.errors import DataError
 from omnibench.registry import Options, importers
 from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.words import plural
 
 RPM = 2 * math.pi / 60  # rad/s
 _METRES = {"m": 1.0, "mm": 1e-3}
@@ -164,7 +165,9 @@ def _read_command(file: Path, wheels: Sequence[str]) -> _Command:
     targets = [f"omega_M{wheel}" for wheel in wheels]
     table = read_numbers(file, _COMMAND, optional=targets)
     if len(table.values) != 1:
-        raise DataError(f"{file}: it has {len(table.values)} rows, expected one: the command of this trajectory")
+        raise DataError(
+            f"{file}: it has {plural(len(table.values), 'row')}, expected one: the command of this trajectory"
+        )
     v, alpha, omega, distance = (float(value) for value in table.columns(_COMMAND)[0])
     target_rates = table.columns(targets)[0] * RPM if all(name in table for name in targets) else None
     return _Command(v, math.radians(alpha), omega, distance, target_rates)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.design.report.design_wording import baseline_runs, command_in_words
+from omnibench.design.report.design_wording import command_in_words
 from omnibench.design.result import Candidate, Design, Precision, SetDesign, Step
 from omnibench.report.blocks import Dash, Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import percent
@@ -29,7 +29,7 @@ def path_figures(design: Design) -> FigureGrid:
         Figure(
             f"{of_set.name}: {plural(of_set.step.effort.runs, 'run')} of {plural(len(of_set.chosen), 'command')}",
             _flower(design, of_set),
-            f"Paths of the {len(of_set.commands)} commands of {of_set.name}; chosen: "
+            f"Paths of the {plural(len(of_set.commands), 'command')} of {of_set.name}; chosen: "
             + ", ".join(
                 f"{command_in_words(design.candidate(chosen.command))} {chosen.runs}x" for chosen in of_set.chosen
             ),
@@ -54,9 +54,10 @@ def path_figures(design: Design) -> FigureGrid:
 
 def precision_figures(design: Design) -> FigureGrid:
     """Standard deviations of the best runs found against their number and against the time that they take."""
+    baseline = plural(design.baseline.precision.effort.runs, "run")
     figures = [
         Figure(
-            f"All elements together, as a multiple of the baseline's ({baseline_runs(design)} runs)",
+            f"All elements together, as a multiple of the baseline's ({baseline})",
             _curves(design, _runs, "runs", [(lambda step: step.relative, "solid")], "standard deviation / baseline's"),
             "Geometric mean of the standard deviations against the number of runs, on logarithmic scales",
         ),

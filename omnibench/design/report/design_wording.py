@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from omnibench.design.config import Per, Use
 from omnibench.design.result import Candidate, Design, Effort, SetDesign
 from omnibench.report.numbers import count, fixed, percent, significant
-from omnibench.words import plural
+from omnibench.words import noun_for, plural
 
 USE_IN_WORDS: Mapping[Use, str] = {"final": "final poses", "trajectory": "whole trajectories"}
 UNIT_OF_COST: Mapping[Per, str] = {"run": "runs", "second": "s", "metre": "m of wheel"}
@@ -77,9 +77,8 @@ def _verdict(design: Design, of_set: SetDesign) -> str:
     equal = next(equal for equal in of_set.equivalents if equal.use == design.use)
     words = f"{of_set.name}: {plural(of_set.step.effort.runs, 'run')} of {plural(len(of_set.chosen), 'command')} give "
     if of_set.reached:
-        words += (
-            f"as much information per {design.per} as the best design from {len(of_set.commands)} commands, within 1 %"
-        )
+        commands = f"{len(of_set.commands)} {noun_for(len(of_set.commands), 'command')}"
+        words += f"as much information per {design.per} as the best design from {commands}, within 1 %"
     else:
         words += f"{percent(of_set.step.efficiency)} of the best design's information per {design.per}"
     if equal.effort is not None:
@@ -93,7 +92,7 @@ def least_in_words(least: float) -> str:
 
 
 def baseline_runs(design: Design) -> str:
-    """How many runs the baseline has."""
+    """Number of the baseline's runs."""
     return count(design.baseline.precision.effort.runs)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
 from omnibench.robot.kinematics import Array
+from omnibench.words import noun_for
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +53,14 @@ def differences_between_repetitions(
     measured = [[runs[index] for index in members if len(runs[index][0])] for members in repeated.groups]
     if contrasts := tuple(contrast for members in measured for contrast in _contrasts(members)):
         words = (
-            f"{len(contrasts)} independent differences between repetitions ({repeated.description}, each within one "
-            f"{repeated.within})"
+            f"{len(contrasts)} independent {noun_for(len(contrasts), 'difference')} between repetitions "
+            f"({repeated.description}, each within one {repeated.within})"
         )
         return Differences(contrasts, "repetitions", words)
     whole = tuple(Difference(stamps, values[..., 0], values[..., 1]) for stamps, values in runs if len(stamps))
     words = (
-        f"the residuals within {len(whole)} runs: no command is repeated, so what the model cannot express counts as "
-        "noise"
+        f"the residuals within {len(whole)} {noun_for(len(whole), 'run')}: no command is repeated, so what the model "
+        "cannot express counts as noise"
     )
     return Differences(whole, "within runs", words)
 
@@ -73,7 +74,7 @@ class Repetitions:
 
     @property
     def description(self) -> str:
-        return f"{sum(map(len, self.groups))} runs of {len(self.groups)} commands"
+        return f"{sum(map(len, self.groups))} runs of {len(self.groups)} {noun_for(len(self.groups), 'command')}"
 
 
 def repetitions_of_commands(trajectories: Sequence[Trajectory]) -> Repetitions:

@@ -11,6 +11,7 @@ from omnibench.errors import DataError
 from omnibench.live.estimation.live_odometry import Motion
 from omnibench.live.estimation.robot_state import RobotState
 from omnibench.live.estimation.saved_state import RobotMemory, SavedState
+from omnibench.words import plural
 
 _PERIOD = 0.1  # s between two states; chosen: a node that is killed loses no more
 _RETRY = 10.0  # s until a state that could not be written is tried again; chosen
@@ -64,7 +65,9 @@ def resume_state(state: RobotState, saved: SavedState, now: float, wall: float) 
     wheels = len(state.calibration.robot.wheels)
     positions = None if saved.positions is None else np.array(saved.positions)
     if positions is not None and len(positions) != wheels:
-        raise DataError(f"the state of robot {state.name!r} is of a robot with {len(positions)} wheels; remove it")
+        raise DataError(
+            f"the state of robot {state.name!r} is of a robot with {plural(len(positions), 'wheel')}; remove it"
+        )
     state.wheel_input.resume(saved.stamp, positions, now - (wall - saved.wall))
     state.odometry.resume(np.array(saved.pose), np.reshape(saved.covariance, (3, 3)), saved.session_time)
     if state.fusion is not None and saved.map_pose is not None and saved.map_covariance is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from omnibench.report.blocks import Block, Cell, Column, Fact, Facts, Row, Table
-from omnibench.report.numbers import NOTHING, count, significant
+from omnibench.report.numbers import NOTHING, significant
 from omnibench.slam.accuracy import ErrorSummary, SlamAccuracy
 from omnibench.words import plural
 
@@ -38,7 +38,7 @@ def _errors(accuracy: SlamAccuracy) -> Table:
             *(_degrees(v) for v in (summary.heading_mean_rad, summary.heading_p95_rad, summary.heading_max_rad)),
             _nees(summary),
         ]
-        rows.append(Row((Cell(name, f"{count(summary.poses)} poses"), *(Cell(value) for value in values))))
+        rows.append(Row((Cell(name, f"{plural(summary.poses, 'pose')}"), *(Cell(value) for value in values))))
     return Table(
         caption="Errors of the reference poses against the truth",
         columns=(

@@ -13,6 +13,7 @@ from omnibench.errors import ConfigError
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 from omnibench.simulate.config import Positive
 from omnibench.simulate.flower import Command
+from omnibench.words import plural
 
 TRUE_STEP = 1e-3  # s between the true wheel angles that are kept (chosen: a tenth of the usual sample period)
 _RESERVE = 0.1  # share of the fastest rate that is left to the controller (chosen)
@@ -137,5 +138,7 @@ def motors_of_wheels(motor: Motor | Sequence[Motor], wheels: int) -> list[Motor]
     """The motor of each wheel. ConfigError: there are not as many motors as wheels."""
     motors = [motor] * wheels if isinstance(motor, Motor) else list(motor)
     if len(motors) != wheels:
-        raise ConfigError(f"{len(motors)} motors for {wheels} wheels; give one for each, or one for all")
+        raise ConfigError(
+            f"{plural(len(motors), 'motor')} for {plural(wheels, 'wheel')}; give one for each, or one for all"
+        )
     return motors

@@ -58,7 +58,7 @@ def test_short_drives_are_left_out_and_counted(tmp_path: Path) -> None:
     bumped = part(REST + RUN + REST + 0.3)
     data = read(write_mcap(tmp_path / "bumped", bumped))
     assert len(data.trajectories) == 1
-    assert "of 2 drives 1 are shorter than 1 s (least_run), and are left out" in data.warnings[0]
+    assert "1 of 2 drives left out: 1 shorter than 1 s (least_run)" in data.warnings[0]
 
 
 def test_the_messages_of_a_topic_begin_runs_and_name_their_commands(tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_a_hole_in_the_wheel_samples_ends_a_run(tmp_path: Path) -> None:
     sent = [each for each in messages(DRIVE) if each.topic == SLAM or not hole[0] < each.logged < hole[1]]
     data = read(write_mcap(tmp_path / "drive", sent))
     assert len(data.trajectories) == 13
-    assert "wheel samples are missing 1 times while the wheels turned, up to 1.02 s" in data.warnings[0]
+    assert "wheel samples are missing 1 time while the wheels turned, up to 1.02 s" in data.warnings[0]
     assert odometry_error(data) < 1e-9
     assert [run.session for run in data.trajectories] == ["drive"] * 2 + ["drive#2"] * 11
 
@@ -138,7 +138,7 @@ def test_a_counter_that_begins_anew_ends_a_run_and_its_session(tmp_path: Path) -
         return changed(each, position=[angle - 500 for angle in each.content["position"]]) if late else each
 
     data = read(write_mcap(tmp_path / "drive", edited(messages(DRIVE), WHEELS, restarted)))
-    assert "the positions begin anew 1 times, by more than 100 rad/s (if that is a counter" in data.warnings[0]
+    assert "the positions begin anew 1 time, by more than 100 rad/s (if that is a counter" in data.warnings[0]
     assert [run.session for run in data.trajectories] == ["drive"] * 3 + ["drive#2"] * 10
     assert odometry_error(data) < 1e-9
 

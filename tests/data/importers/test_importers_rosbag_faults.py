@@ -42,7 +42,7 @@ def test_messages_recorded_out_of_order_are_sorted_and_counted(tmp_path: Path) -
 
 def test_repeated_messages_are_left_out_and_counted(tmp_path: Path) -> None:
     data = read(write_mcap(tmp_path / "drive", [*part(12.4), *part(12.4)[10:15]]))
-    assert "5 of 625 messages are left out: 5 repeat a stamp (first: message " in data.warnings[0]
+    assert "5 of 625 messages left out: 5 with a repeated stamp (first: message " in data.warnings[0]
     assert odometry_error(data) < 1e-9
 
 
@@ -52,19 +52,19 @@ def test_repeated_messages_are_left_out_and_counted(tmp_path: Path) -> None:
         (
             WHEELS,
             lambda each: changed(each, position=[1.0, float("nan"), 1.0]),
-            "have no finite position of every wheel",
+            "without a finite position of every wheel",
         ),
-        (WHEELS, lambda each: changed(each, position=[1.0, 1e300, 1.0]), "have no finite position of every wheel"),
-        (WHEELS, lambda each: changed(each, position=[1.0]), "have no finite position of every wheel"),
-        (WHEELS, lambda each: changed(each, header=header(0)), r"have no header stamp \(it is 0\)"),
-        (WHEELS, lambda each: Sent(each.topic, each.kind, b"\0\1\0\0garbage", each.logged), "cannot be decoded"),
-        (SLAM, lambda each: changed(each, header=header(0)), r"have no header stamp \(it is 0\)"),
-        (SLAM, lambda each: changed(each, pose={"pose": pose((float("inf"), 0, 0))}), "have no finite position"),
-        (SLAM, lambda each: changed(each, pose={}), "have a wrong orientation, as quaternion has length 0, expected 1"),
+        (WHEELS, lambda each: changed(each, position=[1.0, 1e300, 1.0]), "without a finite position of every wheel"),
+        (WHEELS, lambda each: changed(each, position=[1.0]), "without a finite position of every wheel"),
+        (WHEELS, lambda each: changed(each, header=header(0)), r"without a header stamp \(it is 0\)"),
+        (WHEELS, lambda each: Sent(each.topic, each.kind, b"\0\1\0\0garbage", each.logged), "that cannot be decoded"),
+        (SLAM, lambda each: changed(each, header=header(0)), r"without a header stamp \(it is 0\)"),
+        (SLAM, lambda each: changed(each, pose={"pose": pose((float("inf"), 0, 0))}), "without a finite position"),
+        (SLAM, lambda each: changed(each, pose={}), "with a wrong orientation, as quaternion has length 0, expected 1"),
         (
             SLAM,
             lambda each: changed(each, pose={"pose": {"orientation": {"x": 0.5**0.5, "w": 0.5**0.5}}}),
-            r"have a wrong orientation, as pose is tilted by 90 degrees; give poses of the robot's body \(z up\)",
+            r"with a wrong orientation, as pose is tilted by 90 degrees; give poses of the robot's body \(z up\)",
         ),
     ],
 )
@@ -75,7 +75,7 @@ def test_useless_messages_are_left_out_and_too_many_are_refused(
     assert len(data.warnings) == 1
     assert re.search(rf"some\.mcap: topic {topic}: .*left out: \d+ {message}", data.warnings[0])
     assert odometry_error(data) < 1e-3
-    with pytest.raises(DataError, match=rf"all\.mcap: topic {topic}: (\d+) of \1 messages are left out: \1 {message}"):
+    with pytest.raises(DataError, match=rf"all\.mcap: topic {topic}: (\d+) of \1 messages left out: \1 {message}"):
         read(write_mcap(tmp_path / "all", edited(part(12.4), topic, edit)))
 
 
@@ -112,7 +112,9 @@ def test_a_robot_that_never_moves_gives_no_run(tmp_path: Path) -> None:
 
 def test_drives_without_two_poses_give_no_run(tmp_path: Path) -> None:
     few = [each for each in part(7) if each.topic == WHEELS or each.logged < EPOCH + 0.9e9]
-    with pytest.raises(DataError, match=r"of 1 drives 1 hold fewer than two reference poses.*; nothing is left"):
+    with pytest.raises(
+        DataError, match=r"1 of 1 drive left out: 1 with fewer than two reference poses.*; nothing is left"
+    ):
         read(write_mcap(tmp_path / "drive", few))
 
 

@@ -108,7 +108,7 @@ def test_empty_scans_are_left_out_and_counted(tmp_path: Path) -> None:
     sent = edited(with_scans(), SCAN, lambda each: changed(each, ranges=[math.inf] * RAYS), every=5)
     data = read(write_mcap(tmp_path / "drive", sent))
     count = len(scans(SECONDS))
-    assert f"topic {SCAN}: {count // 5} of {count} messages are left out: {count // 5} are empty" in data.warnings[0]
+    assert f"topic {SCAN}: {count // 5} of {count} messages left out: {count // 5} without a range" in data.warnings[0]
     assert data.scans is not None
     assert all(np.isfinite(found.ranges).any(axis=1).all() for _, found in data.scans)
 
@@ -150,7 +150,7 @@ def test_messages_that_are_recorded_late_or_twice_come_in_order(tmp_path: Path) 
     data = read(write_mcap(tmp_path / "late", twice))
     plain = read(write_mcap(tmp_path / "plain", sent))
     assert [warning.partition(f"topic {SCAN}: ")[2] for warning in data.warnings] == [
-        f"3 of {len(scans(SECONDS)) + 3} messages are left out: 3 repeat a stamp (first: message "
+        f"3 of {len(scans(SECONDS)) + 3} messages left out: 3 with a repeated stamp (first: message "
         + data.warnings[0].rpartition("message ")[2],
         data.warnings[1].partition(f"topic {SCAN}: ")[2],
     ]
@@ -181,13 +181,13 @@ def test_scans_of_two_shapes_are_refused(tmp_path: Path, change: dict[str, Any],
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"range_max": 0.01}, "are empty|is not below range_max"),
+        ({"range_max": 0.01}, "without a range|is not below range_max"),
         ({"angle_increment": 0.0}, "angle_increment is 0; all rays would point the same way"),
         ({"angle_increment": 1.0}, "361 rays, 1 rad apart, are more than a whole turn"),
         ({"time_increment": -1e-4}, "time_increment: .*greater than or equal to 0"),
         ({"angle_min": math.inf}, "angle_min"),
-        ({"ranges": []}, "are empty"),
-        ({"header": header(0)}, "have no header stamp"),
+        ({"ranges": []}, "without a range"),
+        ({"header": header(0)}, "without a header stamp"),
     ],
 )
 def test_a_scanner_that_cannot_be_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
@@ -343,7 +343,7 @@ def test_without_poses_and_scans_the_bag_is_refused(tmp_path: Path) -> None:
 
 def test_drives_without_two_scans_give_no_run(tmp_path: Path) -> None:
     few = [each for each in without_poses(seconds=7) if each.topic != SCAN or each.logged < EPOCH + 0.5e9]
-    with pytest.raises(DataError, match=r"of 1 drives 1 hold fewer than two scans.*; nothing is left"):
+    with pytest.raises(DataError, match=r"1 of 1 drive left out: 1 with fewer than two scans.*; nothing is left"):
         read(write_mcap(tmp_path / "drive", few))
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from omnibench.errors import DataError, UnknownNameError
+from omnibench.words import plural
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -31,7 +32,7 @@ class Topic:
     messages: int
 
     def __str__(self) -> str:
-        return f"{self.name} ({self.type}, {self.messages} messages)"
+        return f"{self.name} ({self.type}, {plural(self.messages, 'message')})"
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class Bag:
                 yield Record(number, logged, self._decoded(data, _full_type(connection.msgtype)))
         if first is None and last is None and number < topic.messages:  # an MCAP without its message indexes
             raise DataError(
-                f"{self.path}: only {number} of {topic.messages} messages on {topic.name} can be found; "
+                f"{self.path}: only {number} of {plural(topic.messages, 'message')} on {topic.name} can be found; "
                 f"its index is damaged; {_repair(self.path)}"
             )
 

@@ -25,6 +25,7 @@ from omnibench.data.importers.rosbag.topic_choice import pose_topic, scan_topic,
 from omnibench.data.importers.rosbag.wheel_samples import FASTEST, Losses, WheelSamples, seconds, wheel_samples
 from omnibench.errors import DataError, one_line
 from omnibench.robot.kinematics import Array
+from omnibench.words import plural
 
 _SAME_TIME = 1e-9  # s, the resolution of the stamps
 
@@ -105,11 +106,11 @@ def cut_into_runs(recording: Recording, options: RosbagOptions, *, alone: bool =
                 runs.append(run)
     reasons = []
     if short:
-        reasons.append(f"{short} are shorter than {options.least_run:g} s (least_run)")
+        reasons.append(f"{short} shorter than {options.least_run:g} s (least_run)")
     if bare:
-        reasons.append(f"{bare} hold fewer than two {'reference poses' if recording.referenced else 'scans'}")
+        reasons.append(f"{bare} with fewer than two {'reference poses' if recording.referenced else 'scans'}")
     if reasons:
-        return runs, [f"{recording.place}: of {pieces} drives {' and '.join(reasons)}, and are left out"]
+        return runs, [f"{recording.place}: {short + bare} of {plural(pieces, 'drive')} left out: {', '.join(reasons)}"]
     if not runs:
         return runs, [f"{recording.place}: {_nothing(options)}"]
     if alone and options.cut == "rests" and uncut == len(runs):
@@ -205,9 +206,12 @@ def _losses_in_words(losses: Losses, options: RosbagOptions) -> list[str]:
     words = []
     if losses.gaps:
         words.append(
-            f"wheel samples are missing {losses.gaps} times while the wheels turned, up to {losses.longest:.3g} s"
+            f"wheel samples are missing {plural(losses.gaps, 'time')} while the wheels turned, "
+            f"up to {losses.longest:.3g} s"
         )
     if losses.restarts:
         hint = "" if options.wheel_wrap else " (if that is a counter that wraps, set wheel_wrap)"
-        words.append(f"the positions begin anew {losses.restarts} times, by more than {FASTEST:g} rad/s{hint}")
+        words.append(
+            f"the positions begin anew {plural(losses.restarts, 'time')}, by more than {FASTEST:g} rad/s{hint}"
+        )
     return words

@@ -14,13 +14,14 @@ from omnibench.data.importers.rosbag.bag import Bag, Record, Topic
 from omnibench.data.importers.rosbag.topic_choice import no_joints, wheel_joints
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array, Robot
+from omnibench.words import plural
 
 T = TypeVar("T")
 Use = Literal["auto", "positions", "velocities"]
 Stamps = NDArray[np.int64]
 
 _SECOND = 1_000_000_000  # ns
-_NO_STAMP = "have no header stamp (it is 0)"
+_NO_STAMP = "without a header stamp (it is 0)"
 _MOST_SET_BACK = 20  # messages that may come over a second late; more mean a clock that was set back (chosen)
 _LARGEST = 1e9  # rad, rad/s or m; a larger value is garbage
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))  # x, y and yaw of a covariance of x, y, z, roll, pitch, yaw
@@ -71,7 +72,7 @@ def read_wheels(
     absolute = _uses_positions(positions, velocities, use)
     values = positions if absolute else velocities
     kind = "position" if absolute else "velocity"
-    good = messages.keep(_possible(values), numbers, f"have no finite {kind} of every wheel")
+    good = messages.keep(_possible(values), numbers, f"without a finite {kind} of every wheel")
     order = good[messages.in_order(stamps[good], numbers[good])]
     messages.require(len(order))
     warnings.extend(messages.warnings())
@@ -89,12 +90,12 @@ def read_poses(bag: Bag, topic: Topic, warnings: list[str]) -> PoseStream:
         stamps.append(stamp)
     table = np.array(rows, dtype=float).reshape(-1, 6)
     number, stamp_array = np.array(numbers, dtype=np.int64), np.array(stamps, dtype=np.int64)
-    good = messages.keep(_possible(table[:, :2]), number, "have no finite position")
+    good = messages.keep(_possible(table[:, :2]), number, "without a finite position")
     headings = planar_headings(table[:, 2:])
     flawed = good[headings.flawed[good]]
     if len(flawed):
         detail = headings.flaw(int(flawed[0]))
-        good = good[messages.keep(~headings.flawed[good], number[good], f"have a wrong orientation, as {detail}")]
+        good = good[messages.keep(~headings.flawed[good], number[good], f"with a wrong orientation, as {detail}")]
     order = good[messages.in_order(stamp_array[good], number[good])]
     messages.require(len(order))
     warnings.extend(messages.warnings())
@@ -124,7 +125,7 @@ class MessageFilter:
             try:
                 stamp, content = header_stamp(record.message), unpack(record.message)
             except (AttributeError, TypeError, ValueError):  # garbage, or a type that the bag defines otherwise
-                self._drop("cannot be decoded", record.number)
+                self._drop("that cannot be decoded", record.number)
                 continue
             if stamp <= 0:
                 self._drop(_NO_STAMP, record.number)
@@ -151,13 +152,13 @@ class MessageFilter:
         self._sorted = int(np.count_nonzero(behind))
         order = np.argsort(stamps, kind="stable")
         fresh: NDArray[np.bool_] = np.diff(stamps[order], prepend=-1) > 0
-        self.keep(fresh, numbers[order], "repeat a stamp")
+        self.keep(fresh, numbers[order], "with a repeated stamp")
         return order[fresh]
 
     def require(self, kept: int) -> None:
         """DataError when more messages were dropped than kept, or fewer than two kept."""
         if kept < max(2, sum(count for count, _ in self._reasons.values())):
-            problem = self._dropped_in_words() or f"it has {self._topic.messages} messages, too few"
+            problem = self._dropped_in_words() or f"it has {plural(self._topic.messages, 'message')}, too few"
             way_out = "; the publisher must fill header.stamp" if _NO_STAMP in self._reasons else ""
             raise DataError(f"{self._place}: {problem}{way_out}")
 
@@ -165,7 +166,10 @@ class MessageFilter:
         """Warnings of messages that were dropped or put in order."""
         warnings = [f"{self._place}: {self._dropped_in_words()}"] if self._reasons else []
         if self._sorted:
-            warnings.append(f"{self._place}: {self._sorted} messages were recorded late and sorted by their stamps")
+            late = "message was recorded late and sorted by its stamp"
+            if self._sorted > 1:
+                late = "messages were recorded late and sorted by their stamps"
+            warnings.append(f"{self._place}: {self._sorted} {late}")
         return warnings
 
     def _drop(self, reason: str, number: int) -> None:
@@ -177,7 +181,7 @@ class MessageFilter:
             return ""
         lost = sum(count for count, _ in self._reasons.values())
         parts = (f"{count} {reason} (first: message {first})" for reason, (count, first) in self._reasons.items())
-        return f"{lost} of {self._topic.messages} messages are left out: {', '.join(parts)}"
+        return f"{lost} of {plural(self._topic.messages, 'message')} left out: {', '.join(parts)}"
 
 
 def _picked(values: Array, places: Sequence[int], names: int) -> Array:

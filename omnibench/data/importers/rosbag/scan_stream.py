@@ -131,7 +131,7 @@ def read_scans(bag: Bag, topic: Topic, mount: Mount | None, warnings: list[str])
         rows.append((record.number, stamp, record.logged, seen, increment))
     numbers, stamps, logged = (np.array([row[column] for row in rows], dtype=np.int64) for column in range(3))
     if shape is not None:
-        empty = f"are empty (no range from {shape.range_min:g} to {shape.range_max:g} m)"
+        empty = f"without a range from {shape.range_min:g} to {shape.range_max:g} m"
         good = messages.keep(np.array([row[3] for row in rows]), numbers, empty)
         order = good[messages.in_order(stamps[good], numbers[good])]
     try:
