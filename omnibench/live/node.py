@@ -48,9 +48,11 @@ class LiveNode:
             self.session = open_session(config.zenoh, f"node {config.name}")
             started.callback(self.session.close)
             self._check_other_nodes()
-            self._serve_foxglove(started)
-            self._record(started)
+            listeners = started.enter_context(ExitStack())  # closed after the services, to have their last messages
             self._services = self._start_services(started)
+            # after the services: a replay begins with the first subscriber, and the samples are for these
+            self._serve_foxglove(listeners)
+            self._record(listeners)
             queries = QueryServer(self.session, self.trackers, partial(robot_info, config, self.keys), memories)
             started.callback(queries.close)
             diagnostics = DiagnosticsTimer(self._services)
@@ -87,22 +89,22 @@ class LiveNode:
         _refuse_taken_robots(self.trackers, others)
         _warn_of_shared_frames(self.config.on_common_frames(), others)
 
-    def _serve_foxglove(self, started: ExitStack) -> None:
+    def _serve_foxglove(self, listeners: ExitStack) -> None:
         """Serve the robots' topics to Foxglove, if the config asks for it."""
         if self.config.foxglove is False:
             return
-        server = started.enter_context(
+        server = listeners.enter_context(
             FoxgloveServer(port=PORT if self.config.foxglove is True else self.config.foxglove)
         )
         server.forward(self.session, self.keys, list(self.trackers))
         LOG.warning("Foxglove: open %s", server.address)
 
-    def _record(self, started: ExitStack) -> None:
+    def _record(self, listeners: ExitStack) -> None:
         """Record the robots' topics, if the config asks for it; in a new file where the config's is there already."""
         if self.config.record is None:
             return
         path = free_path(self.config.record)
-        started.enter_context(Recorder(self.session, self.keys, list(self.trackers), path, on_failure=LOG.error))
+        listeners.enter_context(Recorder(self.session, self.keys, list(self.trackers), path, on_failure=LOG.error))
         LOG.warning("recording to %s", path)
 
     def _start_services(self, started: ExitStack) -> list[RobotService]:

@@ -18,7 +18,9 @@ from sessions import free_port, until
 
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.config import LiveConfig
+from omnibench.live.network.presence import alive_robots
 from omnibench.live.node import LiveNode
+from omnibench.live.wire.recorder import Recorder
 from omnibench.live.wire.topics import TOPICS
 
 
@@ -114,6 +116,22 @@ def test_what_has_started_is_closed_in_reverse_order_when_a_later_step_fails(
         again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         again.bind(("127.0.0.1", port))
     assert_nothing_is_open(config)
+
+
+def test_a_replay_that_waits_for_a_subscriber_finds_the_node_before_its_recorder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alive: list[tuple[str, ...]] = []
+
+    class LateRecorder(Recorder):
+        def start(self) -> None:
+            alive.append(alive_robots(self._session, 1.0))
+            super().start()
+
+    monkeypatch.setattr("omnibench.live.node.Recorder", LateRecorder)
+    driven(config_of(tmp_path, record="run.mcap"), 0.1)
+    assert alive == [("apr",)]
+    assert recorded(tmp_path / "run.mcap")["/apr/odom"] == 11
 
 
 def test_a_config_with_foxglove_serves_the_robots_topics(tmp_path: Path) -> None:
