@@ -40,18 +40,14 @@ class Output:
 def odometry(update: Update, frames: Frames) -> Odometry:
     """Pose in odom, which never jumps, and twist."""
     return Odometry(
-        *(update.stamp, frames.odom, frames.base),
-        *(update.pose, update.covariance, update.twist, update.twist_covariance),
+        update.stamp, frames.odom, frames.base, update.pose, update.covariance, update.twist, update.twist_covariance
     )
 
 
 def filtered_odometry(update: Update, frames: Frames) -> Odometry:
     """Pose in the map, fused with SLAM, and twist."""
     pose, covariance = _in_map(update)
-    return Odometry(
-        *(update.stamp, frames.map, frames.base),
-        *(pose, covariance, update.twist, update.twist_covariance),
-    )
+    return Odometry(update.stamp, frames.map, frames.base, pose, covariance, update.twist, update.twist_covariance)
 
 
 def transforms(update: Update, frames: Frames) -> tuple[Transform, Transform]:
