@@ -36,7 +36,7 @@ _PUBLIC = {
 }
 __all__ = list(_PUBLIC)
 
-if TYPE_CHECKING:  # the same names for type checkers; tests/ground/test_package.py holds the two lists equal
+if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py holds them equal to the list
     from omnibench.compare.read_config import read_compare_config as read_compare_config
     from omnibench.compare.run import run_comparison as run_comparison
     from omnibench.data.dataset import Dataset as Dataset

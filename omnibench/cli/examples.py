@@ -1,4 +1,4 @@
-"""What ``omnibench example`` writes: configs and plug-ins to begin with, and a small simulated recording.
+"""Files that ``omnibench example`` writes: configs and plug-ins to begin with, and a small simulated recording.
 
 An example is laid out as the repository is, ``configs`` beside ``plugins``, so that the paths in a config hold.
 """

@@ -45,7 +45,7 @@ class Bootstrap(Model):
 
 
 class CertificateChoice(Model):
-    """How closely the lowest possible cost in each box is to be proven."""
+    """Precision to which the lowest possible cost in each box is to be proven."""
 
     gap: float = Field(1e-3, gt=0, lt=1, description="share of the lowest cost that may stay unproven")
     seconds: float = Field(10.0, gt=0, description="time for each box; what is proven by then is reported")

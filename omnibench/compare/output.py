@@ -60,7 +60,7 @@ def write_results(result: ComparisonResult) -> None:
     for name, table in _tables(result).items():
         write_table(result.output / f"{name}.parquet", table)
     written: set[str] = set()
-    for stale in (result.output / "calibrations").glob("*.yaml"):  # of entries that the config may no longer have
+    for stale in (result.output / "calibrations").glob("*.yaml"):  # files of entries that the config may no longer have
         remove(stale)
     for entry in result.statistics:
         if entry.typical is not None and entry.calibrator != "theoretical":

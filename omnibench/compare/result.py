@@ -79,7 +79,7 @@ class BoxCertificate(Model):
 
 @dataclass(frozen=True, eq=False)
 class SplitScore:
-    """How well a matrix does on one split.
+    """Costs and errors of a matrix on one split.
 
     costs (Z,): the cost of each trajectory. errors (Z, 3): odometry minus reference at the last reference pose of each
     trajectory, m, m, rad.

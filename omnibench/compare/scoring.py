@@ -165,7 +165,7 @@ def _parameters(run: PlannedRun, result: RunResult) -> tuple[FittedParameter, ..
 
 
 def _is_exact(run: PlannedRun, record: RunRecord) -> bool:
-    """Whether a run's training cost is the optimum in its box of matrix elements, and one to divide by."""
+    """True if a run's training cost is the optimum in its box of matrix elements, and one to divide by."""
     exact = calibrators.entry(record.calibrator).cls.exact and run.element_box is not None
     return exact and record.outcome is Outcome.CONVERGED and bool(record.train_cost)
 
@@ -183,7 +183,7 @@ def _with_gap(run: PlannedRun, scored: ScoredRun, exact: Sequence[tuple[PlannedR
 
 
 def is_comparable(run: PlannedRun, matrix: Array, other: PlannedRun) -> bool:
-    """Whether a run's matrix (3, N) can be compared with the lowest cost in the box of ``other``, which has one.
+    """True if a run's matrix (3, N) can be compared with the lowest cost in the box of ``other``, which has one.
 
     The data must be the same, and so must the box; for a geometry, or an answer without a box, the other's box must
     contain the matrix.

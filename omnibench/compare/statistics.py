@@ -48,7 +48,7 @@ def design_costs(runs: Sequence[ScoredRun], bootstrap: Bootstrap) -> dict[str, d
 
 
 def is_mean(run: ScoredRun) -> bool:
-    """Whether the run's cost is the mean of its trajectories' costs, as the intervals and differences suppose."""
+    """True if the run's cost is the mean of its trajectories' costs, as the intervals and differences suppose."""
     train = run.scores.get("train")
     return train is None or bool(np.isclose(train.costs.mean(), train.cost, rtol=1e-6, atol=0.0))
 

@@ -1,1 +1,1 @@
-"""Where recordings come from: data sets on disk, importers and simulation."""
+"""Recordings: data sets on disk, importers, and checks of what they hold."""

@@ -26,7 +26,7 @@ _POSITIONS = (
     (1e-3, "positions look like mm; x and y must be m"),
     (1e-2, "positions look like cm; x and y must be m"),
 )
-_MOST_TRAJECTORIES = 24  # that are looked at
+_MOST_TRAJECTORIES = 24  # trajectories checked, at most (chosen)
 # Misfit of the design model (chosen): errors of calibration, slip and noise stay below, wrong units and wheels do not.
 _SUSPICIOUS = 0.15
 _EXPLAINED = 0.35  # share of the misfit that may remain with an explanation (chosen)
@@ -73,7 +73,9 @@ class _Recording:
         self._poses = np.concatenate([pose[chosen] for pose, chosen in zip(poses, moments, strict=True)])
         self._starts = np.array([pose[0] for pose in poses])[self._odometry.trajectory]
         self._first = np.diff(self._odometry.trajectory, prepend=-1) > 0
-        self._length = float(np.mean([wheel.distance for wheel in robot.wheels]))  # of the robot, m
+        self._length = float(
+            np.mean([wheel.distance for wheel in robot.wheels])
+        )  # m: mean distance of the wheels from the robot's centre
         self.wheels = robot.wheel_names
 
     def misfits(self, matrices: Array, metre: float = 1.0, radian: float = 1.0) -> Array:

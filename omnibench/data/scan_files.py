@@ -22,7 +22,7 @@ _COLUMNS = ("trajectory", "t", "ranges")
 _SCHEMA = {"trajectory": pl.String(), "t": pl.Float64(), "ranges": pl.List(pl.Float32)}
 _ROW_GROUP = 256  # rows of a Parquet row group; about 1 MB
 _MOST_ROWS = 4096  # rows of a Parquet file that are read at a time; about 20 MB
-_ROWS_OF_CSV = 65536  # the same for CSV: more, since every reading begins at the file's first line
+_ROWS_OF_CSV = 65536  # rows of a CSV file read at a time: more, since every reading begins at its first line
 
 Rows = NDArray[np.intp]
 
@@ -83,9 +83,8 @@ class ScansOnDisk(Scans):
     def _lazy(self) -> pl.LazyFrame:
         if self.file.suffix == ".parquet":
             return pl.scan_parquet(self.file)
-        return pl.scan_csv(
-            self.file, infer_schema=False
-        )  # as text, so that a cell that is no number is reported with its row
+        # Cells are read as text, so that one that is no number is reported with its row.
+        return pl.scan_csv(self.file, infer_schema=False)
 
     def _read(self, rows: Rows, whose: str, times: Array) -> Ranges:
         """The checked ranges (n, R) of some rows."""

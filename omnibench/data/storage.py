@@ -106,7 +106,7 @@ def save_dataset(dataset: Dataset, path: Path | str, table_format: TableFormat =
     }
     contents: dict[Path, FileContent] = {folder / "dataset.yaml": to_yaml(header_of(dataset)).encode()}
     for name, frame in tables.items():
-        # What only some trajectories have is left out of the sample tables, which may have no gaps.
+        # A column that only some trajectories have is left out of the sample tables, which may have no gaps.
         allowed = len(frame) - 1 if name == "trajectories" else 0
         kept = frame.select(column for column in frame.iter_columns() if column.null_count() <= allowed)
         contents[folder / f"{name}.{table_format}"] = encode_table(kept, table_format)
@@ -117,7 +117,7 @@ def save_dataset(dataset: Dataset, path: Path | str, table_format: TableFormat =
     write_files(contents)
     if scans is None:
         remove(folder / f"scans.{table_format}")
-    for name in (*tables, "scans"):  # of a data set in the other format that was there before
+    for name in (*tables, "scans"):  # remove tables in the other format that an earlier data set left
         remove(folder / f"{name}.{'csv' if table_format == 'parquet' else 'parquet'}")
 
 

@@ -279,7 +279,7 @@ def _checked(pool: CandidatePool) -> CandidatePool:
 
 
 def _noiseless(noise: Noise) -> bool:
-    """Whether position or heading has no noise of any kind."""
+    """True if position or heading has no noise of any kind."""
     return any(
         not any(getattr(noise, f"{kind}_{coordinate}") for kind in ("pose", "walk", "bias"))
         for coordinate in ("position", "heading")

@@ -19,8 +19,8 @@ from omnibench.simulate.dataset_source import DatasetSource
 from omnibench.simulate.flower import Command, grid_of
 from omnibench.words import plural
 
-_MOST_COMMANDS = 5000  # of a set (chosen)
-_MOST_SAMPLES = 2e7  # wheel samples and poses of a set's commands together (chosen)
+_MOST_COMMANDS = 5000  # commands of a set, at most (chosen)
+_MOST_SAMPLES = 2e7  # wheel samples and poses of a set's commands together, at most (chosen)
 Name = Annotated[str, Field(min_length=1, max_length=60)]
 
 
@@ -160,7 +160,7 @@ Per = Literal["run", "second", "metre"]
 
 
 class ComparedData(Model):
-    """What a design takes from the config of a comparison: its data sets, and how their odometry is integrated."""
+    """Part of a comparison's config that a design takes: the data sets, and the integration of their odometry."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 

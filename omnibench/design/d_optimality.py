@@ -95,7 +95,7 @@ class Candidates:
         return float(_log_determinants(self.sum(counts)[None])[0] - self.parameters * np.log(self.cost(counts)))
 
     def identifies(self, counts: Array | Counts) -> bool:
-        """Whether ``counts`` runs (C,) determine every direction of the parameters."""
+        """True if ``counts`` runs (C,) determine every direction of the parameters."""
         share = np.linalg.eigvalsh(self.sum(counts))[0] / self.cost(counts)
         return bool(share > _NULL_SHARE)
 

@@ -111,7 +111,7 @@ class Baseline(Model):
 
 
 class Design(Model):
-    """Which commands are worth driving."""
+    """The commands that are worth driving, and the precision that they give."""
 
     source: str
     name: str

@@ -110,7 +110,7 @@ class DiscoveryDocument(Model):
     candidates: tuple[tuple[CandidateEntry, ...], ...]
     classes: tuple[tuple[str, ...], ...]
     experiments: tuple[Experiment, ...]  # their configs are files beside this one, too
-    measurements: tuple[Absorbed, ...]  # those that would tell the absorbed effects
+    measurements: tuple[Absorbed, ...]  # measurements that would identify the absorbed effects
     not_looked_for: tuple[NotLookedFor, ...]
     hidden: tuple[Hidden, ...]
     steps: tuple[Step, ...]

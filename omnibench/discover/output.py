@@ -60,7 +60,7 @@ def write_discovery(discovery: Discovery, options: DiscoverOptions, folder: Path
         with suppress(OSError):
             chosen.rmdir()  # only if it is empty
         raise
-    for stale in chosen.glob("experiment-*.yaml"):  # of an earlier discovery
+    for stale in chosen.glob("experiment-*.yaml"):  # files of an earlier discovery
         if stale.name not in map(experiment_file, range(1, len(discovery.experiments) + 1)):
             remove(stale)
     if folder is None:

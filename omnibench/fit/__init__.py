@@ -1,1 +1,1 @@
-"""How a model is fitted to recordings: costs, the calibration problem, calibrators."""
+"""Fit of a model to recordings: costs, the calibration problem, calibrators, uncertainty."""

@@ -19,7 +19,7 @@ from omnibench.robot.kinematics import Array
 
 
 class Outcome(StrEnum):
-    """How a run ended."""
+    """The end of a run."""
 
     CONVERGED = "converged"  # by the calibrator's own rule
     BUDGET = "budget"  # the evaluations were spent

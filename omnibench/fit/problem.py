@@ -188,7 +188,7 @@ class CalibrationProblem:
         return vectors
 
     def inside(self, vectors: Array) -> NDArray[np.bool_]:
-        """Which vectors (P, n) lie in the box, up to rounding: (P,) of bool."""
+        """True (P,) for the vectors (P, n) that lie in the box, up to rounding."""
         slack = 1e-12 * np.maximum(np.abs(self.lower), np.abs(self.upper))
         within = (vectors >= self.lower - slack) & (vectors <= self.upper + slack)
         return np.asarray(within.all(axis=-1))
@@ -226,7 +226,7 @@ class CalibrationProblem:
         return self.objective.combine(poses, self.odometry.trajectory)
 
     def _relevant(self) -> NDArray[np.bool_]:
-        """Which elements (n,) the cost depends on: a cost of headings alone depends on row 3 of the matrix only."""
+        """True (n,) for elements that the cost depends on: a cost of headings alone depends on row 3 of the matrix only."""
         cost = self.objective
         if not (
             isinstance(cost, SumOfNorms) and 0.0 in cost.weights and isinstance(self.parameterisation, MatrixElements)

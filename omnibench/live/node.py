@@ -40,7 +40,7 @@ class LiveNode:
         self.config = config
         self.keys = KeySpace(config.profile, config.domain)
         load_effects(config)
-        with ExitStack() as started:  # what is started last is closed first
+        with ExitStack() as started:  # closes the parts in reverse order of their start
             memories = self._open_memories(started) if remember else {}
             self.trackers = {
                 robot.name: make_tracker(config, robot, memories.get(robot.name)) for robot in config.robots

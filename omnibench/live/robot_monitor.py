@@ -39,7 +39,7 @@ class RobotMonitor:
     def __init__(self, session: zenoh.Session, keys: KeySpace, robot: str | None) -> None:
         self._session = session
         self._robot = None if robot is None else checked_robot(robot)
-        self._name_part = 0 if keys.profile == "plain" else 1  # which part of a key is the robot's name
+        self._name_part = 0 if keys.profile == "plain" else 1  # index of the robot's name in the parts of a key
         self._streams: dict[tuple[str, str], _Stream] = {}
         self._answers: dict[str, tuple[float, HealthSummary]] = {}
         self._lock = Lock()

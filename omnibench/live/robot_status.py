@@ -1,4 +1,4 @@
-"""What is known of a robot from its messages: newest odometry, rate, age and health; also as a JSON document."""
+"""State of a robot as its messages give it: newest odometry, rate, age and health; also as a JSON document."""
 
 from __future__ import annotations
 

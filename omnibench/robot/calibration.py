@@ -19,7 +19,7 @@ from omnibench.robot.odometry import Integration
 from omnibench.words import plural
 
 FORMAT: Final = "omnibench-calibration/1"
-_LARGEST_ELEMENT = 1e3  # of the matrix, m or rad per rad of wheel; no wheel is so large
+_LARGEST_ELEMENT = 1e3  # m or rad per rad of wheel: no wheel is so large
 Row = tuple[FiniteFloat, ...]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Deviation = Annotated[float, Field(ge=0, le=1e3, allow_inf_nan=False)]

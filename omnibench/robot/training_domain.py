@@ -62,7 +62,7 @@ class TrainingDomain:
         return bool(np.linalg.norm(self._known - at_wheels, axis=1).min() > _NEAR * self._size)
 
     def outside(self, motions: Array) -> NDArray[np.bool_]:
-        """Which of many motions (k, 3) are outside: (k,) of bool."""
+        """True (k,) for each of many motions (k, 3) that is outside."""
         from scipy.spatial import KDTree
 
         at_wheels = motions * self._scale
@@ -71,7 +71,7 @@ class TrainingDomain:
         return outside
 
     def outside_in_run(self, motions: Array) -> NDArray[np.bool_]:
-        """Which motions (k, 3) of one run are outside: (k,) of bool, all False where they are mere transitions."""
+        """True (k,) for the motions (k, 3) of one run that are outside; all False where they are mere transitions."""
         outside = self.outside(motions)
         return outside if outside.mean() >= _OFTEN else np.zeros_like(outside)
 

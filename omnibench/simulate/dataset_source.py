@@ -24,7 +24,7 @@ class ImportSource(Model):
 
 
 class DatasetSource(Model):
-    """Where a data set comes from: exactly one of the three."""
+    """Source of a data set: exactly one of the three keys is given."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_by_name=True, validate_by_alias=True)
 

@@ -12,7 +12,7 @@ from omnibench.robot.planar import unit_twist
 
 _AROUND = 0.25  # s of odometry besides the scan's own time that the fit takes in (chosen)
 _INSTANT = 0.02  # s between the odometry poses of the fit (chosen)
-_DEGREE = 3  # of the polynomial in time
+_DEGREE = 3  # degree of the polynomial in time
 _ALIKE = 4.0  # successive poses with one error, as encoder ticks give (chosen)
 
 

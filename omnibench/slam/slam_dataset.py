@@ -158,7 +158,7 @@ def _from_start(path: SlamPath, start: Array, before: _Before) -> SlamPath:
 
 
 def _with_path(trajectory: Trajectory, path: SlamPath) -> Trajectory:
-    symmetric = (path.covariances + np.swapaxes(path.covariances, 1, 2)) / 2  # as a data set holds them
+    symmetric = (path.covariances + np.swapaxes(path.covariances, 1, 2)) / 2  # data sets hold symmetric covariances
     return replace(trajectory, pose_times=path.times, poses=path.poses, pose_covariances=symmetric)
 
 

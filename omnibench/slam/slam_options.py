@@ -12,7 +12,7 @@ from omnibench.robot.kinematics import Array
 
 
 class SlamOptions(Model):
-    """How scans become poses. The defaults suit a robot indoors, up to 0.5 m/s and 1 rad/s with four scans a second."""
+    """Options of SLAM. The defaults suit a robot indoors, up to 0.5 m/s and 1 rad/s with four scans a second."""
 
     start: Literal["odometry", "last_pose"] = Field(
         "odometry",

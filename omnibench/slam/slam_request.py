@@ -94,6 +94,6 @@ class SlamRequest:
 
 
 def _workers(model: OdometryModel | None) -> int:
-    """How many processes: other processes do not know the classes of plug-ins."""
+    """Number of worker processes: one where terms come from plug-ins, whose classes other processes do not know."""
     terms = () if model is None else model.terms
     return _WORKERS if all(type(term.effect).__module__.startswith("omnibench.") for term in terms) else 1

@@ -46,7 +46,7 @@ class Conformance:
 
 
 class CaseOutcome(StrEnum):
-    """How a case ended."""
+    """The end of a case."""
 
     PASSED = "passed"
     FAILED = "failed"

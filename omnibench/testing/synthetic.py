@@ -19,8 +19,8 @@ from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, WheelLog
 
-PERIOD = 0.2  # s, of wheel samples
-_SAMPLES = 20  # of a run
+PERIOD = 0.2  # s between wheel samples
+_SAMPLES = 20  # wheel samples of a run
 _SPEED = 0.25  # m/s
 # True radii and distances as shares of the design values. One factor for all distances keeps zeros of the matrix zero,
 # so that the answer lies in every box that omnibench offers.

@@ -1,1 +1,1 @@
-"""What commands print on a terminal: tables, summaries and progress."""
+"""Output of commands on a terminal: tables, summaries and progress."""

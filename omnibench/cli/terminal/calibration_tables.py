@@ -1,4 +1,4 @@
-"""What ``calibrate``, ``evaluate`` and ``certify`` print: a matrix, its errors on a data set, a proven bound."""
+"""Output of ``calibrate``, ``evaluate`` and ``certify``: a matrix, its errors on a data set, a proven bound."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the commands of the live runtime print."""
+"""Output of the commands of the live runtime."""
 
 from __future__ import annotations
 

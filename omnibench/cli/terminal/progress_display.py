@@ -1,4 +1,4 @@
-"""What a command shows while it works: bars on a terminal, plain lines in a pipe."""
+"""Progress of a command while it works: bars on a terminal, plain lines in a pipe."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class EvaluationsBar:
 
 
 class ProofLine:
-    """How far a proof has come, on a terminal."""
+    """Progress of a proof, on a terminal."""
 
     def __init__(self) -> None:
         console = make_console(error=True)
@@ -83,7 +83,7 @@ class ProofLine:
 
 
 class Steps:
-    """What is under way and how far it is: a bar for each stage on a terminal, a line for each where it is piped."""
+    """Progress of the stages of a command: a bar for each on a terminal, a line for each in a pipe."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -114,7 +114,7 @@ class Steps:
 
 
 class Stages:
-    """What is under way: a line that changes on a terminal, a line for each stage where it is piped."""
+    """Names of the stages of a command: a line that changes on a terminal, a line for each stage in a pipe."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -136,7 +136,7 @@ class Stages:
         self._progress.stop()
 
     def stage(self, text: str) -> None:
-        """What is done from now on."""
+        """Show that this stage begins."""
         if self._console.is_terminal:
             self._progress.update(self._task, description=text)
         else:
@@ -171,7 +171,7 @@ class Bars:
         self._preparation(what, done, total)
 
     def planned(self, runs: int) -> None:
-        """How many runs there will be; only now is there something to show."""
+        """Set the number of runs; only now is there something to show."""
         self._preparation.__exit__()
         self._progress.update(self._all, total=runs)
         self._progress.start()
@@ -213,7 +213,7 @@ class Lines:
         self._preparation(what, done, total)
 
     def planned(self, runs: int) -> None:
-        """How many runs there will be."""
+        """Set the number of runs."""
         self._runs = runs
 
     def began(self, run: PlannedRun) -> None: ...
@@ -233,7 +233,7 @@ def run_title(run: PlannedRun) -> str:
 
 
 def run_line(run: PlannedRun, result: RunResult, reused: bool) -> str:
-    """How a run ended, in one line."""
+    """Outcome of a run, in one line."""
     cost = "no answer" if result.cost is None else f"cost {result.cost:.6f}"
     kept = ", kept from an earlier run" if reused else ""
     figures = f"{cost}, {plural(result.evaluations, 'evaluation')}, {result.seconds:.1f} s{kept}"
@@ -241,7 +241,7 @@ def run_line(run: PlannedRun, result: RunResult, reused: bool) -> str:
 
 
 class ReplayBar:
-    """How far a replay is, on a terminal; a line every ten seconds when piped."""
+    """Progress of a replay, on a terminal; a line every ten seconds when piped."""
 
     _PERIOD = 10.0  # s
 

@@ -12,7 +12,7 @@ from omnibench.robot.kinematics import Array
 
 
 def data_section(view: DatasetView) -> Section:
-    """Where the data come from, how much there is, the robot, and warnings on reading them."""
+    """The section about the data: origin, amount, robot, and warnings on reading them."""
     dataset = view.dataset
     trajectories = dataset.trajectories
     durations = np.array([trajectory.pose_times[-1] for trajectory in trajectories])

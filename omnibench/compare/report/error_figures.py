@@ -115,7 +115,7 @@ def _quantities(before: Array, after: Array) -> tuple[_Quantity, _Quantity]:
 
 
 def _is_flower(trajectories: Sequence[Trajectory]) -> bool:
-    """Whether at least three directions were driven at each of a few speeds and rates of turn."""
+    """True if at least three directions were driven at each of a few speeds and rates of turn."""
     if any(t.alpha is None or t.omega is None for t in trajectories):
         return False
     directions: dict[_Motion, set[int]] = {}

@@ -24,7 +24,7 @@ _SEEDS_DIFFER = 0.25
 
 
 def result_section(view: DatasetView) -> Section:
-    """Which calibrator is best, by how much the error fell and how sure that is, and which are as good."""
+    """The section with the result: the best calibrator, its improvement with an interval, and equally good ones."""
     return Section("result", "Result", _blocks(view))
 
 
@@ -66,7 +66,7 @@ def _verdict(view: DatasetView, best: EntryStatistics) -> str:
 
 
 def _standing(view: DatasetView, best: EntryStatistics) -> str:
-    """Which entry is best; where several are level, that the training cost decided."""
+    """The best entry, in words; where several are level, the lowest training cost decides."""
     if len(view.calibrated) == 1:
         return f"{best.label} is the only calibrator with an answer"
     level = [entry.label for entry in view.level]

@@ -23,7 +23,7 @@ _FOLDED_ABOVE = 20  # runs: a longer table of runs is folded away (chosen)
 
 
 def outcome_section(view: DatasetView) -> Section:
-    """How each entry did over its seeds, what is proven, and every run."""
+    """The section with the outcomes: each entry over its seeds, proven bounds, and every run."""
     proofs = (certificate_table(view.certificates),) if view.certificates else ()
     runs: Block = run_table(view)
     if len(view.runs) > _FOLDED_ABOVE:

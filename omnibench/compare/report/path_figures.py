@@ -145,7 +145,7 @@ def _tail_traces(style: EntryStyle, poses: Array, final: Array, half: float, wid
 
 
 def _ends_in_words(view: DatasetView, trajectory: Trajectory) -> str:
-    """How far the theoretical end and the best one are from the reference's."""
+    """Distances of the theoretical end and the best entry's end from the reference's, in words."""
     (design,) = view.model(view.design_matrix).poses([trajectory.final_log])
     parts = [f"theoretical {_distance_mm(design[-1], trajectory.final_pose):.0f} mm off"]
     best = view.best

@@ -104,7 +104,7 @@ def _compared_improvement(what: str, ours: Interval, published: Sequence[float])
 
 
 def _over_time(view: DatasetView, best: EntryStatistics | None) -> list[Finding]:
-    """How the cost changes from training to validation, before and after calibration."""
+    """Findings about the change of the cost from training to validation, before and after calibration."""
     pairs = [[result.costs(split) for split in SPLITS] for result in view.config.published_results]
     published = [(train, validation) for train, validation in pairs if train is not None and validation is not None]
     kinds = (

@@ -31,7 +31,7 @@ _CUSTOMARY = {
 
 @dataclass(frozen=True)
 class EntryStyle:
-    """How an entry is drawn in every plot of the report."""
+    """Colour and marks of an entry in every plot of the report."""
 
     key: str
     label: str

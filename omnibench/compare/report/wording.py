@@ -20,7 +20,7 @@ def improvement_in_words(entry: EntryStatistics, split: Split, decimals: int) ->
 
 
 def level_in_words(view: DatasetView) -> str:
-    """How many entries are practically equal to the best; empty where it is alone."""
+    """Number of entries practically equal to the best, in words; empty where it is alone."""
     return f"of {len(view.level)} that are level" if len(view.level) > 1 else ""
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from omnibench.robot.kinematics import Array
 
 _LARGEST_TILT = np.radians(20)  # rad; a larger tilt is that of another frame than the robot's body (chosen)
-_LENGTH_TOLERANCE = 0.01  # of a quaternion's length 1 (chosen)
+_LENGTH_TOLERANCE = 0.01  # largest deviation of a quaternion's length from 1 (chosen)
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ def effort_in_words(effort: Effort) -> str:
 
 
 def origin_in_words(design: Design) -> str:
-    """Where candidates and noise come from, so that nobody takes an assumption for a measurement."""
+    """Origin of candidates and noise, so that nobody takes an assumption for a measurement."""
     if design.recorded:
         kind = "simulated recordings" if design.simulated else "recordings"
         return f"candidates: commands of {kind}; noise {design.noise_source}"
@@ -45,7 +45,7 @@ def origin_in_words(design: Design) -> str:
 
 
 def choice_in_words(design: Design, of_set: SetDesign) -> str:
-    """How close the chosen runs of a set come to the bound that no design exceeds."""
+    """Efficiency of a set's chosen runs against the bound that no design exceeds, in words."""
     runs = plural(of_set.step.effort.runs, "run")
     share = percent(of_set.step.efficiency, 2)
     lost = percent(1 - of_set.step.efficiency, 2)
@@ -58,7 +58,7 @@ def choice_in_words(design: Design, of_set: SetDesign) -> str:
 
 
 def equal_in_words(design: Design, of_set: SetDesign, use: Use) -> str:
-    """How many runs of a set give as much information as the baseline."""
+    """Number of runs of a set that give as much information as the baseline, in words."""
     equal = next(equal for equal in of_set.equivalents if equal.use == use)
     if equal.least is None:
         return "none: they leave part of the matrix undetermined"

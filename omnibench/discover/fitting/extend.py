@@ -25,7 +25,7 @@ from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
 
-_STEPS = 4  # of Gauss-Newton, at most
+_STEPS = 4  # Gauss-Newton steps, at most; chosen
 _STILL = 0.05  # standard errors: smaller steps end the fit; chosen
 
 

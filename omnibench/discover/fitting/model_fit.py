@@ -24,7 +24,7 @@ from omnibench.robot.odometry import OdometryBatch, WheelLog
 _UNKNOWN_NOISE = NoiseEstimate(
     Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.01, walk_heading=0.01), "within runs", 1, ""
 )
-_ROUNDS = 4  # of noise and matrix by turns, at most; fewer where the noise stays within 2 %
+_ROUNDS = 4  # rounds that fit noise and matrix by turns, at most; fewer where the noise stays within 2 %
 _NEAR = 0.02
 
 

@@ -88,7 +88,7 @@ def deviations_of(
             return deviations
         chosen.append(best)
         deviations[best] = trials[best][0]
-        for kind in (*chosen, *chosen):  # what came in before may have stood for what came now
+        for kind in (*chosen, *chosen):  # earlier kinds may have stood in for later ones: fit all again
             deviations[kind] = likelihood.along(deviations, kind)[0]
     return deviations
 

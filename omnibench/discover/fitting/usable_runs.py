@@ -11,7 +11,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
-_MOST_STAMPS = 80  # of a run: neighbours in denser references share their errors
+_MOST_STAMPS = 80  # reference poses used of a run: neighbours in denser references share their errors
 _STANDING = 1e-3  # rad/s: slower wheels stand
 _OVERHANG = 0.5  # s: poses so long after the last wheel sample are used, the robot going on as in its last samples
 

@@ -21,10 +21,10 @@ from omnibench.robot.effects.smooth_wheels import HARMONICS, hat_functions
 from omnibench.robot.kinematics import Array
 
 _ORDERS = 6  # smooth functions of time; chosen
-_FREQUENCIES = 32  # at which errors of a clock are tried; chosen
+_FREQUENCIES = 32  # frequencies at which errors of a clock are tried; chosen
 _GRID = 5  # patches along each side of the area; chosen
-_NARROW = 0.02  # of the largest motion: width, at least, within which another motion counts as the same; chosen
-_SMALL = 1e-9  # below it a covariate does not vary
+_NARROW = 0.02  # share of the largest motion: least width of a bump about one motion; chosen
+_SMALL = 1e-9  # range below which a covariate does not vary
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +170,7 @@ def _wheel_angle(paths: Paths) -> Iterator[Basis]:
     rates = paths.signals.rates
     for harmonic in HARMONICS:
         half = harmonic / 2 * paths.signals.durations[:, None]
-        mean = np.sin(half * rates) / half  # of the rate times the wave over a sample
+        mean = np.sin(half * rates) / half  # amplitude of rate times wave, as a mean over a sample
         columns = [
             paths.of_wheel(wheel, mean[:, [wheel]] * waves(angles[:, wheel], (harmonic,)))
             for wheel in range(rates.shape[1])

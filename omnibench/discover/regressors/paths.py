@@ -25,7 +25,7 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.signals import Signals, signals_of
 
-_STEP = 0.1  # of the plausible range: by so much a reference effect's parameter is moved to see its slope; chosen
+_STEP = 0.1  # share of the plausible range: step of a reference effect's parameter for its slope; chosen
 _BLOCK = 8_000_000  # numbers that are summed at once: 64 MB
 
 

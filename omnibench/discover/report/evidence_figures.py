@@ -284,5 +284,5 @@ GAPS: tuple[EvidenceFigure, ...] = (gap_grid, waterfall_grid)
 
 
 def drawn(figures: Sequence[EvidenceFigure], discovery: Discovery) -> tuple[FigureGrid, ...]:
-    """Those of the figures for which the discovery has data."""
+    """The figures for which the discovery has data."""
     return tuple(grid for figure in figures if (grid := figure(discovery)) is not None)

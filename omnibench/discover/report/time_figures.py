@@ -19,9 +19,9 @@ from omnibench.report.numbers import fixed
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
-_TIMES = 14  # at which the mean residual is drawn (chosen)
-_BLOCKS = 12  # of runs, at most (chosen)
-_RUNS = 3  # in a block, at least (chosen)
+_TIMES = 14  # times at which the mean residual is drawn (chosen)
+_BLOCKS = 12  # blocks of runs, at most (chosen)
+_RUNS = 3  # runs in a block, at least (chosen)
 _STAMPS = 30  # bins of the stamps of a run (chosen)
 _MOVING = 0.01  # m/s; slower counts as standing
 _TURNING = math.radians(2.0)  # rad/s; slower counts as straight

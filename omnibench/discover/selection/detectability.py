@@ -23,7 +23,7 @@ from omnibench.robot.kinematics import Array
 
 _ALIKE = 0.95  # share of one effect's signature that another makes: they are one class; chosen
 _SUM = 0.98  # share of one effect's signature that several others make together: they imitate it; chosen
-_TOGETHER = 3  # of these others, at most
+_TOGETHER = 3  # effects that imitate one together, at most; chosen
 _NORMAL_95 = 1.96  # standard errors
 _DETECTED = 5.5  # standard errors from which on an effect is found nearly always
 

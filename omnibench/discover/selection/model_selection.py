@@ -24,7 +24,7 @@ from omnibench.discover.selection.evidence import (
 from omnibench.discover.selection.screening import Screening
 
 SURE = 0.95  # weight from which on a name counts as sure; chosen
-CHANCE = 0.002  # of naming anything where nothing is missing; chosen
+CHANCE = 0.002  # probability of naming an effect where none is missing; chosen
 ABSORBED = 1e-4  # share of its signature that an effect must keep beyond the matrix to be told from it; chosen
 _MOST = 3  # effects that are named, at most; chosen
 _CLEARLY = 3.0  # standard deviations by which generic bases must find something for a larger set to explain it; chosen

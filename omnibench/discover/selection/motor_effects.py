@@ -20,9 +20,9 @@ from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect
 from omnibench.robot.kinematics import Array, Robot
 
-_STEP = 0.2  # of the plausible range: by so much a parameter is moved to see what it does
-_KNOTS = 7  # of the functions of target rates
-_ORDERS = 5  # of the functions of time
+_STEP = 0.2  # share of the plausible range: step of a parameter for its slope; chosen
+_KNOTS = 7  # knots of the functions of target rates; chosen
+_ORDERS = 5  # orders of the functions of time; chosen
 _EQUAL = 1e-9  # rad/s: rates nearer to their targets are copies of them
 
 

@@ -42,7 +42,7 @@ _QUADRATURE = 1e-9  # m, error of the quadrature of arcs, which the bound subtra
 # The other numbers are chosen; they change how fast the bound becomes tight, not whether it holds.
 _CUT_OFF = 3.0  # preference for cutting rows 1 and 2 over row 3
 _IMBALANCE = 1e-9  # m or rad per rad: assumed imbalance of u_s, so that no width of a box counts as exactly harmless
-_STEPS = 25  # of the reweighted least squares that find u_s
+_STEPS = 25  # steps of the reweighted least squares that find u_s
 _LOOSE = 0.9  # share of the expected cost below which a bound is tried again with headings alone
 _SMOOTHING = 3.0  # digits: norms are smoothed below this negative power of ten of their mean
 _SETTLED = 1e-5  # change of a norm, m or rad, that ends the reweighting

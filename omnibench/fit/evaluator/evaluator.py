@@ -71,7 +71,7 @@ class PoseEvaluator:
         return len(self._join.anchors)
 
     def covers(self, matrices: Array) -> NDArray[np.bool_]:
-        """Which matrices (P, 3, N) lie in the box: (P,) of bool."""
+        """True (P,) for the matrices (P, 3, N) that lie in the box."""
         inside = (matrices >= self._box.lower) & (matrices <= self._box.upper)
         return np.asarray(inside.all(axis=(1, 2)))
 

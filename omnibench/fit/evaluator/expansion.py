@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array
 
-_MOST_TERMS = 3000  # of a basis; chosen
+_MOST_TERMS = 3000  # terms of a basis, at most; chosen
 _LARGEST_ANGLE = 4.0  # rad: beyond it the power series of J_n loses digits
 
 

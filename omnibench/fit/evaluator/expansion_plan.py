@@ -1,4 +1,4 @@
-"""How recordings are cut into segments and expanded: the choice that makes a candidate cheapest."""
+"""Plan of the expansion of recordings: the cut into segments that makes a candidate cheapest."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LIMITS = (np.inf, 2.0, 1.0, 0.5, 0.25)
 # Time that a sample of direct integration, a segment and a term of the basis take, in units of one multiplication and
 # addition of a matrix product. Measured roughly; they decide only which way is faster.
 _SAMPLE, _SEGMENT, _TERM = 400.0, 1000.0, 100.0
-_MOST_BYTES = 48e6  # of the large product; chosen
+_MOST_BYTES = 48e6  # bytes of the large matrix product, at most; chosen
 
 
 @dataclass(frozen=True, eq=False)

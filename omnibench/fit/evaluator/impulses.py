@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, WheelLog
 
-_MOST_NODES = 8  # of the quadrature; chosen
+_MOST_NODES = 8  # nodes of the quadrature, at most; chosen
 _LONGEST_SEGMENT = 4096  # pieces: keeps the time of cutting linear in the length of a recording; chosen
 
 

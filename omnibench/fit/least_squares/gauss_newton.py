@@ -12,8 +12,8 @@ from omnibench.fit.least_squares.trajectory_fit import Estimate, Linearisation, 
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.robot.kinematics import Array
 
-_MOST_STEPS = 25
-_MOST_HALVINGS = 8  # of one step
+_MOST_STEPS = 25  # Gauss-Newton steps; chosen
+_MOST_HALVINGS = 8  # lengths of one step that are tried, each half the one before; chosen
 _SHARES = (1.0, 0.3, 0.0)  # parts of the nuisances' step that every run tries
 _RANK = 1e-12  # share of the largest eigenvalue of the information below which a direction is undetermined
 # Decrease of chi2 that ends the steps with free nuisances: absolute, and as a share of chi2. Chosen.

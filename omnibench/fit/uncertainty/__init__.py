@@ -1,1 +1,1 @@
-"""How precisely recordings determine a calibration: covariance, intervals, identifiability."""
+"""Precision with which recordings determine a calibration: covariance, intervals, identifiability."""

@@ -39,7 +39,7 @@ LARGEST_DEVIATION = 0.10
 
 
 class DirectionIdentifiability(Model):
-    """How precisely the data determine the matrix along one direction of wheel rates.
+    """Precision with which the data determine the matrix along one direction of wheel rates.
 
     motion: of the design robot under these rates (``turning on the spot``; empty: the wheels only slip). share: RMS
     wheel angle along it, relative to the strongest direction. state: driven; weak (so little that slip alone may
@@ -80,7 +80,7 @@ class Identifiability(Model):
 def identifiability(
     robot: Robot, trajectories: Sequence[Trajectory], integration: Integration = "arc"
 ) -> Identifiability:
-    """How precisely runs determine the matrix, along every direction of wheel rates, and the wheels' geometry.
+    """Precision with which runs determine the matrix, along every direction of wheel rates, and the wheels' geometry.
 
     Standard deviations are those of the Cramer-Rao bound: no unbiased estimator has smaller ones, and a model that does
     not fit has larger ones. The noise is estimated from repetitions of commands or, without any, from all residuals of

@@ -10,7 +10,7 @@ from omnibench.errors import DataError
 from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrices
 
-_STEP = 1e-6  # of central differences, as a share of each parameter's scale
+_STEP = 1e-6  # share of each parameter's scale: step of central differences; chosen
 _UNIDENTIFIED = 1e-3  # share of a parameter's axis in the unidentified space from which on it is not identified; chosen
 
 
@@ -72,7 +72,7 @@ def matrix_slopes(robot: Robot, geometry: Array) -> Array:
 
 
 def identified_parameters(robot: Robot, kept: Array) -> tuple[bool, ...]:
-    """Which of the 3N parameters are identified by a matrix that is unknown along the directions ``kept`` (q, N).
+    """True (3N,) for the parameters that a matrix identifies which is unknown along the directions ``kept`` (q, N).
 
     Linearised about the design: a parameter is identified if every change of the geometry that moves it changes the
     known part of the matrix.

@@ -17,7 +17,7 @@ from omnibench.fit.span import (
 )
 from omnibench.robot.kinematics import Robot
 
-_LITTLE_SHARE = 0.2  # of the strongest direction: one that is driven less is mentioned; chosen
+_LITTLE_SHARE = 0.2  # share of the strongest direction: one that is driven less is mentioned; chosen
 
 
 def open_directions(robot: Robot, span: DrivenSpan) -> Iterator[str]:

@@ -88,7 +88,7 @@ class LiveOdometry:
             self._elements = np.array(calibration.covariance)[: 3 * wheels, : 3 * wheels]
             by_row = self._elements.reshape(3, wheels, 3, wheels)
             self._blocks = np.stack([by_row[row, :, row] for row in range(3)])
-        self._matrix_variances = [0.0, 0.0, 0.0]  # of the twist, from the covariance of the matrix
+        self._matrix_variances = [0.0, 0.0, 0.0]  # variances of the twist by the matrix's covariance
 
     @property
     def pose(self) -> Array:

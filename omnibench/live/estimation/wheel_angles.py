@@ -1,4 +1,4 @@
-"""How far wheels turned between two readings of their counters, which may wrap, restart, or miss a silence."""
+"""Angles of wheels between two readings of their counters, which may wrap, restart, or miss a silence."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ _MEMORY = 0.995  # share of the past in the pace of the stamps, which is 1 of a 
 
 
 class WheelSettings(Model):
-    """How wheel messages are read."""
+    """Settings for reading wheel messages."""
 
     joints: tuple[str, ...] | None = Field(None, description="names in the messages, in the robot's order of wheels")
     use: Literal["auto", "positions", "velocities"] = Field("auto", description="auto: positions where there are any")

@@ -33,7 +33,7 @@ Outcome = Literal["fused", "located", "reacquired", "rejected", "too late", "ahe
 
 
 class FusionSettings(Model):
-    """How SLAM poses are fused."""
+    """Settings of the fusion of SLAM poses."""
 
     history: float = Field(5.0, ge=2.0, le=600.0, description="how late a pose may come, s")
     ahead: float = Field(1.0, ge=0.0, le=60.0, description="how far its stamp may lie in the future, s")

@@ -1,4 +1,4 @@
-"""Which robots are present: each robot that a node runs has a liveliness token, ``omnibench/<robot>/alive``."""
+"""Presence of robots: each robot that a node runs has a liveliness token, ``omnibench/<robot>/alive``."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def _speed(value: Any) -> Any:
 
 
 class ReplayConfig(Model):
-    """How a recording is replayed."""
+    """Settings of a replay of a recording."""
 
     speed: Annotated[float, BeforeValidator(_speed, json_schema_input_type=float | Literal["max"])] = Field(
         1.0, gt=0, description="1: real time; 10: ten times as fast; max: as fast as possible without losing messages"

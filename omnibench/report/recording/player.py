@@ -26,7 +26,7 @@ from omnibench.report.style import INK
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 
-_FRAMES = 240  # of a run (chosen: steps of the slider that can be told apart)
+_FRAMES = 240  # frames drawn of a run (chosen: steps of the slider that can be told apart)
 _MEAN_OVER = 0.1  # s; wheel rates are means over this time before each frame
 _SCANS = 60  # scans drawn of a run (chosen: keeps the file small)
 _RAYS = 270  # rays drawn of a scan (chosen: keeps the file small)

@@ -25,7 +25,7 @@ from omnibench.robot.effects.smooth import (
 from omnibench.robot.kinematics import Array
 
 _AXES = {"x": "m", "y": "m", "theta": "rad"}
-_ROUNDS = 200  # of the fixed-point iteration that inverts a map; chosen
+_ROUNDS = 200  # steps of the fixed-point iteration that inverts a map, at most; chosen
 _SAME = 1e-13  # m, rad: a smaller change ends the iteration
 
 

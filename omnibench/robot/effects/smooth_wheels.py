@@ -12,8 +12,8 @@ from omnibench.robot.effects.wheel_angle import ripple
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import STILL, Signals
 
-KNOTS = 8  # of the function of each wheel's rate; chosen
-_COMMON_KNOTS = 33  # of the function that all wheels share; chosen
+KNOTS = 8  # knots of the function of each wheel's rate; chosen
+_COMMON_KNOTS = 33  # knots of the function that all wheels share; chosen
 HARMONICS = (0.5, *(float(number) for number in range(1, 17)), 1.5, 2.5, 3.5)  # waves in a turn of a wheel; chosen
 
 _TOP = scale("top", "rad/s", 1e-6, 1e6, 6.0, "the fastest rate that was seen; knots are spread from -top to top")

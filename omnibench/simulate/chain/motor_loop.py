@@ -50,7 +50,7 @@ def motor_steps(
     resistance: float, inductance: float, torque: float, inertia: float, static: float, coulomb: float, viscous: float
 ) -> MotorSteps:
     """Transition of a motor. Units: ohm, H; at the wheel N m/A (= V s/rad), kg m2, N m, N m, N m s/rad."""
-    system = np.zeros((5, 5))  # of current, rate, angle, voltage, friction; the last two are constant
+    system = np.zeros((5, 5))  # state: current, rate, angle, voltage, friction; the last two are constant
     system[0, [0, 1, 3]] = [-resistance / inductance, -torque / inductance, 1 / inductance]
     system[1, [0, 1, 4]] = [torque / inertia, -viscous / inertia, -1 / inertia]
     system[2, 1] = 1.0
@@ -117,7 +117,7 @@ def _controlled(
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _stepped(motor: MotorSteps, current: float, rate: float, voltage: float) -> tuple[float, float, float]:
     """Current, A, and rate, rad/s, after one step, and the angle turned in it, rad."""
-    direction = 0.0  # of the motion, against which friction acts
+    direction = 0.0  # sign of the motion, against which friction acts
     if rate != 0.0:
         direction = math.copysign(1.0, rate)
     elif abs(motor.torque * current) > motor.static:

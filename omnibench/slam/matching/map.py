@@ -21,7 +21,7 @@ _FEWEST = 20  # points that a map needs to be matched against
 _WORTH = 5  # new points that are worth rebuilding the search tree
 _SAME_SIDE = 0.7  # least cosine between normals that may be of one surface
 _FINEST = 1e-5  # m and rad; small_gicp's search ends with a step shorter than this
-_ITERATIONS = 20  # of small_gicp, at most
+_ITERATIONS = 20  # iterations of small_gicp, at most
 
 
 @dataclass(frozen=True, eq=False)

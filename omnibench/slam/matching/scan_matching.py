@@ -100,7 +100,7 @@ def refine(
 
 
 def _observability(pairs: Correspondences, directions: Array, information: Array) -> Array:
-    """How far (3,), 0 to 1, the points determine the pose along directions (3, 3; columns) as long as the limits.
+    """Observability (3,), 0 to 1, of the pose along directions (3, 3; columns) as long as the limits.
 
     It is I^2 / (1 + I^2) of the certain information I, so steep that nothing of the start remains where a scan
     determines the pose.

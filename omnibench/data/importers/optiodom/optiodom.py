@@ -37,7 +37,7 @@ _DESCRIPTION = (
 
 
 class OptiodomOptions(Options):
-    """Which groups of runs train and validate. A group is the folder that holds session folders: circular, square."""
+    """Choice of groups that train and validate. A group is the folder that holds session folders: circular, square."""
 
     train: Names = Field((), description="groups that train; default: the first by name")
     validation: Names = Field((), description="groups that validate; default: all others")

@@ -52,7 +52,7 @@ def find_rests(times: Array, angles: Array, least: float, turned: float) -> list
     balance = np.zeros(len(times) + 1, dtype=int)
     np.add.at(balance, quiet[:, 0], 1)
     np.add.at(balance, quiet[:, 1], -1)
-    resting = np.cumsum(balance)[:-1] > 0  # of the sample that begins at each time
+    resting = np.cumsum(balance)[:-1] > 0  # (T,): the sample that begins at each time is at rest
     steps = np.flatnonzero(np.diff(resting.astype(int), prepend=0, append=0))
     return [(float(times[begin]), float(times[end])) for begin, end in zip(steps[::2], steps[1::2], strict=True)]
 
