@@ -73,9 +73,7 @@ class _Recording:
         self._poses = np.concatenate([pose[chosen] for pose, chosen in zip(poses, moments, strict=True)])
         self._starts = np.array([pose[0] for pose in poses])[self._odometry.trajectory]
         self._first = np.diff(self._odometry.trajectory, prepend=-1) > 0
-        self._length = float(
-            np.mean([wheel.distance for wheel in robot.wheels])
-        )  # m: mean distance of the wheels from the robot's centre
+        self._length = float(np.mean([wheel.distance for wheel in robot.wheels]))  # m: mean lever arm of the wheels
         self.wheels = robot.wheel_names
 
     def misfits(self, matrices: Array, metre: float = 1.0, radian: float = 1.0) -> Array:

@@ -226,7 +226,7 @@ class CalibrationProblem:
         return self.objective.combine(poses, self.odometry.trajectory)
 
     def _relevant(self) -> NDArray[np.bool_]:
-        """True (n,) for elements that the cost depends on: a cost of headings alone depends on row 3 of the matrix only."""
+        """True (n,) for elements that the cost depends on: for a cost of headings alone, those of row 3."""
         cost = self.objective
         if not (
             isinstance(cost, SumOfNorms) and 0.0 in cost.weights and isinstance(self.parameterisation, MatrixElements)
