@@ -80,7 +80,7 @@ class Trajectory:
 class Dataset:
     """Recordings of one robot. Make it with :func:`make_dataset`, which unwraps headings and looks for wrong units.
 
-    scans: those of its laser scanner, if it has one and they were recorded. referenced: the poses are reference poses;
+    scans: scans of its laser scanner, if it has one and they were recorded. referenced: the poses are reference poses;
     False: they are placeholders until ``slam_dataset`` makes poses from the scans, and the data set cannot be saved.
     """
 

@@ -72,7 +72,7 @@ class Scanner(Model):
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryScans:
-    """Scans of one trajectory. times (S,): of each scan's first ray, s. ranges (S, R), m; inf: nothing was seen."""
+    """Scans of one trajectory. times (S,): stamps of the first rays, s. ranges (S, R), m; inf: nothing was seen."""
 
     times: Array
     ranges: Ranges

@@ -47,9 +47,9 @@ _STARTS = 120  # random starts of the exchange for designs of 1 run; 120 / n for
 class Candidates:
     """Runs that a design may choose from, in standard coordinates: their mean information per cost is the identity.
 
-    information (C, p, p): of one run of each, in any coordinates; designs do not depend on the choice. costs (C,): of
-    one run of each, > 0. most: how many runs of one candidate an exact design may have. ValueError when the candidates
-    together leave a direction of the parameters undetermined.
+    information (C, p, p): information of one run of each, in any coordinates; designs do not depend on the choice.
+    costs (C,): cost of one run of each, > 0. most: number of runs of one candidate that an exact design may have.
+    ValueError when the candidates together leave a direction of the parameters undetermined.
     """
 
     def __init__(self, information: Array, costs: Array | None = None, most: int | None = None) -> None:

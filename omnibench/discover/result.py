@@ -107,7 +107,7 @@ class Gap:
 
     metric: "eq6" (m and rad, final poses) or "chi2" (whitened, all poses, per number). closed: the share of before -
     floor that is gone; None where that is not larger than two standard errors, or no command is repeated.
-    standard_error: that of before - floor.
+    standard_error: standard error of before - floor.
     """
 
     metric: Literal["eq6", "chi2"]

@@ -76,9 +76,9 @@ def slam_accuracy(poses: Dataset, truth: Mapping[str, TruePath]) -> SlamAccuracy
 class RunErrors:
     """Errors of a run's reference poses after the first.
 
-    times (K,): of the poses, s. driven (K,): true distance driven until then, m. in_robot (K, 3): errors along the
-    robot's axes, m, m, rad. nees (K,): error' covariance^-1 error, NaN where the covariance is singular; None without
-    covariances.
+    times (K,): times of the poses, s. driven (K,): true distance driven until then, m. in_robot (K, 3): errors along
+    the robot's axes, m, m, rad. nees (K,): error' covariance^-1 error, NaN where the covariance is singular; None
+    without covariances.
     """
 
     times: Array

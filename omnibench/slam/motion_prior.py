@@ -36,7 +36,7 @@ class MotionPrediction:
 
 
 class MotionPrior(ABC):
-    """Prior of the motion of one run. times (S,): of its scans, s; scan 0 is the first. duration: of a scan, s."""
+    """Prior of the motion of one run. times (S,): times of its scans, s; scan 0 is the first. duration: a scan's, s."""
 
     def __init__(self, times: Array, duration: float) -> None:
         self._periods, self._duration = np.diff(times, prepend=times[0]), duration

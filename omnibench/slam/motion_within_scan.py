@@ -48,8 +48,8 @@ class MotionWithinScan:
 def smoothed(odometry: Callable[[Array], Array], times: Array, duration: float) -> tuple[list[MotionWithinScan], Array]:
     """The motion within each scan, and standard deviations (3,) of the odometry's poses about the fit, m, m, rad.
 
-    A motion is the cubic through the odometry about a scan, by least squares. times (S,): of the scans, s. duration: of
-    each, s. There is no odometry before t = 0.
+    A motion is the cubic through the odometry about a scan, by least squares. times (S,): times of the scans, s.
+    duration: duration of a scan, s. There is no odometry before t = 0.
     """
     if not duration:
         return [MotionWithinScan.steady(np.zeros(3), 0.0)] * len(times), np.zeros(3)

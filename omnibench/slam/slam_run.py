@@ -133,7 +133,7 @@ class _Slam:
     def _is_keyframe(self, match: Match, deviations: Array) -> bool:
         """True if the robot has come far enough for new surfaces; a scan that may be skewed waits while it can.
 
-        deviations (3,): of the twist within the scan, m/s, m/s, rad/s.
+        deviations (3,): standard deviations of the twist within the scan, m/s, m/s, rad/s.
         """
         x, y, turned = match.pose - self._keyframe
         far = np.hypot(x, y) > self._options.keyframe_distance or abs(turned) > self._options.keyframe_angle
@@ -150,7 +150,7 @@ class _Slam:
     def _add(self, scan: ScanPoints, deviations: Array) -> None:
         """Make the last pose a keyframe, if its scan saw something new.
 
-        deviations (3,): of the twist within the scan, m/s, m/s, rad/s.
+        deviations (3,): standard deviations of the twist within the scan, m/s, m/s, rad/s.
         """
         self._keyframe = self._pose
         if not self._map.add(scan.lines, self._pose, self._errors.keyframes):

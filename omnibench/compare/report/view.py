@@ -52,9 +52,9 @@ THEORETICAL_STYLE = EntryStyle("theoretical", "theoretical (design values)", THE
 class DatasetView:
     """One data set of the comparison.
 
-    warnings: those of the whole comparison. styles: by label, the same in the whole report. design_costs: mean cost of
-    the design values on each split that has trajectories. design_errors: final pose errors (Z, 3) of the design matrix
-    on each such split, m, m, rad.
+    warnings: warnings of the whole comparison. styles: styles by label, the same in the whole report. design_costs:
+    mean cost of the design values on each split that has trajectories. design_errors: final pose errors (Z, 3) of the
+    design matrix on each such split, m, m, rad.
     """
 
     name: str

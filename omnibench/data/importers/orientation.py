@@ -17,9 +17,9 @@ _LENGTH_TOLERANCE = 0.01  # largest deviation of a quaternion's length from 1 (c
 class PlanarHeadings:
     """Yaw of K orientations, and whether they are those of a robot on the floor.
 
-    headings (K,): rad, within a turn. lengths (K,): of the quaternions, 1 for a rotation. tilts (K,): rad, between the
-    z axes of body and world. flawed (K,): the length is not 1 (to 1 %), or the tilt above 20 degrees: then it is
-    another frame than the robot's body (z up), for example a camera's.
+    headings (K,): rad, within a turn. lengths (K,): the quaternions' lengths, 1 for a rotation. tilts (K,): rad,
+    between the z axes of body and world. flawed (K,): the length is not 1 (to 1 %), or the tilt above 20 degrees: then
+    it is another frame than the robot's body (z up), for example a camera's.
     """
 
     headings: Array

@@ -33,8 +33,8 @@ _STILL = 0.05  # standard errors: smaller steps end the fit; chosen
 class Extended:
     """A fit with effects.
 
-    data: whitened columns of the matrix elements, then of the effects' linear parameters. columns (K, 3, p): of each
-    run, before whitening. values (n,): the effects' linear parameters. covariance (p, p): of matrix elements and
+    data: whitened columns of the matrix elements, then of the effects' linear parameters. columns (K, 3, p): each run's
+    columns, before whitening. values (n,): the effects' linear parameters. covariance (p, p): of matrix elements and
     parameters, by the scatter of the runs' scores where that is wider than the noise model says.
     """
 

@@ -41,7 +41,7 @@ def compare_held_out(plain: Extended, extended: Extended, validation: Validation
 class Errors:
     """Errors of a model on Z runs.
 
-    finals (Z, 3): of the final poses, m, m, rad. chi2 (Z,): whitened chi-square per number, over all poses.
+    finals (Z, 3): errors of the final poses, m, m, rad. chi2 (Z,): whitened chi-square per number, over all poses.
     """
 
     finals: Array

@@ -33,9 +33,9 @@ _BLOCK = 8_000_000  # numbers that are summed at once: 64 MB
 class Paths:
     """Paths of runs one after another: F samples, S stamps.
 
-    signals: of all samples. sessions: the samples of each session. owner (F,): the run of each sample. middle (F, 3):
-    pose in the middle of each sample. poses (S, 3): at the stamps. run (S,): the run of each stamp. parts: the stamps
-    of each run. ends: of each run, poses at the start and at the end of each sample.
+    signals: signals of all samples. sessions: the samples of each session. owner (F,): the run of each sample. middle
+    (F, 3): pose in the middle of each sample. poses (S, 3): poses at the stamps. run (S,): the run of each stamp.
+    parts: the stamps of each run. ends: for each run, poses at the start and at the end of each sample.
     """
 
     robot: Robot

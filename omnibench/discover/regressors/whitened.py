@@ -84,7 +84,7 @@ def _scores(columns: Sequence[Array], residuals: Sequence[Array]) -> Array:
 class Given:
     """Schur complement of the information matrix: what columns add once others are fitted.
 
-    information (p, p), scores (Z, p): of the columns' parts beyond those others. total (p,): diagonal of the
+    information (p, p), scores (Z, p): computed from the columns' parts beyond the others. total (p,): diagonal of the
     information before, against which a direction counts as determined.
     """
 

@@ -54,7 +54,7 @@ class EncoderQuantisation:
     """
 
     def __init__(self, fit: Fit, columns: Sequence[Array]) -> None:
-        """columns (K, 3, p): of every run of the fit, before whitening."""
+        """columns (K, 3, p): columns of every run of the fit, before whitening."""
         self.steps = quantisation_steps(fit.runs)
         self._count = columns[0].shape[2]
         if not self.steps.any():

@@ -29,7 +29,7 @@ def extrapolations_of(
 ) -> tuple[Extrapolation, ...]:
     """One entry for every command of ``runs`` that leaves the training domain.
 
-    models: those that the data cannot tell apart, with their weights; where these disagree the bound is wide.
+    models: the models that the data cannot tell apart, with their weights; where these disagree the bound is wide.
     """
     model, domain = plain.fit.model, training_domain(plain)
     extrapolations = []

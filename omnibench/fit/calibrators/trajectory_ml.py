@@ -71,11 +71,11 @@ class TrajectoryMLOptions(Options):
 class TrajectoryEstimate:
     """The estimate with its nuisances and covariance.
 
-    vector (n,), its covariance (n, n) and degrees_of_freedom. noise: of the reference. start_heading: standard
-    deviation of the start headings, rad. start_corrections (Z, 3): corrections added to the start poses, m, m, rad.
-    clocks (Z, 2): offset (s) and slope of each run's reference clock. trajectories: ids of the Z runs.
-    misfit: evidence in words that the model is wrong, or empty. description: source of the covariance, in words.
-    rounds: of noise and fit. settled: True if they converged.
+    vector (n,), its covariance (n, n) and degrees_of_freedom. noise: noise model of the reference. start_heading:
+    standard deviation of the start headings, rad. start_corrections (Z, 3): corrections added to the start poses, m, m,
+    rad. clocks (Z, 2): offset (s) and slope of each run's reference clock. trajectories: ids of the Z runs. misfit:
+    evidence in words that the model is wrong, or empty. description: source of the covariance, in words. rounds: number
+    of rounds of noise and fit. settled: True if they converged.
     """
 
     vector: Array

@@ -30,9 +30,10 @@ _MOST_BYTES = 48e6  # bytes of the large matrix product, at most; chosen
 class ExpansionPlan:
     """Logs cut into segments, the basis of their expansion, and bounds of what is neglected.
 
-    paths, segments: of each log. nodes: of the quadrature within a piece. free (N,): wheels whose element of row 3 has
-    a width in the box. error: bound of truncation and quadrature, m. spare: what the decomposition may neglect in a
-    row, m. A row is a place on a path where a displacement is wanted: a stamp, or the start of the next segment.
+    paths, segments: one for each log. nodes: number of quadrature nodes within a piece. free (N,): wheels whose element
+    of row 3 has a width in the box. error: bound of truncation and quadrature, m. spare: what the decomposition may
+    neglect in a row, m. A row is a place on a path where a displacement is wanted: a stamp, or the start of the next
+    segment.
     """
 
     logs: Sequence[WheelLog]

@@ -41,8 +41,8 @@ LARGEST_DEVIATION = 0.10
 class DirectionIdentifiability(Model):
     """Precision with which the data determine the matrix along one direction of wheel rates.
 
-    motion: of the design robot under these rates (``turning on the spot``; empty: the wheels only slip). share: RMS
-    wheel angle along it, relative to the strongest direction. state: driven; weak (so little that slip alone may
+    motion: the design robot's motion under these rates (``turning on the spot``; empty: the wheels only slip). share:
+    RMS wheel angle along it, relative to the strongest direction. state: driven; weak (so little that slip alone may
     explain it); undriven. deviations: predicted standard deviation of each row (x, y, heading) along the direction, as
     a share of the row's largest element, when every reference pose is used; None where undriven.
     """

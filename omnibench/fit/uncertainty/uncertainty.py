@@ -48,12 +48,12 @@ class NoCovarianceError(DataError):
 class Uncertainty:
     """Uncertainty of a calibration, given that the values it kept are right.
 
-    covariance (3N, 3N): of the elements, row by row, m and rad per rad of wheel. Rows and columns of elements that are
-    held at their start or lie on a bound are zero, and so is the variance along directions of wheel rates that were
-    kept at the design values. standard_deviations (3, N). intervals: 95 %, by Student's t.
-    parameters: the wheels' geometry, if it was searched or follows from the matrix (three omni wheels); a parameter
-    that the data do not identify has no standard deviation. noise: of the reference poses.
-    basis: likelihood (the calibrator's own covariance) or scatter of the runs. source: the data behind it, in words.
+    covariance (3N, 3N): the elements' covariance, row by row, m and rad per rad of wheel. Rows and columns of elements
+    that are held at their start or lie on a bound are zero, and so is the variance along directions of wheel rates that
+    were kept at the design values. standard_deviations (3, N). intervals: 95 %, by Student's t. parameters: the wheels'
+    geometry, if it was searched or follows from the matrix (three omni wheels); a parameter that the data do not
+    identify has no standard deviation. noise: the reference poses'. basis: likelihood (the calibrator's own covariance)
+    or scatter of the runs. source: the data behind it, in words.
     """
 
     covariance: Array

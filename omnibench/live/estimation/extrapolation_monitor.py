@@ -19,7 +19,7 @@ _TRANSITION = 1.0  # s; a motion that lasts no longer is a transition and does n
 class ExtrapolationMonitor:
     """Counts the time that a robot drives outside its calibration's training domain; warns in the log the first time.
 
-    seconds: that time so far; None where the calibration has no effects, or does not say what it was fitted to.
+    seconds: the time so far; None where the calibration has no effects, or does not say what it was fitted to.
     """
 
     def __init__(self, robot: str, calibration: Calibration) -> None:

@@ -243,7 +243,7 @@ class _RandomWalk:
 class _MatrixJacobian:
     """Derivative J of the pose with respect to the matrix, Eq. (L3), to first order in the turn of one step.
 
-    values (3, 3N): of (x, y, heading), by the matrix's elements row by row.
+    values (3, 3N): derivatives of (x, y, heading) by the matrix's elements, row by row.
     """
 
     def __init__(self, wheels: int, integration: Integration) -> None:

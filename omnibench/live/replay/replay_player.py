@@ -67,7 +67,8 @@ def events(
     """The messages of a drive, by time of arrival.
 
     origin: stamp of the drive's start, ns (default: the config's, or now). noise: noise model of the reference, for
-    poses whose covariance neither the data set nor the config gives. names (N,): of the joints; default: the wheels'.
+    poses whose covariance neither the data set nor the config gives. names (N,): names of the joints; default: the
+    wheels'.
     """
     return _Messages(drive, config, noise, names).stamped_from(origin)
 

@@ -108,7 +108,7 @@ class ActuatorEffect(Effect):
 
     @abstractmethod
     def driven(self, durations: Array, targets: Array, values: Values) -> Array:
-        """Mean wheel rates (F, N) under targets (F, N), rad/s, from rest; durations (F,): of the samples, s."""
+        """Mean wheel rates (F, N) under targets (F, N), rad/s, from rest; durations (F,): the samples', s."""
 
 
 effects.contract = Effect

@@ -85,7 +85,7 @@ class FloorPlan:
     def check_path(self, positions: Array, times: Array, radius: float, what: str) -> None:
         """ConfigError in one line when a robot, a disc of ``radius`` m, leaves the free area.
 
-        positions (K, 2): of the robot's centre, m, at times (K,), s. what: name of the path, for the message. The path
+        positions (K, 2): the robot's centre, m, at times (K,), s. what: name of the path, for the message. The path
         is checked every 1 cm, so that a collision less deep than that may be missed.
         """
         way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(positions, axis=0).T))])

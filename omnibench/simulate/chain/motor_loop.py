@@ -64,8 +64,8 @@ def drive_wheel(
 ) -> tuple[Array, Array, Array]:
     """One run of one wheel from rest at the angle ``start`` (rad) towards target rates (F,), rad/s.
 
-    tick: of the encoder, rad. sample_steps: milliseconds of a sample. Returns true angles (sample_steps F + 1,) at
-    every millisecond, rad; the encoder's count (F,) at the end of every sample; voltages (F,), V.
+    tick: angle of an encoder tick, rad. sample_steps: milliseconds of a sample. Returns true angles (sample_steps F +
+    1,) at every millisecond, rad; the encoder's count (F,) at the end of every sample; voltages (F,), V.
     """
     angles, counts, voltages = _drive(motor, pid, tick, np.ascontiguousarray(targets, float), start, sample_steps)
     return angles, counts, voltages

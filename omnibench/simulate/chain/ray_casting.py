@@ -19,7 +19,7 @@ def cast_rays(segments: Array, scanner: Scanner, track_times: Array, track_poses
     """True distances (S, R), m, from a moving scanner to the nearest wall along each of its rays; inf: there is none.
 
     segments (W, 4): x, y of both ends of each wall, m. track_poses (M, 3): the robot's poses at track_times
-    (M,), interpolated linearly, constant outside. times (S,): of the first ray of each scan, s.
+    (M,), interpolated linearly, constant outside. times (S,): times of the scans' first rays, s.
     """
     mount = scanner.mount
     return _cast(

@@ -30,7 +30,7 @@ _TRIMMED = 2  # points dropped before such an end, since they may belong to the 
 def grow_lines(ranges: _Float, cosines: _Float, sines: _Float, deviations: _Float, rays: _Int, part_of: _Int) -> Any:
     """Lines through neighbouring points (m, 7): a, b, covariances aa, ab, bb, index of the first and last point.
 
-    ranges, cosines, sines, deviations (n,): of the points, in the order of their rays (n,). part_of (n,): output,
+    ranges, cosines, sines, deviations (n,): the points' values, in the order of their rays (n,). part_of (n,): output,
     the number of the line that a point is part of, or -1.
     """
     count = len(ranges)

@@ -17,7 +17,8 @@ class Lines:
     """Line segments.
 
     centres (m, 2): m. normals (m, 2): unit vectors towards the scanner. half_lengths (m,): m. rays (m,): number of rays
-    that were fitted. tilt_variances (m,): of the normals' direction, rad^2. delays (m,): since the scan's stamp, s.
+    that were fitted. tilt_variances (m,): variances of the normals' directions, rad^2. delays (m,): times since the
+    scan's stamp, s.
     """
 
     centres: Array

@@ -29,8 +29,8 @@ class Surface:
     """Points of the map.
 
     centres (m, 2): m. normals (m, 2): unit vectors towards the scanner that saw them. line (m,): number of the line
-    that a point is part of. rays (m,): number of rays that the line was fitted to. tilt_variances (m,): of the normal's
-    direction, rad^2. keyframe (m,): number of the keyframe that saw it.
+    that a point is part of. rays (m,): number of rays that the line was fitted to. tilt_variances (m,): variances
+    of the normals' directions, rad^2. keyframe (m,): number of the keyframe that saw it.
     """
 
     centres: Array

@@ -60,7 +60,7 @@ def find_rests(times: Array, angles: Array, least: float, turned: float) -> list
 def between_rests(span: tuple[float, float], rests: Sequence[tuple[float, float]], stamps: Array) -> list[Piece]:
     """The drives between rests, each with a little rest at both ends, from a reference pose to another.
 
-    stamps (K,): of the reference poses, s. Drives on either side of a rest share at most an instant of it.
+    stamps (K,): stamps of the reference poses, s. Drives on either side of a rest share at most an instant of it.
     """
     edges = [(span[0], span[0]), *rests, (span[1], span[1])]
     if rests and rests[0][0] == span[0]:

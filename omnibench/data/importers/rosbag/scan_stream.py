@@ -26,7 +26,7 @@ _WAY_OUT = "scans=false leaves the scans out"
 class ScanStream:
     """Usable scans of a bag's topic.
 
-    stamps (S,): of the first rays, ns, increasing. logged (S,): times of recording, ns.
+    stamps (S,): stamps of the first rays, ns, increasing. logged (S,): times of recording, ns.
     """
 
     path: Path
@@ -114,7 +114,7 @@ def gather_scans(runs: Mapping[str, RunScans]) -> BagScans | None:
 def read_scans(bag: Bag, topic: Topic, mount: Mount | None, warnings: list[str]) -> ScanStream:
     """Check every scan of a topic; what is left out is added to ``warnings``. DataError.
 
-    mount: of the scanner; None: that of /tf_static, or else the middle of the robot, with a warning.
+    mount: pose of the scanner on the robot; None: as in /tf_static, or else the middle of the robot, with a warning.
     """
     messages, place = MessageFilter(bag, topic), f"{bag.path}: topic {topic.name}"
     shape, frame, scan_time = None, "", 0.0
