@@ -10,6 +10,7 @@ from omnibench.registry import costs
 from omnibench.robot.kinematics import Array
 from omnibench.testing.conformance import Conformance, require
 from omnibench.testing.synthetic import synthetic_robot, synthetic_trajectories, true_robot
+from omnibench.words import plural
 
 
 class CostConformance(Conformance):
@@ -28,7 +29,9 @@ class CostConformance(Conformance):
         """Shape (P,), also for one candidate."""
         for candidates in (1, 6):
             shape = np.shape(self.make().combine(*self.errors(candidates)))
-            require(shape == (candidates,), f"combine gave shape {shape} for {candidates} candidates, not (P,)")
+            require(
+                shape == (candidates,), f"combine gave shape {shape} for {plural(candidates, 'candidate')}, not (P,)"
+            )
 
     def test_costs_are_finite_and_not_negative(self) -> None:
         """Finite errors have finite costs >= 0."""

@@ -156,7 +156,8 @@ def _reproduction(result: ComparisonResult) -> Section:
     facts = Facts(
         (
             Fact(
-                "Budget of each run", f"{count(config.budget.evaluations)} evaluations or {config.budget.seconds:g} s"
+                "Budget of each run",
+                f"{plural(config.budget.evaluations, 'evaluation')} or {config.budget.seconds:g} s",
             ),
             Fact("Seeds", listing([str(seed) for seed in config.seeds], 20)),
             Fact("Intervals", f"{count(config.bootstrap.resamples)} bootstrap resamples, seed {config.bootstrap.seed}"),

@@ -22,6 +22,7 @@ from omnibench.data.splits import Names, every_second, repetitions, split_by_nam
 from omnibench.errors import DataError
 from omnibench.registry import Options, importers
 from omnibench.robot.kinematics import Array
+from omnibench.words import plural
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -87,7 +88,7 @@ class CsvOptions(Options):
         for key, allowed in (("wheel_columns", (0, wheels)), ("wheel_signs", (0, wheels)), ("pose_columns", (3,))):
             given = len(getattr(self, key))
             if given not in allowed:
-                raise ValueError(f"{key} has {given} values, expected {allowed[-1]}")
+                raise ValueError(f"{key} has {plural(given, 'value')}, expected {allowed[-1]}")
         if self.command_pattern is not None:
             try:
                 groups = re.compile(self.command_pattern).groups

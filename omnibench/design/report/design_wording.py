@@ -82,7 +82,9 @@ def _verdict(design: Design, of_set: SetDesign) -> str:
     else:
         words += f"{percent(of_set.step.efficiency)} of the best design's information per {design.per}"
     if equal.effort is not None:
-        words += f"; {count(equal.effort.runs)} of the best runs give as much as the baseline's {baseline_runs(design)}"
+        give = "gives" if equal.effort.runs == 1 else "give"
+        runs = count(equal.effort.runs)
+        words += f"; {runs} of the best runs {give} as much as the baseline's {baseline_runs(design)}"
     return words + "."
 
 

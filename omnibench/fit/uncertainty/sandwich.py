@@ -14,6 +14,7 @@ from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.least_squares.repetitions import grouped, repetitions_of_commands
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
+from omnibench.words import plural
 
 # Level of the F test that decides whether clusters scatter more than repetitions explain; chosen strict.
 _CHANCE = 0.001
@@ -109,7 +110,7 @@ def sandwich(scores: Scores) -> Sandwich:
     count, size = len(runs), int(np.linalg.matrix_rank(hessian, _NOTHING * np.abs(hessian).max(), hermitian=True))
     free_runs = count - max(1, -(-size // 3))  # a run has three numbers
     if free_runs < 1:
-        raise DataError(f"runs are too few ({count}) for the scatter of {size} fitted numbers")
+        raise DataError(f"runs are too few ({count}) for the scatter of {plural(size, 'fitted number')}")
     repeated = repetitions_of_commands(runs)
     groups = repeated.groups
     if not groups:

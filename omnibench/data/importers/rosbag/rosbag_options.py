@@ -11,6 +11,7 @@ from omnibench.data.importers.rosbag.message_streams import Use
 from omnibench.data.scans import Mount
 from omnibench.data.splits import Names
 from omnibench.registry import Options
+from omnibench.words import plural
 
 
 class RosbagOptions(Options):
@@ -73,7 +74,7 @@ class RosbagOptions(Options):
         for key in ("joints", "joint_signs"):
             given = len(getattr(self, key))
             if given not in (0, wheels):
-                raise ValueError(f"{key} has {given} values, expected {wheels}, one for each wheel")
+                raise ValueError(f"{key} has {plural(given, 'value')}, expected {wheels}, one for each wheel")
         if not self.scans and (self.scan_topic is not None or self.scanner_mount is not None):
             raise ValueError("scans=false leaves the scans out; leave scan_topic and scanner_mount out, too")
         if len(set(self.joints)) < len(self.joints):

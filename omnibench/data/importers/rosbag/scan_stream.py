@@ -16,6 +16,7 @@ from omnibench.data.importers.rosbag.scanner_frames import ScannerMounting, scan
 from omnibench.data.scans import Mount, Ranges, Scanner, Scans, TrajectoryScans
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import Array
+from omnibench.words import plural
 
 _SAME = 1e-5  # rad over the whole scan, m; differences of geometry within one scanner: messages are in single precision
 _SAME_INCREMENT = 0.1  # relative difference of the time between rays, which some drivers measure anew for every scan
@@ -181,7 +182,7 @@ def _measured(message: Any) -> Ranges:
 def _difference(expected: _Shape, given: _Shape) -> str:
     """The first difference between two scans, as ``range_max is 12, expected 30``; empty if there is none."""
     if given.rays != expected.rays:
-        return f"a scan has {given.rays} ranges, expected {expected.rays}"
+        return f"a scan has {plural(given.rays, 'range')}, expected {expected.rays}"
     for name, tolerance in (
         ("angle_min", _SAME),
         ("angle_increment", _SAME / max(expected.rays, 1)),
