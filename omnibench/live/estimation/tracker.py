@@ -1,8 +1,9 @@
-"""The way of a robot's samples, from the payload that a subscriber receives to the update that is published.
+"""One robot's estimation: from the payload that a subscriber receives to the update that is published.
 
 A wheel sample is decoded, put in order and repaired, integrated to odometry with its covariance, fused with the poses
-of SLAM, and published. A pose of SLAM is decoded and checked, freed of the reference's effects, and fused at its own
-time; the next wheel sample publishes what it changed. There is no network here, and any thread may call.
+of SLAM, and published. A pose of SLAM is decoded and checked, corrected for the calibration's effects on the
+reference (latency, lever arm of the LIDAR), and fused at its own time; the changed pose is published with the next
+wheel sample. There is no network here, and any thread may call.
 """
 
 from __future__ import annotations
@@ -63,8 +64,10 @@ class RobotTracker:
         self._pose_input = PoseInput(self.frames.map, self.counts)
         self._state_writer = StateWriter(memory)
         self._health = HealthReporter(stale_after)
-        self._publishing = threading.Lock()  # samples may come over several links: one is published after another
-        self._lock = threading.Lock()  # held while the state is read or changed, but not while updates are published
+        # samples may come over several links: the updates of one are published before those of the next
+        self._publish_lock = threading.Lock()
+        # held while the state is read or changed, but not while updates are published
+        self._state_lock = threading.Lock()
         self._closed = False
 
     def take_wheels(
@@ -74,8 +77,8 @@ class RobotTracker:
 
         Mostly there is one; none while a sample is refused or has to be confirmed. arrival: s, monotonic.
         """
-        with self._publishing:
-            with self._lock:
+        with self._publish_lock:
+            with self._state_lock:
                 message = self._decode(payload)
                 steps = self._order_and_repair(message, arrival)
                 updates = []
@@ -90,7 +93,7 @@ class RobotTracker:
 
     def take_pose(self, payload: bytes, arrival: float) -> Outcome | None:
         """Take a geometry_msgs/PoseWithCovarianceStamped in CDR; None: it is invalid, or there is no fusion."""
-        with self._lock:
+        with self._state_lock:
             fusion = self._state.fusion
             if fusion is None:
                 return None
@@ -190,53 +193,54 @@ class RobotTracker:
 
     def health(self, now: float) -> Health:
         """The robot's health. now: s, monotonic."""
-        with self._lock:
+        with self._state_lock:
             return self._health.report(self._state, now)
 
     def pose_at(self, stamp: int | None = None) -> PoseAt:
         """The pose at a time (ns; default: of the last sample). DataError: nothing is remembered of that time."""
-        with self._lock:
+        with self._state_lock:
             return pose_at(self._state, stamp)
 
     def swap(self, calibration: Calibration) -> None:
         """Continue with another calibration from the next sample on. DataError: it is not this robot's."""
-        with self._lock:
+        with self._state_lock:
             swap_calibration(self._state, calibration)
             self._state_writer.save(self._state)
 
     def refuse_swap(self, reason: str) -> None:
         """Count a calibration that was sent and cannot be read."""
-        with self._lock:
+        with self._state_lock:
             record_refused_swap(self._state, None, reason)
 
     def set_pose(self, pose: Array, covariance: Array) -> None:
         """Set the pose (3,) in the map, now. DataError without fusion: odometry itself never jumps."""
-        with self._lock:
-            self._fusion_for("set_pose").set_pose(pose, covariance)
+        with self._state_lock:
+            self._required_fusion("set_pose").set_pose(pose, covariance)
 
     def reset(self) -> None:
         """Forget the pose in the map; odometry continues. DataError without fusion."""
-        with self._lock:
-            self._fusion_for("reset").reset()
+        with self._state_lock:
+            self._required_fusion("reset").reset()
             self._state.reference.restart()
 
     def resume(self, saved: SavedState, now: float, wall: float) -> None:
         """Continue where another node stopped. now, wall: monotonic and unix time, s."""
-        with self._lock:
+        with self._state_lock:
             self._add_to_timeline(resume_state(self._state, saved, now, wall))
 
     def count_failure(self) -> None:
         """Count a message on which omnibench itself failed."""
-        with self._lock:
+        with self._state_lock:
             self.counts.failures += 1
 
     def close(self) -> None:
         """Take no more wheel samples, and write the state."""
-        with self._publishing, self._lock:
+        with self._publish_lock, self._state_lock:
             self._closed = True
             self._state_writer.close(self._state)
 
-    def _fusion_for(self, order: str) -> Fusion:
+    def _required_fusion(self, order: str) -> Fusion:
+        """The fusion that an order needs. order: its name, for messages. DataError: there is no fusion."""
         if self._state.fusion is None:
             raise DataError(f"{order}: robot {self.name!r} runs without fusion, and odom itself never jumps")
         return self._state.fusion

@@ -118,7 +118,7 @@ def concatenate_recording(recording: Recording, *, pause: float = 1.0, split: Sp
 
 
 def true_start_poses(recording: Recording, split: Split | None = None) -> Array:
-    """Start poses (R, 3) at which each run truly starts where the one before truly ended. DataError without a truth.
+    """Start poses (R, 3) of the runs in one drive: each at the true end of the one before. DataError without a truth.
 
     With them the errors of a drive's reference poses do not accumulate from run to run.
     """

@@ -142,7 +142,7 @@ def test_more_requests_than_the_server_holds_are_refused_and_the_stream_goes_on(
         received = ReceivedMessages(session, bob__odom=ODOMETRY)
         wheels = session.declare_publisher("bob/joint_states")
         until(lambda: wheels.matching_status.matching, "the node's subscription")
-        with node.trackers["apr"]._lock:  # the query server is held up by the first
+        with node.trackers["apr"]._state_lock:  # the query server is held up by the first
             waiting = [session.get("omnibench/apr/health", timeout=20.0) for _ in range(100)]
             sent(wheels, path.samples())
             until(lambda: len(received["bob__odom"]) == 101, "the odometry")
