@@ -146,8 +146,8 @@ def test_a_matrix_that_was_not_fitted_has_no_covariance_and_needs_no_word_of_it(
 def test_a_search_that_stops_far_from_the_minimum_has_no_covariance_and_says_why(dataset: Dataset) -> None:
     run = calibrate(dataset, "random_search", options={"candidates": 20})
     assert run.uncertainty is None
-    assert run.warnings[0].startswith("no covariance: the answer is ")
-    assert run.warnings[0].endswith(" standard deviations or more from a better one")
+    assert run.warnings[0].startswith("no covariance: the answer does not minimise the cost (a better one is at least ")
+    assert run.warnings[0].endswith(" standard deviations away); search longer or take another calibrator")
 
 
 @pytest.mark.parametrize("calibrator", ["closed_form", "crs"])

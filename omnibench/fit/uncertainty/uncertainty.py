@@ -128,9 +128,13 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult) -> tuple[Array, 
         raise NoCovarianceError(f"no covariance: the cost {objective.name} is no sum of norms")
     free = problem.free & ~np.isin(problem.names, result.at_bounds)
     if not element_slopes(problem, result.vector)[:, free].any():
-        raise NoCovarianceError("no covariance: nothing was free to be fitted")
+        raise NoCovarianceError(
+            "no covariance: no number was free to be fitted; each is kept at its design value or lies on a bound"
+        )
     if result.cost is not None and result.cost < _NO_ERROR:
-        raise NoCovarianceError("no covariance: no error is left to judge by")
+        raise NoCovarianceError(
+            "no covariance: the answer fits the runs exactly, and their scatter about it is what a covariance rests on"
+        )
     try:
         scores = _scores(problem, objective, result.vector, free)
         answer = sandwich(scores)
@@ -171,7 +175,8 @@ def _check_minimum(
     count = float(np.max(away[deviations > 0] / deviations[deviations > 0], initial=0.0))
     if count > 1.0:
         raise NoCovarianceError(
-            f"no covariance: the answer is {count:.0f} standard deviations or more from a better one"
+            f"no covariance: the answer does not minimise the cost (a better one is at least {count:.0f} standard "
+            "deviations away); search longer or take another calibrator"
         )
 
 

@@ -221,13 +221,13 @@ class TestBasis:
 
     def test_data_without_any_error_are_told(self) -> None:
         problem = make_problem(driven(FLOWER, noise=0.0))
-        with pytest.raises(NoCovarianceError, match="no error is left to judge by"):
+        with pytest.raises(NoCovarianceError, match="the answer fits the runs exactly"):
             uncertainty_of(problem, solved(problem))
 
     def test_a_robot_that_never_moved_is_told(self) -> None:
         still = [replace(run, rates=0 * run.rates) for run in driven(FLOWER)]
         problem = make_problem(still)
-        with pytest.raises(NoCovarianceError, match="nothing was free to be fitted"):
+        with pytest.raises(NoCovarianceError, match="no number was free to be fitted; "):
             uncertainty_of(problem, solved(problem))
 
     def test_an_answer_that_is_no_minimum_is_told(self) -> None:
@@ -235,7 +235,7 @@ class TestBasis:
         best = solved(problem)
         assert best.vector is not None
         off = replace(best, vector=best.vector * 1.02, matrix=problem.matrix(best.vector * 1.02))
-        with pytest.raises(NoCovarianceError, match="standard deviations or more from a better one"):
+        with pytest.raises(NoCovarianceError, match="standard deviations away"):
             uncertainty_of(problem, off)
 
 
