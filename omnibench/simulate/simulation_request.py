@@ -17,7 +17,7 @@ from omnibench.files import TableFormat, write_text
 from omnibench.robot.calibration import read_calibration
 from omnibench.simulate.like import simulate_like
 from omnibench.simulate.simulation import Simulation
-from omnibench.simulate.source import SimulationSource, read_simulation
+from omnibench.simulate.source import SimulationSource, check_effect_options, read_simulation
 from omnibench.slam.accuracy import SlamAccuracy, slam_accuracy
 
 ACCURACY_FILE = "slam_accuracy.json"
@@ -91,6 +91,7 @@ class SimulationRequest:
             dataset = simulate_like(load_dataset(self.like), calibration, (self.seed or 0) if self.noise else None)
             save_dataset(dataset, self.output, table_format)
             return WrittenSimulation(dataset)
+        check_effect_options(self.effects)
         simulation = self.source.simulate(watch)
         save_dataset(simulation.dataset, self.output, table_format)
         accuracy = slam_accuracy(simulation.dataset, simulation.paths) if simulation.paths else None

@@ -12,6 +12,7 @@ from pydantic import ConfigDict, Field
 from omnibench.config import Model, parse_yaml, read_yaml, validate
 from omnibench.data.progress import ProgressCallback, no_progress
 from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.registry import effects
 from omnibench.robot.calibration import EffectTerm
 from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.simulate.config import FlowerConfig, Truth
@@ -62,8 +63,8 @@ class SimulationSource:
         if not given:
             return self
         truth = self.config.truth
-        effects = [*truth.effects, *map(_effect, given)]
-        changed = validate(Truth, {**truth.model_dump(), "effects": effects}, "--effect")
+        terms = [*truth.effects, *map(_effect, given)]
+        changed = validate(Truth, {**truth.model_dump(), "effects": terms}, "--effect")
         return replace(self, config=self.config.model_copy(update={"truth": changed}))
 
     def simulate(self, watch: ProgressCallback = no_progress) -> Simulation:
@@ -87,6 +88,12 @@ def read_simulation(path: Path | str, dataset: str | None = None) -> SimulationS
     folder = path.resolve().parent
     plugins = tuple((folder / each).resolve() for each in config.plugins)
     return SimulationSource(name, chosen, config.description, plugins)
+
+
+def check_effect_options(given: Sequence[str]) -> None:
+    """Raise UnknownNameError for an ``--effect`` that is not known; to be called once the plug-ins are loaded."""
+    for text in given:
+        effects.entry(_effect(text).name, f"--effect {text}")
 
 
 def _chosen(

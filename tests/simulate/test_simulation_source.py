@@ -165,7 +165,10 @@ class TestTheCommand:
             (["CONFIG", "--seed", "1"], "--seed: is for --like"),
             (["--like", "CONFIG", "--model", "CALIBRATION"], "a data set is a folder"),
             (["--like", "DATA", "--model", "CONFIG"], "is this a calibration file?"),
-            (["CONFIG", "--effect", "heading_drft: {b: 1}"], "unknown effect 'heading_drft'; did you mean 'heading_"),
+            (
+                ["CONFIG", "--effect", "heading_drft: {b: 1}"],
+                "--effect heading_drft: {b: 1}: unknown effect 'heading_drft'",
+            ),
         ],
     )
     def test_what_does_not_go_together_is_refused(
