@@ -256,12 +256,13 @@ def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
             ),
         ),
         (
-            LegendItem("limit", "could be this large (95 %)", AFTER),
-            LegendItem("detectable", "found nearly always from here on", INK, "dot"),
+            LegendItem("limit", "dot: could be this large (95 %)", AFTER),
+            LegendItem("detectable", "diamond: found nearly always from here on", INK),
         ),
         1,
-        "Of each effect the parameter that could be largest. Left of the dotted line the data tell more than what is "
-        "plausible of such an effect anyway; right of it an effect of plausible size could hide.",
+        "Each effect is shown by the parameter that could be largest. The dotted line is the end of the plausible "
+        "range, 100 %. Of an effect whose dot is left of it, the data tell more than what is plausible anyway; an "
+        "effect whose dot is right of it could hide at a plausible size.",
     )
 
 
