@@ -36,7 +36,7 @@ class CandidateRun:
 
     @property
     def duration(self) -> float:
-        """The mean duration of its runs, s."""
+        """The mean duration of the command's runs, s."""
         return float(np.mean([run.pose_times[-1] for run in self.runs]))
 
     @property

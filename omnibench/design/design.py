@@ -136,7 +136,10 @@ def _equal_otherwise(problem: DesignProblem, name: str, use: Use) -> Equivalent:
 def _equal(
     problem: DesignProblem, name: str, use: Use, optimum: ContinuousDesign, designs: Sequence[Counts] = ()
 ) -> Equivalent:
-    """The smallest design with as much information as the baseline, from ``designs`` where one of them has it."""
+    """The smallest design for a use that tells as much about the matrix as the baseline.
+
+    designs: made already, from the smallest on; the first that tells as much is taken; if none does, one is made.
+    """
     everything = problem.everything(use)
     target = everything.root(problem.pool.baseline)
     counts = next((design for design in designs if everything.root(design) >= target), None)

@@ -1,4 +1,4 @@
-"""Discovering what a model lacks. The whole way on one page.
+"""Discovering what a model lacks: all steps, in their order.
 
 Fit the plain matrix; screen its residuals for all that could explain them; select the effects of the catalogue that do;
 extend the model by these; confirm them once the noise is known better; compare plain and extended model on runs that
@@ -39,7 +39,9 @@ from omnibench.errors import DataError
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 
-_EXPLAINED = 0.5  # share of what names left that may remain once they are fitted in full; otherwise they are wrong
+# Effects that the first selection gave up are kept if, once they are fitted in full, less than this share of the
+# chi-square that they left to first order remains (chosen).
+_EXPLAINED = 0.5
 
 
 class StageCallback(Protocol):
@@ -66,7 +68,8 @@ def discover_effects(
     """Find where the odometry of a data set's training split disagrees with its reference, and which effect is missing.
 
     without: effects that are not to be tried. unknown_term: where no effect explains what is missing, add a smooth term
-    over the covariate that the residuals depend on. calibration: whose matrix to begin at. The validation split is used
+    over the covariate that the residuals depend on. calibration: the plain
+    matrix is fitted from this one's matrix on, by default from the robot's design values. The validation split is used
     when all is decided, and only to say how well the models predict it.
 
     Raises UnknownNameError for a name in ``without`` that is no effect's, DataError for a training split without

@@ -1,4 +1,4 @@
-"""The calibration problem: all that a calibrator is given, and the only way to evaluate candidates."""
+"""The calibration problem: all that a calibrator is given, and the evaluation of candidates within a budget."""
 
 from __future__ import annotations
 
@@ -66,10 +66,12 @@ class CalibrationProblem:
     trajectories: the training runs; a calibrator cannot reach the validation runs.
     start (n,): the vector of the design values; lower, upper (n,): its box; names: of its n elements.
     free (n,): True for elements that may be searched; the others keep their start values.
-    cost(candidates): the objective, counted against the budget.
+    objective: the Cost. cost(candidates): its values, counted against the budget and recorded; a search calls this.
+    values(candidates): the same values, neither counted nor recorded; for judging an answer, not for searching.
     rng: the only source of randomness that a calibrator may use.
     best_vector, best_cost: the best candidate in the box so far; the start and infinity before the first.
     history: every improvement of the best cost.
+    watch: called with the evaluations and the best cost so far, at most every 0.1 s.
     """
 
     def __init__(
@@ -112,8 +114,8 @@ class CalibrationProblem:
         self._evaluator: PoseEvaluator | None = None
         self._evaluator_tried = False
         self._watch = watch
-        self._began = time.perf_counter()
-        self._shown = 0.0
+        self._began = time.perf_counter()  # s, of that clock, when the problem was made
+        self._shown = 0.0  # s after that when ``watch`` was last called
 
     @property
     def size(self) -> int:

@@ -30,7 +30,7 @@ class MotionWithinScan:
 
     @classmethod
     def steady(cls, twist: Array, duration: float) -> MotionWithinScan:
-        """The motion with a constant twist (3,), m/s, m/s, rad/s."""
+        """The motion of a robot that keeps one twist (3,), m/s, m/s, rad/s, for the whole scan (duration, s)."""
         return cls(twist[None], duration, np.zeros(3))
 
     def at(self, delays: Array) -> Array:

@@ -67,7 +67,7 @@ def trial_values(effect: Effect, robot: Robot, seed: int = 0) -> Iterator[Values
 
 
 def without(effect: Effect, robot: Robot, values: Values) -> Values:
-    """The values, with 0 for parameters without choices: no effect."""
+    """The values with every parameter that has no choices set to 0, at which the effect changes nothing."""
     shapes = {item.name for item in effect.parameters(robot, SESSIONS) if item.choices}
     return {name: value if name in shapes else 0.0 for name, value in values.items()}
 

@@ -23,7 +23,7 @@ _FOLDED_ABOVE = 20  # runs: a longer table of runs is folded away (chosen)
 
 
 def outcome_section(view: DatasetView) -> Section:
-    """The section with the outcomes: each entry over its seeds, proven bounds, and every run."""
+    """The section "Outcomes": tables of the entries, of the proven bounds if there are any, and of all runs."""
     proofs = (certificate_table(view.certificates),) if view.certificates else ()
     runs: Block = run_table(view)
     if len(view.runs) > _FOLDED_ABOVE:

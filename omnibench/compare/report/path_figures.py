@@ -15,9 +15,9 @@ from omnibench.report.recording.runs import describe
 from omnibench.report.style import INK, equal_aspect, plot, text
 from omnibench.robot.kinematics import Array
 
-_SHOWN = 4  # trajectories
-_POINTS = 160  # points that a path is drawn with
-_TAIL = 0.15  # share of a run's duration that the figure of its end shows
+_SHOWN = 4  # trajectories that are drawn, as many as in Fig. 6 of the paper
+_POINTS = 160  # points that a path is drawn with (chosen)
+_TAIL = 0.15  # last share of a run's duration, which the figure of its end shows (chosen)
 _PAPER_DIRECTIONS = (30, 210, 120, 300)  # deg, of Fig. 6 (a) to (d)
 _PAPER_TURN_RATE = 0.35  # rad/s
 

@@ -20,7 +20,7 @@ from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import WheelLog
 
-_LAST = 5  # samples whose mean rate tells how the robot goes on after the last one
+_LAST = 5  # wheel samples at the end of a run, with whose mean rate it goes on after them (chosen)
 _LEAST_GAIN = 6.6  # twice the gain in log-likelihood that a variance of zero exceeds by chance once in 200 times
 
 NUISANCES = ("start heading", "clock offset", "clock slope")

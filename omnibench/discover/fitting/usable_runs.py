@@ -11,9 +11,9 @@ from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
-_MOST_STAMPS = 80  # reference poses used of a run: neighbours in denser references share their errors
-_STANDING = 1e-3  # rad/s: slower wheels stand
-_OVERHANG = 0.5  # s: poses so long after the last wheel sample are used, the robot going on as in its last samples
+_MOST_STAMPS = 80  # reference poses used of a run (chosen: neighbours in denser references share their errors)
+_STANDING = 1e-3  # rad/s: slower wheels count as standing (chosen)
+_OVERHANG = 0.5  # s after the last wheel sample in which reference poses are still used (chosen; see ``log_of``)
 
 
 def usable_runs(trajectories: Sequence[Trajectory]) -> tuple[Trajectory, ...]:

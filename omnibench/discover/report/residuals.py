@@ -26,7 +26,7 @@ from omnibench.robot.kinematics import Array
 NORMAL_95 = 1.96
 CIRCLE_95 = 2.448
 _STAMPS = 15_000  # fitted at most, of all runs (chosen: keeps a report below seconds)
-_DETERMINED = 1e-4  # share of a bin's information that the other bins must leave (chosen)
+_DETERMINED = 1e-4  # share of the largest eigenvalue of the information, below which a direction is left open (chosen)
 _COMMANDS = 8  # with so many or more, random signs are drawn for whole commands (chosen)
 
 

@@ -47,11 +47,11 @@ STAGES: Mapping[Stage, str] = {
 }
 METRICS: Mapping[Literal["eq6", "chi2"], str] = {"eq6": "Eq. (6), final poses", "chi2": "whitened χ² per residual"}
 
-_COUNTS = ("", "1")  # units of parameters without a dimension
+_DIMENSIONLESS = ("", "1")  # how effects write the unit of a parameter without a dimension
 _DEGREES = math.degrees(1.0)
 # Units that people read in place of SI units: factor and unit.
 _READ_AS: Mapping[str, tuple[float, str]] = {
-    **dict.fromkeys(_COUNTS, (100.0, "%")),
+    **dict.fromkeys(_DIMENSIONLESS, (100.0, "%")),
     "m": (1e3, "mm"),
     "m/s": (1e3, "mm/s"),
     "s": (1e3, "ms"),
@@ -90,7 +90,7 @@ def with_unit(number: str, unit: str) -> str:
 
 def value_and_interval(parameter: EstimatedParameter) -> tuple[str, str, str]:
     """A parameter's value, 95 % interval (empty if it has none) and unit, with the same decimals."""
-    shown = Reading(1.0, "") if parameter.shape and parameter.unit in _COUNTS else reading(parameter.unit)
+    shown = Reading(1.0, "") if parameter.shape and parameter.unit in _DIMENSIONLESS else reading(parameter.unit)
     value = shown.factor * parameter.value
     low, high = shown.factor * parameter.low, shown.factor * parameter.high
     if parameter.shape or not (math.isfinite(low) and math.isfinite(high)):

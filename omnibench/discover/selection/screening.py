@@ -17,7 +17,7 @@ from omnibench.discover.selection.candidate_groups import Groups, make_groups
 from omnibench.discover.selection.encoder_quantisation import EncoderQuantisation
 from omnibench.robot.kinematics import Array
 
-_COARSE = 0.03  # s: samples are merged into longer ones, since all that is screened varies more slowly
+_COARSE = 0.03  # s: shorter wheel samples are merged up to this duration (chosen: the covariates vary more slowly)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Screening:
         return given(self.data, self.groups.matrix.index)
 
     def index_with(self, chosen: Sequence[Group]) -> list[int]:
-        """The columns of the matrix and of some groups."""
+        """The column numbers of the matrix, then those of the chosen groups."""
         return [*self.groups.matrix.index, *(index for group in chosen for index in group.index)]
 
     def confirms(self, others: Sequence[Group], group: Group) -> bool:

@@ -45,7 +45,8 @@ _IMBALANCE = 1e-9  # m or rad per rad: assumed imbalance of u_s, so that no widt
 _STEPS = 25  # steps of the reweighted least squares that find u_s
 _LOOSE = 0.9  # share of the expected cost below which a bound is tried again with headings alone
 _SMOOTHING = 3.0  # digits: norms are smoothed below this negative power of ten of their mean
-_SETTLED = 1e-5  # change of a norm, m or rad, that ends the reweighting
+# The reweighting ends when no deviation changes by more, in units in which the normal equations' diagonal is 1.
+_SETTLED = 1e-5
 _RIDGE = 1e-13  # added to the normalised normal equations, which are singular where the data leave a direction open
 
 

@@ -35,8 +35,8 @@ Pose = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 _LARGEST = 1000.0  # m; a larger plan is one in mm
 _SMALLEST_AREA = 1e-6  # m²
-_STEP = 0.01  # m between the points at which a path is checked
-_OUTSIDE = 0.01  # m that an obstacle may reach into the walls
+_STEP = 0.01  # m between the points at which a path is checked (chosen)
+_OUTSIDE = 0.01  # m that an obstacle may reach outside the boundary (chosen)
 
 
 class RoomPlan(Model):

@@ -135,7 +135,10 @@ def _slower(command: Command, straight: float, turning: float) -> float:
 def _planned(
     seconds: float, set_point: SetPoint, link: CommandLink, rng: np.random.Generator
 ) -> tuple[SetPoint, tuple[SentCommand, ...], tuple[tuple[float, float], ...]]:
-    """Set point of a whole run, commands sent, stops by the watchdog. seconds: duration of the run at full speed, s."""
+    """Plan a run: its set point, the commands sent, and the stops by the watchdog as (start, end), s.
+
+    seconds: duration of the run at full speed, s. A stop that lasts to the end of the run ends at infinity.
+    """
     sent: list[SentCommand] = []
     stops: list[tuple[float, float]] = []
     expires, reached = 0.0, False

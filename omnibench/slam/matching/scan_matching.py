@@ -22,7 +22,7 @@ _SINGULAR = 1e-12  # share of the largest information below which a direction ha
 _SUSPECT = 0.02  # share of the largest information below which a direction is tested,
 _CERTAIN = 0.98  # or share of its information that errors of the map's normals cannot explain;
 _NOTHING = 1e-3  # observability below which it is not worth a test
-_TESTED: Array = np.array([0.1, 0.1, 0.05])  # m, m, rad; how far the scan is moved
+_TESTED: Array = np.array([0.1, 0.1, 0.05])  # m, m, rad; largest parts of the move with which a direction is tested
 _MOST = 200  # points that are moved
 _FALSE, _TRUE = 0.5, 0.8  # actual by predicted rise: below the first no information is left, above the second all
 
