@@ -75,7 +75,7 @@ class LiveNode:
         return self.trackers[robot].health(time.monotonic())
 
     def _open_memories(self, started: ExitStack) -> dict[str, RobotMemory]:
-        """Each robot's memory, the files of its saved state, locked for this node; none if no ``state`` is configured."""
+        """Each robot's memory: the files of its saved state, locked for this node; none without a ``state`` folder."""
         memories: dict[str, RobotMemory] = {}
         if self.config.state is not None:
             for robot in self.config.robots:
