@@ -57,7 +57,7 @@ EXAMPLES = (
         ("configs/hidden_effect.yaml",),
         (
             "omnibench simulate configs/hidden_effect.yaml -o data/hidden --truth data/truth",
-            "omnibench discover data/hidden --output found",
+            "omnibench discover data/hidden -o found",
         ),
     ),
     Example(
@@ -70,7 +70,7 @@ EXAMPLES = (
         "design",
         "which commands are worth driving, without any recording",
         ("configs/design.yaml",),
-        ("omnibench design configs/design.yaml --output design",),
+        ("omnibench design configs/design.yaml -o design",),
     ),
     Example(
         "live",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from commands import ROOT, Command, assert_refused
+from commands import ROOT, Command, Prepared, assert_refused
 from pydantic import TypeAdapter
 from typed_commands import commands_in, parse
 
@@ -105,6 +105,20 @@ def test_python_that_is_shown_uses_public_names(page: Path) -> None:
     for program in _PYTHON.findall(page.read_text(encoding="utf-8")):
         compile(program, str(page), "exec")
         assert set(re.findall(r"omnibench\.(\w+)\(", program)) <= set(omnibench.__all__)
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", BY_NAME["python"].file], ids=relative)
+def test_the_first_python_that_is_shown_runs(
+    page: Path, prepared: Prepared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, target in {"data/robot": prepared.data, "configs/apr02.yaml": prepared.config}.items():
+        link = tmp_path / name
+        link.parent.mkdir()
+        link.symlink_to(target)
+    (program,) = _PYTHON.findall(page.read_text(encoding="utf-8"))
+    exec(compile(program, str(page), "exec"), {})  # noqa: S102 (a program of the handbook)
+    assert (tmp_path / "calibration.yaml").is_file()
 
 
 def test_the_handbook_tells_of_every_public_name() -> None:
