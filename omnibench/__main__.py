@@ -54,6 +54,7 @@ def _run(app: Any) -> None:
 
     from omnibench.errors import Interrupted, OmnibenchError
 
+    _replace_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # a letter that the terminal lacks becomes a ?
@@ -82,6 +83,14 @@ def _run(app: Any) -> None:
         if code == 130:  # newer versions of Typer return this after Ctrl-C
             _fail("interrupted", 130)
         sys.exit(code if isinstance(code, int) else 0)
+
+
+def _replace_closed_streams() -> None:
+    """Send to nowhere what would be printed on a stream that was closed before the start (``>&-``)."""
+    if sys.stdout is None:
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 (open until the process ends)
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
 
 
 def _usage(error: Any) -> str:

@@ -67,6 +67,8 @@ def read_yaml(path: Path) -> Any:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise ConfigError(f"{path}: is a folder; name the file in it") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
     return parse_yaml(text, str(path))
@@ -102,21 +104,23 @@ def read_model(model: type[M], path: Path) -> M:
 
 def validate(model: type[M], data: Any, where: str) -> M:
     """``data`` as ``model``; ConfigError with ``where`` in front names the first fault."""
-    if data is None:
+    empty = data is None
+    if empty:
         data = {}
     if not isinstance(data, Mapping | BaseModel):
         raise ConfigError(f"{where}: expected keys and values, found {type(data).__name__}")
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise ConfigError(f"{where}: {_describe(model, error)}") from None
+        raise ConfigError(f"{where}: {'is empty: ' if empty else ''}{_describe(model, error)}") from None
 
 
 def _describe(model: type[BaseModel], error: ValidationError) -> str:
     details = error.errors(include_url=False)
     # An unknown key explains a missing one, so it comes first.
     details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
-    rest = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+    more = len(details) - 1
+    rest = f" (and {more} more mistake{'s' if more > 1 else ''})" if more else ""
     return _describe_one(model, details[0]) + rest
 
 

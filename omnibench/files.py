@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
-from errno import EACCES, EPERM, EROFS
+from errno import EACCES, EDQUOT, EFBIG, EISDIR, ENOSPC, EPERM
 from io import BytesIO
 from pathlib import Path
 from typing import Literal
@@ -19,6 +19,16 @@ RESULTS = Path("results")  # the folder of results, where the user names none
 TableFormat = Literal["parquet", "csv"]
 # The bytes of a file, or a function that writes it to a path and raises OSError when the disk refuses.
 FileContent = bytes | Callable[[Path], None]
+
+_MORE_SPACE = "free space or choose another place"
+_MORE_RIGHTS = "get permission to write there or choose another place"
+_WAYS_OUT = {
+    ENOSPC: _MORE_SPACE,
+    EDQUOT: _MORE_SPACE,
+    EFBIG: _MORE_SPACE,
+    EACCES: _MORE_RIGHTS,
+    EPERM: _MORE_RIGHTS,
+}
 
 
 @contextmanager
@@ -55,7 +65,9 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def _refused(path: Path, error: OSError) -> DataError:
-    way_out = "choose another place" if error.errno in (EACCES, EPERM, EROFS) else "free space or choose another place"
+    if error.errno == EISDIR:
+        return DataError(f"{path}: cannot be written: is a folder; name a file")
+    way_out = _WAYS_OUT.get(error.errno or 0, "choose another place")
     return DataError(f"{path}: cannot be written: {error.strerror or error}; {way_out}")
 
 

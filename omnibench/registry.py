@@ -167,6 +167,8 @@ def registered_from(path: Path) -> list[tuple[Registry[Any], Entry[Any]]]:
 
 
 def _load_folder(folder: Path) -> list[PluginFailure]:
+    if folder.is_file():
+        raise PluginError(f"plug-in folder {folder} is a file; name the folder that it lies in with --plugins")
     if not folder.is_dir():
         raise PluginError(f"plug-in folder {folder} does not exist; make it or name another with --plugins")
     files = [path for path in sorted(folder.glob("*.py")) if not path.name.startswith(("test_", "_", "conftest"))]

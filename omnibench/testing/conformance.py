@@ -91,6 +91,8 @@ def _run_case(suite: Conformance, method: str) -> CaseResult:
 
 def load_plugin(path: Path) -> None:
     """Load a plug-in file for a test. PluginError names the file and why it cannot be loaded."""
+    if path.is_dir():
+        raise PluginError(f"{path}: is a folder; name the plug-in's file in it")
     if not path.is_file():
         raise PluginError(f"{path}: no such file")
     failure = load_plugin_file(path)

@@ -37,8 +37,9 @@ pytestmark = pytest.mark.usefixtures("registries_as_before")
         (["compare", "CONFIG", "--data", "flwer=DATA"], ["unknown data set 'flwer'; did you mean 'flower'?"]),
         (["compare", "CONFIG", "--data", "CONFIG"], ["no such folder; a data set is a folder with dataset.yaml in it"]),
         (["compare", "CONFIG", "--plugins", "nowhere"], ["plug-in folder ", "nowhere does not exist"]),
+        (["compare", "CONFIG", "--plugins", "CONFIG"], ["plug-in folder ", "small.yaml is a file; name the folder"]),
         (["compare", "CONFIG", "--output", "x" * 300], ["File name too long"]),
-        (["compare", "."], [".: cannot be read: "]),
+        (["compare", "."], [".: is a folder; name the file in it"]),
         (["compare", "DATA/dataset.yaml"], ["unknown key 'format'"]),
         (["calibrate", "DATA"], ["say where the calibration goes: -o calibration.yaml"]),
         (["calibrate", "nowhere", "-o", "x"], ["nowhere: no such folder"]),
@@ -59,7 +60,7 @@ pytestmark = pytest.mark.usefixtures("registries_as_before")
             ["calibrate", "DATA", "-o", "x", "--set", "tolerence=1"],
             ["unknown key 'tolerence'; did you mean 'tolerance'"],
         ),
-        (["calibrate", "DATA", "-o", "DATA"], ["cannot be written: Is a directory"]),
+        (["calibrate", "DATA", "-o", "DATA"], ["cannot be written: is a folder; name a file"]),
         (["calibrate", "DATA", "-o", "CONFIG/x"], ["cannot be written", "small.yaml is not a folder"]),
         (["evaluate", "CALIBRATION"], ["Missing argument 'dataset'"]),
         (["evaluate", "CONFIG", "DATA"], ["format is None, expected 'omnibench-calibration/1'"]),
@@ -78,6 +79,7 @@ pytestmark = pytest.mark.usefixtures("registries_as_before")
         (["import", "optiodom", "nowhere", "-o", "x"], ["nowhere: no such file or folder"]),
         (["import", "table1", "DATA", "-o", "x", "--set", "splt=1"], ["unknown key 'splt'"]),
         (["inspect", "CONFIG"], ["no such folder; a data set is a folder with dataset.yaml in it"]),
+        (["plugin", "check", "DATA"], ["is a folder; name the plug-in's file in it"]),
         (["list", "--plugins", "nowhere"], ["plug-in folder nowhere does not exist"]),
         (["plugin", "new"], ["Missing argument 'name'"]),
         (["plugin", "new", "My-Search"], ["'My-Search' cannot name a plug-in"]),
@@ -146,6 +148,14 @@ def test_a_reader_that_has_gone_is_no_error(prepared: Prepared) -> None:
     )
     assert run.returncode in (0, 1)
     assert run.stderr == ""
+
+
+@pytest.mark.parametrize("closed", [1, 2])
+def test_a_stream_that_was_closed_before_the_start_is_no_traceback(closed: int) -> None:
+    run = omnibench("list", preexec_fn=lambda: os.close(closed))
+    assert run.returncode == 0
+    assert run.stderr == ""
+    assert ("closed_form" in run.stdout) == (closed == 2)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from omnibench.errors import DataError, one_line
-from omnibench.files import check_results_folder, link_latest, new_results_folder, write_text
+from omnibench.files import check_results_folder, link_latest, new_results_folder, replacing, write_text
 
 
 def test_a_link_goes_on_pointing_to_the_file_that_is_written(tmp_path: Path) -> None:
@@ -45,6 +46,20 @@ def test_a_full_device_is_one_line(tmp_path: Path) -> None:
         assert stat.S_ISCHR(device.stat().st_mode)
     else:
         pytest.fail("the device took what it was given")
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [
+        (errno.EISDIR, "is a folder; name a file"),
+        (errno.ENOSPC, "No space left on device; free space or choose another place"),
+        (errno.EACCES, "Permission denied; get permission to write there or choose another place"),
+        (errno.EROFS, "Read-only file system; choose another place"),
+    ],
+)
+def test_the_advice_fits_what_the_disk_refuses(number: int, words: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=f"cannot be written: {words}$"), replacing(tmp_path / "x"):
+        raise OSError(number, os.strerror(number))
 
 
 def test_a_text_from_anywhere_becomes_one_line_that_can_be_written(tmp_path: Path) -> None:

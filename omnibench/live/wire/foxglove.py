@@ -32,7 +32,7 @@ class FoxgloveServer:
             import foxglove
         except ImportError:
             raise ConfigError(
-                "the Foxglove server needs the package foxglove-sdk: pip install 'omnibench[foxglove]'"
+                'the Foxglove server needs the package foxglove-sdk: pip install "foxglove-sdk"'
             ) from None
         if not 0 <= port <= 65535:
             raise ConfigError(f"Foxglove server: port {port}: expected 0 to 65535")

@@ -124,7 +124,7 @@ def test_without_the_package_the_line_says_how_to_install_it() -> None:
         "except ConfigError as error: print(error)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout == "the Foxglove server needs the package foxglove-sdk: pip install 'omnibench[foxglove]'\n"
+    assert done.stdout == 'the Foxglove server needs the package foxglove-sdk: pip install "foxglove-sdk"\n'
 
 
 def test_a_misspelt_topic_is_answered_with_the_nearest(loopback: Loopback, server: FoxgloveServer) -> None:
