@@ -3,6 +3,7 @@
 Ctrl-C is handled from the first import on; therefore nothing of omnibench is imported before ``main`` runs.
 """
 
+import gc
 import os
 import signal
 import sys
@@ -20,11 +21,24 @@ def main() -> None:
         with suppress(ValueError):  # not in the main thread
             signal.signal(signal.SIGINT, _interrupted)
     try:
-        from omnibench.cli.app import app
-
-        _run(app)
+        _run(_command_line())
     except KeyboardInterrupt:
         _fail("interrupted", 130)
+
+
+def _command_line() -> Any:
+    """The command line as one command. What is made on the way stays: collecting garbage would only take time."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        import typer
+
+        from omnibench.cli.app import app
+
+        return typer.main.get_command(app)
+    finally:
+        if collecting:
+            gc.enable()
 
 
 def _interrupted(number: int, frame: FrameType | None) -> None:
@@ -47,7 +61,7 @@ def _imports_of_a_command(frame: FrameType | None) -> bool:
     return False
 
 
-def _run(app: Any) -> None:
+def _run(command: Any) -> None:
     from io import TextIOWrapper
 
     import typer
@@ -58,7 +72,6 @@ def _run(app: Any) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # a letter that the terminal lacks becomes a ?
-    command = typer.main.get_command(app)
     usage_error: Any = typer.BadParameter.__mro__[1]  # click's UsageError, wherever this Typer keeps it
     try:
         code = command.main(prog_name="omnibench", standalone_mode=False)
