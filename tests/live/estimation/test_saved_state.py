@@ -116,7 +116,7 @@ def test_a_file_that_changed_takes_the_place_of_what_was_swapped_in(tmp_path: Pa
 
 def test_a_calibration_that_the_disk_refuses_is_one_line(tmp_path: Path, memory: RobotMemory) -> None:
     (tmp_path / "apr.calibration.yaml").mkdir()
-    with pytest.raises(DataError, match=r"apr\.calibration\.yaml: cannot be written: Is a directory"):
+    with pytest.raises(DataError, match=r"apr\.calibration\.yaml: cannot be written: is a folder; name a file"):
         memory.keep_calibration(calibration())
 
 
