@@ -67,7 +67,8 @@ def replacing(path: Path) -> Iterator[Path]:
 def _refused(path: Path, error: OSError) -> DataError:
     if error.errno == EISDIR:
         return DataError(f"{path}: cannot be written: is a folder; name a file")
-    way_out = _WAYS_OUT.get(error.errno or 0, "choose another place")
+    # An error without a number is polars', which mostly meets a full disk.
+    way_out = _MORE_SPACE if error.errno is None else _WAYS_OUT.get(error.errno, "choose another place")
     return DataError(f"{path}: cannot be written: {error.strerror or error}; {way_out}")
 
 
