@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
-from errno import EACCES, EDQUOT, EFBIG, EISDIR, ENOSPC, EPERM
+from errno import EACCES, EDQUOT, EFBIG, EIO, EISDIR, ENOSPC, EPERM
 from io import BytesIO
 from pathlib import Path
 from typing import Literal
@@ -26,6 +26,7 @@ _WAYS_OUT = {
     ENOSPC: _MORE_SPACE,
     EDQUOT: _MORE_SPACE,
     EFBIG: _MORE_SPACE,
+    EIO: _MORE_SPACE,  # as polars' errors are raised, which are mostly of a full disk
     EACCES: _MORE_RIGHTS,
     EPERM: _MORE_RIGHTS,
 }
@@ -67,8 +68,7 @@ def replacing(path: Path) -> Iterator[Path]:
 def _refused(path: Path, error: OSError) -> DataError:
     if error.errno == EISDIR:
         return DataError(f"{path}: cannot be written: is a folder; name a file")
-    # An error without a number is polars', which mostly meets a full disk.
-    way_out = _MORE_SPACE if error.errno is None else _WAYS_OUT.get(error.errno, "choose another place")
+    way_out = _WAYS_OUT.get(error.errno or 0, "choose another place")
     return DataError(f"{path}: cannot be written: {error.strerror or error}; {way_out}")
 
 
