@@ -26,7 +26,7 @@ _WAYS_OUT = {
     ENOSPC: _MORE_SPACE,
     EDQUOT: _MORE_SPACE,
     EFBIG: _MORE_SPACE,
-    EIO: _MORE_SPACE,  # as polars' errors are raised, which are mostly of a full disk
+    EIO: _MORE_SPACE,  # polars reports a full disk as an error of input or output
     EACCES: _MORE_RIGHTS,
     EPERM: _MORE_RIGHTS,
 }
