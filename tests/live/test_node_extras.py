@@ -55,7 +55,9 @@ def test_a_config_with_record_writes_the_mcap_file(tmp_path: Path, caplog: pytes
     config = config_of(tmp_path, record="recordings/run.mcap")
     driven(config)
     file = tmp_path / "recordings" / "run.mcap"
-    assert recorded(file) == {"/apr/joint_states": 51, "/apr/odom": 51, "/apr/odometry/filtered": 51, "/tf": 51}
+    counts = recorded(file)
+    counts.pop("/apr/diagnostics", None)  # once a second: one more where the machine is busy
+    assert counts == {"/apr/joint_states": 51, "/apr/odom": 51, "/apr/odometry/filtered": 51, "/tf": 51}
     assert f"recording to {file}" in caplog.text
 
 
