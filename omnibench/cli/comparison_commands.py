@@ -32,7 +32,7 @@ def compare(
 ) -> None:
     """Run calibrators on equal terms, score them, write a report.
 
-    All calibrators of the config get the same data and the same budget. Run again with the same --output, it goes on
+    All calibrators of the config get the same data and the same budget. Run again with the same -o, it goes on
     where it was stopped.
     """
     from omnibench.cli.terminal.comparison_tables import print_result

@@ -94,7 +94,7 @@ def _resumable(plan: Sequence[PlannedRun], store: RunStore, folder: Path) -> Ite
         yield
     except KeyboardInterrupt:
         kept = sum(store.get(run.key) is not None for run in plan)
-        message = f"interrupted; {kept} of {len(plan)} runs are kept in {folder}: run again with --output {folder}"
+        message = f"interrupted; {kept} of {len(plan)} runs are kept in {folder}: run again with -o {folder}"
         raise Interrupted(message) from None
 
 

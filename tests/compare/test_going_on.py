@@ -88,7 +88,7 @@ def test_ctrl_c_exits_with_130(stopped: Stopped) -> None:
 
 
 def test_ctrl_c_says_in_one_line_what_is_kept_and_how_to_go_on(stopped: Stopped) -> None:
-    line = f"interrupted; 1 of 4 runs are kept in {stopped.output}: run again with --output {stopped.output}"
+    line = f"interrupted; 1 of 4 runs are kept in {stopped.output}: run again with -o {stopped.output}"
     assert [text for text in stopped.stderr.splitlines() if text] == [line]
 
 

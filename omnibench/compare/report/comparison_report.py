@@ -174,7 +174,7 @@ def _reproduction(result: ComparisonResult) -> Section:
         "How to reproduce",
         (
             Paragraph("The effective config lies beside this report. From this folder:"),
-            Code("omnibench compare config.yaml --output again"),
+            Code("omnibench compare config.yaml -o again"),
             facts,
             Details("Effective config", (Code(to_yaml(config)),)),
         ),

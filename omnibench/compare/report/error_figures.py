@@ -40,7 +40,7 @@ _Motion = tuple[float, float]  # speed, m/s, and rate of turn, rad/s
 def error_section(view: DatasetView) -> Section:
     """Final errors on the scored split as table and figures; the table of the other split is folded away."""
     others = (
-        Details(f"The same on the {SPLIT_NAMES[split]} data", (final_error_table(view, split),))
+        Details(f"Final errors on the {SPLIT_NAMES[split]} data", (final_error_table(view, split),))
         for split in view.splits
         if split != view.scored
     )

@@ -62,7 +62,7 @@ def precision_figures(design: Design) -> FigureGrid:
             "Geometric mean of the standard deviations against the number of runs, on logarithmic scales",
         ),
         Figure(
-            "The same against the time of driving",
+            "All elements together, against the time of driving",
             _curves(
                 design,
                 lambda step: step.effort.seconds,

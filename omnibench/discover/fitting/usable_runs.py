@@ -1,4 +1,4 @@
-"""The training runs that can be used: with a reference pose after the start, at most 80 stamps each."""
+"""The runs of a split that can be used: with a reference pose after the start, at most 80 stamps each."""
 
 from __future__ import annotations
 
@@ -16,19 +16,18 @@ _STANDING = 1e-3  # rad/s: slower wheels count as standing (chosen)
 _OVERHANG = 0.5  # s after the last wheel sample in which reference poses are still used (chosen; see ``log_of``)
 
 
-def usable_runs(trajectories: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
-    """Runs with a reference pose after their start, by session and time, at most 80 stamps each.
+def usable_runs(trajectories: Sequence[Trajectory], split: str = "train") -> tuple[Trajectory, ...]:
+    """Runs of a split with a reference pose after their start, by session and time, at most 80 stamps each.
 
     Raises DataError where there are none, or where the wheels stand in all of them.
     """
     runs = [run for run in trajectories if _covered_poses(run) > 1]
     if not runs:
         raise DataError(
-            "no trajectory of the split train has a reference pose between its start and its last wheel sample; "
-            "nothing can be found"
+            f"no trajectory of the split {split} has a reference pose between its start and its last wheel sample"
         )
     if max(float(np.abs(run.rates).max()) for run in runs) < _STANDING:
-        raise DataError("the wheels stand in all training runs; drive some, or check the columns omega_*")
+        raise DataError(f"the wheels stand in all runs of the split {split}; drive some, or check the columns omega_*")
     runs.sort(key=lambda run: (str(run.session), run.started_at or 0.0))
     return tuple(_thinned(run) for run in runs)
 

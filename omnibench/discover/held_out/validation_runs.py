@@ -10,6 +10,7 @@ from omnibench.discover.fitting.model_fit import Fit, at_runs
 from omnibench.discover.fitting.outliers import without_jumps
 from omnibench.discover.fitting.start_frames import in_start_frames
 from omnibench.discover.fitting.usable_runs import usable_runs
+from omnibench.errors import DataError
 from omnibench.robot.model import OdometryModel
 
 _LATER, _LATER_S = 1.1, 60  # times, and s more than, the latest training run: beyond it a session's time is new
@@ -35,7 +36,11 @@ def validation_runs(dataset: Dataset, fit: Fit) -> ValidationRuns:
         )
     if not able:
         return ValidationRuns((), (), tuple(warnings))
-    runs = usable_runs(able)
+    try:
+        runs = usable_runs(able, "validation")
+    except DataError as error:
+        warnings.append(f"{error}; nothing is compared on it.")
+        return ValidationRuns((), (), tuple(warnings))
     kept, jumps = without_jumps(runs, in_start_frames(runs, at_runs(fit, runs).residuals), fit.noise.noise)
     if jumps:
         warnings.append(f"{jumps} validation poses contradict their neighbours; chi2 is without them.")

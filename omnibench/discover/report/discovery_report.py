@@ -196,7 +196,7 @@ def _hidden(discovery: Discovery) -> Iterator[Block]:
     grid = hidden_grid(discovery.hidden)
     if grid is not None:
         yield grid
-    yield Details(f"The same in numbers ({len(discovery.hidden)})", (hidden_table(discovery.hidden),))
+    yield Details(f"These effects in numbers ({len(discovery.hidden)})", (hidden_table(discovery.hidden),))
 
 
 def better_section(discovery: Discovery) -> Section:

@@ -118,7 +118,7 @@ def test_config_versions_and_hardware_are_told(result: ComparisonResult, report:
     assert "name: closed_form" in report.text
     assert f"numpy {result.environment.versions['numpy']}" in report.text
     assert result.environment.platform in report.text
-    assert "omnibench compare config.yaml --output again" in report.text
+    assert "omnibench compare config.yaml -o again" in report.text
 
 
 def test_notes_and_warnings_are_told(result: ComparisonResult, tmp_path: Path) -> None:
