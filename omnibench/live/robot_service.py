@@ -7,6 +7,7 @@ import time
 
 import zenoh
 
+from omnibench.live.estimation.counts import anomalies_in_words
 from omnibench.live.estimation.health import Health, diagnostic
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.estimation.update import Update
@@ -83,7 +84,7 @@ class RobotService:
             LOG.info("%s: %s (%s)", health.robot, health.status, health.message)
         anomalies = self.tracker.counts.anomalies()
         new = {kind: count - self._logged_anomalies.get(kind, 0) for kind, count in anomalies.items()}
-        in_words = ", ".join(f"{count} {kind}" for kind, count in new.items() if count)
+        in_words = anomalies_in_words({kind: count for kind, count in new.items() if count})
         if in_words and self._rate_limiter.allows("anomalies"):
             self._logged_anomalies = anomalies
             last = f"; the last: {health.last_refusal}" if health.last_refusal else ""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+
+from omnibench.words import plural
 
 
 @dataclass(slots=True)
@@ -43,3 +46,34 @@ class Counts:
         """The counters above 0 of what should not happen."""
         usual = ("samples", "poses", "swaps", "wraps")
         return {name: value for name, value in self.as_dict().items() if value and name not in usual}
+
+
+_WORDS = {  # noun, and what follows it, of the counters in ``Counts.anomalies``
+    "missing": ("wheel sample", "missing"),
+    "irregular": ("wheel sample", "at irregular times"),
+    "duplicates": ("wheel sample", "twice"),
+    "late": ("wheel sample", "out of order"),
+    "gaps": ("gap", "longer than max_gap"),
+    "clock_jumps": ("jump", "of the wheel samples' clock"),
+    "bad_stamps": ("wheel sample", "with an unlikely stamp"),
+    "counter_restarts": ("restart", "of a wheel's counter"),
+    "not_finite": ("wheel sample", "not finite"),
+    "too_fast": ("wheel sample", "faster than max_rate"),
+    "wrong_joints": ("wheel sample", "without all wheels"),
+    "undecodable": ("wheel message", "undecodable"),
+    "pose_rejected": ("pose", "refused by the gate"),
+    "pose_too_late": ("pose", "older than the history"),
+    "pose_ahead": ("pose", "ahead of the wheel samples"),
+    "pose_duplicates": ("pose", "twice"),
+    "pose_invalid": ("pose", "invalid"),
+    "pose_undecodable": ("pose message", "undecodable"),
+    "reacquired": ("restart", "of the filter at SLAM's pose"),
+    "swaps_refused": ("calibration", "refused"),
+    "failures": ("error", "of omnibench"),
+}
+
+
+def anomalies_in_words(anomalies: Mapping[str, int]) -> str:
+    """Anomalies by their counters' names as a list in words: ``3 wheel samples missing, 1 pose invalid``."""
+    worded = ((count, *_WORDS[name]) for name, count in anomalies.items())
+    return ", ".join(f"{plural(count, noun)} {rest}" for count, noun, rest in worded)
