@@ -45,6 +45,8 @@ class UnknownNameError(ConfigError):
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """``did you mean 'x'? `` for the known name closest to ``name``, or an empty text."""
-    matches = get_close_matches(str(name), list(known), n=1, cutoff=0.5)
+    """``did you mean 'x'? `` for the known name closest to ``name``, or an empty text where none is like it."""
+    name, names = str(name), list(known)
+    alike = get_close_matches(name, names, cutoff=0.5)  # short names with one letter wrong, and chance
+    matches = get_close_matches(name, names, n=1) or [known_name for known_name in alike if known_name[0] == name[0]]
     return f"did you mean {matches[0]!r}? " if matches else ""

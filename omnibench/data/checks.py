@@ -138,7 +138,10 @@ def _odd_wheels(recording: _Recording, design: Array) -> list[_Explanation]:
         f"{name} <- {'-' if sign < 0 else ''}{names[column]}"
         for name, column, sign in zip(names, order, signs, strict=True)
     )
-    warning = f"wheels look swapped or sign-flipped; the reference fits with omega of {shown}"
+    warning = (
+        f"wheels look swapped or sign-flipped; the reference fits with omega of {shown} "
+        "(importer csv: wheel_columns and wheel_signs set them right)"
+    )
     return [_Explanation((warning,), float(misfits[best]))]
 
 

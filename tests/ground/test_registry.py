@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from omnibench.errors import ConfigError, PluginError, UnknownNameError
+from omnibench.errors import ConfigError, PluginError, UnknownNameError, nearest
 from omnibench.fit.calibrator import Calibrator, run_calibrator
 from omnibench.registry import calibrators, load_plugin_file, load_plugins, registered_from
 from omnibench.testing import synthetic_problem
@@ -71,6 +71,11 @@ def test_an_unknown_name_gets_the_nearest_known_and_all_known() -> None:
     message = str(failure.value)
     assert message.startswith("apr02.yaml: calibrators.0: unknown calibrator 'theoretica'; did you mean 'theoretical'?")
     assert "random_search" in message
+
+
+def test_a_name_unlike_all_known_ones_gets_no_suggestion() -> None:
+    assert nearest("foo", ["robot", "dataset"]) == ""
+    assert nearest("kz", ["kx", "robot"]) == "did you mean 'kx'? "
 
 
 def test_an_unknown_option_gets_the_nearest_known() -> None:
