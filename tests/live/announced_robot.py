@@ -17,8 +17,8 @@ class AnnouncedRobot:
     def __init__(self, session: zenoh.Session, name: str, profile: Profile = "plain") -> None:
         node = GraphNode(session, KeySpace(profile), f"node_of_{name}")
         self.name = name
-        self.odom = node.publisher(name, "odom")
-        self.filtered = node.publisher(name, "odometry/filtered")
+        self.odom = node.publisher(name, "odom", lossless=True)
+        self.filtered = node.publisher(name, "odometry/filtered", lossless=True)
         self.diagnostics = node.publisher(name, "diagnostics")
         self.token = session.liveliness().declare_token(f"omnibench/{name}/alive")
         self._session = session

@@ -15,9 +15,9 @@ from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace, Publisher
 
 
 def publishers(loopback: Loopback, robot: str = "apr02") -> dict[str, Publisher[Any]]:
-    """A publisher for each topic of a robot."""
+    """A publisher for each topic of a robot; bursts lose nothing."""
     node = GraphNode(loopback.router, KeySpace(), "node")
-    return {topic: node.publisher(robot, topic) for topic in TOPICS}
+    return {topic: node.publisher(robot, topic, lossless=True) for topic in TOPICS}
 
 
 def wait_for_subscribers(*publishers: Publisher[Any]) -> None:

@@ -124,7 +124,7 @@ def profile(request: pytest.FixtureRequest) -> Profile:
 def node(network: Loopback, profile: Profile) -> dict[str, Publisher[Any]]:
     """A node's publishers of every topic."""
     graph = GraphNode(network.client(), KeySpace(profile, domain=PROFILES.index(profile)), "omnibench")
-    return {topic: graph.publisher("apr02", topic) for topic in TOPICS}
+    return {topic: graph.publisher("apr02", topic, lossless=True) for topic in TOPICS}
 
 
 @contextmanager
@@ -206,7 +206,7 @@ def sdk(network: Loopback) -> Iterator[Any]:
 def rmw_node(network: Loopback) -> Iterator[dict[str, Publisher[Any]]]:
     """A node of another ROS domain."""
     graph = GraphNode(network.client(), KeySpace("rmw", domain=42), "omnibench")
-    yield {topic: graph.publisher("apr02", topic) for topic in TOPICS}
+    yield {topic: graph.publisher("apr02", topic, lossless=True) for topic in TOPICS}
     graph.session.close()
 
 
