@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import socket
+import time
 from collections.abc import Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Final
@@ -16,6 +19,7 @@ if TYPE_CHECKING:
     from foxglove import Channel
 
 PORT: Final = 8765  # the application's default
+STOPPING_S: Final = 5.0  # how long ``close`` waits for its port; without load it is free after some milliseconds
 
 
 class FoxgloveServer:
@@ -44,7 +48,8 @@ class FoxgloveServer:
             raise ConfigError(
                 f"Foxglove server on {host}:{port}: {reason}; close what uses it or choose another host or port"
             ) from None
-        self.address = f"ws://{host}:{self._server.port}"
+        self._host, self._port = host, int(self._server.port)
+        self.address = f"ws://{host}:{self._port}"
         self._channels: dict[str, Channel] = {}
         self._listeners: list[TopicListener] = []
 
@@ -66,10 +71,13 @@ class FoxgloveServer:
         return name in self._channels and self._channels[name].has_sinks()
 
     def close(self) -> None:
-        """Stop serving."""
+        """Stop serving, and return when another server can have the port."""
         for listener in self._listeners:
             listener.close()
-        self._server.stop()
+        self._server.stop()  # which only asks its threads to stop
+        end = time.monotonic() + STOPPING_S
+        while _in_use(self._host, self._port) and time.monotonic() < end:
+            time.sleep(0.002)
 
     def __enter__(self) -> FoxgloveServer:
         return self
@@ -83,3 +91,12 @@ class FoxgloveServer:
         channel = self._channels.get(arrival.name)
         if channel is not None:
             channel.log(arrival.payload, log_time=arrival.time)
+
+
+def _in_use(host: str, port: int) -> bool:
+    """True if a program listens there, whatever the state of the connections that it had."""
+    try:
+        socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
+    except OSError as error:
+        return error.errno == errno.EADDRINUSE
+    return False

@@ -105,6 +105,14 @@ def test_a_port_in_use_is_one_line() -> None:
             FoxgloveServer(port=port)
 
 
+def test_the_port_of_a_closed_server_can_be_used_at_once(loopback: Loopback) -> None:
+    port = free_port()
+    for _ in range(20):
+        with FoxgloveServer(port=port) as server, connected(server) as application:
+            server.forward(loopback.client(), KEYS, ["apr02"])
+            advertised(application)
+
+
 def test_a_host_that_is_not_this_machine_is_one_line() -> None:
     with pytest.raises(ConfigError, match=r"Foxglove server on 192\.0\.2\.1:"):
         FoxgloveServer("192.0.2.1", free_port())
