@@ -124,7 +124,7 @@ def test_listen_prints_a_line_a_second_when_piped(workplace: Path) -> None:
             run = omnibench("listen", "apr", "--config", config, "--seconds", "3", "--json")
     assert run.returncode == 0, run.stderr
     documents = [json.loads(line) for line in run.stdout.splitlines()]
-    assert 2 <= len(documents) <= 4
+    assert 1 <= len(documents) <= 4  # fewer when the machine is busy
     assert documents[-1]["robot"] == "apr"
 
 
@@ -230,7 +230,7 @@ def wait_for(address: str) -> zenoh.Session:
             return False
         return True
 
-    until(connected, "a node", 20.0)
+    until(connected, "a node")
     return sessions[0]
 
 

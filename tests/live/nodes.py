@@ -71,13 +71,13 @@ class Command:
     def kill(self) -> None:
         """As when the machine fails: no farewell."""
         self.process.kill()
-        self.process.communicate(timeout=20)
+        self.process.communicate(timeout=60)
 
     def stop(self, number: int = signal.SIGINT) -> tuple[str, str]:
         """End it as a user does; what it printed."""
         if self.process.poll() is None:
             os.kill(self.process.pid, number)
-        out, err = self.process.communicate(timeout=20)
+        out, err = self.process.communicate(timeout=60)
         return out, err
 
     def __enter__(self) -> Command:
@@ -90,7 +90,7 @@ class Command:
 
 def asked(session: zenoh.Session, selector: str, payload: str | bytes | None = None) -> Any:
     """The one answer to a query: its JSON, with ``error`` in it when it was refused."""
-    (reply,) = list(session.get(selector, payload=payload, timeout=10.0))
+    (reply,) = list(session.get(selector, payload=payload, timeout=60.0))
     answer = reply.ok if reply.ok is not None else reply.err
     assert answer is not None
     return json.loads(answer.payload.to_bytes())

@@ -60,7 +60,7 @@ def open_loopback() -> Loopback:
     return Loopback(port, raw_session("router", listen=[f"tcp/127.0.0.1:{port}"]))
 
 
-def until(condition: Callable[[], object], what: str, seconds: float = 10.0) -> None:
+def until(condition: Callable[[], object], what: str, seconds: float = 60.0) -> None:
     """Wait until ``condition`` holds; the test fails, saying ``what`` was waited for, when it does not in time."""
     deadline = time.monotonic() + seconds
     while not condition():

@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 import time
+from itertools import pairwise
 
 import pytest
 
@@ -16,15 +17,15 @@ from omnibench.live.stopping import stop_on_signals, ticks
 def test_a_signal_sets_the_event(number: signal.Signals) -> None:
     with stop_on_signals() as stop:
         os.kill(os.getpid(), number)
-        assert stop.wait(5)
+        assert stop.wait(60)
 
 
 def interrupted_twice() -> None:
     with stop_on_signals() as stop:
         os.kill(os.getpid(), signal.SIGINT)
-        assert stop.wait(5)
+        assert stop.wait(60)
         os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(5)
+        time.sleep(60)
 
 
 def test_a_second_ctrl_c_interrupts() -> None:
@@ -43,9 +44,9 @@ def test_ticks_come_at_once_and_then_every_period_until_the_time_is_over() -> No
     began = time.monotonic()
     passed = list(ticks(threading.Event(), 0.1, 0.35))
     assert passed[0] == 0.0
-    assert len(passed) in (3, 4)  # fewer when the machine is busy
-    assert passed == sorted(passed)
-    assert 0.35 <= time.monotonic() - began < 1.0
+    assert 1 <= len(passed) <= 4  # fewer when the machine is busy
+    assert all(later - earlier >= 0.1 for earlier, later in pairwise(passed))
+    assert passed[-1] < 0.35 <= time.monotonic() - began
 
 
 def test_ticks_end_when_stopped() -> None:

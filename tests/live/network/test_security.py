@@ -68,7 +68,7 @@ def running(folder: Path, config: dict[str, Any]) -> Iterator[RouterProcess]:
         yield router
     finally:
         try:
-            process.communicate(timeout=10)
+            process.communicate(timeout=60)
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()

@@ -273,7 +273,7 @@ def test_another_ros_client_reads_the_content(
     try:
         until(lambda: rmw_node[topic].matched, "the subscription")
         rmw_node[topic].put(sample(topic))
-        assert came.wait(10)
+        assert came.wait(60)
     finally:
         subscriber.close()
     until(lambda: not rmw_node[topic].matched, "the subscription to go")

@@ -145,7 +145,7 @@ def fill(recorder: Recorder, publisher: Publisher[Any]) -> None:
             publisher.put_encoded(kind.encode(type(message)(message.stamp, (noise, "b", "c"), message.positions)))
         return recorder.failure is not None
 
-    until(full, "the disk to be full", seconds=30)
+    until(full, "the disk to be full")
 
 
 def test_a_full_disk_ends_the_recording_with_one_line_and_a_file_that_can_be_read(
