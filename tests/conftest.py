@@ -11,7 +11,10 @@ from hypothesis import settings
 
 from omnibench import registry
 
-settings.register_profile("omnibench", deadline=None)  # the machine may be busy
+# The machine may be busy. What does not land shall be at fault itself, and not an example that this run alone drew:
+# new ones are looked for with --hypothesis-profile explore.
+settings.register_profile("omnibench", deadline=None, derandomize=True)
+settings.register_profile("explore", deadline=None, max_examples=1000, print_blob=True)
 settings.load_profile("omnibench")
 
 

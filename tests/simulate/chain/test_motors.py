@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
@@ -78,16 +78,21 @@ def petals(seed: int) -> list[Array]:
 
 
 @given(motors)
+@example(Motor(resistance=0.3, inductance=0.002, torque_constant=0.03, inertia=0.2))  # its two roots are one
 def test_a_motor_without_friction_runs_up_as_its_closed_form_says(motor: Motor) -> None:
     free = motor.model_copy(update={"static_friction": 0.0, "coulomb_friction": 0.0, "viscous_friction": 0.0})
     run = drive((FULL, 0.5), motor=free)
     times = STEP * np.arange(len(run.wheel_angles))
     constant, supply = free.wheel_torque_constant, free.supply_voltage
-    # s1, s2: roots of s2 + R/L s + K2/(J L) = 0; the rate goes from 0 to V/K.
+    # s1, s2 = -middle +- spread: roots of s2 + R/L s + K2/(J L) = 0, which may be one; the rate goes from 0 to V/K.
     middle = free.resistance / free.inductance / 2
-    spread = np.emath.sqrt(middle**2 - constant**2 / (free.inertia * free.inductance))
-    s1, s2 = -middle + spread, -middle - spread
-    course = (s2 / s1 * np.expm1(s1 * times) - s1 / s2 * np.expm1(s2 * times)) / (s2 - s1)
+    product = constant**2 / (free.inertia * free.inductance)
+    spread = np.emath.sqrt(middle**2 - product)
+    first = np.exp((spread - middle) * times)
+    apart = -2 * spread * times  # of the exponents
+    difference = -np.expm1(apart) / (2 * spread) if spread else times
+    mean = (1 + np.exp(apart)) / 2
+    course = 2 * middle / product * (1 - first * mean) - (2 * middle**2 / product - 1) * first * difference
     expected = supply / constant * np.real(times - course)
     assert np.abs(run.wheel_angles[:, 0] - expected).max() < 1e-9
 
