@@ -74,7 +74,7 @@ class FoxgloveServer:
         """Stop serving, and return when another server can have the port."""
         for listener in self._listeners:
             listener.close()
-        self._server.stop()  # which only asks its threads to stop
+        self._server.stop()  # asks the server's threads to stop, and does not wait for them
         end = time.monotonic() + STOPPING_S
         while _in_use(self._host, self._port) and time.monotonic() < end:
             time.sleep(0.002)
