@@ -1,48 +1,28 @@
-"""The conformance cases pass what keeps the contract and fail, case by case, what does not."""
+"""The cases of calibrators pass what keeps the contract and fail, case by case, what does not."""
 
 from __future__ import annotations
 
 import random
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from pydantic import Field
+from conformance_suites import failures, suite
 
-from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.importer import Importer
-from omnibench.data.storage import load_dataset, save_dataset
-from omnibench.errors import ConfigError, DataError, PluginError
+from omnibench.errors import ConfigError, PluginError
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.cost import Cost, SumOfNorms
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem
 from omnibench.registry import Options
 from omnibench.robot.kinematics import Array
 from omnibench.testing import (
     CalibratorConformance,
-    CaseOutcome,
-    Conformance,
-    CostConformance,
-    ImporterConformance,
     Nonconformance,
     load_plugin,
-    run_cases,
     synthetic_problem,
     synthetic_robot,
 )
-from omnibench.testing.synthetic import synthetic_dataset, true_robot
-
-
-def suite(base: type[Conformance], cls: type, **attributes: Any) -> Conformance:
-    """The cases of ``base`` on instances of ``cls``, which need not be registered for that."""
-    return type("Suite", (base,), {"name": cls.__name__, "make": lambda _: cls(cls.Options()), **attributes})()
-
-
-def failures(base: type[Conformance], cls: type, **attributes: Any) -> dict[str, str]:
-    """The cases that instances of ``cls`` fail, and what is said of each."""
-    return {result.case: result.message for result in run_cases(suite(base, cls, **attributes)) if not result.passed}
+from omnibench.testing.synthetic import true_robot
 
 
 class Honest(Calibrator):
@@ -353,192 +333,6 @@ def test_the_synthetic_problem_can_be_solved_to_zero_within_its_box(parameterisa
     assert problem.values(vector[None])[0] < 1e-12
     assert problem.values(problem.start[None])[0] > 0.05
     assert (problem.free.sum() < problem.size) == (fixed and (parameterisation, wheels) != ("matrix", 4))
-
-
-class GoodCost(SumOfNorms):
-    """The norm of Eq. (6)."""
-
-
-class ScalarCost(GoodCost):
-    """One number for all candidates."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Any:
-        return super().combine(errors, trajectory).mean()
-
-
-class NegativeCost(GoodCost):
-    """A logarithm."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        return np.log(super().combine(errors, trajectory) + 1e-300)
-
-
-class OffsetCost(GoodCost):
-    """Something for nothing."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        return super().combine(errors, trajectory) + 1
-
-
-class FreeCost(GoodCost):
-    """Nothing for anything."""
-
-    weights = (0.0, 0.0, 0.0)
-
-
-class IgnoresNan(GoodCost):
-    """Leaves out what it cannot add."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        return super().combine(np.nan_to_num(errors), trajectory)
-
-
-class RaisesOnNan(GoodCost):
-    """Insists."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        if np.isnan(errors).any():
-            raise ValueError("NaN")
-        return super().combine(errors, trajectory)
-
-
-class RelativeCost(GoodCost):
-    """Relative to the worst of the batch."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        values = super().combine(errors, trajectory)
-        return values / max(values.max(), 1e-300)
-
-
-class InPlaceCost(GoodCost):
-    """Squares where it stands."""
-
-    def combine(self, errors: Array, trajectory: Array) -> Array:
-        errors *= errors
-        return np.sqrt(errors.sum(axis=-1)) @ self.shares(trajectory)
-
-
-CASES_OF_COSTS = [
-    (ScalarCost, "every candidate has one cost", "shape ()"),
-    (NegativeCost, "costs are finite and not negative", "negative"),
-    (OffsetCost, "no error costs nothing", "errors of zero cost 1"),
-    (OffsetCost, "exact recordings cost nothing", "the true matrix costs 1"),
-    (FreeCost, "errors cost something", "cost nothing"),
-    (IgnoresNan, "nan stays with its candidate", "they must cost NaN"),
-    (RaisesOnNan, "nan stays with its candidate", "ValueError: NaN"),
-    (RelativeCost, "costs do not depend on the batch", "depends on the others"),
-    (RelativeCost, "nan stays with its candidate", "spoils another's cost"),
-    (InPlaceCost, "inputs are left unchanged", "combine changed its arguments"),
-]
-
-
-def test_a_good_cost_passes_every_case() -> None:
-    assert failures(CostConformance, GoodCost) == {}
-
-
-@pytest.mark.parametrize(("cls", "case", "message"), CASES_OF_COSTS)
-def test_a_cost_fails_the_case_it_breaks(cls: type[Cost], case: str, message: str) -> None:
-    assert message in failures(CostConformance, cls)[case]
-
-
-class GoodImporter(Importer):
-    """Reads the project's own data set folders."""
-
-    def read(self, source: Path) -> Dataset:
-        return load_dataset(source)
-
-
-class OpensAnything(GoodImporter):
-    """Lets the operating system complain."""
-
-    def read(self, source: Path) -> Dataset:
-        (source / "dataset.yaml").read_text()
-        return load_dataset(source)
-
-
-class AcceptsAnything(GoodImporter):
-    """Makes something of everything."""
-
-    def read(self, source: Path) -> Dataset:
-        try:
-            return load_dataset(source)
-        except DataError:
-            return Dataset("nothing", None, 0.1, ())  # type: ignore[arg-type]
-
-
-class Altered(GoodImporter):
-    """Changes trajectories after they were made."""
-
-    def read(self, source: Path) -> Dataset:
-        dataset = load_dataset(source)
-        return replace(dataset, trajectories=tuple(self.alter(run) for run in dataset.trajectories))
-
-    def alter(self, run: Trajectory) -> Trajectory:
-        return replace(run, times=run.times[::-1])
-
-
-class NumpyNumbers(Altered):
-    """A speed that is a NumPy number."""
-
-    def alter(self, run: Trajectory) -> Trajectory:
-        return replace(run, v=np.float64(0.25))
-
-
-class Jitters(Altered):
-    """Adds noise."""
-
-    def alter(self, run: Trajectory) -> Trajectory:
-        return replace(run, rates=run.rates + np.random.default_rng().normal(size=run.rates.shape))
-
-
-class TidiesUp(GoodImporter):
-    """Improves the files that it reads."""
-
-    def read(self, source: Path) -> Dataset:
-        dataset = load_dataset(source)
-        (source / "dataset.yaml").write_text((source / "dataset.yaml").read_text() + "# read\n")
-        return dataset
-
-
-CASES_OF_IMPORTERS = [
-    (OpensAnything, "missing source is refused", "it raised FileNotFoundError"),
-    (AcceptsAnything, "empty folder is refused", "read without complaint"),
-    (Altered, "sample is a valid data set", "trajectory 01: times must increase"),
-    (NumpyNumbers, "sample saves and loads back equal", "v of trajectory 01"),
-    (Jitters, "sample reads the same twice", "different data sets"),
-    (TidiesUp, "sample is left unchanged", "it changed the files"),
-]
-
-
-@pytest.fixture
-def sample(tmp_path: Path) -> Path:
-    save_dataset(synthetic_dataset(), tmp_path / "sample")
-    return tmp_path / "sample"
-
-
-def test_a_good_importer_passes_every_case(sample: Path) -> None:
-    assert failures(ImporterConformance, GoodImporter, source=sample) == {}
-
-
-@pytest.mark.parametrize(("cls", "case", "message"), CASES_OF_IMPORTERS)
-def test_an_importer_fails_the_case_it_breaks(cls: type[Importer], case: str, message: str, sample: Path) -> None:
-    assert message in failures(ImporterConformance, cls, source=sample)[case]
-
-
-def test_an_importer_without_a_sample_is_tried_on_refusals_only() -> None:
-    outcomes = {result.case: result.outcome for result in run_cases(suite(ImporterConformance, GoodImporter))}
-    assert outcomes["empty file is refused"] is CaseOutcome.PASSED
-    assert outcomes["sample is a valid data set"] is CaseOutcome.SKIPPED
-
-
-def test_an_option_that_is_not_described_fails_an_importer() -> None:
-    class Bare(GoodImporter):
-        """Has an option."""
-
-        class Options(Options):
-            rate: float = Field(1.0, gt=0)
-
-    assert "rate" in failures(ImporterConformance, Bare)["class and options are documented"]
 
 
 def test_a_class_that_cannot_be_made_fails_each_case_in_one_line() -> None:
