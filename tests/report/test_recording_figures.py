@@ -1,0 +1,137 @@
+"""What the figures of a recording show: which runs, where walls are, and how the wheels turned."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from recording_samples import COMMANDS, NOISE, TICK, Sample, sample
+
+from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
+from omnibench.report.recording.runs import representative_runs
+from omnibench.report.recording.scan_points import scan_points, thinned
+from omnibench.report.recording.wheel_figures import rate_step, wheel_rates
+from omnibench.slam.accuracy import run_errors
+
+
+@pytest.fixture(scope="module")
+def made() -> Sample:
+    return sample()
+
+
+def test_one_run_of_each_kind_of_motion_is_shown(made: Sample) -> None:
+    chosen = representative_runs(made.dataset)
+    assert [name.split(":")[0] for name in chosen] == ["straight", "turning left", "turning right", "on the spot"]
+    assert [run.command for run in chosen.values()] == list(COMMANDS)
+
+
+def test_of_each_kind_the_run_of_median_odometry_error_is_shown() -> None:
+    runs = sample(repetitions=3, duration=1.0).dataset
+    wrong = {"left-0": 0.5, "left-1": 0.3, "left-2": -0.4}  # m that the reference is moved by at the end
+    moved = [
+        replace(run, poses=run.poses + np.outer(run.pose_times == run.pose_times[-1], [wrong.get(run.id, 0), 0, 0]))
+        for run in runs.trajectories
+    ]
+    chosen = representative_runs(replace(runs, trajectories=tuple(moved)))
+    assert [run.id for name, run in chosen.items() if name.startswith("turning left")] == ["left-2"]
+
+
+def test_runs_without_scans_are_not_shown_where_others_have_them(made: Sample) -> None:
+    scans = made.dataset.scans
+    assert scans is not None
+    only = ScansInMemory(scans.scanner, {"left-1": scans.of("left-1")})
+    assert [run.id for run in representative_runs(replace(made.dataset, scans=only)).values()] == ["left-1"]
+
+
+@given(
+    x=st.floats(-2, 2),
+    y=st.floats(-5, 5),
+    heading=st.floats(-0.5, 0.5),
+    turn=st.floats(-0.3, 0.3),
+    speed=st.floats(-0.5, 0.5),
+    mount=st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)),
+)
+def test_points_of_a_wall_lie_on_it_however_the_robot_moves(
+    x: float, y: float, heading: float, turn: float, speed: float, mount: tuple[float, float, float]
+) -> None:
+    scanner = Scanner(
+        rays=31,
+        angle_min=-0.4,
+        angle_increment=0.8 / 30,
+        time_increment=0.02,
+        range_max=1e3,
+        mount=Mount(x=mount[0], y=mount[1], yaw=mount[2]),
+    )
+    begin, velocity = np.array([x, y, heading]), np.array([speed, -speed, turn])
+    stamp, wall = 0.2, 10.0
+    poses = begin + np.outer(stamp + scanner.delays, velocity)
+    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    place = poses[:, 0] + cosine * mount[0] - sine * mount[1]
+    ranges = (wall - place) / np.cos(poses[:, 2] + mount[2] + scanner.angles)
+    reference = np.array([begin, begin + velocity])
+    run = replace(sample().dataset.trajectories[0], pose_times=np.array([0.0, 1.0]), poses=reference)
+    scans = TrajectoryScans(np.array([stamp]), ranges[None].astype(np.float32))
+    points = scan_points(run, scanner, scans, 0)
+    assert len(points) == 31
+    np.testing.assert_allclose(points[:, 0], wall, atol=1e-4)
+
+
+def test_rays_that_saw_nothing_make_no_points(made: Sample) -> None:
+    scans, run = made.dataset.scans, made.dataset.trajectories[0]
+    assert scans is not None
+    found = scans.of(run.id)
+    ranges = found.ranges.copy()
+    ranges[0, ::2] = np.inf
+    assert len(scan_points(run, scans.scanner, TrajectoryScans(found.times, ranges), 0)) == 45
+
+
+def test_thinning_keeps_points_far_apart_and_below_the_limit() -> None:
+    points = np.random.default_rng(1).uniform(0, 1, (5000, 2))
+    kept = thinned(points, 300)
+    assert 150 < len(kept) <= 300
+    assert {tuple(point) for point in kept} <= {tuple(point) for point in points}
+
+
+def test_encoder_ticks_are_found_in_quantised_rates(made: Sample) -> None:
+    assert rate_step(made.dataset.trajectories[0]) == pytest.approx(TICK)
+
+
+def test_rates_that_are_not_quantised_have_no_step(made: Sample) -> None:
+    run = made.dataset.trajectories[0]
+    noisy = run.rates + np.random.default_rng(2).normal(0, 1e-3, run.rates.shape)
+    assert rate_step(replace(run, rates=noisy)) is None
+
+
+def test_the_mean_over_100_ms_is_that_of_the_samples(made: Sample) -> None:
+    run = made.dataset.trajectories[0]
+    figure = wheel_rates(run, made.dataset.robot).figures[0].plot
+    mean = next(trace for trace in figure.data if trace.legendgroup == "mean")
+    np.testing.assert_allclose(mean.y[:5], run.rates[:50, 0].reshape(5, 10).mean(axis=1), atol=1e-4)
+    np.testing.assert_allclose(mean.x[:5], 0.05 + 0.1 * np.arange(5), atol=1e-9)
+
+
+def test_the_error_is_measured_minus_target(made: Sample) -> None:
+    run = made.dataset.trajectories[0]
+    slow = replace(run, rates=np.asarray(run.targets) - 0.25)
+    _, error = wheel_rates(slow, made.dataset.robot).figures
+    assert error.title == "Measured − target: mean −0.25, RMS 0.25 rad/s"
+    assert all(np.allclose(trace.y, -0.25) for trace in error.plot.data)
+
+
+def test_wheels_without_targets_have_no_error(made: Sample) -> None:
+    assert len(wheel_rates(replace(made.dataset.trajectories[0], targets=None), made.dataset.robot).figures) == 1
+
+
+def test_errors_do_not_depend_on_where_the_reference_has_its_origin(made: Sample) -> None:
+    run = made.dataset.trajectories[2]
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    moved = run.poses @ turn.T + [3.0, -1.0, math.pi / 2]
+    narrow = np.tile(np.diag(NOISE**2 * [1, 9, 1]), (len(run.poses), 1, 1))
+    here = run_errors(replace(run, pose_covariances=narrow), made.truth[run.id])
+    there = run_errors(replace(run, poses=moved, pose_covariances=turn @ narrow @ turn.T), made.truth[run.id])
+    np.testing.assert_allclose(there.position, here.position, atol=1e-12)
+    np.testing.assert_allclose(there.nees, here.nees, rtol=1e-9)
