@@ -16,7 +16,7 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
-from test_storage import FORMATS, Format, everything_known, read_frame, table_file, write_frame
+from storage_samples import FORMATS, Format, everything_known, read_frame, table_file, write_frame
 
 from omnibench.data.dataset import Dataset
 from omnibench.data.scan_files import ScansOnDisk
