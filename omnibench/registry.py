@@ -24,7 +24,7 @@ from omnibench.config import Model, validate
 from omnibench.errors import OmnibenchError, PluginError, UnknownNameError
 
 T = TypeVar("T")
-C = TypeVar("C", bound=type)
+C = TypeVar("C", bound=type[Any])
 
 
 class Options(Model):
@@ -95,7 +95,7 @@ class Registry(Generic[T]):
             options = getattr(cls, "Options", Options)
             if not (isinstance(options, type) and issubclass(options, BaseModel)):
                 raise PluginError(f"{self.kind} {name!r}: Options must be a class derived from omnibench's Options")
-            cls.name = name  # type: ignore[attr-defined]
+            cls.name = name
             self._entries[name] = Entry(name, cls, _origin(cls))
             return cls
 
@@ -118,8 +118,9 @@ class Registry(Generic[T]):
         entry = self.entry(name, where)
         place = f"{where}: {self.kind} {name!r}" if where else f"{self.kind} {name!r}"
         validated = validate(entry.options, options or {}, place)
+        make: Any = entry.cls
         try:
-            return entry.cls(validated)  # type: ignore[call-arg]
+            return make(validated)
         except OmnibenchError:
             raise
         except Exception as error:  # a plug-in may raise anything

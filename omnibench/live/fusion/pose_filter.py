@@ -16,25 +16,12 @@ _TURN = 2 * math.pi
 _POSE = np.eye(3)  # measurement matrix: SLAM measures the pose itself
 
 
-class _Planar(ExtendedKalmanFilter):  # type: ignore[misc]
-    """filterpy's filter with the motion model of odometry."""
-
-    x: Array
-
-    def predict_x(self, u: Motion) -> None:
-        before = self.x
-        self.x = advance(before, u.moved, u.integration)
-        self.F[0, 2] = before[1] - self.x[1]
-        self.F[1, 2] = self.x[0] - before[0]
-        self.Q[0, 0] = self.Q[1, 1] = u.position_variance
-        self.Q[2, 2] = u.heading_variance
-
-
 class PoseFilter:
     """Pose (3,) and covariance (3, 3); motions predict them, measured poses correct them."""
 
     def __init__(self, pose: Array, covariance: Array) -> None:
-        self._filter: Any = _Planar(dim_x=3, dim_z=3)
+        self._filter: Any = ExtendedKalmanFilter(dim_x=3, dim_z=3)
+        self._filter.predict_x = self._predict_pose
         self._filter.Q = np.zeros((3, 3))
         self.set(pose, covariance)
 
@@ -64,6 +51,15 @@ class PoseFilter:
     def correct(self, pose: Array, covariance: Array) -> None:
         """Correct pose and covariance by a measured pose (3,) with its covariance (3, 3)."""
         self._filter.update(pose, lambda _: _POSE, lambda x: x, R=covariance, residual=innovation_of)
+
+    def _predict_pose(self, motion: Motion) -> None:
+        """The motion model of odometry in filterpy's prediction: pose, its derivative F and noise Q."""
+        before, after = self.pose, advance(self.pose, motion.moved, motion.integration)
+        self._filter.x = after
+        self._filter.F[0, 2] = before[1] - after[1]
+        self._filter.F[1, 2] = after[0] - before[0]
+        self._filter.Q[0, 0] = self._filter.Q[1, 1] = motion.position_variance
+        self._filter.Q[2, 2] = motion.heading_variance
 
 
 def innovation_of(measured: Array, expected: Array) -> Array:

@@ -10,9 +10,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.linalg import expm
 
+from omnibench.robot.compiled import compiled
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.chain.motors import TRUE_STEP
 
@@ -71,7 +71,7 @@ def drive_wheel(
     return angles, counts, voltages
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _drive(
     motor: MotorSteps, pid: Pid, tick: float, targets: Array, start: float, sample_steps: int
 ) -> tuple[Array, Array, Array]:
@@ -101,7 +101,7 @@ def _drive(
     return angles, counts, voltages
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _controlled(
     pid: Pid, target: float, measured: float, before: float, integral: float, period: float
 ) -> tuple[float, float]:
@@ -114,7 +114,7 @@ def _controlled(
     return math.copysign(pid.supply, voltage), grown if error * voltage < 0.0 else integral
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _stepped(motor: MotorSteps, current: float, rate: float, voltage: float) -> tuple[float, float, float]:
     """Current, A, and rate, rad/s, after one step, and the angle turned in it, rad."""
     direction = 0.0  # sign of the motion, against which friction acts

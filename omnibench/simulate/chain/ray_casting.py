@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
 
 from omnibench.data.scans import Scanner
+from omnibench.robot.compiled import compiled
 from omnibench.robot.kinematics import Array
-
-_Float = NDArray[np.float64]
 
 
 def cast_rays(segments: Array, scanner: Scanner, track_times: Array, track_poses: Array, times: Array) -> Array:
@@ -34,17 +30,17 @@ def cast_rays(segments: Array, scanner: Scanner, track_times: Array, track_poses
     )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _cast(
-    segments: _Float,
-    track_times: _Float,
-    track_poses: _Float,
-    times: _Float,
-    delays: _Float,
-    angles: _Float,
+    segments: Array,
+    track_times: Array,
+    track_poses: Array,
+    times: Array,
+    delays: Array,
+    angles: Array,
     mount_x: float,
     mount_y: float,
-) -> Any:
+) -> Array:
     distances = np.empty((len(times), len(angles)))
     for scan in range(len(times)):
         after = np.searchsorted(track_times, times[scan])
@@ -61,8 +57,8 @@ def _cast(
     return distances
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _pose(track_times: _Float, track_poses: _Float, after: int, time: float) -> Any:
+@compiled
+def _pose(track_times: Array, track_poses: Array, after: int, time: float) -> tuple[float, float, float]:
     """The pose at a time. after: index of the first pose of the track that is not earlier."""
     before = max(after - 1, 0)
     after = min(after, len(track_times) - 1)
@@ -75,8 +71,8 @@ def _pose(track_times: _Float, track_poses: _Float, after: int, time: float) -> 
     )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _nearest(segments: _Float, x: float, y: float, along_x: float, along_y: float) -> float:
+@compiled
+def _nearest(segments: Array, x: float, y: float, along_x: float, along_y: float) -> float:
     """Distance from (x, y) to the nearest wall in a direction of length 1.
 
     A wall is hit if its ends are on either side of the ray. No ray slips through where two walls meet: for both, the

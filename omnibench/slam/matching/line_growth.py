@@ -7,14 +7,15 @@ to the ranges, since only they are noisy; a fit to the points would tilt towards
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from omnibench.robot.compiled import compiled
 
 _Float = NDArray[np.float64]
 _Int = NDArray[np.int64]
+_Fit = tuple[float, float, float, float, float, float, float]
 
 _SEED = 8  # points that a segment begins with
 _MOST = 256  # points of a segment
@@ -26,8 +27,8 @@ _OFF = 2  # successive points off the line that end it
 _TRIMMED = 2  # points dropped before such an end, since they may belong to the next segment
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def grow_lines(ranges: _Float, cosines: _Float, sines: _Float, deviations: _Float, rays: _Int, part_of: _Int) -> Any:
+@compiled
+def grow_lines(ranges: _Float, cosines: _Float, sines: _Float, deviations: _Float, rays: _Int, part_of: _Int) -> _Float:
     """Lines through neighbouring points (m, 7): a, b, covariances aa, ab, bb, index of the first and last point.
 
     ranges, cosines, sines, deviations (n,): the points' values, in the order of their rays (n,). part_of (n,): output,
@@ -63,7 +64,7 @@ def grow_lines(ranges: _Float, cosines: _Float, sines: _Float, deviations: _Floa
     return grown[:lines]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled
 def _reach(
     ranges: _Float,
     cosines: _Float,
@@ -72,8 +73,8 @@ def _reach(
     rays: _Int,
     first: int,
     last: int,
-    fit: Any,
-) -> Any:
+    fit: _Fit,
+) -> tuple[int, bool]:
     """Index up to which the following points lie on a line, at most twice its length on; and whether the line ends."""
     most = min(len(ranges), first + _MOST, 2 * last - first)
     off = 0
@@ -93,8 +94,8 @@ def _reach(
     return most, most == len(ranges) or most == first + _MOST
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _fit(ranges: _Float, cosines: _Float, sines: _Float, deviations: _Float, first: int, last: int) -> Any:
+@compiled
+def _fit(ranges: _Float, cosines: _Float, sines: _Float, deviations: _Float, first: int, last: int) -> _Fit:
     """Fit a line: a, b, covariances aa, ab, bb, misfit (sum of squares), number of points without outliers."""
     a = b = 0.0
     aa = ab = bb = misfit = 0.0
@@ -130,13 +131,13 @@ def _fit(ranges: _Float, cosines: _Float, sines: _Float, deviations: _Float, fir
     return a, b, bb / determinant, -ab / determinant, aa / determinant, misfit, float(points)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _straight(fit: Any) -> Any:
+@compiled
+def _straight(fit: _Fit) -> bool:
     freedom = fit[6] - 2
     return freedom >= _SEED - 4 and fit[5] < freedom + 3.0 * math.sqrt(2.0 * freedom)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _seen(fit: Any, cosine: float, sine: float) -> Any:
+@compiled
+def _seen(fit: _Fit, cosine: float, sine: float) -> float:
     inverse = fit[0] * cosine + fit[1] * sine
     return 1.0 / inverse if inverse > 1e-9 else -1.0
