@@ -179,7 +179,5 @@ def _start_matrix(dataset: Dataset, calibration: Calibration | None) -> Array:
             f"the calibration {calibration.name!r} holds effects already ({names}), and discover begins at a plain "
             "matrix; give one without effects, such as the plain.yaml beside it, or none"
         )
-    if calibration.robot.wheel_names != dataset.robot.wheel_names:
-        ours, theirs = ", ".join(calibration.robot.wheel_names), ", ".join(dataset.robot.wheel_names)
-        raise DataError(f"the calibration is for wheels {ours}, the data set {dataset.name} has {theirs}")
+    calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
     return calibration.matrix_array

@@ -84,9 +84,7 @@ def certify_optimum(
     Raises DataError when the wheels differ, the calibration has effects or the training split is empty, ConfigError for
     a cost that is no sum of norms.
     """
-    if calibration.robot.wheel_names != dataset.robot.wheel_names:
-        ours, theirs = ", ".join(calibration.robot.wheel_names), ", ".join(dataset.robot.wheel_names)
-        raise DataError(f"the calibration is for wheels {ours}, the data set {dataset.name} has {theirs}")
+    calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
     if calibration.effects:
         named = ", ".join(term.name for term in calibration.effects)
         raise DataError(

@@ -10,7 +10,6 @@ import numpy as np
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory
 from omnibench.data.domain_check import extrapolation_warning
-from omnibench.errors import DataError
 from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
@@ -48,9 +47,7 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
 
     DataError: the robots' wheels differ, or the recordings lack what an effect of the calibration needs.
     """
-    if calibration.robot.wheel_names != dataset.robot.wheel_names:
-        ours, theirs = ", ".join(calibration.robot.wheel_names), ", ".join(dataset.robot.wheel_names)
-        raise DataError(f"the calibration is for wheels {ours}, the data set {dataset.name} has {theirs}")
+    calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
     present = {split: dataset.split(split) for split in SPLITS if dataset.split(split)}
     groups: dict[str, tuple[Trajectory, ...]] = {str(name): group for name, group in present.items()}
     groups["all"] = dataset.trajectories

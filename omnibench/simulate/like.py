@@ -22,12 +22,7 @@ def simulate_like(dataset: Dataset, calibration: Calibration, noise_seed: int | 
     include motions that the calibration's effects were not fitted to. DataError in one line: the calibration is for
     another robot or has no noise, or the recording lacks what one of its effects needs.
     """
-    ours, theirs = calibration.robot.wheel_names, dataset.robot.wheel_names
-    if ours != theirs:
-        raise DataError(
-            f"calibration {calibration.name!r} is for wheels {', '.join(ours)}, the data set {dataset.name} has "
-            f"{', '.join(theirs)}; simulate it with a calibration of its own robot"
-        )
+    calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
     reported = calibration.model.reported([run.log(run.pose_times) for run in dataset.trajectories])
     poses = [np.vstack([run.start, path[1:]]) for run, path in zip(dataset.trajectories, reported, strict=True)]
     how = "without noise"

@@ -87,9 +87,7 @@ class SlamRequest:
         if self.model is None:
             return None
         calibration = read_calibration(self.model)
-        if calibration.robot.wheel_names != recorded.robot.wheel_names:
-            ours, theirs = (", ".join(robot.wheel_names) for robot in (calibration.robot, recorded.robot))
-            raise DataError(f"--model {self.model}: wheels are {ours}, but the data set's are {theirs}")
+        calibration.check_wheels(recorded.robot, f"the data set {recorded.name}")
         return calibration.model
 
 

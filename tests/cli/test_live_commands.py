@@ -211,7 +211,9 @@ def test_a_recording_of_other_wheels_is_refused_before_it_is_played(command: InP
     write_calibration(calibration(wheels=4), tmp_path / "calibration.yaml")
     write_config(tmp_path, datasets={"flower": {"simulate": flower()}})
     refused = command("live", "node.yaml", "--replay", "small.yaml", "--speed", "max")
-    assert_refused(refused, "recording 'flower' has wheels a, b, c", "'synthetic 1' of robot 'apr' has fl, fr, rl, rr")
+    assert_refused(
+        refused, "'synthetic 1' is for wheels fl, fr, rl, rr", "recording flower for robot 'apr' has a, b, c"
+    )
 
 
 def test_joints_for_other_wheels_are_refused_in_one_line(command: InProcess, tmp_path: Path) -> None:

@@ -208,7 +208,7 @@ def test_the_report_is_written(command: Command, driven: Driven) -> None:
             ["DATA", "-o", "found", "--model", "nowhere", "--start", "last_pose"],
             ["--model nowhere: is for --start odometry"],
         ),
-        (["DATA", "-o", "found", "--model", "FOUR"], ["wheels are fl, fr, rl, rr, but the data set's are a, b, c"]),
+        (["DATA", "-o", "found", "--model", "FOUR"], ["is for wheels fl, fr, rl, rr, the data set", "has a, b, c"]),
     ],
 )
 def test_a_mistake_is_one_line_and_writes_nothing(

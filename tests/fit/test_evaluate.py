@@ -84,7 +84,9 @@ def test_a_calibration_of_other_wheels_is_refused_in_one_line() -> None:
     other = ROBOT.model_copy(update={"wheels": renamed})
     with pytest.raises(DataError) as refusal:
         evaluate(calibration(other), dataset())
-    assert str(refusal.value) == "the calibration is for wheels a1, b1, c1, the data set synthetic has a, b, c"
+    assert str(refusal.value).startswith(
+        "calibration 'synthetic' is for wheels a1, b1, c1, the data set synthetic has a, b, c; "
+    )
 
 
 def test_a_calibration_with_effects_is_judged_by_what_its_reference_reports() -> None:

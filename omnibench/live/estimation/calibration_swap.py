@@ -39,11 +39,7 @@ def record_refused_swap(state: RobotState, name: str | None, reason: str) -> Non
 
 def check_same_robot(calibration: Calibration, running: Calibration) -> None:
     """DataError: a calibration has other wheels than the running one, or its matrix is far off the design's."""
-    wheels, own_wheels = calibration.robot.wheel_names, running.robot.wheel_names
-    if wheels != own_wheels:
-        raise DataError(
-            f"calibration {calibration.name!r} has wheels {', '.join(wheels)}; this robot has {', '.join(own_wheels)}"
-        )
+    calibration.check_wheels(running.robot, "this robot")
     for robot in (calibration.robot, running.robot):
         design = robot.inverse_kinematic_matrix
         off = np.abs(calibration.matrix_array - design).max(axis=1) / np.abs(design).max(axis=1)

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 import zenoh
 
-from omnibench.errors import ConfigError
 from omnibench.live.config import LiveConfig, client_session, robot_called
 from omnibench.live.estimation.health import Health
 from omnibench.live.network.session import open_session
@@ -96,13 +95,15 @@ def demonstrate(
 ) -> Demonstration:
     """Run the node of ``config``, replay ``recording`` to it as the config's ``replay`` says, and evaluate its output.
 
-    The node starts without saved state. ConfigError: the recording has other wheels than the robot's calibration; other
+    The node starts without saved state. DataError: the recording has other wheels than the robot's calibration; other
     errors as from LiveNode and Player.
     """
     stop = stop or threading.Event()
     robot = robot_called(config, config.replay.robot)
     load_effects(config)
-    _check_wheels(recording, read_calibration(robot.calibration), robot.name)
+    read_calibration(robot.calibration).check_wheels(
+        recording.dataset.robot, f"the recording {recording.dataset.name} for robot {robot.name!r}"
+    )
     drive = concatenate_recording(recording, pause=config.replay.pause, split=config.replay.split)
     with LiveNode(config, remember=False) as node:
         tracker = node.trackers[robot.name]
@@ -136,16 +137,6 @@ def demonstrate(
             if not guarded:
                 session.close()
         return _evaluated(drive, recording, tracker.calibration, report, odometry, fused, health)
-
-
-def _check_wheels(recording: Recording, calibration: Calibration, robot: str) -> None:
-    """ConfigError: recording and calibration differ in wheels, which nodes match by name, the evaluation by index."""
-    recorded, calibrated = recording.dataset.robot.wheel_names, calibration.robot.wheel_names
-    if recorded != calibrated:
-        raise ConfigError(
-            f"recording {recording.dataset.name!r} has wheels {', '.join(recorded)}, calibration {calibration.name!r} "
-            f"of robot {robot!r} has {', '.join(calibrated)}; replay one of that robot, or calibrate with this one"
-        )
 
 
 def _wait_for_the_last(

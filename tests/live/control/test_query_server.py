@@ -178,7 +178,7 @@ def test_a_bad_calibration_that_is_put_is_refused_and_stands_in_health(tmp_path:
         until(lambda: node.health("apr").counts["swaps_refused"] == 1, "the refusal")
         swap = asked(session, "omnibench/apr/health")["last_swap"]
         assert not swap["accepted"]
-        assert "has wheels fl, fr, rl, rr; this robot has a, b, c" in swap["reason"]
+        assert "is for wheels fl, fr, rl, rr, this robot has a, b, c" in swap["reason"]
         assert asked(session, "omnibench/apr/info")["calibration"] == "synthetic 1"
 
 

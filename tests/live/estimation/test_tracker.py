@@ -175,7 +175,7 @@ def test_a_calibration_of_another_robot_is_refused_and_the_old_one_runs_on() -> 
     robot = tracker()
     running = robot.calibration
     for other, reason in (
-        (calibration(wheels=4), "has wheels fl, fr, rl, rr; this robot has a, b, c"),
+        (calibration(wheels=4), "is for wheels fl, fr, rl, rr, this robot has a, b, c"),
         (calibration(scale=30.0), "off the design of robot"),
     ):
         with pytest.raises(DataError, match=reason):
