@@ -85,7 +85,7 @@ def test_a_calibration_of_other_wheels_is_refused_in_one_line() -> None:
     with pytest.raises(DataError) as refusal:
         evaluate(calibration(other), dataset())
     assert str(refusal.value).startswith(
-        "calibration 'synthetic' is for wheels a1, b1, c1, the data set synthetic has a, b, c; "
+        "calibration 'truth' is for wheels a1, b1, c1, the data set synthetic has a, b, c; "
     )
 
 
