@@ -8,8 +8,8 @@ import pytest
 from discovery_samples import simulated
 
 from omnibench.discover import discover
-from omnibench.discover.regressors.whitened import Given
 from omnibench.discover.result import Discovery
+from omnibench.fit.least_squares.whitened import Given
 from omnibench.robot.odometry import OdometryBatch
 
 

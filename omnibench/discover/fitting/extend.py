@@ -19,7 +19,7 @@ from omnibench.discover.fitting.model_fit import (
 )
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.paths import Paths, make_paths
-from omnibench.discover.regressors.whitened import Whitened, given
+from omnibench.fit.least_squares.whitened import Whitened, given
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array

@@ -12,8 +12,8 @@ from omnibench.discover.fitting.nuisances import Nuisances, deviations_of, log_o
 from omnibench.discover.fitting.outliers import without_jumps
 from omnibench.discover.fitting.start_frames import in_start_frames
 from omnibench.discover.regressors.paths import Paths, make_paths
-from omnibench.discover.regressors.whitened import Whitened, given, whitened
 from omnibench.fit.least_squares.noise import NoiseEstimate, Whitener, estimate_noise
+from omnibench.fit.least_squares.whitened import Whitened, given, whitened
 from omnibench.robot.calibration import Noise
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array, Robot

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.extend import Extended
-from omnibench.discover.regressors.whitened import Whitened
 from omnibench.fit.least_squares.repetitions import grouped
+from omnibench.fit.least_squares.whitened import Whitened
 from omnibench.robot.kinematics import Array
 
 _FOLDS = 5

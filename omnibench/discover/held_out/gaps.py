@@ -18,9 +18,9 @@ from omnibench.discover.held_out.cross_validation import (
     random_folds_of_repetitions,
 )
 from omnibench.discover.held_out.validation_runs import ValidationRuns
-from omnibench.discover.regressors.whitened import whitened
 from omnibench.discover.result import Gap, HeldOut
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions
+from omnibench.fit.least_squares.whitened import whitened
 from omnibench.robot.kinematics import Array
 
 _CLEARLY = 2.0  # standard errors that a gap must measure for a share of it to be said to be closed; chosen

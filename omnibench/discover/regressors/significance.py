@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from omnibench.discover.regressors.column_group import Group
-from omnibench.discover.regressors.whitened import Given, Whitened, given
+from omnibench.fit.least_squares.whitened import Given, Whitened, given
 from omnibench.robot.kinematics import Array
 
 _FLIPS = 499  # random sign flips; chosen

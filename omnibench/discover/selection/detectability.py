@@ -13,11 +13,11 @@ from itertools import combinations
 import numpy as np
 
 from omnibench.discover.regressors.column_group import Group
-from omnibench.discover.regressors.whitened import Given, given
 from omnibench.discover.result import Absorbed, Hidden
 from omnibench.discover.selection.candidate_groups import Missing
 from omnibench.discover.selection.model_selection import ABSORBED, Selection
 from omnibench.discover.selection.screening import Screening
+from omnibench.fit.least_squares.whitened import Given, given
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Array
 

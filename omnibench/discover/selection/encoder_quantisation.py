@@ -11,8 +11,8 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.regressors.whitened import given
 from omnibench.fit.least_squares.repetitions import grouped
+from omnibench.fit.least_squares.whitened import given
 from omnibench.robot.kinematics import Array
 
 _FEWEST = 50  # samples in which a wheel turns: with fewer, multiples may be chance

@@ -19,7 +19,7 @@ import numpy as np
 
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.significance import Significance
-from omnibench.discover.regressors.whitened import Given
+from omnibench.fit.least_squares.whitened import Given
 from omnibench.robot.kinematics import Array
 
 DISCREPANCY = 0.1  # share of an effect's size by which its true form differs from the catalogue's

@@ -13,7 +13,6 @@ import numpy as np
 
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.significance import Significance, significance_of
-from omnibench.discover.regressors.whitened import Given
 from omnibench.discover.selection.evidence import (
     credibility_of,
     effect_sets,
@@ -22,6 +21,7 @@ from omnibench.discover.selection.evidence import (
     names_of,
 )
 from omnibench.discover.selection.screening import Screening
+from omnibench.fit.least_squares.whitened import Given
 
 SURE = 0.95  # weight from which on a name counts as sure; chosen
 CHANCE = 0.002  # probability of naming an effect where none is missing; chosen

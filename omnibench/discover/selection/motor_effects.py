@@ -12,10 +12,10 @@ from omnibench.data.dataset import Trajectory
 from omnibench.discover.held_out.cross_validation import folds_of_repetitions
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.covariate_bases import Basis
-from omnibench.discover.regressors.whitened import Whitened
 from omnibench.discover.selection.candidate_groups import Groups
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.screening import Screening
+from omnibench.fit.least_squares.whitened import Whitened
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect
 from omnibench.robot.kinematics import Array, Robot

@@ -12,9 +12,9 @@ from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit, paths_of, split_runs
 from omnibench.discover.held_out.cross_validation import folds_of_repetitions, is_confirmed
 from omnibench.discover.regressors.column_group import Group
-from omnibench.discover.regressors.whitened import Given, Whitened, given
 from omnibench.discover.selection.candidate_groups import Groups, make_groups
 from omnibench.discover.selection.encoder_quantisation import EncoderQuantisation
+from omnibench.fit.least_squares.whitened import Given, Whitened, given
 from omnibench.robot.kinematics import Array
 
 _COARSE = 0.03  # s: shorter wheel samples are merged up to this duration (chosen: the covariates vary more slowly)

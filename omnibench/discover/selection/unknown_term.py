@@ -21,10 +21,10 @@ from omnibench.discover.held_out.cross_validation import (
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Significance
-from omnibench.discover.regressors.whitened import Whitened, given
 from omnibench.discover.selection.competing_models import CompetingModels
 from omnibench.discover.selection.model_selection import CHANCE, Selection
 from omnibench.discover.selection.screening import Screening
+from omnibench.fit.least_squares.whitened import Whitened, given
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Array, Robot
 

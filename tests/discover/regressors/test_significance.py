@@ -7,7 +7,7 @@ from scipy.stats import binomtest
 
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.significance import significance_of
-from omnibench.discover.regressors.whitened import Whitened
+from omnibench.fit.least_squares.whitened import Whitened
 
 GROUPS = tuple(Group("covariate", f"group {start}", tuple(range(start, start + 2))) for start in range(2, 22, 2))
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given as cases
 from hypothesis import strategies as st
 
-from omnibench.discover.regressors.whitened import given, whitened
+from omnibench.fit.least_squares.whitened import given, whitened
 from omnibench.robot.calibration import Noise
 
 NOISE = Noise(pose_position=0.01, pose_heading=0.02, walk_position=0.005, walk_heading=0.01, bias_position=0.02)
