@@ -96,12 +96,16 @@ class Table:
 
 @dataclass(frozen=True)
 class LegendItem:
-    """One line of a legend; ``key`` is the ``legendgroup`` of the traces that it switches on and off."""
+    """One line of a legend; ``key`` is the ``legendgroup`` of the traces that it switches on and off.
+
+    symbol: of the marks of these traces, by Plotly's name.
+    """
 
     key: str
     label: str
     colour: str
     dash: Dash = "solid"
+    symbol: str = "circle"
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ import plotly.graph_objects as go
 
 from omnibench.report.blocks import Dash
 from omnibench.report.numbers import power_of_ten
+from omnibench.robot.kinematics import Array
 
 FONT = 'system-ui, -apple-system, "Segoe UI", "Helvetica Neue", "Liberation Sans", Arial, sans-serif'
 INK = "#1f2933"
@@ -73,11 +74,11 @@ def colours(wanted: Mapping[str, str | None]) -> dict[str, tuple[str, Dash]]:
 
 
 def text(words: str) -> str:
-    """Words escaped for a plot, since Plotly interprets some HTML."""
-    return html.escape(words, quote=False)
+    """Words escaped for a plot, since Plotly interprets some HTML; lines stay lines."""
+    return html.escape(words, quote=False).replace("\n", "<br>")
 
 
-def plot(*traces: go.Scatter, **layout: Any) -> go.Figure:
+def plot(*traces: go.Scatter, x_title: str | None = None, y_title: str | None = None, **layout: Any) -> go.Figure:
     """A figure of these traces in the common style, without a legend of its own."""
     figure = go.Figure(data=list(traces))
     figure.update_layout(
@@ -85,8 +86,18 @@ def plot(*traces: go.Scatter, **layout: Any) -> go.Figure:
         showlegend=False,
         hovermode="closest",
         margin={"l": 62, "r": 18, "t": 12, "b": 50},
+        xaxis_title_text=x_title,
+        yaxis_title_text=y_title,
         **layout,
     )
+    return figure
+
+
+def plan(*traces: go.Scatter, window: Array | None = None, x_title: str = "x (m)", y_title: str = "y (m)") -> go.Figure:
+    """A figure with the same scale in x and y. window (2, 2): least and greatest x, then y; default: all is shown."""
+    figure = plot(*traces, x_title=x_title, y_title=y_title, yaxis={"scaleanchor": "x", "scaleratio": 1})
+    if window is not None:
+        figure.update_layout(xaxis_range=window[0].tolist(), yaxis_range=window[1].tolist())
     return figure
 
 
@@ -114,11 +125,6 @@ def logarithmic(figure: go.Figure, axis: Literal["x", "y"], low: float, high: fl
             }
         }
     )
-
-
-def equal_aspect(figure: go.Figure) -> None:
-    """Give x and y the same scale."""
-    figure.update_yaxes(scaleanchor="x", scaleratio=1)
 
 
 _AXIS_STYLE = {

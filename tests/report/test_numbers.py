@@ -8,7 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omnibench.report.numbers import NOTHING, decimals_for, fixed, listing, percent, power_of_ten, seconds, significant
+from omnibench.report.numbers import (
+    NOTHING,
+    decimals_for,
+    fixed,
+    listing,
+    percent,
+    power_of_ten,
+    round_down,
+    seconds,
+    significant,
+)
 from omnibench.words import noun_for, plural
 
 
@@ -82,3 +92,8 @@ def test_plurals_are_english() -> None:
 
 def test_powers_of_ten_are_set_as_such() -> None:
     assert [power_of_ten(exponent) for exponent in (-10, -1, 0, 3, 4)] == ["10⁻¹⁰", "0.1", "1", "1,000", "10⁴"]
+
+
+@pytest.mark.parametrize(("value", "step"), [(7.3, 5), (5.0, 5), (1.0, 1), (0.37, 0.2), (99.0, 50)])
+def test_enlargements_are_round(value: float, step: float) -> None:
+    assert round_down(value) == pytest.approx(step)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_STYLE, DatasetView, EntryStyle
+from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_STYLE, DatasetView
 from omnibench.compare.report.wording import entry_cell, position_unit
 from omnibench.compare.result import EntryStatistics, ScoredRun
 from omnibench.data.dataset import Split, Trajectory
@@ -27,14 +26,13 @@ from omnibench.report.blocks import (
     Section,
     Table,
 )
+from omnibench.report.motions import MOST_MOTIONS, Motion, direction_of, motion_items, motion_of, moves
 from omnibench.report.numbers import fixed
 from omnibench.report.style import INK, plot, text
+from omnibench.report.traces import coordinates
 from omnibench.robot.kinematics import Array
 
-# Colours of turn rates, from the most negative to the most positive.
-_TURN_COLOURS = ("#0072b2", "#5b6772", "#d97706", "#aa3377", "#4fb0e8", "#7b4b2a", "#8f8f1f")
 _MANY_GROUPS = 12  # commands or sessions: with more, all trajectories of a split share one box plot (chosen)
-_Motion = tuple[float, float]  # speed, m/s, and rate of turn, rad/s
 
 
 def error_section(view: DatasetView) -> Section:
@@ -118,34 +116,21 @@ def _is_flower(trajectories: Sequence[Trajectory]) -> bool:
     """True if at least three directions were driven at each of a few speeds and rates of turn."""
     if any(t.alpha is None or t.omega is None for t in trajectories):
         return False
-    directions: dict[_Motion, set[int]] = {}
+    directions: dict[Motion, set[int]] = {}
     for trajectory in trajectories:
-        if _moves(trajectory):
-            directions.setdefault(_motion(trajectory), set()).add(round(math.degrees(trajectory.alpha or 0.0)) % 360)
-    return 0 < len(directions) <= len(_TURN_COLOURS) and all(len(driven) >= 3 for driven in directions.values())
-
-
-def _motion(trajectory: Trajectory) -> _Motion:
-    """Speed and rate of turn, without the digits that a measured command has."""
-    return round(trajectory.v or 0.0, 2), round(trajectory.omega or 0.0, 2)
-
-
-def _moves(trajectory: Trajectory) -> bool:
-    return trajectory.v is None or trajectory.v > 0
+        if moves(trajectory):
+            directions.setdefault(motion_of(trajectory), set()).add(round(direction_of(trajectory)) % 360)
+    return 0 < len(directions) <= MOST_MOTIONS and all(len(driven) >= 3 for driven in directions.values())
 
 
 def _flower_blocks(
     view: DatasetView, trajectories: Sequence[Trajectory], after: Array, label: str
 ) -> tuple[Block, ...]:
-    turn_rates = sorted({_motion(t) for t in trajectories if _moves(t)})
-    several_speeds = len({speed for speed, _ in turn_rates}) > 1
-    legend = []
-    for index, (speed, omega) in enumerate(turn_rates):
-        name = f"ω = {fixed(omega, 2)} rad/s" + (f", v = {fixed(speed, 2)} m/s" if several_speeds else "")
-        legend.append(LegendItem(f"turn-{index}", name, _TURN_COLOURS[index % len(_TURN_COLOURS)]))
+    motions = sorted({motion_of(t) for t in trajectories if moves(t)})
+    legend = motion_items(motions)
     figures = []
     for quantity in _quantities(view.design_errors[view.scored], after):
-        means = [_petals(trajectories, key, quantity) for key in turn_rates]
+        means = [_petals(trajectories, motion, quantity) for motion in motions]
         largest = max(float(max(before.max(), values.max())) for _, before, values in means)
         reached = max(float(values.max()) for _, _, values in means)
         for title, column, limit in (
@@ -170,12 +155,12 @@ def _flower_blocks(
     return (grid, *_turns_on_the_spot(view, trajectories, after))
 
 
-def _petals(trajectories: Sequence[Trajectory], key: _Motion, quantity: _Quantity) -> tuple[Array, Array, Array]:
+def _petals(trajectories: Sequence[Trajectory], motion: Motion, quantity: _Quantity) -> tuple[Array, Array, Array]:
     """Directions (deg) and mean errors before and after of one speed and rate of turn, the first direction repeated."""
-    of_key = [i for i, t in enumerate(trajectories) if _moves(t) and _motion(t) == key]
-    direction = np.array([round(math.degrees(trajectories[i].alpha or 0.0), 3) % 360 for i in of_key])
+    like = [i for i, t in enumerate(trajectories) if moves(t) and motion_of(t) == motion]
+    direction = np.array([direction_of(trajectories[i]) for i in like])
     angles = np.unique(direction)
-    chosen = [np.array(of_key)[direction == angle] for angle in angles]
+    chosen = [np.array(like)[direction == angle] for angle in angles]
     before = np.array([quantity.before[rows].mean() for rows in chosen])
     after = np.array([quantity.after[rows].mean() for rows in chosen])
     closed = np.append(angles, angles[0])
@@ -188,8 +173,8 @@ def _polar(
     hover = f"%{{r:.{quantity.decimals}f}} {quantity.unit}"
     traces = [
         go.Scatterpolar(
-            theta=angles.tolist(),
-            r=np.round(values, 4).tolist(),
+            theta=coordinates(angles),
+            r=coordinates(values),
             mode="lines+markers",
             line={"color": item.colour, "width": 2},
             marker={"size": 5},
@@ -210,7 +195,7 @@ def _polar(
 
 
 def _turns_on_the_spot(view: DatasetView, trajectories: Sequence[Trajectory], after: Array) -> tuple[Block, ...]:
-    still = np.array([not _moves(t) for t in trajectories])
+    still = np.array([not moves(t) for t in trajectories])
     if not still.any():
         return ()
     parts = [
@@ -233,19 +218,19 @@ def _box_plots(view: DatasetView, best: EntryStatistics, typical: ScoredRun) -> 
             after.append(errors)
     quantities = _quantities(np.concatenate(before), np.concatenate(after))
     style = view.styles[best.label]
+    styles = [THEORETICAL_STYLE] if style is THEORETICAL_STYLE else [THEORETICAL_STYLE, style]
     figures = tuple(
         Figure(
             f"Final {quantity.name} ({quantity.unit})",
-            _box_figure(groups, quantity, style),
+            _box_figure(groups, quantity, styles),
             f"Final {quantity.name} in {quantity.unit} of each group of trajectories, theoretical and {best.label}",
             80 + 44 * len(set(groups)),
         )
         for quantity in quantities
     )
-    items = (THEORETICAL_STYLE.legend,) if style is THEORETICAL_STYLE else (THEORETICAL_STYLE.legend, style.legend)
     return FigureGrid(
         figures,
-        items,
+        tuple(styles),
         1,
         "Every point is a trajectory; the box holds the middle half, its line is the median.",
     )
@@ -259,12 +244,11 @@ def _groups(view: DatasetView, split: Split) -> list[str]:
     return [SPLIT_NAMES[split]] * len(trajectories)
 
 
-def _box_figure(groups: Sequence[str], quantity: _Quantity, style: EntryStyle) -> go.Figure:
-    series = [(THEORETICAL_STYLE, quantity.before)] + ([] if style is THEORETICAL_STYLE else [(style, quantity.after)])
+def _box_figure(groups: Sequence[str], quantity: _Quantity, styles: Sequence[LegendItem]) -> go.Figure:
     traces = [
         go.Box(
             y=[text(group) for group in groups],
-            x=np.round(values, 4).tolist(),
+            x=coordinates(values),
             orientation="h",
             boxpoints="all",
             jitter=0.5,
@@ -275,9 +259,9 @@ def _box_figure(groups: Sequence[str], quantity: _Quantity, style: EntryStyle) -
             legendgroup=drawn.key,
             hovertemplate=f"{text(drawn.label)}: %{{x:.{quantity.decimals}f}} {quantity.unit}<extra></extra>",
         )
-        for drawn, values in series
+        for drawn, values in zip(styles, (quantity.before, quantity.after), strict=False)
     ]
-    figure = plot(*traces, boxmode="group", xaxis_title_text=f"final {quantity.name} ({quantity.unit})")
+    figure = plot(*traces, boxmode="group", x_title=f"final {quantity.name} ({quantity.unit})")
     figure.update_xaxes(rangemode="tozero")
     figure.update_yaxes(tickfont_color=INK, autorange="reversed", ticks="")  # first group on top
     return figure

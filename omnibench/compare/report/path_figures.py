@@ -8,11 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.compare.report.view import REFERENCE_STYLE, SPLIT_NAMES, THEORETICAL_STYLE, DatasetView, EntryStyle
+from omnibench.compare.report.view import REFERENCE_STYLE, SPLIT_NAMES, THEORETICAL_STYLE, DatasetView
 from omnibench.data.dataset import Trajectory
-from omnibench.report.blocks import Figure, FigureGrid, Section
+from omnibench.report.blocks import Figure, FigureGrid, LegendItem, Section
 from omnibench.report.recording.runs import describe
-from omnibench.report.style import INK, equal_aspect, plot, text
+from omnibench.report.recording.scan_points import evenly
+from omnibench.report.style import plan, text
+from omnibench.report.traces import START, line, marks, path
 from omnibench.robot.kinematics import Array
 
 _SHOWN = 4  # trajectories that are drawn, as many as in Fig. 6 of the paper
@@ -32,25 +34,13 @@ def path_section(view: DatasetView) -> Section:
     styles = [REFERENCE_STYLE, THEORETICAL_STYLE, *(view.styles[entry.label] for entry, _ in view.calibrated)]
     grid = FigureGrid(
         tuple(figures),
-        tuple(style.legend for style in styles),
+        tuple(styles),
         2,
         f"As Fig. 5 to 7 of the paper, on {SPLIT_NAMES[view.scored]} trajectories. Right: final poses about the "
         "reference's final position, the short strokes show the headings. The window holds the nearer ends; "
         "Autoscale, at the top right of a plot, shows all.",
     )
     return Section("paths", "Paths", (grid,))
-
-
-def _path_figure(view: DatasetView, trajectory: Trajectory) -> Figure:
-    title = describe(trajectory)
-    description = f"Paths of {title}: reference, theoretical and calibrated odometry, x and y in metres"
-    return Figure(title, _path(view, trajectory), description, 400)
-
-
-def _end_figure(view: DatasetView, trajectory: Trajectory) -> Figure:
-    title = f"Its end: {_ends_in_words(view, trajectory)}"
-    description = f"Final poses of {describe(trajectory)} about the reference's final position, in millimetres"
-    return Figure(title, _end(view, trajectory), description, 400)
 
 
 def chosen_trajectories(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
@@ -68,8 +58,7 @@ def chosen_trajectories(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
         distinct = [t for t in commanded if math.isclose(abs(t.omega or 0.0), strongest)]
         distinct.sort(key=lambda t: ((t.omega or 0.0) < 0, t.alpha or 0.0))
     pool = distinct if len(distinct) >= _SHOWN else list(trajectories)
-    picks = np.unique(np.linspace(0, len(pool) - 1, min(_SHOWN, len(pool))).round().astype(int))
-    return [pool[index] for index in picks]
+    return [pool[index] for index in evenly(len(pool), _SHOWN)]
 
 
 def _with_command(trajectories: Sequence[Trajectory], degrees: float) -> Trajectory | None:
@@ -80,36 +69,31 @@ def _with_command(trajectories: Sequence[Trajectory], degrees: float) -> Traject
     return None
 
 
-def _models(view: DatasetView) -> list[tuple[EntryStyle, Array]]:
+def _models(view: DatasetView) -> list[tuple[LegendItem, Array]]:
     drawn = [(THEORETICAL_STYLE, view.design_matrix)]
     calibrated = sorted(view.calibrated, key=lambda pair: pair[0].is_best)  # the best on top
     drawn += [(view.styles[entry.label], run.matrix) for entry, run in calibrated if run.matrix is not None]
     return drawn
 
 
-def _path(view: DatasetView, trajectory: Trajectory) -> go.Figure:
-    reference = _thinned(trajectory.poses, 2 * _POINTS)
+def _path_figure(view: DatasetView, trajectory: Trajectory) -> Figure:
+    reference = trajectory.poses[evenly(len(trajectory.poses), 2 * _POINTS)]
     stamps = np.linspace(0.0, trajectory.pose_times[-1], _POINTS)
-    traces = [_line(REFERENCE_STYLE, reference, 3.5), _ends(REFERENCE_STYLE, reference[-1:], 9)]
+    traces = [path(REFERENCE_STYLE, reference, 3.5), _end_mark(REFERENCE_STYLE, reference, 9)]
     for style, matrix in _models(view):
         (poses,) = view.model(matrix).poses([trajectory.log(stamps)])
-        traces += [_line(style, poses, 1.8), _ends(style, poses[-1:], 7)]
-    start = trajectory.start
-    traces.append(
-        go.Scatter(
-            x=[start[0]],
-            y=[start[1]],
-            mode="markers",
-            marker={"symbol": "circle-open", "size": 9, "color": INK, "line": {"width": 2}},
-            hovertemplate="start<extra></extra>",
-        )
-    )
-    figure = plot(*traces, xaxis_title_text="x (m)", yaxis_title_text="y (m)")
-    equal_aspect(figure)
-    return figure
+        traces += [path(style, poses, 1.8), _end_mark(style, poses, 7)]
+    traces.append(marks(START, 9, trajectory.start[:1], trajectory.start[1:2], hover="start"))
+    title = describe(trajectory)
+    description = f"Paths of {title}: reference, theoretical and calibrated odometry, x and y in metres"
+    return Figure(title, plan(*traces), description, 400)
 
 
-def _end(view: DatasetView, trajectory: Trajectory) -> go.Figure:
+def _end_mark(style: LegendItem, poses: Array, size: int) -> go.Scatter:
+    return marks(style, size, poses[-1:, 0], poses[-1:, 1], marker_line_width=2)
+
+
+def _end_figure(view: DatasetView, trajectory: Trajectory) -> Figure:
     final = trajectory.final_pose
     duration = trajectory.pose_times[-1]
     stamps = np.linspace((1 - _TAIL) * duration, duration, 60)
@@ -120,28 +104,25 @@ def _end(view: DatasetView, trajectory: Trajectory) -> go.Figure:
     traces = _tail_traces(REFERENCE_STYLE, late, final, half, width=2.6)
     for style, poses in tails:
         traces += _tail_traces(style, poses, final, half, width=1.6)
-    figure = plot(*traces, xaxis_title_text="x − x of reference (mm)", yaxis_title_text="y − y of reference (mm)")
-    figure.update_xaxes(range=[-half, half])
-    figure.update_yaxes(range=[-half, half])
-    equal_aspect(figure)
-    return figure
+    window = half * np.array([[-1.0, 1.0]] * 2)
+    return Figure(
+        f"Its end: {_ends_in_words(view, trajectory)}",
+        plan(*traces, window=window, x_title="x − x of reference (mm)", y_title="y − y of reference (mm)"),
+        f"Final poses of {describe(trajectory)} about the reference's final position, in millimetres",
+        400,
+    )
 
 
-def _tail_traces(style: EntryStyle, poses: Array, final: Array, half: float, width: float) -> list[go.Scatter]:
+def _tail_traces(style: LegendItem, poses: Array, final: Array, half: float, width: float) -> list[go.Scatter]:
     millimetres = 1e3 * (poses[:, :2] - final[:2])
     end = millimetres[-1]
     stroke = end + 0.28 * half * np.array([[0.0, 0.0], [math.cos(poses[-1, 2]), math.sin(poses[-1, 2])]])
-    words = f"{text(style.label)}: {math.hypot(*end):.1f} mm, {math.degrees(poses[-1, 2] - final[2]):.2f}°"
-    shared = {"legendgroup": style.key, "hovertemplate": f"{words}<extra></extra>"}
-    colour = {"color": style.colour}
+    hover = f"{text(style.label)}: {math.hypot(*end):.1f} mm, {math.degrees(poses[-1, 2] - final[2]):.2f}°"
     return [
-        go.Scatter(x=_short(millimetres[:, 0]), y=_short(millimetres[:, 1]), mode="lines", opacity=0.55,
-                   line={**colour, "width": width, "dash": style.dash}, **shared),
-        go.Scatter(x=_short(stroke[:, 0]), y=_short(stroke[:, 1]), mode="lines",
-                   line={**colour, "width": 2.2}, **shared),
-        go.Scatter(x=_short(end[:1]), y=_short(end[1:]), mode="markers",
-                   marker={**colour, "symbol": style.symbol, "size": 11, "line": {"width": 2}}, **shared),
-    ]  # fmt: skip
+        line(style, width, *millimetres.T, hover=hover, opacity=0.55),
+        line(style, 2.2, *stroke.T, hover=hover, line_dash="solid"),
+        marks(style, 11, end[:1], end[1:], hover=hover, marker_line_width=2),
+    ]
 
 
 def _ends_in_words(view: DatasetView, trajectory: Trajectory) -> str:
@@ -163,37 +144,3 @@ def _window(distances: Sequence[float]) -> float:
 
 def _distance_mm(pose: Array, reference: Array) -> float:
     return 1e3 * float(math.hypot(pose[0] - reference[0], pose[1] - reference[1]))
-
-
-def _line(style: EntryStyle, poses: Array, width: float) -> go.Scatter:
-    return go.Scatter(
-        x=_short(poses[:, 0]),
-        y=_short(poses[:, 1]),
-        mode="lines",
-        line={"color": style.colour, "width": width, "dash": style.dash},
-        legendgroup=style.key,
-        hovertemplate=f"{text(style.label)}<br>x %{{x:.3f}} m, y %{{y:.3f}} m<extra></extra>",
-    )
-
-
-def _ends(style: EntryStyle, poses: Array, size: int) -> go.Scatter:
-    return go.Scatter(
-        x=_short(poses[:, 0]),
-        y=_short(poses[:, 1]),
-        mode="markers",
-        marker={"color": style.colour, "size": size, "symbol": style.symbol, "line": {"width": 2}},
-        legendgroup=style.key,
-        hoverinfo="skip",
-    )
-
-
-def _thinned(poses: Array, limit: int) -> Array:
-    picks = np.unique(np.linspace(0, len(poses) - 1, min(limit, len(poses))).round().astype(int))
-    thinned: Array = poses[picks]
-    return thinned
-
-
-def _short(values: Array) -> list[float]:
-    """Coordinates with the digits that a screen can show."""
-    rounded: list[float] = np.round(values, 5).tolist()
-    return rounded

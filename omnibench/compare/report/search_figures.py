@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,12 +12,13 @@ import numpy as np
 import plotly.graph_objects as go
 
 from omnibench.compare.plan import SearchSpace
-from omnibench.compare.report.view import THEORETICAL_STYLE, DatasetView, EntryStyle
+from omnibench.compare.report.view import THEORETICAL_STYLE, DatasetView
 from omnibench.compare.result import ScoredRun
 from omnibench.fit.problem import Improvement
-from omnibench.report.blocks import Figure, FigureGrid, Paragraph, Section
+from omnibench.report.blocks import Figure, FigureGrid, LegendItem, Paragraph, Section
 from omnibench.report.numbers import listing, significant
 from omnibench.report.style import logarithmic, plot, text
+from omnibench.report.traces import coordinates, joined, line, marks
 from omnibench.robot.kinematics import Array
 
 TARGETS: Array = np.logspace(0, -8, 81)  # relative gaps above the best known cost (chosen)
@@ -37,7 +38,7 @@ class Course:
     """
 
     run: ScoredRun
-    style: EntryStyle
+    style: LegendItem
     evaluations: Array
     seconds: Array
     costs: Array
@@ -62,9 +63,9 @@ def search_section(view: DatasetView) -> Section:
         runs=Counter(run.record.label for run in view.runs),
         theoretical=view.theoretical_cost("train"),
     )
-    figures = [figure(searches, axis) for figure in (_cost_figure, _gap_figure, _target_figure) for axis in AXES]
+    figures = [figure(searches, axis) for figure in (_costs, _gaps, _targets) for axis in AXES]
     styles = {course.style.key: course.style for course in drawn}.values()
-    legend = (*(style.legend for style in styles), THEORETICAL_STYLE.legend)
+    legend = (*styles, THEORETICAL_STYLE)
     return Section("searches", "Searches", (FigureGrid(tuple(figures), legend, 2, _caption(drawn)),))
 
 
@@ -80,33 +81,6 @@ class _Searches:
     points: int
     runs: Mapping[str, int]
     theoretical: float | None
-
-
-def _cost_figure(searches: _Searches, axis: Axis) -> Figure:
-    return Figure(
-        f"Best training cost against {axis}",
-        _cost_plot(searches.courses, axis, searches.points, searches.theoretical),
-        f"Best training cost found so far by each run against {axis}, both axes logarithmic",
-        360,
-    )
-
-
-def _gap_figure(searches: _Searches, axis: Axis) -> Figure:
-    return Figure(
-        f"Gap above the best known cost against {axis}",
-        _gap_plot(searches.courses, axis, searches.points),
-        f"Relative gap above the best known cost in the same box against {axis}, both axes logarithmic",
-        360,
-    )
-
-
-def _target_figure(searches: _Searches, axis: Axis) -> Figure:
-    return Figure(
-        f"Targets reached against {axis}",
-        _target_plot(searches.courses, axis, searches.runs),
-        f"Share of targets that each entry reached, over its seeds, against {axis}",
-        360,
-    )
 
 
 def courses(view: DatasetView) -> list[Course]:
@@ -193,93 +167,89 @@ def _with_answer(run: ScoredRun) -> tuple[Improvement, ...]:
     return (*run.history, last)
 
 
-def _groups(drawn: Sequence[Course]) -> Mapping[EntryStyle, list[Course]]:
-    groups: dict[EntryStyle, list[Course]] = {}
+def _groups(drawn: Sequence[Course]) -> Mapping[LegendItem, list[Course]]:
+    groups: dict[LegendItem, list[Course]] = {}
     for course in drawn:
         groups.setdefault(course.style, []).append(course)
     return groups
 
 
-def _steps(style: EntryStyle, group: Sequence[Course], axis: Axis, limit: int, gaps: bool) -> list[go.Scatter]:
-    """One trace for all seeds of an entry, with a break between them, and a mark at each end."""
-    x: list[float | None] = []
-    y: list[float | None] = []
-    seeds: list[int | None] = []
-    for course in group:
-        picks = thinned(_along(course, axis), course.gaps, limit)
-        values = course.gaps if gaps else course.costs
-        x += [*(float(f"{value:.5g}") for value in _along(course, axis)[picks]), None]
-        y += [*(float(f"{value:.6g}") for value in values[picks]), None]
-        seeds += [*([course.run.record.seed] * len(picks)), None]
-    ends = [index - 1 for index, value in enumerate(x) if value is None]
-    words = f"{text(style.label)}, seed %{{customdata}}<br>%{{x:.4g}}{' s' if axis == 'time' else ' evaluations'}"
-    shared = {
-        "legendgroup": style.key,
-        "hovertemplate": f"{words}, {'gap' if gaps else 'cost'} %{{y:.5g}}<extra></extra>",
-    }
-    line = {"color": style.colour, "width": 1.8, "dash": style.dash, "shape": "hv"}
-    marker = {"color": style.colour, "symbol": style.symbol, "size": 8, "line": {"width": 1.8}}
-    return [
-        go.Scatter(x=x, y=y, customdata=seeds, mode="lines", line=line, opacity=0.8, **shared),
-        go.Scatter(
-            x=[x[i] for i in ends], y=[y[i] for i in ends], customdata=[seeds[i] for i in ends],
-            mode="markers", marker=marker, **shared,
-        ),
-    ]  # fmt: skip
-
-
-def _cost_plot(drawn: Sequence[Course], axis: Axis, limit: int, theoretical: float | None) -> go.Figure:
-    traces = [trace for style, group in _groups(drawn).items() for trace in _steps(style, group, axis, limit, False)]
-    low = min(course.costs.min() for course in drawn)
-    high = max(course.costs.max() for course in drawn)
-    if theoretical is not None:
-        high = max(high, theoretical)
-        traces.append(
-            go.Scatter(
-                x=list(_extent(drawn, axis)),
-                y=[theoretical, theoretical],
-                mode="lines",
-                line={"color": THEORETICAL_STYLE.colour, "width": 1.8, "dash": THEORETICAL_STYLE.dash},
-                legendgroup=THEORETICAL_STYLE.key,
-                hovertemplate=f"theoretical, cost {theoretical:.5g}<extra></extra>",
-            )
-        )
-    figure = plot(*traces, xaxis_title_text=_TITLES[axis], yaxis_title_text="best training cost so far")
-    logarithmic(figure, "x", *_extent(drawn, axis))
+def _costs(searches: _Searches, axis: Axis) -> Figure:
+    traces = _steps(searches, axis, "cost", lambda course: course.costs)
+    low = min(course.costs.min() for course in searches.courses)
+    high = max(course.costs.max() for course in searches.courses)
+    design = searches.theoretical
+    if design is not None:
+        high = max(high, design)
+        extent = _extent(searches.courses, axis)
+        traces.append(line(THEORETICAL_STYLE, 1.8, extent, [design] * 2, hover=f"theoretical, cost {design:.5g}"))
+    figure = _against(axis, searches, traces, "best training cost so far")
     logarithmic(figure, "y", float(low), float(high))
-    return figure
+    return Figure(
+        f"Best training cost against {axis}",
+        figure,
+        f"Best training cost found so far by each run against {axis}, both axes logarithmic",
+        360,
+    )
 
 
-def _gap_plot(drawn: Sequence[Course], axis: Axis, limit: int) -> go.Figure:
-    traces = [trace for style, group in _groups(drawn).items() for trace in _steps(style, group, axis, limit, True)]
-    figure = plot(*traces, xaxis_title_text=_TITLES[axis], yaxis_title_text="relative gap above best known cost")
-    logarithmic(figure, "x", *_extent(drawn, axis))
-    logarithmic(figure, "y", _FLOOR, float(max(course.gaps.max() for course in drawn)))
-    return figure
+def _gaps(searches: _Searches, axis: Axis) -> Figure:
+    traces = _steps(searches, axis, "gap", lambda course: course.gaps)
+    figure = _against(axis, searches, traces, "relative gap above best known cost")
+    logarithmic(figure, "y", _FLOOR, float(max(course.gaps.max() for course in searches.courses)))
+    return Figure(
+        f"Gap above the best known cost against {axis}",
+        figure,
+        f"Relative gap above the best known cost in the same box against {axis}, both axes logarithmic",
+        360,
+    )
 
 
-def _target_plot(drawn: Sequence[Course], axis: Axis, runs: Mapping[str, int]) -> go.Figure:
+def _targets(searches: _Searches, axis: Axis) -> Figure:
     traces = []
-    low, high = _extent(drawn, axis)
-    for style, group in _groups(drawn).items():
-        reached, share = targets_reached(group, runs[style.label], axis)
+    low, high = _extent(searches.courses, axis)
+    for style, group in _groups(searches.courses).items():
+        reached, share = targets_reached(group, searches.runs[style.label], axis)
         x = np.concatenate([[low], reached, [high]])
         y = np.concatenate([[0.0], share, [share[-1] if len(share) else 0.0]])
         keep = np.append(np.flatnonzero(np.diff(x) > 0), len(x) - 1)
-        traces.append(
-            go.Scatter(
-                x=[float(f"{value:.5g}") for value in x[keep]],
-                y=np.round(100 * y[keep], 2).tolist(),
-                mode="lines",
-                line={"color": style.colour, "width": 2.2, "dash": style.dash, "shape": "hv"},
-                legendgroup=style.key,
-                hovertemplate=f"{text(style.label)}<br>%{{y:.1f}} % by %{{x:.4g}}<extra></extra>",
-            )
-        )
-    figure = plot(*traces, xaxis_title_text=_TITLES[axis], yaxis_title_text="targets reached (%)")
-    logarithmic(figure, "x", low, high)
+        hover = f"{text(style.label)}<br>%{{y:.1f}} % by %{{x:.4g}}"
+        traces.append(line(style, 2.2, x[keep], 100 * y[keep], hover=hover, line_shape="hv"))
+    figure = _against(axis, searches, traces, "targets reached (%)")
     figure.update_yaxes(range=[-1, 104])
+    return Figure(
+        f"Targets reached against {axis}",
+        figure,
+        f"Share of targets that each entry reached, over its seeds, against {axis}",
+        360,
+    )
+
+
+def _against(axis: Axis, searches: _Searches, traces: Sequence[go.Scatter], y_title: str) -> go.Figure:
+    figure = plot(*traces, x_title=_TITLES[axis], y_title=y_title)
+    logarithmic(figure, "x", *_extent(searches.courses, axis))
     return figure
+
+
+def _steps(searches: _Searches, axis: Axis, name: str, values: Callable[[Course], Array]) -> list[go.Scatter]:
+    """For each entry one trace of all its seeds, with a break between them, and a mark at each end."""
+    traces = []
+    for style, group in _groups(searches.courses).items():
+        steps = []
+        for course in group:
+            along, seed = _along(course, axis), np.full(len(course.costs), course.run.record.seed)
+            picks = thinned(along, course.gaps, searches.points)
+            steps.append(np.column_stack([along, values(course), seed])[picks])
+        ends = np.array([each[-1] for each in steps])
+        unit = " s" if axis == "time" else " evaluations"
+        hover = f"{text(style.label)}, seed %{{customdata}}<br>%{{x:.4g}}{unit}, {name} %{{y:.5g}}"
+        for points, trace, size, looks in (
+            (joined(steps), line, 1.8, {"line_shape": "hv", "opacity": 0.8}),
+            (ends, marks, 8, {"marker_line_width": 1.8}),
+        ):
+            seeds = coordinates(points[:, 2], 17)
+            traces.append(trace(style, size, *points[:, :2].T, hover=hover, customdata=seeds, **looks))
+    return traces
 
 
 def _extent(drawn: Sequence[Course], axis: Axis) -> tuple[float, float]:

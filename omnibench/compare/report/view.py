@@ -10,7 +10,7 @@ from omnibench.compare.result import BoxCertificate, ComparisonResult, EntryStat
 from omnibench.data.dataset import SPLITS, Dataset, Split
 from omnibench.fit.evaluate import final_errors
 from omnibench.registry import calibrators
-from omnibench.report.blocks import Dash, LegendItem
+from omnibench.report.blocks import LegendItem
 from omnibench.report.style import REFERENCE, SYMBOLS, THEORETICAL, colours
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
@@ -29,23 +29,8 @@ _CUSTOMARY = {
 }
 
 
-@dataclass(frozen=True)
-class EntryStyle:
-    """Colour and marks of an entry in every plot of the report."""
-
-    key: str
-    label: str
-    colour: str
-    dash: Dash
-    symbol: str
-
-    @property
-    def legend(self) -> LegendItem:
-        return LegendItem(self.key, self.label, self.colour, self.dash)
-
-
-REFERENCE_STYLE = EntryStyle("reference", "reference", REFERENCE, "solid", "circle")
-THEORETICAL_STYLE = EntryStyle("theoretical", "theoretical (design values)", THEORETICAL, "dash", "circle")
+REFERENCE_STYLE = LegendItem("reference", "reference", REFERENCE)
+THEORETICAL_STYLE = LegendItem("theoretical", "theoretical (design values)", THEORETICAL, "dash")
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +49,7 @@ class DatasetView:
     statistics: tuple[EntryStatistics, ...]
     certificates: tuple[BoxCertificate, ...]
     warnings: tuple[str, ...]
-    styles: Mapping[str, EntryStyle]
+    styles: Mapping[str, LegendItem]
     design_costs: Mapping[Split, Interval]
     design_errors: Mapping[Split, Array]
 
@@ -128,7 +113,7 @@ def views(result: ComparisonResult) -> list[DatasetView]:
     return [_view(result, name, styles) for name in result.datasets]
 
 
-def _view(result: ComparisonResult, name: str, styles: Mapping[str, EntryStyle]) -> DatasetView:
+def _view(result: ComparisonResult, name: str, styles: Mapping[str, LegendItem]) -> DatasetView:
     dataset = result.datasets[name]
     design = OdometryModel.of_design(dataset.robot, result.config.integration)
     return DatasetView(
@@ -145,14 +130,14 @@ def _view(result: ComparisonResult, name: str, styles: Mapping[str, EntryStyle])
     )
 
 
-def _styles(result: ComparisonResult) -> dict[str, EntryStyle]:
+def _styles(result: ComparisonResult) -> dict[str, LegendItem]:
     """A style for each label; the design values have theirs."""
     names = {entry.label: entry.calibrator for entry in result.statistics}
     names |= {run.record.label: run.record.calibrator for run in result.runs}
     searches = {label: name for label, name in names.items() if name != THEORETICAL_NAME}
     drawn = colours({label: _CUSTOMARY.get(name) for label, name in searches.items()})
     styles = {
-        label: EntryStyle(f"entry-{index}", label, colour, dash, SYMBOLS[index % len(SYMBOLS)])
+        label: LegendItem(f"entry-{index}", label, colour, dash, SYMBOLS[index % len(SYMBOLS)])
         for index, (label, (colour, dash)) in enumerate(drawn.items())
     }
     return {label: styles.get(label, THEORETICAL_STYLE) for label in names}

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import cycle
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -12,12 +14,17 @@ from omnibench.design.report.design_wording import command_in_words
 from omnibench.design.result import Candidate, Design, Precision, SetDesign, Step
 from omnibench.report.blocks import Dash, Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import percent
-from omnibench.report.style import INK, PALETTE, QUIET, equal_aspect, logarithmic, plot, text
+from omnibench.report.style import INK, PALETTE, QUIET, logarithmic, plan, plot, text
+from omnibench.report.traces import ORIGIN, line, marks
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
-_LEFT, _STRAIGHT, _RIGHT = PALETTE[0], "#5b6772", PALETTE[1]
-_UNUSED = "#d4d9df"
+_LEFT = LegendItem("left", "turning left", PALETTE[0])
+_STRAIGHT = LegendItem("straight", "straight", "#5b6772")
+# Left and right turns may run along the same circle: dashes over a line show both.
+_RIGHT = LegendItem("right", "turning right", PALETTE[1], "dash")
+_UNUSED = LegendItem("unused", "candidates not chosen", "#d4d9df")
+_BASELINE = LegendItem("", "baseline", QUIET, symbol="diamond")
 _STRAIGHT_BELOW = math.radians(2)  # rad: a run that turns by less is drawn as straight (chosen)
 _ROW_DASHES: tuple[Dash, ...] = ("solid", "dash", "dot")
 _ROW_NAMES = ("x (row 1)", "y (row 2)", "heading (row 3)")
@@ -37,15 +44,9 @@ def path_figures(design: Design) -> FigureGrid:
         )
         for of_set in design.sets
     )
-    legend = (
-        LegendItem("left", "turning left", _LEFT),
-        LegendItem("straight", "straight", _STRAIGHT),
-        LegendItem("right", "turning right", _RIGHT, "dash"),
-        LegendItem("unused", "candidates not chosen", _UNUSED),
-    )
     return FigureGrid(
         figures,
-        legend,
+        (_LEFT, _STRAIGHT, _RIGHT, _UNUSED),
         2 if len(figures) > 1 else 1,
         "All paths start at the origin, heading along x, and end at the dot. The more often a command is driven, the "
         "wider its line (and its number stands at its end). Turns on the spot are arcs about the origin.",
@@ -105,20 +106,10 @@ def efficiency_figure(design: Design) -> FigureGrid:
     """Efficiency of exact designs against the number of runs; 100 % is the bound that no design exceeds."""
     traces = []
     lowest = min(step.efficiency for of_set in design.sets for step in of_set.steps)
-    for of_set, colour in _coloured(design):
-        traces.append(
-            _line(
-                [step.effort.runs for step in of_set.steps],
-                [100 * step.efficiency for step in of_set.steps],
-                [f"{of_set.name}, {_step_in_words(step)}" for step in of_set.steps],
-                of_set.name,
-                colour,
-                "solid",
-            )
-        )
-        traces.append(_ring(of_set.step.effort.runs, 100 * of_set.step.efficiency, of_set.name, colour))
+    for of_set, item in zip(design.sets, _legend(design), strict=True):
+        traces += _curve(item, of_set, _runs, lambda step: 100 * step.efficiency)
     most = max(of_set.steps[-1].effort.runs for of_set in design.sets)
-    figure = plot(*traces, xaxis_title_text="runs", yaxis_title_text="efficiency (% of the bound)")
+    figure = plot(*traces, x_title="runs", y_title="efficiency (% of the bound)")
     few = min(of_set.steps[0].effort.runs for of_set in design.sets)
     logarithmic(figure, "x", few, most)
     figure.update_yaxes(range=[max(0.0, 100 * lowest - 3), 102])
@@ -150,23 +141,13 @@ def _curves(
 ) -> go.Figure:
     baseline = design.baseline.precision
     traces = []
-    for of_set, colour in _coloured(design):
-        words = [f"{of_set.name}, {_step_in_words(step)}" for step in of_set.steps]
-        x = [across(step) for step in of_set.steps]
+    for of_set, item in zip(design.sets, _legend(design), strict=True):
         for value, dash in upwards:
-            traces.append(_line(x, [value(step) for step in of_set.steps], words, of_set.name, colour, dash))
-            traces.append(_ring(across(of_set.step), value(of_set.step), of_set.name, colour))
+            traces += _curve(item, of_set, across, value, dash)
     for value, _ in upwards:
-        traces.append(
-            go.Scatter(
-                x=[across(baseline)],
-                y=[value(baseline)],
-                mode="markers",
-                marker={"symbol": "diamond", "size": 10, "color": QUIET},
-                hovertemplate=f"baseline, {text(design.baseline.name)}: %{{y:.3g}}<extra></extra>",
-            )
-        )
-    figure = plot(*traces, xaxis_title_text=x_title, yaxis_title_text=y_title)
+        hover = f"baseline, {text(design.baseline.name)}: %{{y:.3g}}"
+        traces.append(marks(_BASELINE, 10, [across(baseline)], [value(baseline)], hover=hover))
+    figure = plot(*traces, x_title=x_title, y_title=y_title)
     if len(upwards) == 1:
         figure.add_hline(y=value(baseline), line={"color": QUIET, "width": 1, "dash": "dot"})
     shown = [step for of_set in design.sets for step in of_set.steps] + [baseline]
@@ -194,42 +175,30 @@ def _distance(step: Precision) -> float:
     return step.physical.distance_percent
 
 
-def _step_in_words(step: Step) -> str:
-    return f"{plural(step.effort.runs, 'run')}, {step.effort.seconds:.0f} s, {percent(step.efficiency, 2)} of the bound"
-
-
-def _line(
-    x: Sequence[float], y: Sequence[float], words: Sequence[str], key: str, colour: str, dash: Dash
-) -> go.Scatter:
-    return go.Scatter(
-        x=list(x),
-        y=[float(f"{value:.6g}") for value in y],
-        mode="lines",
-        line={"color": colour, "width": 2, "dash": dash},
-        legendgroup=key,
-        text=[text(line) for line in words],
-        hovertemplate="%{text}<br>%{y:.4g}<extra></extra>",
-    )
-
-
-def _ring(x: float, y: float, key: str, colour: str) -> go.Scatter:
-    return go.Scatter(
-        x=[x],
-        y=[y],
-        mode="markers",
-        marker={"symbol": "circle-open", "size": 11, "color": colour, "line": {"width": 2.5}},
-        legendgroup=key,
-        hoverinfo="skip",
-    )
-
-
-def _coloured(design: Design) -> Iterator[tuple[SetDesign, str]]:
-    for index, of_set in enumerate(design.sets):
-        yield of_set, PALETTE[index % len(PALETTE)]
+def _curve(
+    item: LegendItem,
+    of_set: SetDesign,
+    across: Callable[[Step], float],
+    upwards: Callable[[Step], float],
+    dash: Dash = "solid",
+) -> list[go.Scatter]:
+    """A line through the steps of a set, with a ring around the chosen one."""
+    x, y = ([value(step) for step in of_set.steps] for value in (across, upwards))
+    words = [
+        f"{of_set.name}, {plural(step.effort.runs, 'run')}, {step.effort.seconds:.0f} s, "
+        f"{percent(step.efficiency, 2)} of the bound"
+        for step in of_set.steps
+    ]
+    ring: dict[str, Any] = {"marker_symbol": "circle-open", "marker_line_width": 2.5}
+    return [
+        line(item, 2.0, x, y, hover="%{text}<br>%{y:.4g}", words=words, line_dash=dash),
+        marks(item, 11, [across(of_set.step)], [upwards(of_set.step)], **ring),
+    ]
 
 
 def _legend(design: Design) -> tuple[LegendItem, ...]:
-    return tuple(LegendItem(of_set.name, of_set.name, colour) for of_set, colour in _coloured(design))
+    colours = cycle(PALETTE)
+    return tuple(LegendItem(of_set.name, of_set.name, next(colours)) for of_set in design.sets)
 
 
 def _flower(design: Design, of_set: SetDesign) -> go.Figure:
@@ -243,42 +212,24 @@ def _flower(design: Design, of_set: SetDesign) -> go.Figure:
         name = candidate.name
         points = _arc(candidate, radii[name]) if name in radii else np.array(candidate.path)[:, :2]
         traces += _path(candidate, points, counts.get(name, 0))
-    traces.append(
-        go.Scatter(x=[0], y=[0], mode="markers", marker={"color": INK, "size": 7}, hovertemplate="start<extra></extra>")
-    )
-    figure = plot(*traces, xaxis_title_text="x (m)", yaxis_title_text="y (m)")
-    equal_aspect(figure)
-    return figure
+    return plan(*traces, marks(ORIGIN, 7, [0], [0], hover="start"))
 
 
 def _path(candidate: Candidate, points: Array, runs: int) -> list[go.Scatter]:
     turned = _turned(candidate)
     width = min(2.0 + 1.2 * runs, 14.0)
-    key, colour = ("left", _LEFT) if turned > 0 else ("right", _RIGHT)
+    item = _LEFT if turned > 0 else _RIGHT
     if abs(turned) < _STRAIGHT_BELOW:
-        key, colour = "straight", _STRAIGHT
-    # Left and right turns may run along the same circle: dashes over a line show both.
-    line = {"color": colour, "width": width, "dash": "dash" if key == "right" else "solid"}
-    words = f"{text(command_in_words(candidate))}, {candidate.duration_s:.3g} s"
-    shared = {"hovertemplate": f"{words}: {plural(runs, 'run') if runs else 'not chosen'}<extra></extra>"}
-    x, y = np.round(points.T, 4).tolist()
+        item = _STRAIGHT
+    hover = f"{text(command_in_words(candidate))}, {candidate.duration_s:.3g} s: "
     if not runs:
-        unused = {"color": _UNUSED, "width": 1}
-        return [go.Scatter(x=x, y=y, mode="lines", line=unused, legendgroup="unused", **shared)]
-    end = {"mode": "markers+text", "text": [f"<b>{runs}×</b>"]} if runs > 1 else {"mode": "markers"}
+        return [line(_UNUSED, 1, *points.T, hover=hover + "not chosen")]
+    hover += plural(runs, "run")
+    end: dict[str, Any] = {"mode": "markers+text", "text": [f"<b>{runs}×</b>"]} if runs > 1 else {}
+    end |= {"textposition": "top center" if points[-1, 1] >= 0 else "bottom center", "cliponaxis": False}
     return [
-        go.Scatter(x=x, y=y, mode="lines", line=line, legendgroup=key, **shared),
-        go.Scatter(
-            x=x[-1:],
-            y=y[-1:],
-            marker={"color": colour, "size": width + 5},
-            textposition="top center" if y[-1] >= 0 else "bottom center",
-            textfont={"size": 13, "color": INK},
-            legendgroup=key,
-            cliponaxis=False,
-            **end,
-            **shared,
-        ),
+        line(item, width, *points.T, hover=hover),
+        marks(item, width + 5, *points[-1:].T, hover=hover, textfont={"size": 13, "color": INK}, **end),
     ]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ import plotly.graph_objects as go
 
 from omnibench.report.blocks import LegendItem
 from omnibench.report.style import QUIET, plot, text
+from omnibench.report.traces import area, joined, marks
 from omnibench.robot.kinematics import Array
 
 BEFORE, AFTER, FLOOR = "#d97706", "#0072b2", "#8a8f98"
@@ -21,22 +21,15 @@ ZERO = {"type": "line", "xref": "x domain", "x0": 0, "x1": 1, "y0": 0, "y1": 0, 
 
 
 @dataclass(frozen=True)
-class ModelStyle:
+class ModelStyle(LegendItem):
     """The style in which one of the two models is drawn. index: 0 before, 1 after."""
 
-    index: int
-    key: str
-    label: str
-    colour: str
-
-    @property
-    def legend(self) -> LegendItem:
-        return LegendItem(self.key, self.label, self.colour)
+    index: int = 0
 
 
-PLAIN = ModelStyle(0, "before", "plain matrix (before)", BEFORE)
-ALONE = ModelStyle(0, "before", "plain matrix", BEFORE)
-EXTENDED = ModelStyle(1, "after", "extended model (after)", AFTER)
+PLAIN = ModelStyle("before", "plain matrix (before)", BEFORE)
+ALONE = ModelStyle("before", "plain matrix", BEFORE)
+EXTENDED = ModelStyle("after", "extended model (after)", AFTER, index=1)
 NOISE = LegendItem("noise", "noise alone, 95 %", _NOISE)
 
 
@@ -76,8 +69,7 @@ class Panel:
 
 def legend(styles: Sequence[ModelStyle], noise: bool = True) -> tuple[LegendItem, ...]:
     """The legend of the models and, if ``noise``, of the noise band."""
-    models = tuple(style.legend for style in styles)
-    return (*models, NOISE) if noise else models
+    return (*styles, NOISE) if noise else tuple(styles)
 
 
 def drawn(panels: Sequence[Panel]) -> list[go.Figure]:
@@ -85,17 +77,6 @@ def drawn(panels: Sequence[Panel]) -> list[go.Figure]:
     limits = [_reach(panel) for panel in panels]
     reach = 1.1 * max(limits, default=1.0) or 1.0
     return [_plot(panel, reach) for panel in panels]
-
-
-def numbers(values: Array) -> list[float | None]:
-    """Values rounded to five digits, None for NaN."""
-    return [None if np.isnan(value) else float(f"{value:.5g}") for value in np.asarray(values, dtype=float)]
-
-
-def round_down(value: float) -> float:
-    """The largest of 1, 2, 5, 10, 20, ... and of 0.5, 0.2, ... that does not exceed ``value``, which is > 0."""
-    decade = 10.0 ** math.floor(math.log10(value))
-    return max(step * decade for step in (1, 2, 5) if step * decade <= value * (1 + 1e-9))
 
 
 def _reach(panel: Panel) -> float:
@@ -109,20 +90,13 @@ def _plot(panel: Panel, reach: float) -> go.Figure:
     bands = panel.curves[:1] if panel.shared else panel.curves
     traces = [_band(panel, curve) for curve in bands]
     words = panel.words or ("",) * len(panel.x)
-    traces += [
-        go.Scatter(
-            x=numbers(panel.x),
-            y=numbers(curve.values),
-            mode="lines+markers" if panel.lines else "markers",
-            line={"color": curve.style.colour, "width": 2},
-            marker={"color": curve.style.colour, "size": 6 if panel.lines else 5},
-            opacity=1.0 if panel.lines else 0.75,
-            legendgroup=curve.style.key,
-            text=[text(each) for each in words],
-            hovertemplate=f"{text(curve.style.label)}<br>%{{text}} %{{y:.3g}} {panel.unit}<extra></extra>",
-        )
-        for curve in panel.curves
-    ]
+    for curve in panel.curves:
+        hover = f"{text(curve.style.label)}<br>%{{text}} %{{y:.3g}} {panel.unit}"
+        if panel.lines:
+            looks = {"mode": "lines+markers", "line_color": curve.style.colour, "line_width": 2}
+            traces.append(marks(curve.style, 6, panel.x, curve.values, hover=hover, words=words, **looks))
+        else:
+            traces.append(marks(curve.style, 5, panel.x, curve.values, hover=hover, words=words, opacity=0.75))
     return plot(
         *traces,
         xaxis={"title": {"text": panel.x_title}, "dtick": panel.ticks},
@@ -133,8 +107,7 @@ def _plot(panel: Panel, reach: float) -> go.Figure:
 
 def _band(panel: Panel, curve: Curve) -> go.Scatter:
     """The band of chance about zero, in a pale shade of the curve's colour or in that of the noise."""
-    x: list[float | None] = []
-    y: list[float | None] = []
+    outlines = []
     known = np.isfinite(curve.half_width)
     pieces = np.split(np.arange(len(known)), np.flatnonzero(np.diff(known.astype(int))) + 1)
     margin = 0.015 * float(np.ptp(panel.x))
@@ -144,18 +117,9 @@ def _band(panel: Panel, curve: Curve) -> go.Scatter:
             if len(piece) == 1:  # a bin between empty ones
                 at, half = at + np.array([-margin, margin]), np.repeat(half, 2)
             low = 0 * half if panel.amplitude else -half
-            x += [*numbers(np.concatenate([at, at[::-1]])), None]
-            y += [*numbers(np.concatenate([half, low[::-1]])), None]
-    colour = BAND if panel.shared else _pale(curve.style.colour)
-    return go.Scatter(
-        x=x,
-        y=y,
-        fill="toself",
-        mode="none",
-        fillcolor=colour,
-        legendgroup=NOISE.key if panel.shared else curve.style.key,
-        hoverinfo="skip",
-    )
+            outlines.append(np.column_stack([np.append(at, at[::-1]), np.append(half, low[::-1])]))
+    key, colour = (NOISE.key, BAND) if panel.shared else (curve.style.key, _pale(curve.style.colour))
+    return area(key, colour, *joined(outlines).T)
 
 
 def _pale(colour: str) -> str:

@@ -8,17 +8,17 @@ from collections.abc import Sequence
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.discover.report.before_after import BAND, NOISE, ModelStyle, legend, numbers
+from omnibench.discover.report.before_after import BAND, NOISE, ModelStyle, legend
 from omnibench.discover.report.command_map import command_in_words, command_maps, mean_of
 from omnibench.discover.report.residuals import NORMAL_95, CommandResidual, Residuals
 from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem, Paragraph
+from omnibench.report.motions import MOST_MOTIONS, direction_of, motion_items, motion_of, moves
 from omnibench.report.numbers import fixed
 from omnibench.report.style import INK, QUIET, plot, text
+from omnibench.report.traces import area, coordinates, line, marks
 
 _ROWS = 16  # commands listed at most (chosen)
 _ON_MAP = 200
-# Colours for rates of turn from the most negative to the most positive.
-_TURN_COLOURS = ("#0072b2", "#5b6772", "#d97706", "#aa3377", "#4fb0e8", "#7b4b2a", "#8f8f1f")
 
 
 def command_blocks(residuals: Residuals, styles: Sequence[ModelStyle]) -> tuple[Block, ...]:
@@ -43,24 +43,16 @@ def _is_flower(commands: Sequence[CommandResidual]) -> bool:
 def _headings_by_direction(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> tuple[Block, ...]:
     """Mean final heading residuals over the commanded direction, a colour for each rate of turn."""
     known = [each for each in commands if each.run.alpha is not None and each.run.omega is not None]
-    moving = [each for each in known if each.run.v is None or each.run.v > 0]
+    moving = sorted((each for each in known if moves(each.run)), key=lambda each: direction_of(each.run))
     still = [each for each in known if each.run.v == 0]
-    motions = sorted({_motion(each) for each in moving})
-    distinct = {(_direction(each), *_motion(each)) for each in moving}
-    directions = {_direction(each) for each in moving}
-    if len(motions) > len(_TURN_COLOURS) or len(distinct) < len(moving) or len(directions) < 3:
+    motions = sorted({motion_of(each.run) for each in moving})
+    distinct = {(direction_of(each.run), *motion_of(each.run)) for each in moving}
+    directions = {direction for direction, *_ in distinct}
+    if len(motions) > MOST_MOTIONS or len(distinct) < len(moving) or len(directions) < 3:
         return (_rows(commands, styles),)
-    several = len({speed for speed, _ in motions}) > 1
-    items = [
-        LegendItem(
-            f"turn-{index}",
-            f"ω = {fixed(rate, 2)} rad/s" + (f", v = {fixed(speed, 2)} m/s" if several else ""),
-            colour,
-        )
-        for index, ((speed, rate), colour) in enumerate(zip(motions, _TURN_COLOURS, strict=False))
-    ]
+    items = motion_items(motions)
     curves = [
-        (item, sorted((each for each in moving if _motion(each) == motion), key=_direction))
+        (item, [each for each in moving if motion_of(each.run) == motion])
         for motion, item in zip(motions, items, strict=True)
     ]
     panels = [_heading_plot(curves, style, moving) for style in styles]
@@ -89,28 +81,16 @@ def _heading_plot(
     commands: Sequence[CommandResidual],
 ) -> tuple[go.Figure, float]:
     half = math.degrees(NORMAL_95 * float(np.median([each.error[2] for each in commands])))
-    ends = [_direction(each) for each in commands]
+    ends = [direction_of(each.run) for each in commands]
     low, high = min(ends) - 10, max(ends) + 10
-    traces = [
-        go.Scatter(x=[low, high, high, low], y=[half, half, -half, -half], mode="none", fill="toself",
-                   fillcolor=BAND, legendgroup=NOISE.key, hoverinfo="skip")
-    ]  # fmt: skip
+    traces = [area(NOISE.key, BAND, [low, high, high, low], [half, half, -half, -half])]
     reach = 1.4 * half
     for item, own in curves:
         values = np.degrees([mean_of(each, style)[2] for each in own])
         reach = max(reach, 1.1 * float(np.abs(values).max()))
-        traces.append(
-            go.Scatter(
-                x=numbers(np.array([_direction(each) for each in own])),
-                y=numbers(values),
-                mode="lines+markers",
-                line={"color": item.colour, "width": 2},
-                legendgroup=item.key,
-                text=[text(command_in_words(each)) for each in own],
-                hovertemplate="%{text}<br>%{y:.3f}°<extra></extra>",
-            )
-        )
-    figure = plot(*traces, xaxis_title_text="commanded direction α (°)", yaxis_title_text="heading residual (°)")
+        x, words = [direction_of(each.run) for each in own], [command_in_words(each) for each in own]
+        traces.append(line(item, 2.0, x, values, hover="%{text}<br>%{y:.3f}°", words=words, mode="lines+markers"))
+    figure = plot(*traces, x_title="commanded direction α (°)", y_title="heading residual (°)")
     figure.update_xaxes(range=[low, high], dtick=60)
     figure.add_hline(y=0, line={"color": QUIET, "width": 1})
     return figure, reach
@@ -120,7 +100,7 @@ def _turns_on_the_spot(still: Sequence[CommandResidual], styles: Sequence[ModelS
     if not still:
         return ()
     parts = []
-    for each in sorted(still, key=_motion):
+    for each in sorted(still, key=lambda each: motion_of(each.run)):
         values = " → ".join(f"{fixed(math.degrees(mean_of(each, style)[2]), 2, signed=True)}°" for style in styles)
         noise = fixed(math.degrees(NORMAL_95 * each.error[2]), 2)
         parts.append(f"{command_in_words(each)}: {values} (noise ±{noise}°)")
@@ -154,42 +134,25 @@ def _rows(commands: Sequence[CommandResidual], styles: Sequence[ModelStyle]) -> 
 def _row_plot(
     commands: Sequence[CommandResidual], styles: Sequence[ModelStyle], axis: int, factor: float, unit: str
 ) -> go.Figure:
-    names = [text(each.name) for each in commands]
-    half = [NORMAL_95 * factor * each.error[axis] for each in commands]
+    names = [each.name for each in commands]
+    half = NORMAL_95 * factor * np.array([each.error[axis] for each in commands])
     traces: list[go.Bar | go.Scatter] = [
         go.Bar(
-            y=names,
-            x=numbers(2 * np.array(half)),
-            base=numbers(-np.array(half)),
+            y=[text(name) for name in names],
+            x=coordinates(2 * half),
+            base=coordinates(-half),
             orientation="h",
             marker={"color": "#d9dde2", "line": {"width": 0}},
             width=0.6,
             legendgroup=NOISE.key,
             hovertemplate="noise ±%{customdata:.3g} " + unit + "<extra></extra>",
-            customdata=numbers(np.array(half)),
+            customdata=coordinates(half),
         )
     ]
-    traces += [
-        go.Scatter(
-            y=names,
-            x=numbers(factor * np.array([mean_of(each, style)[axis] for each in commands])),
-            mode="markers",
-            marker={"color": style.colour, "size": 9},
-            legendgroup=style.key,
-            hovertemplate=f"{text(style.label)}: %{{x:.3g}} {unit}<extra></extra>",
-        )
-        for style in styles
-    ]
-    figure = plot(*traces, xaxis_title_text=f"residual ({unit})")
+    for style in styles:
+        values = factor * np.array([mean_of(each, style)[axis] for each in commands])
+        traces.append(marks(style, 9, values, names, hover=f"{text(style.label)}: %{{x:.3g}} {unit}"))
+    figure = plot(*traces, x_title=f"residual ({unit})")
     figure.update_yaxes(autorange="reversed", ticks="", tickfont_color=INK)
     figure.add_vline(x=0, line={"color": QUIET, "width": 1})
     return figure
-
-
-def _motion(each: CommandResidual) -> tuple[float, float]:
-    """Speed and rate of turn of a command, rounded so that repetitions of a measured command agree."""
-    return round(each.run.v or 0.0, 2), round(each.run.omega or 0.0, 2)
-
-
-def _direction(each: CommandResidual) -> float:
-    return round(math.degrees(each.run.alpha or 0.0), 3) % 360

@@ -8,11 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 import plotly.graph_objects as go
 
-from omnibench.discover.report.before_after import BAND, NOISE, ModelStyle, legend, numbers, round_down
+from omnibench.discover.report.before_after import BAND, NOISE, ModelStyle, legend
 from omnibench.discover.report.residuals import CIRCLE_95, CommandResidual
-from omnibench.report.blocks import Figure, FigureGrid
-from omnibench.report.numbers import fixed
-from omnibench.report.style import INK, QUIET, equal_aspect, plot, text
+from omnibench.report.blocks import Figure, FigureGrid, LegendItem
+from omnibench.report.numbers import fixed, round_down
+from omnibench.report.style import QUIET, plan
+from omnibench.report.traces import ORIGIN, area, arrows, joined, marks
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
@@ -46,68 +47,23 @@ def command_maps(commands: Sequence[CommandResidual], styles: Sequence[ModelStyl
 
 
 def _map(commands: Sequence[CommandResidual], style: ModelStyle, factor: float, window: Array) -> go.Figure:
-    traces = []
-    circles_x: list[float | None] = []
-    circles_y: list[float | None] = []
-    lines_x: list[float | None] = []
-    lines_y: list[float | None] = []
-    tips, words = [], []
     turn = np.linspace(0, 2 * np.pi, 33)
-    for each in commands:
-        x, y = each.end[:2]
-        radius = factor * CIRCLE_95 * each.error[0]
-        circles_x += [*numbers(x + radius * np.cos(turn)), None]
-        circles_y += [*numbers(y + radius * np.sin(turn)), None]
-        residual = mean_of(each, style)
-        tip = each.end[:2] + factor * residual[:2]
-        lines_x += [*numbers(np.array([x, tip[0]])), None]
-        lines_y += [*numbers(np.array([y, tip[1]])), None]
-        tips.append(tip)
-        words.append(f"{text(command_in_words(each))}<br>{_in_words(residual)}<br>{plural(each.runs, 'run')}")
+    circle = CIRCLE_95 * factor * np.column_stack([np.cos(turn), np.sin(turn)])
+    circles = joined([each.end[:2] + each.error[0] * circle for each in commands])
+    residuals = [mean_of(each, style) for each in commands]
+    words = [
+        f"{command_in_words(each)}\n{_in_words(residual)}\n{plural(each.runs, 'run')}"
+        for each, residual in zip(commands, residuals, strict=True)
+    ]
     ends = np.array([each.end[:2] for each in commands])
-    traces.append(
-        go.Scatter(x=circles_x, y=circles_y, mode="none", fill="toself", fillcolor=BAND, legendgroup=NOISE.key,
-                   hoverinfo="skip")
-    )  # fmt: skip
-    traces.append(
-        go.Scatter(x=lines_x, y=lines_y, mode="lines", line={"color": style.colour, "width": 2.2},
-                   legendgroup=style.key, hoverinfo="skip")
-    )  # fmt: skip
-    traces.append(_dots(ends, QUIET, 3, words, style))
-    traces.append(_dots(np.array(tips), style.colour, 6, words, style, _directions(commands, style)))
-    traces.append(_dots(np.zeros((1, 2)), INK, 7, ["start"], style))
-    figure = plot(*traces, xaxis_title_text="x (m)", yaxis_title_text="y (m)")
-    figure.update_xaxes(range=numbers(window[0]))
-    figure.update_yaxes(range=numbers(window[1]))
-    equal_aspect(figure)
-    return figure
-
-
-def _directions(commands: Sequence[CommandResidual], style: ModelStyle) -> list[float]:
-    """The direction of each arrow, clockwise from up, deg."""
-    found = [mean_of(each, style)[:2] for each in commands]
-    return [90.0 - math.degrees(math.atan2(residual[1], residual[0])) for residual in found]
-
-
-def _dots(
-    points: Array,
-    colour: str,
-    size: int,
-    words: Sequence[str],
-    style: ModelStyle,
-    angles: Sequence[float] | None = None,
-) -> go.Scatter:
-    marker: dict[str, object] = {"color": colour, "size": size}
-    if angles is not None:
-        marker |= {"symbol": "triangle-up", "angle": [round(each, 1) for each in angles], "size": size + 3}
-    return go.Scatter(
-        x=numbers(points[:, 0]),
-        y=numbers(points[:, 1]),
-        mode="markers",
-        marker=marker,
-        text=list(words),
-        hovertemplate="%{text}<extra></extra>",
-        legendgroup=style.key if angles is not None else None,
+    shafts, heads = arrows(style, ends, ends + factor * np.array(residuals)[:, :2], words)
+    return plan(
+        area(NOISE.key, BAND, *circles.T),
+        shafts,
+        marks(LegendItem("", "end", QUIET), 3, *ends.T, hover="%{text}", words=words),
+        heads,
+        marks(ORIGIN, 7, [0], [0], hover="start"),
+        window=window,
     )
 
 

@@ -25,12 +25,15 @@ from omnibench.discover.result import Candidate, Discovery, Gap, Hidden, Step
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import fixed
 from omnibench.report.style import INK, QUIET, logarithmic, plot, text
+from omnibench.report.traces import coordinates, marks
 
 EvidenceFigure = Callable[[Discovery], FigureGrid | None]
 _CANDIDATES = 8  # shown of each step (chosen)
 _UNCHOSEN = "#b9c0c8"
 _GAINED, _LOST = "#7fb8d8", "#e3a3a3"
 _FLOOR_LEGEND = LegendItem("floor", "floor", FLOOR, "dash")
+_LIMIT = LegendItem("limit", "dot: could be this large (95 %)", AFTER)
+_DETECTABLE = LegendItem("detectable", "diamond: found nearly always from here on", INK, symbol="diamond-open")
 
 
 def candidate_grid(discovery: Discovery) -> FigureGrid | None:
@@ -100,26 +103,28 @@ class _Bar:
 
 def _bars(bars: Sequence[_Bar], x_title: str, room: float) -> go.Figure:
     """A plot of bars from the top down. room: width of the plot as a multiple of the longest bar, for the labels."""
-    traces = [
-        go.Bar(
-            y=[bar.name for bar in bars if bar.key == key],
-            x=[float(f"{bar.high - bar.low:.6g}") for bar in bars if bar.key == key],
-            base=[float(f"{bar.low:.6g}") for bar in bars if bar.key == key],
-            orientation="h",
-            marker={"color": [bar.colour for bar in bars if bar.key == key]},
-            text=[bar.label for bar in bars if bar.key == key],
-            textposition="outside",
-            cliponaxis=False,
-            textfont={"size": 12, "color": INK},
-            legendgroup=key,
-            hovertemplate="%{y}: %{text}<extra></extra>",
+    traces = []
+    for key in dict.fromkeys(bar.key for bar in bars):
+        own = [bar for bar in bars if bar.key == key]
+        traces.append(
+            go.Bar(
+                y=[text(bar.name) for bar in own],
+                x=coordinates([bar.high - bar.low for bar in own]),
+                base=coordinates([bar.low for bar in own]),
+                orientation="h",
+                marker={"color": [bar.colour for bar in own]},
+                text=[bar.label for bar in own],
+                textposition="outside",
+                cliponaxis=False,
+                textfont={"size": 12, "color": INK},
+                legendgroup=key,
+                hovertemplate="%{y}: %{text}<extra></extra>",
+            )
         )
-        for key in dict.fromkeys(bar.key for bar in bars)
-    ]
-    figure = plot(*traces, barmode="overlay", xaxis_title_text=x_title)
+    figure = plot(*traces, barmode="overlay", x_title=x_title)
     figure.update_xaxes(range=[0, room * max(bar.high for bar in bars)])
     figure.update_yaxes(
-        ticks="", tickfont_color=INK, categoryorder="array", categoryarray=[bar.name for bar in reversed(bars)]
+        ticks="", tickfont_color=INK, categoryorder="array", categoryarray=[text(bar.name) for bar in reversed(bars)]
     )
     return figure
 
@@ -221,27 +226,16 @@ def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
     shown = [each for each in reversed(worst_of_each(hidden)) if each.plausible > 0 and each.limit > 0]
     if not shown:
         return None
-    names = [text(f"{each.name}: {each.parameter}") for each in shown]
+    names = [f"{each.name}: {each.parameter}" for each in shown]
     traces = []
-    for key, symbol, colour, attribute, words in (
-        ("limit", "circle", AFTER, "limit", "at most"),
-        ("detectable", "diamond-open", INK, "detectable", "found nearly always from"),
+    for item, values, words in (
+        (_LIMIT, [each.limit for each in shown], "at most"),
+        (_DETECTABLE, [each.detectable for each in shown], "found nearly always from"),
     ):
-        values = [getattr(each, attribute) for each in shown]
-        traces.append(
-            go.Scatter(
-                y=names,
-                x=[float(f"{100 * value / each.plausible:.4g}") for value, each in zip(values, shown, strict=True)],
-                mode="markers",
-                marker={"color": colour, "symbol": symbol, "size": 9, "line": {"width": 1.5}},
-                legendgroup=key,
-                text=[
-                    f"{words} ±{reading(each.unit).words(value, 2)}" for value, each in zip(values, shown, strict=True)
-                ],
-                hovertemplate="%{y}<br>%{text}<extra></extra>",
-            )
-        )
-    figure = plot(*traces, xaxis_title_text="% of the plausible range")
+        shares = [100 * value / each.plausible for value, each in zip(values, shown, strict=True)]
+        sizes = [f"{words} ±{reading(each.unit).words(value, 2)}" for value, each in zip(values, shown, strict=True)]
+        traces.append(marks(item, 9, shares, names, hover="%{y}<br>%{text}", words=sizes, marker_line_width=1.5))
+    figure = plot(*traces, x_title="% of the plausible range")
     shares = [100 * value / each.plausible for each in shown for value in (each.limit, each.detectable)]
     logarithmic(figure, "x", min([*shares, 50.0]), max([*shares, 200.0]))
     figure.add_vline(x=100, line={"color": QUIET, "width": 1.2, "dash": "dot"})
@@ -255,10 +249,7 @@ def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
                 90 + 26 * len(shown),
             ),
         ),
-        (
-            LegendItem("limit", "dot: could be this large (95 %)", AFTER),
-            LegendItem("detectable", "diamond: found nearly always from here on", INK),
-        ),
+        (_LIMIT, _DETECTABLE),
         1,
         "Each effect is shown by the parameter that could be largest. The dotted line is the end of the plausible "
         "range, 100 %. Of an effect whose dot is left of it, the data tell more than what is plausible anyway; an "
@@ -269,10 +260,10 @@ def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
 def _folded(name: str) -> str:
     """A long name on two lines."""
     if len(name) < 16 or "_" not in name:
-        return text(name)
+        return name
     cuts = [index for index, letter in enumerate(name) if letter == "_"]
     cut = min(cuts, key=lambda index: abs(index - len(name) / 2))
-    return f"{text(name[: cut + 1])}<br>{text(name[cut + 1 :])}"
+    return f"{name[: cut + 1]}\n{name[cut + 1 :]}"
 
 
 def _exponent(value: float) -> int:

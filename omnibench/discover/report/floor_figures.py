@@ -10,17 +10,19 @@ import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
 
-from omnibench.discover.report.before_after import ModelStyle, numbers, round_down
-from omnibench.discover.report.motion_figures import MODES, CovariateFigure, fit_modes
-from omnibench.discover.report.residuals import CIRCLE_95, Residuals
+from omnibench.discover.report.before_after import Curve, ModelStyle
+from omnibench.discover.report.motion_figures import MODES, CovariateFigure, motion_panels
+from omnibench.discover.report.residuals import CIRCLE_95, NORMAL_95, Residuals
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
-from omnibench.report.style import equal_aspect, plot, text
+from omnibench.report.numbers import round_down
+from omnibench.report.style import plan
+from omnibench.report.traces import arrows, coordinates
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
 _CELLS = 8  # along the longer side (chosen)
 _LEAST = 0.003  # share of the samples; a cell with fewer is left out (chosen)
-_INSIDE = "#c3c9d0"
+_INSIDE = LegendItem("inside", "within the noise", "#c3c9d0")
 _SCALE = 6.0  # standard errors at the ends of the colour scale (chosen)
 
 # By cell: mean residual (3,) in m, m, rad, standard error of its x and y (m), number of runs.
@@ -98,7 +100,7 @@ def arrow_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid
     )
     return FigureGrid(
         figures,
-        (*(style.legend for style in styles), LegendItem("inside", "within the noise", _INSIDE)),
+        (*styles, _INSIDE),
         2,
         f"Mean pose residual of the runs that cross a cell, enlarged {factor:g} times, in the frame of the reference; "
         "grey where noise alone would do as much once in 20 times.",
@@ -135,41 +137,14 @@ def _arrows(means: _Means, style: ModelStyle, cells: _Cells, factor: float, wind
         ]
         if not chosen:
             continue
-        colour, key = (style.colour, style.key) if outside else (_INSIDE, "inside")
         starts = np.array([centre for centre, _, _ in chosen])
         tips = starts + factor * np.array([mean[:2] for _, mean, _ in chosen])
-        gaps = np.full(len(chosen), np.nan)
         words = [
             f"{1e3 * np.hypot(*mean[:2]):.1f} mm, {math.degrees(mean[2]):.2f}°, {plural(runs, 'run')}".replace("-", "−")
             for _, mean, runs in chosen
         ]
-        traces.append(
-            go.Scatter(
-                x=numbers(np.column_stack([starts[:, 0], tips[:, 0], gaps]).ravel()),
-                y=numbers(np.column_stack([starts[:, 1], tips[:, 1], gaps]).ravel()),
-                mode="lines",
-                line={"color": colour, "width": 2},
-                legendgroup=key,
-                hoverinfo="skip",
-            )
-        )
-        pointing = 90.0 - np.degrees(np.arctan2(*(tips - starts).T[::-1]))
-        traces.append(
-            go.Scatter(
-                x=numbers(tips[:, 0]),
-                y=numbers(tips[:, 1]),
-                mode="markers",
-                marker={"color": colour, "size": 9, "symbol": "triangle-up", "angle": numbers(pointing)},
-                legendgroup=key,
-                text=[text(each) for each in words],
-                hovertemplate="%{text}<extra></extra>",
-            )
-        )
-    figure = plot(*traces, xaxis_title_text="x (m)", yaxis_title_text="y (m)")
-    figure.update_xaxes(range=numbers(window[0]))
-    figure.update_yaxes(range=numbers(window[1]))
-    equal_aspect(figure)
-    return figure
+        traces += arrows(style if outside else _INSIDE, starts, tips, words)
+    return plan(*traces, window=window)
 
 
 def motion_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
@@ -184,17 +159,16 @@ def motion_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGri
     if len(chosen) < 3:
         return None
     bins = (where[:, None] == chosen).astype(float)
-    fitted = fit_modes(residuals, bins)
+    panels = motion_panels(residuals, styles, bins, chosen.astype(float), "", "the floor")
     figures = []
-    for style in styles:
-        values, errors = fitted.values[:, style.index], fitted.errors[:, style.index]
-        for index, (name, factor, unit) in enumerate(MODES):
-            part = slice(index * len(chosen), (index + 1) * len(chosen))
-            if np.isfinite(errors[part]).any():
+    for index, style in enumerate(styles):
+        for panel, (name, _, unit) in zip(panels, MODES, strict=True):
+            curve = panel.curves[index]
+            if np.isfinite(curve.half_width).any():
                 figures.append(
                     Figure(
                         f"Error {name}, {style.label}",
-                        _map(cells, chosen, factor * values[part], factor * errors[part], unit),
+                        _map(cells, chosen, curve, unit),
                         f"Error {name} of the motion in each cell of the floor, in standard errors, {style.label}",
                         270,
                     )
@@ -206,37 +180,30 @@ def motion_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGri
     return FigureGrid(tuple(figures), (), 3, caption) if figures else None
 
 
-def _map(cells: _Cells, chosen: NDArray[np.intp], values: Array, errors: Array, unit: str) -> go.Figure:
-    columns, rows = cells.shape
-    scores = np.full(columns * rows, np.nan)
-    scores[chosen] = values / errors
-    words = np.full(columns * rows, "", dtype=object)
-    words[chosen] = [
-        f"{value:.3g} ± {1.96 * error:.2g} {unit}".replace("-", "−")
-        for value, error in zip(values, errors, strict=True)
+def _map(cells: _Cells, chosen: NDArray[np.intp], curve: Curve, unit: str) -> go.Figure:
+    scores = np.full(cells.shape, np.nan)
+    scores.flat[chosen] = curve.values / (curve.half_width / NORMAL_95)
+    words = np.full(cells.shape, "", dtype=object)
+    words.flat[chosen] = [
+        f"{value:.3g} ± {half:.2g} {unit}".replace("-", "−")
+        for value, half in zip(curve.values, curve.half_width, strict=True)
     ]
-    table = [[numbers(np.array([scores[c * rows + r]]))[0] for c in range(columns)] for r in range(rows)]
-    middles = [(edges[1:] + edges[:-1]) / 2 for edges in cells.edges]
-    figure = plot(
+    x, y = ((edges[1:] + edges[:-1]) / 2 for edges in cells.edges)
+    figure = plan(
         go.Heatmap(
-            x=numbers(middles[0]),
-            y=numbers(middles[1]),
-            z=table,
+            x=coordinates(x),
+            y=coordinates(y),
+            z=[coordinates(row) for row in scores.T],
             zmin=-_SCALE,
             zmax=_SCALE,
             colorscale=[[0.0, "#0072b2"], [0.5, "#f3f4f6"], [1.0, "#d97706"]],
             colorbar={"thickness": 10, "tickvals": [-6, -4, -2, 0, 2, 4, 6], "outlinewidth": 0, "x": 1.01, "len": 0.8},
-            text=[[str(words[c * rows + r]) for c in range(columns)] for r in range(rows)],
+            text=words.T.tolist(),
             hovertemplate="%{text}<extra></extra>",
             hoverongaps=False,
-        ),
-        xaxis_title_text="x (m)",
-        yaxis_title_text="y (m)",
+        )
     )
-    equal_aspect(figure)
-    figure.update_xaxes(constrain="domain")
-    figure.update_yaxes(constrain="domain")
-    return figure
+    return figure.update_layout(xaxis_constrain="domain", yaxis_constrain="domain")
 
 
 # Figures over each covariate: a figure that is added here is shown.

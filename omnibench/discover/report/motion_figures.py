@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omnibench.discover.report.before_after import Curve, ModelStyle, Panel, drawn, legend
 from omnibench.discover.report.residuals import CIRCLE_95, NORMAL_95, Fitted, Residuals, shares
@@ -30,23 +31,6 @@ MODES = (
 )
 
 
-def fit_modes(residuals: Residuals, bins: Array) -> Fitted:
-    """Fit of the error along the path, across it and in turning, constant in each bin: 3 B values, mode by mode.
-
-    bins (F, B): the share of each sample in each bin.
-    """
-    paths = residuals.paths
-    twists = paths.signals.twists
-    nothing = np.zeros(len(twists))
-    moving = (np.abs(paths.signals.rates) > _STILL).any(axis=1).astype(float)
-    directions = (
-        np.column_stack([twists[:, :2], nothing]),
-        np.column_stack([-twists[:, 1], twists[:, 0], nothing]),
-        np.column_stack([nothing, nothing, moving]),
-    )
-    return residuals.fit(np.concatenate([paths.of_twist(each, bins) for each in directions], axis=2))
-
-
 def motion_panels(
     residuals: Residuals,
     styles: Sequence[ModelStyle],
@@ -57,23 +41,59 @@ def motion_panels(
     words: tuple[str, ...] = (),
     ticks: float | None = None,
 ) -> list[Panel]:
-    """Three panels: the error along the path, across it and in turning, in each bin.
+    """Three panels: the error along the path, across it and in turning, constant in each bin.
 
     bins (F, B): the share of each sample in each bin. x (B,): the position at which a bin is drawn.
     """
-    count = bins.shape[1]
-    fitted = fit_modes(residuals, bins)
-    panels = []
-    for index, (name, factor, unit) in enumerate(MODES):
-        part = slice(index * count, (index + 1) * count)
-        panel = _panel(fitted, part, factor, styles, x, f"Error {name}, over {over}", x_title, f"error ({unit})", unit)
-        if not panel.empty:
-            panels.append(replace(panel, words=words, ticks=ticks))
+    paths = residuals.paths
+    twists = paths.signals.twists
+    nothing = np.zeros(len(twists))
+    moving = (np.abs(paths.signals.rates) > _STILL).any(axis=1).astype(float)
+    directions = (
+        np.column_stack([twists[:, :2], nothing]),
+        np.column_stack([-twists[:, 1], twists[:, 0], nothing]),
+        np.column_stack([nothing, nothing, moving]),
+    )
+    parts = []
+    for direction, (name, factor, unit) in zip(directions, MODES, strict=True):
+        title, y_title = f"Error {name}, over {over}", f"error ({unit})"
+        panel = Panel(title, x, (), x_title, y_title, unit, words=words, ticks=ticks)
+        parts.append((paths.of_twist(direction, bins), factor, panel))
+    return fitted_panels(residuals, styles, parts)
+
+
+def fitted_panels(
+    residuals: Residuals, styles: Sequence[ModelStyle], parts: Sequence[tuple[Array, float, Panel]]
+) -> list[Panel]:
+    """Panels with the curves of one fit.
+
+    parts: for each panel its columns (S, 3, B), as for ``Residuals.fit``, the factor from SI to its unit, and the panel
+    without curves.
+    """
+    if not parts:
+        return []
+    fitted = residuals.fit(np.concatenate([columns for columns, _, _ in parts], axis=2))
+    panels, first = [], 0
+    for columns, factor, panel in parts:
+        part = slice(first, first + columns.shape[2])
+        panels.append(replace(panel, curves=fitted_curves(fitted, styles, factor, part)))
+        first = part.stop
     return panels
 
 
+def fitted_curves(
+    fitted: Fitted, styles: Sequence[ModelStyle], factor: float, part: slice = slice(None)
+) -> tuple[Curve, ...]:
+    """Curves of a part of the fitted values, with their 95 % bands. factor: from SI to the unit that is drawn."""
+    return tuple(
+        Curve(style, factor * fitted.values[part, style.index], NORMAL_95 * factor * fitted.errors[part, style.index])
+        for style in styles
+    )
+
+
 def grid(panels: Sequence[Panel], styles: Sequence[ModelStyle], caption: str = "") -> FigureGrid | None:
-    """Panels side by side, those of the same unit with the same scale; None without panels."""
+    """Panels on which the data say something, side by side, those of the same unit on one scale; None without any."""
+    panels = [panel for panel in panels if not panel.empty]
     figures: list[Figure | None] = [None] * len(panels)
     for unit in dict.fromkeys(panel.unit for panel in panels):
         own = [index for index, panel in enumerate(panels) if panel.unit == unit]
@@ -100,8 +120,8 @@ def heading_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGr
     ):
         wrapped = (np.degrees(angle) + 180) % 360 - 180
         edges = np.linspace(-180, 180, _BINS + 1)
-        bins = _filled(shares(wrapped, edges) * chosen[:, None])
-        if bins.any(axis=0).sum() >= 3:
+        bins = _binned(wrapped, edges, chosen)
+        if bins is not None:
             panels += motion_panels(residuals, styles, bins, _middles(edges), title, over, ticks=90)
     return grid(panels, styles, "Heading and direction of travel are those of the reference's frame.")
 
@@ -109,33 +129,19 @@ def heading_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGr
 def wheel_rate_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
     """The error of each wheel's rim speed over its rate."""
     paths = residuals.paths
-    rates = paths.signals.rates
-    columns, centres, names = [], [], []
-    for wheel in range(rates.shape[1]):
-        own = rates[:, wheel]
-        top = float(np.quantile(np.abs(own), 0.998))
+    parts = []
+    for index, wheel in enumerate(paths.robot.wheels):
+        rates = np.abs(paths.signals.rates[:, index])
+        top = float(np.quantile(rates, 0.998))
         if top < _STILL:
             continue
         edges = np.linspace(-top * 1.001, top * 1.001, _BINS + 1)
-        bins = _filled(shares(own, edges) * (np.abs(own) > _STILL)[:, None])
-        if bins.any(axis=0).sum() >= 3:
-            columns.append(paths.of_wheel(wheel, bins))
-            centres.append(_middles(edges))
-            names.append(wheel)
-    if not columns:
-        return None
-    fitted = residuals.fit(np.concatenate(columns, axis=2))
-    panels, first = [], 0
-    for wheel, middles in zip(names, centres, strict=True):
-        part = slice(first, first + len(middles))
-        first += len(middles)
-        factor = 1e3 * paths.robot.wheels[wheel].radius
-        title = f"Wheel {paths.robot.wheels[wheel].name}"
-        panel = _panel(
-            fitted, part, factor, styles, middles, title, "wheel rate (rad/s)", "error (mm/s at the rim)", "mm/s"
-        )
-        panels.append(panel)
-    return grid([each for each in panels if not each.empty], styles)
+        bins = _binned(paths.signals.rates[:, index], edges, rates > _STILL)
+        if bins is not None:
+            title = f"Wheel {wheel.name}"
+            panel = Panel(title, _middles(edges), (), "wheel rate (rad/s)", "error (mm/s at the rim)", "mm/s")
+            parts.append((paths.of_wheel(index, bins), 1e3 * wheel.radius, panel))
+    return grid(fitted_panels(residuals, styles, parts), styles)
 
 
 def wheel_angle_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
@@ -146,58 +152,42 @@ def wheel_angle_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> Figu
         return None
     spectrum = _spectrum_panels(residuals, styles, angles)
     strongest = _strongest(spectrum)
-    columns = []
-    edges = np.linspace(0, 360, _BINS + 1)
-    for wheel in range(rates.shape[1]):
-        turned = np.degrees(strongest * angles[:, wheel]) % 360
-        columns.append(paths.of_wheel(wheel, shares(turned, edges) * rates[:, [wheel]]))
-    fitted = residuals.fit(np.concatenate(columns, axis=2))
     times = "" if strongest == 1 else f"{strongest:g} × "
-    panels = []
-    for wheel, each in enumerate(paths.robot.wheels):
-        panel = _panel(
-            fitted, slice(wheel * _BINS, (wheel + 1) * _BINS), 100.0, styles, _middles(edges),
-            f"Wheel {each.name}, over its angle", f"{times}wheel angle (°)", "error of the rate (%)", "%",
-        )  # fmt: skip
-        panels.append(replace(panel, ticks=90))
-    panels = [each for each in [*spectrum, *panels] if not each.empty]
+    edges = np.linspace(0, 360, _BINS + 1)
+    parts = []
+    for index, wheel in enumerate(paths.robot.wheels):
+        turned = np.degrees(strongest * angles[:, index]) % 360
+        title, x_title = f"Wheel {wheel.name}, over its angle", f"{times}wheel angle (°)"
+        panel = Panel(title, _middles(edges), (), x_title, "error of the rate (%)", "%", ticks=90)
+        parts.append((paths.of_wheel(index, shares(turned, edges) * rates[:, [index]]), 100.0, panel))
     over = "the angle itself" if strongest == 1 else f"{strongest:g} times the angle, the harmonic that stands out most"
     caption = f"Top: the amplitude of each harmonic, fitted alone. Below: over {over}."
-    return grid(panels, styles, caption)
+    return grid([*spectrum, *fitted_panels(residuals, styles, parts)], styles, caption)
 
 
 def acceleration_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:
     """The error of each component of the twist over its own acceleration."""
     paths = residuals.paths
-    accelerations = paths.signals.accelerations
-    columns, centres, kinds = [], [], []
-    for axis in range(3):
-        own = accelerations[:, axis]
-        top = float(np.quantile(np.abs(own), 0.995))
+    degrees = math.degrees(1.0)
+    parts = []
+    for axis, (title, factor, unit, x_factor, x_unit) in enumerate(
+        (
+            ("Forward", 1e3, "mm/s", 1.0, "m/s²"),
+            ("To the left", 1e3, "mm/s", 1.0, "m/s²"),
+            ("In turning", degrees, "°/s", degrees, "°/s²"),
+        )
+    ):
+        accelerations = paths.signals.accelerations[:, axis]
+        top = float(np.quantile(np.abs(accelerations), 0.995))
         if top < 1e-3:
             continue
         edges = np.linspace(-top, top, 10)
-        bins = _filled(shares(own, edges), 5e-4)
-        if bins.any(axis=0).sum() >= 3:
-            columns.append(paths.of_twist(np.tile(np.eye(3)[axis], (len(own), 1)), bins))
-            centres.append(_middles(edges))
-            kinds.append(axis)
-    if not columns:
-        return None
-    fitted = residuals.fit(np.concatenate(columns, axis=2))
-    panels, first = [], 0
-    for axis, middles in zip(kinds, centres, strict=True):
-        part = slice(first, first + len(middles))
-        first += len(middles)
-        name = ("Forward", "To the left", "In turning")[axis]
-        factor, unit, x_factor, x_unit = (
-            (1e3, "mm/s", 1.0, "m/s²") if axis < 2 else (math.degrees(1.0), "°/s", math.degrees(1.0), "°/s²")
-        )
-        panel = _panel(
-            fitted, part, factor, styles, x_factor * middles, name, f"acceleration ({x_unit})", f"error ({unit})", unit
-        )
-        panels.append(panel)
-    return grid([each for each in panels if not each.empty], styles)
+        bins = _binned(accelerations, edges, least=5e-4)
+        if bins is not None:
+            x_title, y_title = f"acceleration ({x_unit})", f"error ({unit})"
+            panel = Panel(title, x_factor * _middles(edges), (), x_title, y_title, unit)
+            parts.append((paths.of_twist(np.tile(np.eye(3)[axis], (len(accelerations), 1)), bins), factor, panel))
+    return grid(fitted_panels(residuals, styles, parts), styles)
 
 
 def _spectrum_panels(residuals: Residuals, styles: Sequence[ModelStyle], angles: Array) -> list[Panel]:
@@ -240,20 +230,16 @@ def _strongest(spectrum: Sequence[Panel]) -> float:
     return float(_HARMONICS[int(together.argmax())]) if together.max() > 1 else 1.0
 
 
-def _panel(
-    fitted: Fitted, part: slice, factor: float, styles: Sequence[ModelStyle], x: Array, title: str, x_title: str,
-    y_title: str, unit: str,
-) -> Panel:  # fmt: skip
-    curves = tuple(
-        Curve(style, factor * fitted.values[part, style.index], NORMAL_95 * factor * fitted.errors[part, style.index])
-        for style in styles
-    )
-    return Panel(title, x, curves, x_title, y_title, unit)
+def _binned(
+    values: Array, edges: Array, chosen: NDArray[np.bool_] | None = None, least: float = _LEAST
+) -> Array | None:
+    """Membership (F, B) of the chosen values (F,) in bins; None unless three or more bins hold some.
 
-
-def _filled(bins: Array, least: float = _LEAST) -> Array:
-    """Bins (F, B) with those set to 0 that hold hardly any samples: nothing is fitted there."""
-    return bins * (bins.mean(axis=0) > least)
+    least: share of the samples; a bin with fewer stays empty, so that nothing is fitted there.
+    """
+    bins = shares(values, edges) * (1.0 if chosen is None else chosen[:, None])
+    bins = bins * (bins.mean(axis=0) > least)
+    return bins if bins.any(axis=0).sum() >= 3 else None
 
 
 def _middles(edges: Array) -> Array:

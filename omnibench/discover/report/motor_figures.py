@@ -18,8 +18,8 @@ from omnibench.robot.kinematics import Array
 
 _BINS = 12
 _START = 2.0  # s from the start of a run in which motors settle (chosen)
-_MEASURED = ModelStyle(0, "before", "measured − target", BEFORE)
-_EXPECTED = ModelStyle(1, "after", "measured − expected with the effects", AFTER)
+_MEASURED = ModelStyle("before", "measured − target", BEFORE)
+_EXPECTED = ModelStyle("after", "measured − expected with the effects", AFTER, index=1)
 
 
 def motor_grid(discovery: Discovery, runs: Sequence[Trajectory]) -> FigureGrid | None:
@@ -50,7 +50,7 @@ def motor_grid(discovery: Discovery, runs: Sequence[Trajectory]) -> FigureGrid |
         _panel("All wheels, at the start of the runs", edges, curves, "time since the start (s)", "% of the target")
     )
     return grid(
-        [panel for panel in panels if not panel.empty],
+        panels,
         [style for style, _ in errors],
         "Mean over the runs; the bands hold 95 % of what the scatter of the runs does to the mean.",
     )

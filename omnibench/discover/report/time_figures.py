@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,8 +11,8 @@ import numpy as np
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.paths import Paths
 from omnibench.discover.report.before_after import Curve, ModelStyle, Panel
-from omnibench.discover.report.motion_figures import CovariateFigure, grid, motion_panels
-from omnibench.discover.report.residuals import NORMAL_95, Fitted, Residuals
+from omnibench.discover.report.motion_figures import CovariateFigure, fitted_curves, fitted_panels, grid, motion_panels
+from omnibench.discover.report.residuals import NORMAL_95, Residuals
 from omnibench.report.blocks import FigureGrid
 from omnibench.report.numbers import fixed
 from omnibench.robot.kinematics import Array
@@ -86,33 +85,34 @@ def stamps_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGri
     velocity = _velocities(paths)
     if np.abs(velocity).max() < 1e-6:
         return None
-    panels = []
     stamp_numbers = residuals.stamp_numbers
     width = max(1, math.ceil((int(stamp_numbers.max()) + 1) / _STAMPS))
     bins = (stamp_numbers // width)[:, None] == np.arange(int(stamp_numbers.max()) // width + 1)
     bins = bins[:, bins.mean(axis=0) > 1e-3]
+    x = np.array([paths.stamps[chosen].mean() for chosen in bins.T])
+    panels = []
     for name, part in (("pose", [1.0, 1.0, 1.0]), ("heading alone", [0.0, 0.0, 1.0])):
-        columns = -(velocity * part)[:, :, None] * bins[:, None, :]
-        x = np.array([paths.stamps[chosen].mean() for chosen in bins.T])
         title = f"Delay of the reference's {name}, over the stamps of a run"
-        panels.append(_delays(title, x, residuals.fit(columns), styles, "stamp (s)"))
-    title = "Delay of the reference's pose, run by run"
-    numbers = np.arange(1.0, len(residuals.runs) + 1)
-    by_run = _delays(title, numbers, residuals.fit_runs(-velocity[:, :, None]), styles, "run, in the order driven")
-    panels.append(replace(by_run, lines=False, words=tuple(run.id for run in residuals.runs)))
+        panel = Panel(title, x, (), "stamp (s)", "apparent delay (ms)", "ms")
+        columns = -(velocity * part)[:, :, None] * bins[:, None, :]
+        panels += fitted_panels(residuals, styles, [(columns, 1e3, panel)])
+    panels.append(
+        Panel(
+            "Delay of the reference's pose, run by run",
+            np.arange(1.0, len(residuals.runs) + 1),
+            fitted_curves(residuals.fit_runs(-velocity[:, :, None]), styles, 1e3),
+            "run, in the order driven",
+            "apparent delay (ms)",
+            "ms",
+            lines=False,
+            words=tuple(run.id for run in residuals.runs),
+        )
+    )
     return grid(
-        [panel for panel in panels if not panel.empty],
+        panels,
         styles,
         "By how much earlier than its stamp a pose would have to be taken to explain the residuals best.",
     )
-
-
-def _delays(title: str, x: Array, fitted: Fitted, styles: Sequence[ModelStyle], x_title: str) -> Panel:
-    curves = tuple(
-        Curve(style, 1e3 * fitted.values[:, style.index], NORMAL_95 * 1e3 * fitted.errors[:, style.index])
-        for style in styles
-    )
-    return Panel(title, x, curves, x_title, "apparent delay (ms)", "ms")
 
 
 def _turning(run: Trajectory) -> str:

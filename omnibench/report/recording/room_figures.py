@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -12,7 +11,7 @@ import plotly.graph_objects as go
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.true_poses import TruePath
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
-from omnibench.report.numbers import count
+from omnibench.report.numbers import count, round_down
 from omnibench.report.recording.drawing import (
     COVARIANCE_ITEM,
     ODOMETRY_ITEM,
@@ -20,12 +19,10 @@ from omnibench.report.recording.drawing import (
     REFERENCE_ITEM,
     SCANS_ITEM,
     TRUTH_ITEM,
-    joined,
-    path_line,
-    scatter,
 )
 from omnibench.report.recording.scan_points import evenly, scan_points, thinned
-from omnibench.report.style import INK, equal_aspect, plot
+from omnibench.report.style import plan
+from omnibench.report.traces import START, joined, line, marks, path
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.words import plural
@@ -47,8 +44,7 @@ def all_runs(dataset: Dataset, shown: Trajectory, outlines: Sequence[Array]) -> 
     """
     runs = [dataset.trajectories[index] for index in evenly(len(dataset.trajectories), _RUNS)]
     flower = joined([_from_start(run, _thin(run.poses)) for run in runs])
-    plain = {"hoverinfo": "skip", "hovertemplate": None}
-    paths = [path_line(REFERENCE_ITEM, flower, 1.0, opacity=0.75, **plain), _start(np.zeros(2))]
+    paths = [line(REFERENCE_ITEM, 1.0, *flower.T, opacity=0.75), _start(np.zeros(2))]
     number = plural(len(dataset.trajectories), "run")
     close = Figure(f"{number} from one start", _map(paths), "Reference paths of all runs from one start, close up", 500)
     words = "Each run is moved to begin at the origin along x."
@@ -60,7 +56,7 @@ def all_runs(dataset: Dataset, shown: Trajectory, outlines: Sequence[Array]) -> 
     points = _from_start(shown, thinned(run_points(dataset, shown), _POINTS))
     room = Figure(
         f"The runs in the room that {shown.id} saw",
-        _map([*_plan(outlines), scatter(SCANS_ITEM, points, 2.5, opacity=0.6), *paths]),
+        _map([*_plan(outlines), marks(SCANS_ITEM, 2.5, *points.T, opacity=0.6), *paths]),
         "Reference paths of all runs with the points that the scans of one have seen, x and y in metres",
         500,
     )
@@ -77,13 +73,13 @@ def one_run(
     end = trajectory.pose_times[-1]
     (driven,) = odometry.poses([trajectory.log(np.linspace(0.0, end, _PATH))])
     lines = [
-        path_line(REFERENCE_ITEM, _thin(trajectory.poses), 2.6),
-        path_line(ODOMETRY_ITEM, driven, 1.8),
+        path(REFERENCE_ITEM, _thin(trajectory.poses), 2.6),
+        path(ODOMETRY_ITEM, driven, 1.8),
     ]
     items = [REFERENCE_ITEM, ODOMETRY_ITEM]
     if truth is not None:
         true_poses = in_frame_of(trajectory.start, truth.poses)
-        lines.append(path_line(TRUTH_ITEM, _thin(true_poses), 1.6))
+        lines.append(path(TRUTH_ITEM, _thin(true_poses), 1.6))
         items.append(TRUTH_ITEM)
     ellipses, words = _ellipses(trajectory, driven)
     items += [COVARIANCE_ITEM] if ellipses else []
@@ -91,14 +87,11 @@ def one_run(
     if dataset.scans is not None and trajectory.id in dataset.scans.trajectories:
         points = thinned(run_points(dataset, trajectory), _POINTS)
         room = _plan(outlines)
-        room += [scatter(SCANS_ITEM, points, 2.5, opacity=0.7), *lines, _start(trajectory.start)]
+        room += [marks(SCANS_ITEM, 2.5, *points.T, opacity=0.7), *lines, _start(trajectory.start)]
         description = "Scan points of the run placed at its reference poses, with its paths, x and y in metres"
         figures.append(Figure("In its room", _map(room), description, 460))
-    poses = [
-        scatter(REFERENCE_ITEM, trajectory.poses[evenly(len(trajectory.poses), 100)], 5),
-        *ellipses,
-        _start(trajectory.start),
-    ]
+    picks = evenly(len(trajectory.poses), 100)
+    poses = [marks(REFERENCE_ITEM, 5, *trajectory.poses[picks, :2].T), *ellipses, _start(trajectory.start)]
     figures.append(
         Figure("Close up", _map([*lines, *poses]), "The run's paths close up, with covariance ellipses", 460)
     )
@@ -137,27 +130,19 @@ def _ellipses(trajectory: Trajectory, driven: Array) -> tuple[list[go.Scatter], 
     if not largest > 0 or not math.isfinite(largest):
         return [], ""
     extent = float(np.ptp(np.vstack([trajectory.poses[:, :2], driven[:, :2]]), axis=0).max())
-    factor = _round_below(_SHOWN_AS * max(extent, 0.1) / largest)
+    factor = round_down(max(1.0, _SHOWN_AS * max(extent, 0.1) / largest))
     angle = np.linspace(0.0, 2 * math.pi, 41)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     shapes = [
         trajectory.poses[index, :2] + factor * (circle * axes) @ frame.T
         for index, axes, frame in zip(picks, half_axes, vectors, strict=True)
     ]
-    trace = path_line(COVARIANCE_ITEM, joined(shapes), 1.4, hoverinfo="skip", hovertemplate=None)
+    trace = line(COVARIANCE_ITEM, 1.4, *joined(shapes).T)
     size = "as they are" if factor == 1 else f"drawn {count(factor)} times as large"
     return [trace], (
         f"Ellipses: 95 % of the position by the reference's covariance, {size}; the largest half axis is "
         f"{1e3 * largest:.3g} mm."
     )
-
-
-def _round_below(factor: float) -> float:
-    """``factor`` rounded down to 1, 2 or 5 times a power of ten, at least 1."""
-    if factor <= 1:
-        return 1.0
-    power = 10.0 ** math.floor(math.log10(factor))
-    return max(step for step in (1, 2, 5) if step * power <= factor * (1 + 1e-9)) * power
 
 
 def _from_start(trajectory: Trajectory, points: Array) -> Array:
@@ -174,9 +159,7 @@ def _thin(poses: Array) -> Array:
 
 
 def _plan(outlines: Sequence[Array]) -> list[go.Scatter]:
-    if not outlines:
-        return []
-    return [path_line(PLAN_ITEM, joined(list(outlines)), 1.5, hoverinfo="skip", hovertemplate=None)]
+    return [line(PLAN_ITEM, 1.5, *joined(outlines).T)] if outlines else []
 
 
 def _room_items(dataset: Dataset, outlines: Sequence[Array]) -> list[LegendItem]:
@@ -184,26 +167,12 @@ def _room_items(dataset: Dataset, outlines: Sequence[Array]) -> list[LegendItem]
 
 
 def _start(position: Array) -> go.Scatter:
-    return go.Scatter(
-        x=[float(position[0])],
-        y=[float(position[1])],
-        mode="markers",
-        marker={"symbol": "circle-open", "size": 9, "color": INK, "line": {"width": 2}},
-        hovertemplate="start<extra></extra>",
-    )
+    return marks(START, 9, position[:1], position[1:2], hover="start")
 
 
 def _map(traces: Sequence[go.Scatter]) -> go.Figure:
-    figure = plot(*traces, xaxis_title_text="x (m)", yaxis_title_text="y (m)")
-    equal_aspect(figure)
-    figure.update_xaxes(range=_framed([trace.x for trace in traces]))
-    figure.update_yaxes(range=_framed([trace.y for trace in traces]))
-    return figure
-
-
-def _framed(columns: Sequence[Any]) -> list[float]:
-    """The range of an axis: least to greatest value with a margin, so that no line runs along the frame."""
-    values = np.concatenate([np.asarray(column, dtype=float) for column in columns])
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    margin = max(0.05 * (high - low), 0.05)  # m
-    return [low - margin, high + margin]
+    """A plan of the traces with a margin, so that no line runs along the frame."""
+    columns = [np.concatenate([np.asarray(getattr(each, axis), float) for each in traces]) for axis in "xy"]
+    window = np.array([[np.nanmin(values), np.nanmax(values)] for values in columns])
+    margin = np.maximum(0.05 * np.ptp(window, axis=1, keepdims=True), 0.05)  # m
+    return plan(*traces, window=window + margin * [-1, 1])

@@ -11,9 +11,9 @@ from omnibench.data.dataset import Dataset
 from omnibench.data.true_poses import TruePath
 from omnibench.report.blocks import Block, Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import count, significant
-from omnibench.report.recording.drawing import joined, short
 from omnibench.report.recording.scan_points import evenly
 from omnibench.report.style import INK, PALETTE, QUIET, plot
+from omnibench.report.traces import coordinates, joined, line
 from omnibench.robot.kinematics import Array
 from omnibench.slam.accuracy import RunErrors, run_errors
 from omnibench.words import plural
@@ -25,6 +25,7 @@ _LEAST = 5  # poses; a bin with fewer shows no mean (chosen)
 _RUN = LegendItem("run", "a run", "#c3c9d0")
 _MEAN = LegendItem("mean", "mean", PALETTE[0])
 _HIGH = LegendItem("high", "95th percentile", PALETTE[2], "dash")
+_EXPECTED = LegendItem("", "expected", INK)
 
 
 def error_figures(dataset: Dataset, truth: Mapping[str, TruePath]) -> tuple[Block, ...]:
@@ -58,19 +59,11 @@ def _nees_figures(errors: Sequence[RunErrors]) -> tuple[Block, ...]:
     heights, _ = np.histogram(values, edges)
     share = heights / len(values) / np.diff(edges)
     x = np.linspace(0.0, limit, 200)
-    bars = go.Bar(
-        x=short((edges[:-1] + edges[1:]) / 2, 3),
-        y=short(share, 4),
-        width=float(edges[1] - edges[0]),
-        marker={"color": PALETTE[0], "opacity": 0.6},
-        hovertemplate="%{y:.3f} at %{x:.1f}<extra></extra>",
-    )
-    line = {"color": INK, "width": 2}
+    bars = _bars(edges, share, 0.6, "%{y:.3f} at %{x:.1f}")
     density = np.sqrt(x / (2 * np.pi)) * np.exp(-x / 2)  # chi-squared with three degrees of freedom
-    expected = go.Scatter(x=short(x, 3), y=short(density, 4), mode="lines", line=line, hoverinfo="skip")
     distribution = Figure(
         f"NEES of all poses: mean {significant(float(values.mean()), 3)}",
-        plot(bars, expected, xaxis_title_text="NEES", yaxis_title_text="density"),
+        plot(bars, line(_EXPECTED, 2.0, x, density), x_title="NEES", y_title="density"),
         "Histogram of the normalised squared errors with the density that right covariances give",
         340,
     )
@@ -108,11 +101,11 @@ def _curves(
     bin_of = np.digitize(x, edges) - 1
     bins = [index for index in range(_BINS) if (bin_of == index).sum() >= _LEAST]
     middles = np.array([float(x[bin_of == index].mean()) for index in bins])
-    traces = [_trace(_RUN, lines[:, 0], lines[:, 1], 0.8, 0.6)]
+    traces = [line(_RUN, 0.8, *lines.T, opacity=0.6)]
     for item, statistic in ((_MEAN, np.mean), (_HIGH, lambda v: np.quantile(v, 0.95))):
         level_of = np.array([float(statistic(y[bin_of == index])) for index in bins])
-        traces.append(_trace(item, middles, level_of, 2.4, 1.0))
-    figure = plot(*traces, xaxis_title_text=x_title, yaxis_title_text=y_title)
+        traces.append(line(item, 2.4, middles, level_of, hover=f"{item.label} %{{y:.3g}} at %{{x:.2f}}"))
+    figure = plot(*traces, x_title=x_title, y_title=y_title)
     figure.update_yaxes(rangemode="tozero")
     if level is not None:
         figure.add_hline(level, line={"color": QUIET, "width": 1})
@@ -121,30 +114,21 @@ def _curves(
     return Figure(title, figure, f"{title} of every run, with its mean and 95th percentile", 340)
 
 
-def _trace(item: LegendItem, x: Array, y: Array, width: float, opacity: float) -> go.Scatter:
-    return go.Scatter(
-        x=short(x, 3),
-        y=short(y, 3),
-        mode="lines",
-        opacity=opacity,
-        line={"color": item.colour, "width": width, "dash": item.dash},
-        legendgroup=item.key,
-        hoverinfo="skip" if item is _RUN else "all",
-        hovertemplate=None if item is _RUN else f"{item.label} %{{y:.3g}} at %{{x:.2f}}<extra></extra>",
-    )
-
-
 def _histogram(values: Sequence[float], unit: str, title: str) -> Figure:
     heights, edges = np.histogram(values, bins=min(40, max(8, len(values) // 8)))
-    bars = go.Bar(
-        x=short((edges[:-1] + edges[1:]) / 2, 4),
-        y=heights.tolist(),
-        width=float(edges[1] - edges[0]),
-        marker={"color": PALETTE[0], "opacity": 0.75},
-        hovertemplate=f"%{{y}} runs about %{{x:.3g}} {unit}<extra></extra>",
-    )
+    bars = _bars(edges, heights, 0.75, f"%{{y}} runs about %{{x:.3g}} {unit}")
     mean, high = float(np.mean(values)), float(np.quantile(values, 0.95))
     gap = "" if unit == "°" else " "
     headline = f"{title}: mean {significant(mean, 2)}{gap}{unit}, 95 % below {significant(high, 2)}{gap}{unit}"
-    figure = plot(bars, xaxis_title_text=f"error ({unit})", yaxis_title_text="runs", bargap=0)
+    figure = plot(bars, x_title=f"error ({unit})", y_title="runs", bargap=0)
     return Figure(headline, figure, f"Histogram of {title.lower()} in {unit}", 320)
+
+
+def _bars(edges: Array, heights: Array, opacity: float, hover: str) -> go.Bar:
+    return go.Bar(
+        x=coordinates((edges[:-1] + edges[1:]) / 2),
+        y=coordinates(heights),
+        width=float(edges[1] - edges[0]),
+        marker={"color": PALETTE[0], "opacity": opacity},
+        hovertemplate=f"{hover}<extra></extra>",
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -11,8 +12,8 @@ import plotly.graph_objects as go
 from omnibench.data.dataset import Trajectory
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import decimals_for, fixed, significant
-from omnibench.report.recording.drawing import short
 from omnibench.report.style import INK, PALETTE, plot
+from omnibench.report.traces import line
 from omnibench.robot.kinematics import Array, Robot
 
 _MEAN_OVER = 0.1  # s; also in the legends
@@ -20,6 +21,7 @@ _DRAWN = 2000  # samples drawn at most (chosen: finer than a screen shows)
 _ROW = 150  # px, height of a wheel's row
 _GAP = 0.05  # space between rows, as a share of the plot
 
+_HOVER = "{}<br>%{{y:.3f}} rad/s at %{{x:.2f}} s"
 _MEASURED = LegendItem("measured", "measured", "#a9c9e8")
 _MEAN = LegendItem("mean", "measured, mean over 100 ms", PALETTE[0])
 _TARGET = LegendItem("target", "target", INK, "dash")
@@ -109,22 +111,11 @@ def _blocks(times: Array, values: Array, size: int) -> _Series:
 
 def _steps(item: LegendItem, series: _Series, wheel: int, width: float) -> go.Scatter:
     values = np.append(series.values[:, wheel], series.values[-1, wheel])
-    return _trace(item, series.edges, values, width, "hv")
+    return line(item, width, series.edges, values, hover=_HOVER.format(item.label), line_shape="hv")
 
 
 def _line(item: LegendItem, series: _Series, wheel: int, width: float) -> go.Scatter:
-    return _trace(item, series.middles, series.values[:, wheel], width, "linear")
-
-
-def _trace(item: LegendItem, times: Array, values: Array, width: float, shape: str) -> go.Scatter:
-    return go.Scatter(
-        x=short(times, 4),
-        y=short(values, 4),
-        mode="lines",
-        line={"color": item.colour, "width": width, "dash": item.dash, "shape": shape},
-        legendgroup=item.key,
-        hovertemplate=f"{item.label}<br>%{{y:.3f}} rad/s at %{{x:.2f}} s<extra></extra>",
-    )
+    return line(item, width, series.middles, series.values[:, wheel], hover=_HOVER.format(item.label))
 
 
 def _stacked(
@@ -132,7 +123,7 @@ def _stacked(
 ) -> go.Figure:
     """Plots in rows above each other with a common time axis from 0 to ``end`` s."""
     height = (1 + _GAP) / len(rows) - _GAP
-    layout: dict[str, object] = {}
+    layout: dict[str, Any] = {}
     traces = []
     for index, (row, title) in enumerate(zip(rows, titles, strict=True)):
         number = "" if index == 0 else str(index + 1)

@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 from discovery_samples import held_out, named
 
-from omnibench.discover.report.before_after import round_down
 from omnibench.discover.report.wording import (
     added,
     chance,
@@ -82,11 +81,6 @@ def test_a_step_names_the_effect_it_added() -> None:
 
 def test_noise_that_is_not_there_is_not_told() -> None:
     assert noise_in_words(Noise(pose_position=0.01)) == ("white 10 mm", "none")
-
-
-@pytest.mark.parametrize(("value", "step"), [(7.3, 5), (5.0, 5), (1.0, 1), (0.37, 0.2), (99.0, 50)])
-def test_enlargements_are_round(value: float, step: float) -> None:
-    assert round_down(value) == pytest.approx(step)
 
 
 def test_runs_of_which_none_is_repeated_are_not_called_repetitions() -> None:
