@@ -61,7 +61,7 @@ def calibrate(
     The fit uses the training split of the data set, and never its validation split.
     """
     from omnibench.cli.terminal.calibration_tables import print_calibration
-    from omnibench.cli.terminal.progress_display import EvaluationsBar
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings
     from omnibench.data.storage import load_dataset
     from omnibench.fit.calibrate import calibrate as fit
@@ -75,7 +75,7 @@ def calibrate(
     if output is None and not as_json:
         raise ConfigError("say where the calibration goes: -o calibration.yaml")
     recordings = load_dataset(dataset)
-    with redirect_stdout(sys.stderr), EvaluationsBar(calibrator, evaluations) as watch:
+    with redirect_stdout(sys.stderr), ProgressDisplay() as watch:
         run = fit(
             recordings,
             calibrator,
@@ -157,14 +157,14 @@ def certify(
     Gives a lower bound on the cost of every matrix in the box, on the training split, whatever the optimiser.
     """
     from omnibench.cli.terminal.calibration_tables import print_certificate
-    from omnibench.cli.terminal.progress_display import ProofLine
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.data.storage import load_dataset
     from omnibench.fit.certify import certify_optimum
     from omnibench.robot.calibration import read_calibration
 
     load_given_plugins(plugins)
     recordings = load_dataset(dataset)
-    with ProofLine() as watch:
+    with ProgressDisplay() as watch:
         certified = certify_optimum(
             read_calibration(calibration), recordings, box=box, gap=gap, seconds=seconds, watch=watch
         )

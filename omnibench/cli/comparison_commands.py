@@ -36,16 +36,14 @@ def compare(
     where it was stopped.
     """
     from omnibench.cli.terminal.comparison_tables import print_result
-    from omnibench.cli.terminal.progress_display import Bars, Lines
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.compare.read_config import read_compare_config
     from omnibench.compare.run import run_comparison
 
     comparison = read_compare_config(config, _named_paths(data))
     folders = [*comparison.plugins, *(folder.resolve() for folder in plugins or [])]
     comparison = comparison.model_copy(update={"plugins": tuple(dict.fromkeys(folders))})
-    console = make_console(error=True)
-    watch: Bars | Lines = Bars(console) if console.is_terminal else Lines(console)
-    with watch:
+    with ProgressDisplay() as watch:
         result = run_comparison(comparison, output, watch)
     warn(result.warnings)
     print_result(make_console(), result)

@@ -38,11 +38,12 @@ def discover(
     tells how much smaller the error becomes on runs that were held out.
     """
     from omnibench.cli.terminal.discovery_summary import print_discovery
-    from omnibench.cli.terminal.progress_display import Stages
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.data.storage import load_dataset
     from omnibench.discover.discover import discover_effects
     from omnibench.discover.document import discovery_document
     from omnibench.discover.output import DiscoverOptions, check_output, write_discovery
+    from omnibench.progress import Progress
     from omnibench.registry import effects
     from omnibench.robot.calibration import read_calibration
 
@@ -52,7 +53,7 @@ def discover(
     check_output(output)
     start = None if model is None else read_calibration(model)
     recordings = load_dataset(dataset)
-    with redirect_stdout(sys.stderr), Stages(make_console(error=True)) as watch:
+    with redirect_stdout(sys.stderr), ProgressDisplay() as watch:
         discovery = discover_effects(
             recordings,
             without=tuple(without or ()),
@@ -61,7 +62,7 @@ def discover(
             watch=watch,
             calibration=start,
         )
-        watch.stage("writing the report")
+        watch(Progress("writing the report"))
         options = DiscoverOptions(
             dataset=str(dataset),
             model=None if model is None else str(model),

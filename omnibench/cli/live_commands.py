@@ -88,7 +88,7 @@ def replay(
 ) -> None:
     """Play a recording onto Zenoh, as the robot and its SLAM would."""
     from omnibench.cli.terminal.live_tables import print_played
-    from omnibench.cli.terminal.progress_display import ReplayBar, Steps
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings, validate
     from omnibench.live.network.presence import checked_robot
     from omnibench.live.replay.arrivals import ReplayConfig
@@ -103,13 +103,13 @@ def replay(
     load_given_plugins(plugins)
     chosen = validate(ReplayConfig, {"speed": _speed(speed), **parse_settings(settings)}, "replay")
     noise = None if calibration is None else read_calibration(calibration).noise
-    with Steps(make_console(error=True)) as watch:
+    with ProgressDisplay() as watch:
         recording = load_recording(dataset, watch=watch)
     drive = concatenate_recording(recording, pause=chosen.pause, split=chosen.split)
     with _client(config, connect, profile, "replay") as (session, keys), stop_on_signals() as stop:
         player = Player(GraphNode(session, keys, "replay"), robot, drive, chosen, noise=noise)
-        with ReplayBar(f"{recording.dataset.name} as {robot}") as bar:
-            report = player.play(stop, bar)
+        with ProgressDisplay() as watch:
+            report = player.play(stop, watch)
     print_played(make_console(), report, recording.dataset.simulated)
     if not report.complete:
         raise typer.Exit(130)
@@ -230,7 +230,7 @@ def _run(config: "LiveConfig", seconds: float | None) -> None:
 
 def _replay_to_node(config: "LiveConfig", dataset: Path | None, speed: str | None, file: Path) -> None:
     from omnibench.cli.terminal.live_tables import node_log, print_demonstration
-    from omnibench.cli.terminal.progress_display import ReplayBar, Steps
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import validate
     from omnibench.live.network.access_log import log_refused_access
     from omnibench.live.replay.arrivals import ReplayConfig
@@ -245,15 +245,15 @@ def _replay_to_node(config: "LiveConfig", dataset: Path | None, speed: str | Non
         checked = validate(ReplayConfig, {"speed": _speed(speed)}, "--speed")
         changed = config.replay.model_copy(update={"speed": checked.speed})
         config = config.model_copy(update={"replay": changed})
-    with Steps(make_console(error=True)) as watch:
+    with ProgressDisplay() as watch:
         recording = load_recording(source, watch=watch)
     with (
-        ReplayBar(recording.dataset.name) as bar,
-        node_log(bar.console, warnings_only=True),
+        ProgressDisplay() as watch,
+        node_log(watch.console, warnings_only=True),
         stop_on_signals() as stop,
         log_refused_access(config.zenoh),
     ):
-        shown = demonstrate(config, recording, stop, bar)
+        shown = demonstrate(config, recording, stop, watch)
     print_demonstration(make_console(), shown)
     if not shown.report.complete:
         raise typer.Exit(130)

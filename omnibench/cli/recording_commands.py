@@ -147,9 +147,10 @@ def slam(
 
     Each scan is matched against a map that grows from scan to scan.
     """
-    from omnibench.cli.terminal.progress_display import Steps
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.cli.terminal.slam_summary import print_slam
     from omnibench.config import parse_settings, validate
+    from omnibench.progress import Progress
     from omnibench.report.recording.section import write_recording_report
     from omnibench.slam.slam_options import SlamOptions
     from omnibench.slam.slam_request import SlamRequest
@@ -162,12 +163,11 @@ def slam(
     )
     if output is None and report is None and not as_json:
         raise ConfigError("say where the poses go: -o DATASET; or ask for figures alone: --json, --report FILE.html")
-    with Steps(make_console(error=True)) as watch:
+    with ProgressDisplay() as watch:
         result = request.run(watch, table_format)
         if report is not None:
-            watch("writing the report", 0, 1)
+            watch(Progress("writing the report"))
             write_recording_report(result.dataset, report, truth=result.truth, accuracy=result.accuracy)
-            watch("writing the report", 1, 1)
     warn(result.summary.warnings)
     if as_json:
         return print_json(result.summary)
@@ -212,18 +212,19 @@ def simulate(
 
     The truth stays out of the data set: it is written to another folder with --truth, or else nowhere.
     """
-    from omnibench.cli.terminal.progress_display import Steps
+    from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.cli.terminal.slam_summary import print_slam_accuracy
+    from omnibench.progress import Progress
     from omnibench.report.recording.section import write_recording_report
     from omnibench.simulate.simulation_request import SimulationRequest
 
     hidden = tuple(effects or ())
     request = SimulationRequest(output, config, truth, dataset, hidden, like, model, noise, seed)
     load_given_plugins([*(plugins or []), *request.plugins] or None)
-    with Steps(make_console(error=True)) as watch:
+    with ProgressDisplay() as watch:
         made = request.write(table_format, watch)
         if report is not None:
-            watch("writing the report", 0, 1)
+            watch(Progress("writing the report"))
             shown = made.simulation
             write_recording_report(
                 made.dataset,

@@ -5,34 +5,26 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
-from typing import Any, Protocol
+from typing import Any
 
 from omnibench.compare.effective_config import load_calibrators
 from omnibench.compare.plan import PlannedRun, RunTask
+from omnibench.compare.run_progress import RunProgress
 from omnibench.compare.store import RunStore, StoredRun
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error, run_calibrator
 from omnibench.processes import end_with_parent, main_module_hidden, one_thread_processes
+from omnibench.progress import Reporter
 from omnibench.registry import calibrators
 
 _GRACE = 10.0  # s after the budget's time: a run that has not stopped by then is killed (chosen)
 _PATIENCE = 2.0  # s that a process may take to exit after its answer (chosen)
 # Modules that the processes share, so that they need not be imported for every run.
 PRELOAD = ("omnibench.compare.execute", "omnibench.fit.sum_of_norms", "nlopt")
-
-
-class Progress(Protocol):
-    """Callbacks during a comparison: stages of its data sets, then its runs."""
-
-    def prepared(self, what: str, done: int, total: int) -> None: ...
-    def planned(self, runs: int) -> None: ...
-    def began(self, run: PlannedRun) -> None: ...
-    def moved(self, run: PlannedRun, evaluations: int, best: float) -> None: ...
-    def ended(self, run: PlannedRun, result: RunResult, reused: bool) -> None: ...
 
 
 @dataclass
@@ -58,7 +50,7 @@ class _Active:
         return RunResult(outcome, reason, None, None, None, self.evaluations, seconds, ())
 
 
-def execute(plan: Sequence[PlannedRun], store: RunStore, progress: Progress, workers: int) -> list[RunResult]:
+def execute(plan: Sequence[PlannedRun], store: RunStore, report: Reporter, workers: int) -> list[RunResult]:
     """Execute the runs, except those whose results are stored: the result of every run, in the plan's order.
 
     Failed runs are not stored: what made them fail (a missing package, too little memory) may be gone next time.
@@ -66,7 +58,7 @@ def execute(plan: Sequence[PlannedRun], store: RunStore, progress: Progress, wor
     """
     results: dict[int, RunResult] = {}
     waiting: list[int] = []
-    progress.planned(len(plan))
+    progress = RunProgress(report, len(plan))
     for index, run in enumerate(plan):
         stored = store.get(run.key)
         if stored is None:
@@ -108,20 +100,20 @@ def _work(connection: Connection, task: RunTask) -> None:
     """Solve one run's problem in a worker process and send the result."""
     threading.Thread(target=end_with_parent, daemon=True).start()
     try:
-        answer = StoredRun.of(_solve(task, lambda evaluations, best: connection.send((evaluations, best))))
+        answer = StoredRun.of(_solve(task, lambda event: connection.send((event.done, event.best))))
     except BaseException as error:  # whatever a plug-in raises, wherever, is this run's outcome
         answer = StoredRun.of(RunResult(Outcome.FAILED, describe_error(error), None, None, None, 0, 0.0, ()))
     with suppress(OSError):  # a plug-in may have closed it
         connection.send(answer)
 
 
-def _solve(task: RunTask, watch: Callable[[int, float], None]) -> RunResult:
+def _solve(task: RunTask, watch: Reporter) -> RunResult:
     load_calibrators(task.config)
     calibrator = calibrators.create(task.entry.name, task.entry.options)
     return run_calibrator(calibrator, task.problem(watch))
 
 
-def _collect(active: dict[int, _Active], progress: Progress) -> Iterator[tuple[int, RunResult]]:
+def _collect(active: dict[int, _Active], progress: RunProgress) -> Iterator[tuple[int, RunResult]]:
     """Wait up to 0.2 s; yield the runs that have ended, and those that are killed because their time is over."""
     ready = wait([item.connection for item in active.values()], timeout=0.2)
     for index, item in list(active.items()):
@@ -134,7 +126,7 @@ def _collect(active: dict[int, _Active], progress: Progress) -> Iterator[tuple[i
             yield index, item.without_answer(Outcome.TIME, f"ended by force: {seconds:g} s spent without an answer")
 
 
-def _receive(item: _Active, progress: Progress) -> RunResult | None:
+def _receive(item: _Active, progress: RunProgress) -> RunResult | None:
     try:
         message = item.connection.recv()
     except (EOFError, OSError):

@@ -1,8 +1,8 @@
-"""The runs of a comparison: data sets x calibrators x seeds, and the calibration problem that each is given."""
+"""The data sets of a comparison, its runs (data sets x calibrators x seeds), and the problem that each run is given."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,7 +11,8 @@ from omnibench.compare.run_key import run_key
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import ConfigError
 from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
-from omnibench.fit.problem import CalibrationProblem, make_parameterisation
+from omnibench.fit.problem import CalibrationProblem, make_parameterisation, training_split
+from omnibench.progress import Reporter, no_progress
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Robot
 
@@ -44,8 +45,8 @@ class RunTask:
     box: Box
     seed: int
 
-    def problem(self, watch: Callable[[int, float], None] | None = None) -> CalibrationProblem:
-        """The calibration problem; ``watch`` is called with the evaluations so far and the best cost."""
+    def problem(self, watch: Reporter = no_progress) -> CalibrationProblem:
+        """The calibration problem; ``watch`` is told the evaluations so far and the best cost."""
         return CalibrationProblem(
             self.robot,
             self.trajectories,
@@ -111,6 +112,15 @@ class PlannedRun:
     def key(self) -> str:
         """The key of the run's stored result."""
         return run_key(self.config, self.dataset, self.entry, self.seed)
+
+
+def load_datasets(config: CompareConfig, progress: Reporter = no_progress) -> dict[str, Dataset]:
+    """Read, import or simulate every data set. DataError when one has no training data."""
+    datasets = {}
+    for name, source in config.datasets.items():
+        datasets[name] = source.load(name, config.description, progress)
+        training_split(datasets[name])
+    return datasets
 
 
 def make_plan(config: CompareConfig, datasets: Mapping[str, Dataset]) -> list[PlannedRun]:

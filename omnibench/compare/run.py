@@ -9,11 +9,10 @@ from pathlib import Path
 
 from omnibench.compare.certificates import certify
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.data_sources import load_datasets
 from omnibench.compare.effective_config import effective_config, load_calibrators
-from omnibench.compare.execute import PRELOAD, Progress, execute
+from omnibench.compare.execute import PRELOAD, execute
 from omnibench.compare.output import prepare_output, write_results
-from omnibench.compare.plan import PlannedRun, make_plan
+from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
 from omnibench.compare.report.comparison_report import write_report
 from omnibench.compare.result import ComparisonResult, ScoredRun
 from omnibench.compare.scoring import score
@@ -23,35 +22,25 @@ from omnibench.compare.uncertainties import typical_uncertainties
 from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
 from omnibench.errors import ConfigError, Interrupted, UnknownNameError
-from omnibench.fit.calibrator import RunResult
 from omnibench.processes import one_thread_processes
+from omnibench.progress import Reporter, no_progress
 from omnibench.registry import PluginFailure
 
 
-class Silent:
-    """Progress that is shown nowhere."""
-
-    def prepared(self, what: str, done: int, total: int) -> None: ...
-    def planned(self, runs: int) -> None: ...
-    def began(self, run: PlannedRun) -> None: ...
-    def moved(self, run: PlannedRun, evaluations: int, best: float) -> None: ...
-    def ended(self, run: PlannedRun, result: RunResult, reused: bool) -> None: ...
-
-
 def run_comparison(
-    config: CompareConfig, output: Path | None = None, progress: Progress | None = None
+    config: CompareConfig, output: Path | None = None, progress: Reporter = no_progress
 ) -> ComparisonResult:
     """Run every calibrator of the config on every data set, score the answers, and write results and report.
 
-    output: the folder of results; runs whose results are there are not repeated. ConfigError or DataError: something
+    output: the folder of results; runs whose results are there are not repeated. progress: told of the making of data
+    sets and of every run. ConfigError or DataError: something
     that the user can correct. Interrupted: Ctrl-C; the results of all runs that had ended are kept.
     """
-    progress = progress or Silent()
     failures = load_calibrators(config)
     with _naming_failed_plugins(failures):
         config = effective_config(config)
         with one_thread_processes(PRELOAD):  # processes started for simulation serve the calibrators, too
-            datasets = load_datasets(config, progress.prepared)
+            datasets = load_datasets(config, progress)
     plan = make_plan(config, datasets)
     folder = prepare_output(config, output)
     store = RunStore(folder / "runs")

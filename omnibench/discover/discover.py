@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -36,6 +35,7 @@ from omnibench.discover.selection.screening import Screening, screen_again, scre
 from omnibench.discover.selection.unknown_term import add_smooth_term
 from omnibench.discover.verdict import lacks_a_name, verdict_of
 from omnibench.errors import DataError
+from omnibench.progress import Reporter, Stages, no_progress
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 
@@ -44,25 +44,13 @@ from omnibench.robot.kinematics import Array
 _EXPLAINED = 0.5
 
 
-class StageCallback(Protocol):
-    """Progress of a discovery."""
-
-    def stage(self, text: str) -> None:
-        """The step that begins now, in words."""
-
-
-class _Unwatched:
-    def stage(self, text: str) -> None:
-        pass
-
-
 def discover_effects(
     dataset: Dataset,
     *,
     without: Sequence[str] = (),
     unknown_term: bool = False,
     seed: int = 0,
-    watch: StageCallback | None = None,
+    watch: Reporter = no_progress,
     calibration: Calibration | None = None,
 ) -> Discovery:
     """Find where the odometry of a data set's training split disagrees with its reference, and which effect is missing.
@@ -70,21 +58,22 @@ def discover_effects(
     without: effects that are not to be tried. unknown_term: where no effect explains what is missing, add a smooth term
     over the covariate that the residuals depend on. calibration: the plain
     matrix is fitted from this one's matrix on, by default from the robot's design values. The validation split is used
-    when all is decided, and only to say how well the models predict it.
+    when all is decided, and only to say how well the models predict it. watch: told of every step as it begins and
+    ends.
 
     Raises UnknownNameError for a name in ``without`` that is no effect's, DataError for a training split without
     reference poses or another robot's calibration.
     """
-    began, progress = time.monotonic(), watch or _Unwatched()
+    began, progress = time.monotonic(), Stages(watch)
     check_names(without)
     rng = np.random.default_rng(seed)
     runs = usable_runs(dataset.split("train"))
     start = _start_matrix(dataset, calibration)
 
-    progress.stage("fitting the plain matrix")
+    progress.begin("fitting the plain matrix")
     plain = fit_matrix(runs, dataset.robot, dataset.sample_period, start)
 
-    progress.stage("looking where it fails, and at the catalogue")
+    progress.begin("looking where it fails, and at the catalogue")
     screening = screen_plain(plain, without)
     selection = select_effects(screening, rng)
     extended = extend(plain, selection.chosen)
@@ -92,12 +81,12 @@ def discover_effects(
     if selection.tentative:
         model = _extend_by_tentative(plain, model, without, rng)
     if model.selection.chosen:
-        progress.stage("looking again, now that the noise is known better")
+        progress.begin("looking again, now that the noise is known better")
         model = _confirm(plain, model, without, rng)
     screening, selection = model.screening, model.selection
     models = competing_models(plain, selection, model.extended)
 
-    progress.stage("looking at the motors")
+    progress.begin("looking at the motors")
     motors = select_motor_effects(runs, dataset.robot, without, rng)
 
     dependences = covariate_dependences(screening, selection, motors)
@@ -109,7 +98,7 @@ def discover_effects(
         models, term_notes = smooth.models, (smooth.note,)
         effects = named_effects(models, motors)
 
-    progress.stage("comparing on runs that were held out")
+    progress.begin("comparing on runs that were held out")
     extended = models.used
     baseline = without_effects(plain, extended)
     validation = validation_runs(dataset, extended.fit)
@@ -133,6 +122,7 @@ def discover_effects(
         extrapolations=extrapolations,
         detectability=detectability,
     )
+    progress.end()
     request = Request(tuple(without), unknown_term, seed)
     return conclude(dataset, request, findings, time.monotonic() - began)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +23,7 @@ from omnibench.fit.span import Unidentified
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals, bootstrap_intervals
 from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
+from omnibench.progress import Reporter, no_progress, renamed
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import Calibration, Provenance, covariance_rows, matrix_rows
 from omnibench.robot.model import OdometryModel
@@ -60,13 +61,14 @@ def calibrate(
     seed: int = 1,
     intervals: bool = False,
     unidentified: Unidentified = "keep",
-    watch: Callable[[int, float], None] | None = None,
+    watch: Reporter = no_progress,
 ) -> CalibrationRun:
     """Fit the odometry model of a data set's training split.
 
     intervals: also draw bootstrap intervals about the optimum (closed_form only).
     unidentified: for motions that the data drive so little that slip alone may explain them, ``keep`` the design values
     or ``fit`` them (see make_parameterisation). The run's warnings name them.
+    watch: told the evaluations and the best cost so far, at most every 0.1 s.
 
     Raises UnknownNameError or ConfigError for wrong arguments, DataError for an empty training split, and ConfigError
     when the calibrator gives no answer.
@@ -92,7 +94,7 @@ def calibrate(
         integration=integration,
         budget=budget or Budget(),
         seed=seed,
-        watch=watch,
+        watch=renamed(watch, calibrator),
     )
     result = run_calibrator(chosen, problem)
     if result.matrix is None or result.vector is None:

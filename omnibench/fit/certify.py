@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import heapq
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from omnibench.config import Model
@@ -19,11 +18,11 @@ from omnibench.fit.bounds.lower_bound import LowerBounds, Node
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
 from omnibench.processes import one_thread
+from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 
-ProofCallback = Callable[["Proof"], None]
 _NO_ERROR = 1e-9  # m, rad: a smaller cost is rounding, of which no share can be proven
 
 
@@ -75,7 +74,7 @@ def certify_optimum(
     box: Box | None = None,
     gap: float = 1e-3,
     seconds: float = 60.0,
-    watch: ProofCallback | None = None,
+    watch: Reporter = no_progress,
 ) -> CertifiedCalibration:
     """Bound how much better than a calibration any matrix of the box could be, on a data set's training split.
 
@@ -135,7 +134,7 @@ def prove(
     *,
     gap: float = 1e-3,
     seconds: float = 60.0,
-    watch: ProofCallback | None = None,
+    watch: Reporter = no_progress,
 ) -> Proof:
     """A lower bound of the cost over the problem's box, within ``gap`` of the best cost known unless time runs out.
 
@@ -154,8 +153,7 @@ def prove(
             spent = time.perf_counter() - began
             finished = proven >= (1 - gap) * best_cost or best_cost < _NO_ERROR or not node.looseness.any()
             proof = Proof(proven, best_cost, best_vector, count, spent, finished)
-            if watch:
-                watch(proof)
+            watch(Progress("proof", count, None, "part", best_cost, f"bound {proven:.6f}"))
             if finished or spent > seconds:
                 return proof
             heapq.heappop(boxes)

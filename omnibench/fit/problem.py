@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +26,7 @@ from omnibench.fit.parameterisation import (
     WheelGeometry,
 )
 from omnibench.fit.span import Unidentified, directions_kept, driven_span
+from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration
 
@@ -71,7 +72,7 @@ class CalibrationProblem:
     rng: the only source of randomness that a calibrator may use.
     best_vector, best_cost: the best candidate in the box so far; the start and infinity before the first.
     history: every improvement of the best cost.
-    watch: called with the evaluations and the best cost so far, at most every 0.1 s.
+    watch: told the evaluations and the best cost so far, at most every 0.1 s.
     """
 
     def __init__(
@@ -84,7 +85,7 @@ class CalibrationProblem:
         integration: Integration,
         budget: Budget,
         seed: int,
-        watch: Callable[[int, float], None] | None = None,
+        watch: Reporter = no_progress,
     ) -> None:
         if not trajectories:
             raise DataError("no trajectories; nothing can be calibrated")
@@ -248,9 +249,9 @@ class CalibrationProblem:
         """Count evaluated candidates (P, n) with their costs (P,), keep the best one and report progress."""
         self._note_improvements(candidates, values)
         self.evaluations += len(candidates)
-        if self._watch and self.seconds - self._shown > _PROGRESS_PERIOD:
+        if self.seconds - self._shown > _PROGRESS_PERIOD:
             self._shown = self.seconds
-            self._watch(self.evaluations, self.best_cost)
+            self._watch(Progress("search", self.evaluations, self.budget.evaluations, "evaluation", self.best_cost))
 
     def _note_improvements(self, candidates: Array, values: Array) -> None:
         """Append to the history every candidate in the box that is better than all before it."""

@@ -9,8 +9,8 @@ from pydantic import ConfigDict, Field, model_validator
 
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
-from omnibench.data.progress import ProgressCallback, no_progress
 from omnibench.data.storage import load_dataset
+from omnibench.progress import Reporter, no_progress
 from omnibench.simulate.simulate import SimulatedConfig, simulate_dataset
 from omnibench.slam.import_dataset import import_dataset
 
@@ -57,7 +57,7 @@ class DatasetSource(Model):
             return self.model_copy(update={"import_": self.import_.model_copy(update=update)})
         return self
 
-    def load(self, name: str, description: str = "", progress: ProgressCallback = no_progress) -> Dataset:
+    def load(self, name: str, description: str = "", progress: Reporter = no_progress) -> Dataset:
         """Read, import or simulate the data set. name, description: of a simulated one. OmnibenchError in one line."""
         if self.simulate is not None:
             return simulate_dataset(self.simulate, name, description, progress).dataset

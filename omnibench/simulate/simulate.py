@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import Discriminator, Tag
 
 from omnibench.config import CHOSEN
-from omnibench.data.progress import ProgressCallback, no_progress
+from omnibench.progress import Reporter, no_progress
 from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.flower import simulate_flower
@@ -35,7 +35,7 @@ def simulate_dataset(
     config: FlowerConfig | RobotConfig,
     name: str = "flower",
     description: str = "",
-    watch: ProgressCallback = no_progress,
+    watch: Reporter = no_progress,
 ) -> Simulation:
     """Simulate the training session and, if there is one, the validation session.
 

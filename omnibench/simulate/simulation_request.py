@@ -9,11 +9,11 @@ from pathlib import Path
 
 from omnibench.config import to_json, to_yaml
 from omnibench.data.dataset import Dataset
-from omnibench.data.progress import ProgressCallback, no_progress
 from omnibench.data.storage import check_dataset_folder, load_dataset, save_dataset
 from omnibench.data.true_poses import TRUTH_FILE, write_true_poses
 from omnibench.errors import ConfigError
 from omnibench.files import TableFormat, write_text
+from omnibench.progress import Reporter, no_progress
 from omnibench.robot.calibration import read_calibration
 from omnibench.simulate.like import simulate_like
 from omnibench.simulate.simulation import Simulation
@@ -78,7 +78,7 @@ class SimulationRequest:
         """Folders of plug-ins that the config's effects may come from."""
         return () if self.config is None else self.source.effect_plugins
 
-    def write(self, table_format: TableFormat = "parquet", watch: ProgressCallback = no_progress) -> WrittenSimulation:
+    def write(self, table_format: TableFormat = "parquet", watch: Reporter = no_progress) -> WrittenSimulation:
         """Simulate and write the data set; write the truth to its own folder, if one is named.
 
         OmnibenchError in one line: the config, the recording or the calibration is wrong, or the disk refuses.

@@ -10,8 +10,8 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field
 
 from omnibench.config import Model, parse_yaml, read_yaml, validate
-from omnibench.data.progress import ProgressCallback, no_progress
 from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.progress import Reporter, no_progress
 from omnibench.registry import effects
 from omnibench.robot.calibration import EffectTerm
 from omnibench.simulate.chain.robot_config import RobotConfig
@@ -67,7 +67,7 @@ class SimulationSource:
         changed = validate(Truth, {**truth.model_dump(), "effects": terms}, "--effect")
         return replace(self, config=self.config.model_copy(update={"truth": changed}))
 
-    def simulate(self, watch: ProgressCallback = no_progress) -> Simulation:
+    def simulate(self, watch: Reporter = no_progress) -> Simulation:
         """Simulate the data set. ConfigError or DataError as for ``simulate_dataset``."""
         return simulate_dataset(self.config, self.name, self.description, watch)
 

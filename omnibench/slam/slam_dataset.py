@@ -9,10 +9,10 @@ from itertools import pairwise
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.progress import ProgressCallback
 from omnibench.data.scans import Scanner, TrajectoryScans
 from omnibench.errors import DataError
 from omnibench.processes import in_processes
+from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.planar import relative
@@ -33,7 +33,7 @@ def slam_dataset(
     *,
     model: OdometryModel | None = None,
     workers: int = 2,
-    watch: ProgressCallback | None = None,
+    watch: Reporter = no_progress,
 ) -> Dataset:
     """The data set with poses, pose times and covariances computed from its scans; each run keeps its start pose.
 
@@ -48,13 +48,13 @@ def slam_paths(
     *,
     model: OdometryModel | None = None,
     workers: int = 2,
-    watch: ProgressCallback | None = None,
+    watch: Reporter = no_progress,
 ) -> list[SlamPath]:
     """The path of every run by SLAM, from its start pose on.
 
     model: the odometry that the search starts from; default: the robot's design matrix, in arcs. workers: processes;
-    the result does not depend on their number. watch: called after every run. DataError in one line: the data set or
-    one of its runs has no scans, or they are bad.
+    the result does not depend on their number. watch: told of every run that ends. DataError in one line: the data set
+    or one of its runs has no scans, or they are bad.
     """
     scans = dataset.scans
     if scans is None:
@@ -69,11 +69,11 @@ def slam_paths(
         for trajectory in dataset.trajectories
     )
     total = len(dataset.trajectories)
-    paths = []
+    paths: list[SlamPath] = []
+    watch(Progress("SLAM", 0, total, "run"))
     for path in in_processes(_locate, jobs, min(workers, total), preload=__name__):
         paths.append(path)
-        if watch is not None:
-            watch("SLAM", len(paths), total)
+        watch(Progress("SLAM", len(paths), total, "run"))
     return paths
 
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.progress import ProgressCallback
 from omnibench.data.storage import check_dataset_folder, load_dataset, save_dataset
 from omnibench.data.true_poses import TruePath, read_true_poses, robot_of_truth
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import TableFormat
+from omnibench.progress import Reporter, no_progress
 from omnibench.robot.calibration import read_calibration
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.accuracy import SlamAccuracy, slam_accuracy
@@ -56,7 +56,7 @@ class SlamRequest:
         if self.model is not None and self.options.start != "odometry":
             raise ConfigError(f"--model {self.model}: is for --start odometry; leave one of the two out")
 
-    def run(self, watch: ProgressCallback | None = None, table_format: TableFormat = "parquet") -> SlamResult:
+    def run(self, watch: Reporter = no_progress, table_format: TableFormat = "parquet") -> SlamResult:
         """Find the poses and write the data set. DataError in one line, before the work where that can be."""
         recorded = load_dataset(self.dataset)
         truth = self._truth_of(recorded)

@@ -111,6 +111,7 @@ def test_a_pipe_gets_one_plain_line_for_each_run_and_the_tables(tmp_path: Path) 
     run = compared(write_config(tmp_path, workers=1), tmp_path / "out")
     lines = run.stderr.splitlines()
     assert [line.split(":")[0] for line in lines] == [
+        "comparing",
         "[1/3] flower theoretical seed 1",
         "[2/3] flower closed_form seed 1",
         "[3/3] flower search seed 1",

@@ -11,7 +11,6 @@ from discovery_samples import incomplete, named, nameless, nothing
 from rich.console import Console
 
 from omnibench.cli.terminal.discovery_summary import print_discovery
-from omnibench.cli.terminal.progress_display import Stages
 from omnibench.discover.result import Discovery
 
 
@@ -63,12 +62,3 @@ def test_many_notes_leave_the_screen_to_the_answer() -> None:
     assert "- note 2" in told
     assert "- note 3" not in told
     assert "6 more notes in the report" in told
-
-
-def test_stages_are_lines_where_nobody_watches() -> None:
-    console = Console(file=StringIO(), width=80, force_terminal=False)
-    with Stages(console) as watch:
-        watch.stage("fitting the plain matrix")
-        watch.stage("looking where it fails")
-    assert isinstance(console.file, StringIO)
-    assert console.file.getvalue() == "fitting the plain matrix\nlooking where it fails\n"

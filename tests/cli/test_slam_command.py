@@ -96,7 +96,7 @@ def test_the_table_says_how_sure_the_poses_are_and_how_far_from_the_recorded_ref
     assert "from the recorded reference (12 poses)" in run.stdout
     assert "3 trajectories: found" in run.stdout
     assert "truth" not in run.stdout
-    assert run.stderr == "SLAM: 3\n"
+    assert run.stderr == "SLAM: 3 runs\n"
 
 
 def test_json_holds_the_same_figures(command: Command, driven: Driven) -> None:
@@ -277,7 +277,7 @@ def test_ctrl_c_leaves_nothing(driven: Driven, tmp_path: Path) -> None:
         text=True,
     )
     assert process.stderr is not None
-    assert process.stderr.readline() == "SLAM: 150\n"  # it is at work
+    assert process.stderr.readline() == "SLAM: 150 runs\n"  # it is at work
     time.sleep(0.3)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=30)

@@ -14,10 +14,9 @@ import pytest
 from commands import COMMAND, ENVIRONMENT, compared, flower, search, small, summary, write_config, write_plugin
 
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.plan import PlannedRun
 from omnibench.compare.run import run_comparison
 from omnibench.data.storage import save_dataset
-from omnibench.fit.calibrator import RunResult
+from omnibench.progress import Progress
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
@@ -55,6 +54,7 @@ def started(config: Path, output: Path) -> subprocess.Popen[str]:
         start_new_session=True,
     )
     assert process.stderr is not None
+    assert process.stderr.readline() == "comparing: 4 runs\n"
     assert process.stderr.readline().startswith("[1/4] flower ")
     return process
 
@@ -164,19 +164,16 @@ def test_the_runs_end_with_a_comparison_that_is_killed(name: str, tmp_path: Path
 
 
 class Watch:
-    """Progress that notes which labels were run and which were there."""
+    """A reporter that notes which runs were run and which were there."""
 
     def __init__(self) -> None:
         self.ran: list[str] = []
         self.kept: list[str] = []
 
-    def prepared(self, what: str, done: int, total: int) -> None: ...
-    def planned(self, runs: int) -> None: ...
-    def began(self, run: PlannedRun) -> None: ...
-    def moved(self, run: PlannedRun, evaluations: int, best: float) -> None: ...
-
-    def ended(self, run: PlannedRun, result: RunResult, reused: bool) -> None:  # noqa: ARG002
-        (self.kept if reused else self.ran).append(f"{run.label} {run.seed}")
+    def __call__(self, event: Progress) -> None:
+        if event.result:
+            run = event.task.removeprefix("flower ").replace(" seed", "")
+            (self.kept if "kept from an earlier run" in event.result else self.ran).append(run)
 
 
 def ran_and_kept(output: Path, **changes: Any) -> tuple[set[str], set[str]]:

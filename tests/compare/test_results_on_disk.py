@@ -13,10 +13,9 @@ import pytest
 from commands import assert_refused, compared, compared_here, flower, omnibench, search, small, summary, write_config
 
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.data_sources import load_datasets
 from omnibench.compare.effective_config import effective_config
 from omnibench.compare.output import prepare_output
-from omnibench.compare.plan import make_plan
+from omnibench.compare.plan import load_datasets, make_plan
 from omnibench.compare.read_config import read_compare_config
 from omnibench.compare.run import run_comparison
 from omnibench.errors import DataError

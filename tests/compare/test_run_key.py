@@ -12,9 +12,8 @@ from commands import flower, search, small, write_plugin
 
 import omnibench
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.data_sources import load_datasets
 from omnibench.compare.effective_config import effective_config, load_calibrators
-from omnibench.compare.plan import make_plan
+from omnibench.compare.plan import load_datasets, make_plan
 from omnibench.compare.run_key import shared_code
 
 pytestmark = pytest.mark.usefixtures("registries_as_before")

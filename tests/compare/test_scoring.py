@@ -11,8 +11,7 @@ from commands import compared_here, small, write_plugin
 from numpy.typing import NDArray
 
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.data_sources import load_datasets
-from omnibench.compare.plan import PlannedRun, make_plan
+from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
 from omnibench.compare.result import RunRecord
 from omnibench.compare.scoring import SplitScorer, heading_error, position_error, score
 from omnibench.errors import PluginError

@@ -15,10 +15,11 @@ import pytest
 from commands import COMMAND, ENVIRONMENT, compared_here, rows, search, small, summary, write_config, write_plugin
 
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.data_sources import load_datasets
+from omnibench.compare.plan import load_datasets
 from omnibench.compare.read_config import read_compare_config
 from omnibench.compare.run import run_comparison
 from omnibench.data.storage import save_dataset
+from omnibench.progress import Progress
 
 pytestmark = pytest.mark.usefixtures("registries_as_before")
 
@@ -148,43 +149,29 @@ def test_every_run_has_one_thread_and_leaves_ctrl_c_to_the_comparison(tmp_path: 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_no_more_runs_are_under_way_than_there_are_workers(workers: int, tmp_path: Path) -> None:
     class Count:
-        now = most = 0
+        most = 0
 
-        def prepared(self, what: str, done: int, total: int) -> None: ...
-        def planned(self, runs: int) -> None: ...
-        def moved(self, *_: object) -> None: ...
+        def __init__(self) -> None:
+            self.now: set[str] = set()
 
-        def began(self, _: object) -> None:
-            self.now += 1
-            self.most = max(self.most, self.now)
-
-        def ended(self, *_: object, reused: bool) -> None:  # noqa: ARG002
-            self.now -= 1
+        def __call__(self, event: Progress) -> None:
+            if event.unit == "evaluation":
+                (self.now.discard if event.over else self.now.add)(event.task)
+                self.most = max(self.most, len(self.now))
 
     count = Count()
     entries = [search(str(number)) for number in range(4)]
     config = CompareConfig.model_validate(small(calibrators=entries, workers=workers))
     run_comparison(config, tmp_path / "out", count)
-    assert (count.most, count.now) == (workers, 0)
+    assert (count.most, count.now) == (workers, set())
 
 
 def test_progress_tells_evaluations_and_the_best_cost(tmp_path: Path) -> None:
-    class Notes:
-        moves: list[tuple[int, float]] = []
-
-        def prepared(self, what: str, done: int, total: int) -> None: ...
-        def planned(self, runs: int) -> None: ...
-        def began(self, run: object) -> None: ...
-        def ended(self, *_: object, reused: bool) -> None: ...
-
-        def moved(self, _: object, evaluations: int, best: float) -> None:
-            self.moves.append((evaluations, best))
-
-    notes = Notes()
+    events: list[Progress] = []
     entries = [search(candidates=20_000, batch=20)]
     config = CompareConfig.model_validate(small(calibrators=entries, budget={"evaluations": 20_000}))
-    result = run_comparison(config, tmp_path / "out", notes)
-    counts, bests = zip(*notes.moves, strict=True)
+    result = run_comparison(config, tmp_path / "out", events.append)
+    counts, bests = zip(*((event.done, event.best) for event in events if event.best is not None), strict=True)
     assert list(counts) == sorted(counts)
     assert list(bests) == sorted(bests, reverse=True)
     assert bests[-1] >= (result.runs[0].record.train_cost or 0.0) - 1e-11  # the verdict is by direct integration

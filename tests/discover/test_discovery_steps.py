@@ -10,30 +10,25 @@ from discovery_samples import simulated
 from omnibench.discover import discover
 from omnibench.discover.result import Discovery
 from omnibench.fit.least_squares.whitened import Given
+from omnibench.progress import Progress
 from omnibench.robot.odometry import OdometryBatch
 
 
-class Recorder:
-    def __init__(self) -> None:
-        self.stages: list[str] = []
-
-    def stage(self, text: str) -> None:
-        self.stages.append(text)
-
-
 def test_steps_are_announced_in_order_and_confirming_comes_only_with_an_effect() -> None:
-    with_effect, without_effect = Recorder(), Recorder()
-    discover.discover_effects(simulated(validation=None), watch=with_effect)
-    discover.discover_effects(simulated((), validation=None), watch=without_effect)
+    with_effect: list[Progress] = []
+    without_effect: list[Progress] = []
+    discover.discover_effects(simulated(validation=None), watch=with_effect.append)
+    discover.discover_effects(simulated((), validation=None), watch=without_effect.append)
     confirming = "looking again, now that the noise is known better"
-    assert with_effect.stages == [
+    stages = [
         "fitting the plain matrix",
         "looking where it fails, and at the catalogue",
         confirming,
         "looking at the motors",
         "comparing on runs that were held out",
     ]
-    assert without_effect.stages == [stage for stage in with_effect.stages if stage != confirming]
+    for events, begun in ((with_effect, stages), (without_effect, [stage for stage in stages if stage != confirming])):
+        assert events == [event for stage in begun for event in (Progress(stage), Progress(stage, result=""))]
 
 
 def test_what_concludes_fits_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

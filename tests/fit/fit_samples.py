@@ -12,6 +12,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.parameterisation import Box, ExplicitBox, GeometryLimits, ParameterisationName
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
+from omnibench.progress import Reporter, no_progress
 from omnibench.registry import Options, costs
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration
@@ -48,7 +49,7 @@ def make_problem(
     evaluations: int = 60_000,
     seconds: float = 600.0,
     seed: int = 1,
-    watch: Callable[[int, float], None] | None = None,
+    watch: Reporter = no_progress,
 ) -> CalibrationProblem:
     """A problem on ``trajectories``, by default noisy ones."""
     robot = synthetic_robot(wheels)

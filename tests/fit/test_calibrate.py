@@ -19,6 +19,7 @@ from omnibench.fit.calibrator import Outcome
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.parameterisation import GeometryLimits
 from omnibench.fit.problem import Budget
+from omnibench.progress import Progress
 from omnibench.registry import costs
 from omnibench.robot.calibration import read_calibration, write_calibration
 from omnibench.testing.synthetic import synthetic_robot
@@ -172,10 +173,10 @@ def test_a_searched_geometry_cannot_keep_it_and_says_so() -> None:
 
 
 def test_progress_is_shown(dataset: Dataset) -> None:
-    shown: list[tuple[int, float]] = []
-    calibrate(dataset, "crs", budget=Budget(seconds=0.4), watch=lambda count, best: shown.append((count, best)))
-    assert shown
-    assert shown == sorted(shown, key=lambda each: each[0])
+    shown: list[Progress] = []
+    calibrate(dataset, "crs", budget=Budget(seconds=0.4), watch=shown.append)
+    assert {event.task for event in shown} == {"crs"}
+    assert [event.done for event in shown] == sorted(event.done for event in shown)
 
 
 def refused(dataset: Dataset, error: type[Exception], **arguments: Any) -> str:
@@ -213,9 +214,7 @@ def test_a_calibrator_that_gives_no_answer_says_why(dataset: Dataset) -> None:
 
 
 def test_intervals_of_a_search_are_refused_before_it_runs(dataset: Dataset) -> None:
-    shown: list[int] = []
-    message = refused(
-        dataset, ConfigError, calibrator="crs", intervals=True, watch=lambda count, _: shown.append(count)
-    )
+    shown: list[Progress] = []
+    message = refused(dataset, ConfigError, calibrator="crs", intervals=True, watch=shown.append)
     assert "use the calibrator closed_form" in message
     assert not shown

@@ -21,6 +21,7 @@ from omnibench.fit.certify import certify_optimum, prove
 from omnibench.fit.cost import Cost
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import CalibrationProblem
+from omnibench.progress import Progress
 from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows
 from omnibench.robot.kinematics import Array
@@ -206,11 +207,14 @@ def test_a_proof_that_is_stopped_says_so_and_still_holds() -> None:
 
 
 def test_the_proof_tells_how_it_gets_on() -> None:
-    seen: list[float] = []
+    seen: list[Progress] = []
     problem = make_problem()
-    prove(problem, problem.start, gap=1e-3, seconds=20, watch=lambda proof: seen.append(proof.lower_bound))
+    proof = prove(problem, problem.start, gap=1e-3, seconds=20, watch=seen.append)
     assert len(seen) > 3
-    assert seen == sorted(seen)
+    assert [event.done for event in seen] == sorted(event.done for event in seen)
+    bounds = [float(event.note.removeprefix("bound ")) for event in seen]
+    assert bounds == sorted(bounds)
+    assert (seen[-1].done, seen[-1].best, bounds[-1]) == (proof.boxes, proof.best_cost, round(proof.lower_bound, 6))
 
 
 def test_a_calibration_outside_the_box_is_said_to_be_outside() -> None:

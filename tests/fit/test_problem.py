@@ -21,6 +21,7 @@ from omnibench.fit.calibrate import calibrate
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.parameterisation import GeometryLimits
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem
+from omnibench.progress import Progress
 from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Array
 from omnibench.testing.synthetic import synthetic_robot
@@ -149,11 +150,11 @@ def test_the_seed_decides_the_random_numbers() -> None:
 
 
 def test_progress_is_shown_while_candidates_are_evaluated() -> None:
-    shown: list[tuple[int, float]] = []
-    problem = make_problem(watch=lambda count, best: shown.append((count, best)))
+    shown: list[Progress] = []
+    problem = make_problem(evaluations=50_000, watch=shown.append)
     while not shown:
         problem.cost(problem.start)
-    assert shown[0] == (problem.evaluations, problem.best_cost)
+    assert shown[0] == Progress("search", problem.evaluations, 50_000, "evaluation", problem.best_cost)
 
 
 @pytest.mark.parametrize("name", ["start", "lower", "upper", "free", "reference", "best_vector"])

@@ -14,6 +14,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.scans import ScansInMemory, TrajectoryScans
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
+from omnibench.progress import Progress
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.published_matrices import published_matrix
 from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
@@ -128,10 +129,10 @@ class TestPoses:
         np.testing.assert_array_equal(run.pose_times, scans.times)
 
     def test_progress_is_told_run_by_run(self) -> None:
-        told: list[tuple[str, int, int]] = []
+        told: list[Progress] = []
         dataset, _ = recorded()
-        slam_dataset(dataset, SlamOptions(), workers=2, watch=lambda *step: told.append(step))
-        assert told == [("SLAM", 1, 3), ("SLAM", 2, 3), ("SLAM", 3, 3)]
+        slam_dataset(dataset, SlamOptions(), workers=2, watch=told.append)
+        assert told == [Progress("SLAM", done, 3, "run") for done in range(4)]
 
 
 class TestWhatIsSaid:

@@ -10,18 +10,17 @@ from typing import Final
 
 import zenoh
 from rich.console import Console
-from rich.live import Live
-from rich.text import Text
 
+from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import DataError
 from omnibench.live.network.presence import alive_robots, nothing_received
 from omnibench.live.stopping import ticks
 from omnibench.live.wire.recorder import Recorder
 from omnibench.live.wire.topics import TOPICS, KeySpace
+from omnibench.progress import Progress
 from omnibench.words import plural
 
 _PERIOD: Final = 0.25  # s between two updates of the line on a terminal; chosen
-_PIPED_PERIOD: Final = 10.0  # s between two lines when the output is piped
 
 
 def record(
@@ -43,9 +42,8 @@ def record(
     DataError: the file exists already or cannot be made, or writing failed while recording.
     """
     recorder = Recorder(session, keys, robots, path, topics, on_failure=lambda _: None)
-    status = _StatusLine(console)
     began = time.monotonic()
-    with recorder, status:
+    with recorder, ProgressDisplay(console) as status:
         silence_reported = False
         for passed in ticks(stop, _PERIOD, seconds):
             if recorder.failure is not None:
@@ -54,55 +52,26 @@ def record(
                 silence_reported = True
                 for robot in recorder.silent_robots:
                     status.keep(f"{nothing_received(robot, passed, alive_robots(session))}; recording goes on")
-            status.update(status_line(recorder, passed), passed)
+            status(Progress(f"recording {path}", note=_figures(recorder, passed)))
     if recorder.failure is not None:
         raise DataError(recorder.failure)
     seconds_recorded = time.monotonic() - began
     if not silence_reported:
         for robot in recorder.silent_robots:
             status.keep(nothing_received(robot, seconds_recorded, alive_robots(session)))
-    status.keep(status_line(recorder, seconds_recorded))
+    status.keep(f"{path}: {_figures(recorder, seconds_recorded)}")
     for name in sorted(recorder.counts.keys() | recorder.undecodable.keys()):
         status.keep(f"  {name}: {recorder.counts[name]:,}{_left_out(recorder.undecodable[name])}")
     return recorder
 
 
-def status_line(recorder: Recorder, seconds: float) -> str:
-    """One line with what was recorded in ``seconds``."""
+def _figures(recorder: Recorder, seconds: float) -> str:
+    """Messages and bytes that were recorded in ``seconds``."""
     lost = f", {recorder.lost:,} lost because the disk was too slow" if recorder.lost else ""
     return (
-        f"{recorder.path}: {seconds:.1f} s, {plural(recorder.messages, 'message')}, {recorder.bytes / 1e6:.2f} MB"
+        f"{seconds:.1f} s, {plural(recorder.messages, 'message')}, {recorder.bytes / 1e6:.2f} MB"
         f"{_left_out(recorder.undecodable.total())}{lost}"
     )
-
-
-class _StatusLine:
-    """A line that is kept up to date on a terminal; when piped, a new line every ten seconds."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
-        self._next = _PIPED_PERIOD
-
-    def __enter__(self) -> None:
-        if self._live:
-            self._live.start()
-
-    def __exit__(self, *_: object) -> None:
-        if self._live:
-            self._live.stop()
-
-    def keep(self, line: str) -> None:
-        """Print a line that stays."""
-        self._console.print(Text(line), soft_wrap=True)
-
-    def update(self, line: str, passed: float) -> None:
-        """Show the state after ``passed`` s."""
-        if self._live:
-            self._live.update(Text(line), refresh=True)
-        elif passed >= self._next:
-            self._next = passed + _PIPED_PERIOD
-            self.keep(line)
 
 
 def _left_out(undecodable: int) -> str:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import zenoh
@@ -16,14 +15,16 @@ from omnibench.live.network.session import open_session
 from omnibench.live.node import LiveNode, load_effects
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_recording, concatenated_truth
 from omnibench.live.replay.played_recording import Recording
-from omnibench.live.replay.replay_player import Player, PlayReport, Progress
+from omnibench.live.replay.replay_player import Player, PlayReport
 from omnibench.live.wire.messages import Odometry
 from omnibench.live.wire.subscriber import Subscription, subscribe
 from omnibench.live.wire.topics import GraphNode
+from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.calibration import Calibration, read_calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.planar import moved_to
+from omnibench.words import plural
 
 _LAST_MESSAGES = 5.0  # s to wait for the last messages after a replay; chosen
 
@@ -91,7 +92,7 @@ def demonstrate(
     config: LiveConfig,
     recording: Recording,
     stop: threading.Event | None = None,
-    watch: Callable[[Progress, Health], None] | None = None,
+    watch: Reporter = no_progress,
 ) -> Demonstration:
     """Run the node of ``config``, replay ``recording`` to it as the config's ``replay`` says, and evaluate its output.
 
@@ -123,11 +124,12 @@ def demonstrate(
                 noise=tracker.calibration.noise,
             )
 
-            def progressed(progress: Progress) -> None:
-                if watch is not None:
-                    watch(progress, node.health(robot.name))
+            def with_health(event: Progress) -> None:
+                health = node.health(robot.name)
+                fused = plural(health.counts["poses"], "pose")
+                watch(replace(event, note=f"{event.note}, {health.rate_hz:.0f} samples/s, {fused} fused"))
 
-            report = player.play(stop, progressed)
+            report = player.play(stop, with_health)
             _wait_for_the_last(odometry, fused, node, robot.name, stop)
             health = node.health(robot.name)
             for collector in (odometry, fused):

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.progress import ProgressCallback, no_progress
 from omnibench.data.storage import load_dataset
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import ConfigError
+from omnibench.progress import Reporter, no_progress
 from omnibench.registry import load_plugins
 from omnibench.simulate.source import read_simulation
 from omnibench.simulate.truth import TruthRecord
@@ -28,7 +28,7 @@ class Recording:
     paths: Mapping[str, TruePath] = field(default_factory=dict)
 
 
-def load_recording(path: Path, dataset: str | None = None, watch: ProgressCallback = no_progress) -> Recording:
+def load_recording(path: Path, dataset: str | None = None, watch: Reporter = no_progress) -> Recording:
     """The data set in a folder, or the simulated one of a comparison's config, with its truth.
 
     dataset: name of the data set if the config has several. ConfigError or DataError in one line: it does not exist.

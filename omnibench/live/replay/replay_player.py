@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,7 @@ from omnibench.live.replay.arrivals import (
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive
 from omnibench.live.wire.messages import JointState, PoseEstimate
 from omnibench.live.wire.topics import GraphNode
+from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
@@ -34,7 +35,6 @@ __all__ = [
     "PlayReport",
     "Player",
     "PoseDeviation",
-    "Progress",
     "ReplayConfig",
     "SlamChannel",
     "WheelChannel",
@@ -108,16 +108,6 @@ class _Messages:
         return PoseEstimate(start + int(self._posed[row]), MAP, self._drive.slam_poses[row], self._covariances[row])
 
 
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """Progress of a replay: messages sent and in all, and seconds of the recording and of the wall clock."""
-
-    done: int
-    total: int
-    data_seconds: float
-    wall_seconds: float
-
-
 @dataclass(frozen=True)
 class PlayReport:
     """Result of a replay. sent: messages by topic; total: messages in all; late: largest delay in sending, s."""
@@ -160,11 +150,11 @@ class Player:
         self._messages = _Messages(drive, config, noise, names)
         self._publishers = {topic: graph.publisher(robot, topic, lossless=True) for topic in TOPICS_PLAYED}
 
-    def play(self, stop: threading.Event | None = None, watch: Callable[[Progress], None] | None = None) -> PlayReport:
+    def play(self, stop: threading.Event | None = None, watch: Reporter = no_progress) -> PlayReport:
         """Send all messages, or stop when ``stop`` is set or Ctrl-C is pressed.
 
-        Waits for a subscriber first; ConfigError: none comes in time. watch: called with the progress ten times a
-        second and at the end.
+        Waits for a subscriber first; ConfigError: none comes in time. watch: told the messages sent ten times a second
+        and at the end.
         """
         stop = stop or threading.Event()
         total, sent = len(self._messages), dict.fromkeys(TOPICS_PLAYED, 0)
@@ -183,18 +173,22 @@ class Player:
                 self._publishers[event.topic].put(event.message)
                 sent[event.topic] += 1
                 arrival, late = event.arrival, max(late, now - due)
-                if watch is not None and now - reported_at >= _PROGRESS_PERIOD:
+                if now - reported_at >= _PROGRESS_PERIOD:
                     reported_at = now
-                    watch(Progress(number, total, arrival, now - begin))
+                    watch(self._progress(number, arrival))
         except KeyboardInterrupt:
             pass
         except zenoh.ZError as error:
             if not stop.is_set():  # otherwise the session was closed after stopping
                 raise OmnibenchError(f"replay of {self._robot}: cannot publish any more: {error}") from None
         seconds = time.perf_counter() - begin
-        if watch is not None:
-            watch(Progress(sum(sent.values()), total, arrival, seconds))
+        watch(self._progress(sum(sent.values()), arrival))
         return PlayReport(sent, total, arrival, seconds, 0.0 if math.isinf(self._config.speed) else late)
+
+    def _progress(self, sent: int, seconds: float) -> Progress:
+        """Messages sent, and how many ``seconds`` of the recording they are."""
+        note = f"{seconds:.0f} s of the drive"
+        return Progress(f"playing as {self._robot}", sent, len(self._messages), "message", note=note)
 
     def _wait_for_subscriber(self, stop: threading.Event) -> None:
         """Wait until the wheel samples have a subscriber, and then up to _SLAM_WAIT s for one of the SLAM poses."""

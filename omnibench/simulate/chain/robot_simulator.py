@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omnibench.data.dataset import Split, Trajectory, make_dataset
-from omnibench.data.progress import ProgressCallback, no_progress
 from omnibench.data.scans import ScansInMemory, TrajectoryScans
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
+from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
@@ -33,7 +33,7 @@ _DENSE = 0.01  # s, at most, between true poses that are kept
 
 
 def simulate_robot(
-    config: RobotConfig, name: str = "robot", description: str = "", watch: ProgressCallback = no_progress
+    config: RobotConfig, name: str = "robot", description: str = "", watch: Reporter = no_progress
 ) -> Simulation:
     """Simulate the training session and, if there is one, the validation session.
 
@@ -52,10 +52,12 @@ def simulate_robot(
     truth = true_record(config.truth, config.robot, config.sample_period, tuple(sessions), name)
     simulator = _RobotSimulator(config, truth.true_robot(TRUE_STEP), plan, commands)
     runs: list[_Recorded] = []
+    total = len(sessions) * len(commands) * config.repetitions
+    watch(Progress("driving and scanning", 0, total, "run"))
     for split, session in sessions.items():
         for run in simulator.session(split, session):
             runs.append(run)
-            watch("driving and scanning", len(runs), len(sessions) * len(commands) * config.repetitions)
+            watch(Progress("driving and scanning", len(runs), total, "run"))
     recorded = make_dataset(
         name,
         config.robot,

@@ -11,8 +11,7 @@ from report_page import Page
 
 from omnibench.compare.certificates import certify
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.data_sources import load_datasets
-from omnibench.compare.plan import PlannedRun, make_plan
+from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
 from omnibench.compare.report.comparison_report import write_report
 from omnibench.compare.result import ComparisonResult, EntryStatistics
 from omnibench.compare.scoring import score

@@ -1,0 +1,69 @@
+"""Progress of long work: events that tell the state of a task, and the callable that they are given to.
+
+Whatever works long takes a reporter and calls it when a task begins, while it goes on and when it ends. Several tasks
+may go on at the same time; a task is known by its name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+
+@dataclass(frozen=True)
+class Progress:
+    """State of a task: ``done`` of ``total`` steps (None: not known beforehand), each a ``unit`` in the singular.
+
+    best: lowest cost so far, of a task that lowers one. note: remark in words. result: None while the task goes on; its
+    outcome in words when it has ended, empty if there is nothing to say.
+    """
+
+    task: str
+    done: int = 0
+    total: int | None = None
+    unit: str = "step"
+    best: float | None = None
+    note: str = ""
+    result: str | None = None
+
+    @property
+    def over(self) -> bool:
+        """True if the task has ended or all its steps are done."""
+        return self.result is not None or self.done == self.total
+
+
+Reporter = Callable[[Progress], None]
+
+
+def no_progress(event: Progress) -> None:
+    """Ignore the progress."""
+
+
+def renamed(report: Reporter, task: str) -> Reporter:
+    """A reporter that passes events on under the name ``task``; it can be pickled if ``report`` can."""
+    return partial(_report_as, report, task)
+
+
+def _report_as(report: Reporter, task: str, event: Progress) -> None:
+    report(replace(event, task=task))
+
+
+class Stages:
+    """Tasks one after the other: each ends when the next begins."""
+
+    def __init__(self, report: Reporter) -> None:
+        self._report = report
+        self._current: Progress | None = None
+
+    def begin(self, task: str) -> None:
+        """End the task that is going on, and begin the next."""
+        self.end()
+        self._current = Progress(task)
+        self._report(self._current)
+
+    def end(self) -> None:
+        """End the task that is going on, if there is one."""
+        if self._current is not None:
+            self._report(replace(self._current, result=""))
+            self._current = None
