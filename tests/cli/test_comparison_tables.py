@@ -109,7 +109,7 @@ def test_data_sets_are_told_apart_where_there_are_several(tmp_path: Path) -> Non
 
 def test_a_pipe_gets_one_plain_line_for_each_run_and_the_tables(tmp_path: Path) -> None:
     run = compared(write_config(tmp_path, workers=1), tmp_path / "out")
-    lines = run.stderr.splitlines()
+    lines = [line for line in run.stderr.splitlines() if " of 2,000" not in line]  # how far a run is, on a busy machine
     assert [line.split(":")[0] for line in lines] == [
         "comparing",
         "[1/3] flower theoretical seed 1",
@@ -152,9 +152,8 @@ def test_a_terminal_shows_a_bar_for_all_runs_and_one_for_each_that_is_under_way(
     code, shown = on_a_terminal("compare", config, "--output", tmp_path / "out")
     assert code == 0, shown
     plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown)
-    assert re.search(r"runs +━+.* 1/3", plain)
-    assert re.search(r"flower \[/b\] one seed 1 ━+.*\d+/10000 best 0\.\d{6}", plain)
-    assert re.search(r"runs +━+ 3/3", plain)
+    assert re.search(r"comparing +━+.* 1 of 3", plain)
+    assert re.search(r"flower \[/b\] one seed 1 ━+.*[\d,]+ of 10,000, best 0\.\d{6} 0:", plain)
     assert "flower two seed 1: budget, cost 0." in plain
     assert "Traceback" not in plain
 

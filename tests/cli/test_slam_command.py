@@ -217,7 +217,10 @@ def test_a_mistake_is_one_line_and_writes_nothing(
     places = _places(tmp_path.with_name(f"{tmp_path.name}_places"), driven)
     named = [_placed(argument, places) for argument in arguments]
     before = load_dataset(driven.data).hash
-    assert_refused(command("slam", *named), *parts)
+    printed = command("slam", *named)
+    told = printed.stderr.splitlines()  # that SLAM begins, where only its work finds the mistake, and the line
+    assert_refused(printed._replace(stderr=told[-1] + "\n"), *parts)
+    assert set(told[:-1]) <= {"SLAM: 1 run"}
     assert not Path("found").exists()
     assert load_dataset(driven.data).hash == before
 

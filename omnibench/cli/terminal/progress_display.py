@@ -16,7 +16,7 @@ from omnibench.progress import Progress
 from omnibench.words import plural
 
 _PERIOD: Final = 10.0  # s between two lines of tasks that go on, in a pipe; chosen
-_BAR: Final = 24  # columns of a bar at most; it shrinks where words need the room
+_BAR: Final = 24  # columns of a bar at most, and a sixth of a narrow terminal; chosen
 
 
 class ProgressDisplay:
@@ -30,7 +30,7 @@ class ProgressDisplay:
         self.console = console or make_console(error=True)
         self._bars = Bars(
             TextColumn("{task.description}", markup=False, table_column=Column()),
-            BarColumn(bar_width=None, table_column=Column(max_width=_BAR)),
+            BarColumn(min(_BAR, self.console.width // 6), table_column=Column(no_wrap=True)),
             TextColumn("{task.fields[state]}", markup=False, table_column=Column()),
             TimeElapsedColumn(table_column=Column(no_wrap=True)),
             console=self.console,
@@ -39,7 +39,7 @@ class ProgressDisplay:
         )
         self._tasks: dict[str, TaskID] = {}
         self._period = period
-        self._said = time.monotonic()  # when the last line of a task that goes on was printed
+        self._said = time.monotonic()  # when the last line was printed
 
     def __enter__(self) -> ProgressDisplay:
         return self
@@ -64,25 +64,22 @@ class ProgressDisplay:
     def keep(self, line: str) -> None:
         """Print a line that stays."""
         self.console.print(line, soft_wrap=True, markup=False, highlight=False)
+        self._said = time.monotonic()
 
     def _say(self, event: Progress, state: str) -> None:
         """A line in a pipe, if there is something to say and it is time."""
-        now = time.monotonic()
         if not self._tasks and not event.done:
             of_all = "" if event.total is None else f": {plural(event.total, event.unit)}"
             self.keep(f"{event.task}{of_all}")
-        elif state and now - self._said >= self._period:
+        elif state and time.monotonic() - self._said >= self._period:
             self.keep(f"{event.task}: {state}")
-        else:
-            return
-        self._said = now
 
 
 def _state(event: Progress) -> str:
     """How far a task is, in words."""
     parts = []
     if event.total is not None:
-        parts.append(f"{event.done:,} of {plural(event.total, event.unit)}")
+        parts.append(f"{event.done:,} of {event.total:,}")
     elif event.done:
         parts.append(plural(event.done, event.unit))
     if event.best is not None and math.isfinite(event.best):
