@@ -12,17 +12,16 @@ the three wheels this one fits the camera's final poses best (tests/plugins/test
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from pydantic import Field
 
 from omnibench.data.alignment import median_period
-from omnibench.data.dataset import Dataset, Split, Trajectory, make_dataset
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.delimited import read_numbers
 from omnibench.data.importer import Importer
-from omnibench.data.splits import Names, every_second, repetitions, split_by_name
+from omnibench.data.splits import Names, divided, every_second
 from omnibench.errors import DataError
 from omnibench.registry import Options, importers
 from omnibench.robot.kinematics import Robot, Wheel
@@ -72,28 +71,18 @@ class Robotino(Importer):
         if not files:
             raise DataError(f"{source}: no exp*.csv below it; name a folder of the research-wheel-slippage data sets")
         runs = sorted((_read_run(file) for file in files), key=lambda run: (run.session, run.v, run.alpha, run.id))
-        numbers = repetitions([run.command for run in runs])
+        commands = list(dict.fromkeys(run.command for run in runs))
+        sides = dict(zip(commands, every_second([0] * len(commands)), strict=True))
+        by_direction = [sides[run.command] for run in runs]
         return make_dataset(
             self.options.name,
             ROBOT,
             median_period([run.times for run in runs]),
-            [
-                replace(run, split=split, repetition=number)
-                for run, split, number in zip(runs, self._splits(runs), numbers, strict=True)
-                if split is not None
-            ],
+            divided(runs, self.options.train, self.options.validation, otherwise=by_direction),
             description="Festo Robotino v2, motor encoders and an overhead camera, translation only",
             source="public GitHub repository BrOleg5/research-wheel-slippage, commit b4303b4c",
             licence="Apache-2.0",
         )
-
-    def _splits(self, runs: list[Trajectory]) -> list[Split | None]:
-        if self.options.train or self.options.validation:
-            names = [run.id for run in runs]
-            return split_by_name(names, self.options.train, self.options.validation, "run")
-        commands = list(dict.fromkeys(run.command for run in runs))
-        sides = dict(zip(commands, every_second([0] * len(commands)), strict=True))
-        return [sides[run.command] for run in runs]
 
 
 def _read_run(file: Path) -> Trajectory:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,11 +39,9 @@ class NumberTable:
     def increasing(self, name: str) -> Array:
         """One column (rows,), which must increase; DataError names the first row that does not."""
         values = self.column(name)
-        bad = np.flatnonzero(np.diff(values) <= 0)
-        if len(bad):
-            row = int(bad[0]) + 1
-            what = "is repeated" if values[row] == values[row - 1] else "goes backwards"
-            raise self.fail(row, f"{name} {what}: {values[row]:.10g} after {values[row - 1]:.10g}")
+        flaw = not_increasing(values)
+        if flaw is not None:
+            raise self.fail(flaw[0], f"{name} {flaw[1]}")
         return values
 
     def fail(self, row: int, what: str) -> DataError:
@@ -56,14 +54,15 @@ def read_numbers(
     required: Sequence[str],
     *,
     optional: Sequence[str] = (),
-    separator: str = ",",
+    separator: str | None = ",",
     header_lines: int = 1,
 ) -> NumberTable:
     """The columns ``required``, and those of ``optional`` that are there, of a delimited text file.
 
     The last of the header lines names the columns; without header lines the file has exactly the required columns.
-    Blank lines are skipped. DataError: the file cannot be read, a column is missing or named twice, the file has no
-    rows, a row has more or fewer fields than columns, a field is not a finite number.
+    separator: None for white space, with comments from ``#`` on. Blank lines are skipped. DataError: the file cannot be
+    read, a column is missing or named twice, the file has no rows, a row has more or fewer fields than columns, a field
+    is not a finite number.
     """
     lines = _read_lines(file, separator)
     names = [name.strip() for name in _header(file, lines, header_lines)] if header_lines else list(required)
@@ -72,10 +71,11 @@ def read_numbers(
         _check_column(file, name, names)
     rows = lines[header_lines:]
     if not rows:
-        raise DataError(f"{file}: it has no rows")
+        raise DataError(f"{file}: it has no rows" + ("" if header_lines else f"; a row is {' '.join(required)}"))
     for row, (line, fields) in enumerate(rows):
         if len(fields) != len(names):
-            raise row_error(file, row, line, f"it has {len(fields)} fields, expected {len(names)}; repair the row")
+            what = f"it has {len(fields)} fields, expected {len(names)}"
+            raise row_error(file, row, line, f"{what}{'; repair the row' if header_lines else ': ' + ' '.join(names)}")
     chosen = [names.index(name) for name in wanted]
     try:
         values = np.array([[fields[index] for index in chosen] for _, fields in rows], dtype=float)
@@ -84,6 +84,22 @@ def read_numbers(
     if not np.isfinite(values).all():
         raise _first_flaw(file, rows, wanted, chosen)
     return NumberTable(file, tuple(wanted), values, np.array([line for line, _ in rows]))
+
+
+def not_increasing(values: Array) -> tuple[int, str] | None:
+    """The first row (0 is the first) of values (rows,) that is not above the one before, and why; None without one."""
+    bad = np.flatnonzero(np.diff(values) <= 0)
+    if not len(bad):
+        return None
+    before, value = values[bad[0]], values[bad[0] + 1]
+    what = "is repeated" if value == before else "goes backwards"
+    return int(bad[0]) + 1, f"{what}: {value:.10g} after {before:.10g}"
+
+
+def missing_column(file: Path, column: str, columns: Iterable[str]) -> DataError:
+    """The error of a table without a column that it must have."""
+    known = ", ".join(filter(None, columns))
+    return DataError(f"{file}: column {column!r} is missing; {nearest(column, columns)}found: {known}")
 
 
 def row_error(file: Path, row: int, line: int, what: str) -> DataError:
@@ -104,7 +120,10 @@ def read_text(file: Path) -> str:
         raise DataError(f"{file}: cannot be read: {error.strerror or error}") from None
 
 
-def _read_lines(file: Path, separator: str) -> list[tuple[int, list[str]]]:
+def _read_lines(file: Path, separator: str | None) -> list[tuple[int, list[str]]]:
+    if separator is None:
+        rows = (text.split("#", 1)[0].split() for text in read_text(file).splitlines())
+        return [(line, fields) for line, fields in enumerate(rows, 1) if fields]
     reader = csv.reader(read_text(file).splitlines(), delimiter=separator)
     try:
         return [(reader.line_num, fields) for fields in reader if any(field.strip() for field in fields)]
@@ -121,8 +140,7 @@ def _header(file: Path, lines: Sequence[tuple[int, list[str]]], header_lines: in
 def _check_column(file: Path, name: str, names: Sequence[str]) -> None:
     count = names.count(name)
     if count == 0:
-        known = ", ".join(filter(None, names))
-        raise DataError(f"{file}: column {name!r} is missing; {nearest(name, names)}found: {known}")
+        raise missing_column(file, name, names)
     if count > 1:
         raise DataError(f"{file}: column {name!r} is there {count} times; name each column once")
 

@@ -12,6 +12,7 @@ import polars as pl
 from numpy.typing import NDArray
 from polars.io.plugins import register_io_source
 
+from omnibench.data.delimited import missing_column, not_increasing
 from omnibench.data.scans import Ranges, Scanner, Scans, TrajectoryScans
 from omnibench.data.table import Table
 from omnibench.errors import DataError, nearest
@@ -25,14 +26,6 @@ _MOST_ROWS = 4096  # rows of a Parquet file that are read at a time; about 20 MB
 _ROWS_OF_CSV = 65536  # rows of a CSV file read at a time: more, since every reading begins at its first line
 
 Rows = NDArray[np.intp]
-
-
-def scans_file(folder: Path) -> Path | None:
-    """The table of scans in a data set's folder, if there is one. DataError when there are two."""
-    files = [file for file in (folder / "scans.parquet", folder / "scans.csv") if file.is_file()]
-    if len(files) > 1:
-        raise DataError(f"{folder}: both scans.parquet and scans.csv are there; remove the one that is not meant")
-    return files[0] if files else None
 
 
 class ScansOnDisk(Scans):
@@ -138,9 +131,9 @@ class ScansOnDisk(Scans):
                 problem = f"trajectory {trajectory} is not in the table of trajectories; {nearest(trajectory, known)}"
                 raise table.fail(int(run_rows[0]), problem.rstrip("; "))
             stamps = times[run_rows]
-            for bad in np.flatnonzero(np.diff(stamps) <= 0)[:1]:
-                what = "goes backwards" if stamps[bad + 1] < stamps[bad] else "is repeated"
-                raise table.fail(int(run_rows[bad + 1]), f"t {what}: {stamps[bad + 1]:g} after {stamps[bad]:g}")
+            flaw = not_increasing(stamps)
+            if flaw is not None:
+                raise table.fail(int(run_rows[flaw[0]]), f"t {flaw[1]}")
             index[str(trajectory)] = run_rows, stamps
         return index
 
@@ -152,16 +145,12 @@ class ScansOnDisk(Scans):
             raise DataError(f"{self.file}: cannot be read: {error}") from None
         for column in _COLUMNS:
             if column not in schema:
-                known = ", ".join(schema)
-                raise DataError(f"{self.file}: column {column!r} is missing; {nearest(column, schema)}found: {known}")
-        if schema["trajectory"].is_nested():
-            raise DataError(f"{self.file}: column 'trajectory' holds {schema['trajectory']}, expected names or numbers")
-        frame = self._collect(self._lazy().select(pl.col("trajectory").cast(pl.String), pl.col("t")))
+                raise missing_column(self.file, column, schema)
+        frame = self._collect(self._lazy().select("trajectory", "t"))
         if frame.is_empty():
             raise DataError(f"{self.file}: it has no rows; remove it, or record scans")
         table = Table(self.file, frame)
-        for row in frame["trajectory"].is_null().arg_true()[:1]:
-            raise table.fail(int(row), "trajectory is missing")
+        table.name_trajectories()
         return table
 
     def _fail(self, row: int, what: str) -> DataError:

@@ -1,16 +1,19 @@
-"""Division of imported runs into training and validation."""
+"""Division of imported runs into training and validation, and what they have in common."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Hashable, Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator
 
-from omnibench.data.dataset import Split
+from omnibench.data.dataset import Split, Trajectory
 from omnibench.errors import ConfigError, nearest
+
+_OPTIONAL = ("angles", "targets", "pose_covariances")  # fields of a run that all runs of a data set have, or none
 
 
 def _as_names(value: Any) -> Any:
@@ -21,6 +24,40 @@ def _as_names(value: Any) -> Any:
 
 Names = Annotated[tuple[str, ...], BeforeValidator(_as_names)]
 """An option that takes one name or pattern, or a list of them."""
+
+
+def divided(
+    runs: Sequence[Trajectory],
+    train: Sequence[str],
+    validation: Sequence[str],
+    kind: str = "run",
+    *,
+    names: Sequence[str] | None = None,
+    otherwise: Sequence[Split] | None = None,
+    alike: Sequence[Hashable] | None = None,
+) -> list[Trajectory]:
+    """The runs with their splits and the number of each repetition; runs that belong to no split are left out.
+
+    train, validation: patterns as for ``split_by_name``, of ``names`` (default: the runs' ids). Without patterns the
+    splits are ``otherwise``; by default every second run of a command validates. alike: equal for repetitions of one
+    motion (default: the command). ConfigError as for ``split_by_name``.
+    """
+    splits: Sequence[Split | None] = otherwise or every_second([run.command for run in runs])
+    if train or validation:
+        splits = split_by_name(names or [run.id for run in runs], train, validation, kind)
+    numbers = repetitions(alike or [run.command or run.id for run in runs])
+    return [
+        replace(run, split=split, repetition=number if run.command else None)
+        for run, split, number in zip(runs, splits, numbers, strict=True)
+        if split is not None
+    ]
+
+
+def complete(runs: Sequence[Trajectory]) -> list[Trajectory]:
+    """The runs without what only some of them hold: absolute angles, targets, covariances of poses."""
+    partial = [name for name in _OPTIONAL if any(getattr(run, name) is None for run in runs)]
+    missing: dict[str, Any] = dict.fromkeys(partial)
+    return [replace(run, **missing) for run in runs]
 
 
 def split_by_name(

@@ -14,9 +14,10 @@ from pydantic import Field, model_validator
 
 from omnibench.config import Model, read_yaml, to_yaml, validate
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, make_dataset
-from omnibench.data.scan_files import ScansOnDisk, scans_file, write_scans
+from omnibench.data.delimited import not_increasing
+from omnibench.data.scan_files import ScansOnDisk, write_scans
 from omnibench.data.scans import Scanner, Scans
-from omnibench.data.table import Table, read_table
+from omnibench.data.table import Table, read_table, table_file
 from omnibench.errors import ConfigError, DataError, nearest
 from omnibench.files import FileContent, TableFormat, encode_table, remove, write_files
 from omnibench.robot.kinematics import Array, Robot
@@ -191,7 +192,7 @@ def _read_header(folder: Path) -> Header:
 
 
 def _scans(folder: Path, header: Header, trajectories: Sequence[str]) -> ScansOnDisk | None:
-    file = scans_file(folder)
+    file = table_file(folder, "scans")
     if file is None:
         return None
     if header.scanner is None:
@@ -272,12 +273,9 @@ def _check_pose_times(poses: Table, groups: Sequence[np.ndarray[Any, np.dtype[np
 
 def _check_increasing(table: Table, times: Array, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]) -> None:
     for rows in groups:
-        steps = np.diff(times[rows])
-        bad = np.flatnonzero(steps <= 0)
-        if len(bad):
-            row, before = int(rows[bad[0] + 1]), int(rows[bad[0]])
-            what = "goes backwards" if steps[bad[0]] < 0 else "is repeated"
-            raise table.fail(row, f"t {what}: {times[row]:g} after {times[before]:g}")
+        flaw = not_increasing(times[rows])
+        if flaw is not None:
+            raise table.fail(int(rows[flaw[0]]), f"t {flaw[1]}")
 
 
 def _trajectory(

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from omnibench.errors import DataError, nearest
+from omnibench.data.delimited import missing_column
+from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
 # Names may consist of digits: 007 is not 7.
@@ -55,6 +56,15 @@ class Table:
             raise self.fail(int(huge[0]), f"{column} is {values[huge[0]]:g}, which no robot can reach; check the units")
         return values
 
+    def name_trajectories(self) -> None:
+        """Make the trajectories' ids texts. DataError when they are neither names nor numbers, or one is missing."""
+        ids = self.frame["trajectory"]
+        if ids.dtype.is_nested():
+            raise DataError(f"{self.file}: column 'trajectory' holds {ids.dtype}, expected names or numbers")
+        for row in ids.is_null().arg_true()[:1]:
+            raise self.fail(int(row), "trajectory is missing")
+        self.frame = self.frame.with_columns(ids.cast(pl.String))
+
     def stack(self, columns: Sequence[str]) -> Array | None:
         """Optional columns as (rows, n), or None when none is there. DataError when only some are."""
         missing = [column for column in columns if column not in self.frame.columns]
@@ -67,12 +77,9 @@ class Table:
 
 def read_table(folder: Path, name: str, required: Sequence[str]) -> Table:
     """The table called ``name`` of a data set. DataError when it, its rows or a required column are missing."""
-    files = [file for file in (folder / f"{name}.parquet", folder / f"{name}.csv") if file.is_file()]
-    if not files:
+    file = table_file(folder, name)
+    if file is None:
         raise DataError(f"{folder}: {name}.parquet (or {name}.csv) is missing")
-    if len(files) > 1:
-        raise DataError(f"{folder}: both {name}.parquet and {name}.csv are there; remove the one that is not meant")
-    (file,) = files
     try:
         if file.suffix == ".parquet":
             frame = pl.read_parquet(file)
@@ -85,15 +92,17 @@ def read_table(folder: Path, name: str, required: Sequence[str]) -> Table:
         raise DataError(f"{file}: column {twice[0].partition('_duplicated_')[0]!r} is there twice; remove one")
     for column in required:
         if column not in frame.columns:
-            known = ", ".join(frame.columns)
-            raise DataError(f"{file}: column {column!r} is missing; {nearest(column, frame.columns)}found: {known}")
+            raise missing_column(file, column, frame.columns)
     if frame.is_empty():
         raise DataError(f"{file}: it has no rows")
     table = Table(file, frame)
-    if frame["trajectory"].dtype.is_nested():
-        raise DataError(f"{file}: column 'trajectory' holds {frame['trajectory'].dtype}, expected names or numbers")
-    missing = frame["trajectory"].is_null().arg_true()
-    if len(missing):
-        raise table.fail(int(missing[0]), "trajectory is missing")
-    table.frame = frame.with_columns(pl.col("trajectory").cast(pl.String))
+    table.name_trajectories()
     return table
+
+
+def table_file(folder: Path, name: str) -> Path | None:
+    """The file of the table called ``name`` in a data set's folder, if there is one. DataError when there are two."""
+    files = [file for file in (folder / f"{name}.parquet", folder / f"{name}.csv") if file.is_file()]
+    if len(files) > 1:
+        raise DataError(f"{folder}: both {name}.parquet and {name}.csv are there; remove the one that is not meant")
+    return files[0] if files else None

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -13,14 +12,14 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from omnibench.data.alignment import align, median_period
-from omnibench.data.dataset import Dataset, Split, Trajectory, make_dataset
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.delimited import read_numbers
 from omnibench.data.importer import Importer
-from omnibench.data.importers.robot_option import RobotOption
+from omnibench.data.importers.recording_options import RecordingOptions
 from omnibench.data.importers.tum import read_tum
-from omnibench.data.splits import Names, every_second, repetitions, split_by_name
+from omnibench.data.splits import Names, divided
 from omnibench.errors import DataError
-from omnibench.registry import Options, importers
+from omnibench.registry import importers
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
@@ -40,10 +39,10 @@ _PREFIX = {"rad": "phi_", "deg": "phi_", "ticks": "ticks_", "ticks/sample": "tic
 _POSE_SUFFIXES = ("_poses.csv", "_poses.tum")
 
 
-class CsvOptions(Options):
+class CsvOptions(RecordingOptions):
     """Names of files and columns, units, the robot, and which runs train and validate."""
 
-    robot: RobotOption = Field(description="mapping as in dataset.yaml, or path of a YAML file")
+    name: str = Field("csv", min_length=1, description="name of the data set")
     wheel_unit: Literal["rad/s", "deg/s", "rpm", "rad", "deg", "ticks", "ticks/sample"] = Field(
         "rad/s", description="rates (.../s, rpm), absolute angles (rad, deg, ticks) or increments (ticks/sample)"
     )
@@ -66,15 +65,6 @@ class CsvOptions(Options):
     command_pattern: str | None = Field(
         None, description="regular expression: its group 1 in a run's name is the command"
     )
-    train: Names = Field((), description="patterns of run names that train")
-    validation: Names = Field((), description="patterns of run names that validate")
-    sample_period: float | None = Field(
-        None, gt=0, allow_inf_nan=False, description="s; default: the median of the wheel samples"
-    )
-    name: str = Field("csv", min_length=1, description="name of the data set")
-    description: str = ""
-    source: str = ""
-    licence: str = ""
 
     @model_validator(mode="after")
     def _fits_together(self) -> CsvOptions:
@@ -138,16 +128,8 @@ class Csv(Importer):
     def read(self, source: Path) -> Dataset:
         """All runs under ``source``; DataError names the file and the row of what is wrong."""
         files = _find_runs(source, self.options)
-        runs = self._with_commands([self._read_run(name, *pair) for name, pair in files.items()])
-        return make_dataset(
-            self.options.name,
-            self.options.robot,
-            self.options.sample_period or median_period([run.times for run in runs]),
-            runs,
-            description=self.options.description,
-            source=self.options.source,
-            licence=self.options.licence,
-        )
+        runs = [self._read_run(name, *pair) for name, pair in files.items()]
+        return self.options.dataset(divided(runs, self.options.train, self.options.validation))
 
     def _read_run(self, name: str, wheel_file: Path, pose_file: Path) -> Trajectory:
         wheels = _read_wheels(wheel_file, self.options)
@@ -159,6 +141,8 @@ class Csv(Importer):
                 f"{pose_times[-1]:.10g} s, wheels {wheels.begin:.10g} to {wheels.times[-1]:.10g} s); check time units"
             )
         times = wheels.times[aligned.kept] - aligned.zero
+        pattern = self.options.command_pattern
+        match = re.search(pattern, name) if pattern else None
         return Trajectory(
             id=name,
             split="train",
@@ -166,25 +150,10 @@ class Csv(Importer):
             rates=wheels.rates[aligned.kept],
             pose_times=aligned.pose_times,
             poses=aligned.poses,
+            command=match.group(1) if match else None,
             duration=float(times[-1]),
             angles=None if wheels.angles is None else wheels.angles[aligned.kept],
         )
-
-    def _with_commands(self, runs: Sequence[Trajectory]) -> list[Trajectory]:
-        pattern = self.options.command_pattern
-        matches = [re.search(pattern, run.id) if pattern else None for run in runs]
-        commands = [match.group(1) if match else None for match in matches]
-        numbers = repetitions([command or run.id for command, run in zip(commands, runs, strict=True)])
-        splits: Sequence[Split | None]
-        if self.options.train or self.options.validation:
-            splits = split_by_name([run.id for run in runs], self.options.train, self.options.validation, "run")
-        else:
-            splits = every_second(commands)
-        return [
-            replace(run, split=split, command=command, repetition=number if command else None)
-            for run, split, command, number in zip(runs, splits, commands, numbers, strict=True)
-            if split is not None
-        ]
 
 
 @dataclass(frozen=True, eq=False)

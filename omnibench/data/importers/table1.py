@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
-from omnibench.data.alignment import align, median_period
-from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, make_dataset
+from omnibench.data.alignment import align
+from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.data.delimited import NumberTable, read_numbers
 from omnibench.data.importer import Importer
+from omnibench.data.importers.recording_options import RecordingOptions
 from omnibench.data.importers.robot_option import RobotOption
-from omnibench.data.splits import Names, every_second, repetitions, split_by_name
+from omnibench.data.splits import complete, divided
 from omnibench.errors import DataError
-from omnibench.registry import Options, importers
+from omnibench.registry import importers
 from omnibench.robot.kinematics import Array, Robot, Wheel
 from omnibench.words import plural
 
@@ -37,20 +38,12 @@ APR_02 = Robot(
 """The design values behind Eq. (7)."""
 
 
-class Table1Options(Options):
+class Table1Options(RecordingOptions):
     """Unit of positions, the robot, and which trajectories train and validate."""
 
     position_unit: Literal["m", "mm"] = Field("m", description="of x and y in slam.csv; Table 1 has m")
     robot: RobotOption = Field(APR_02, description="mapping as in dataset.yaml, or path of a YAML file; default APR-02")
-    train: Names = Field((), description="patterns of trajectory names that train")
-    validation: Names = Field((), description="patterns of trajectory names that validate")
-    sample_period: float | None = Field(
-        None, gt=0, allow_inf_nan=False, description="s; default: the median of the wheel samples"
-    )
     name: str = Field("table1", min_length=1, description="name of the data set")
-    description: str = ""
-    source: str = ""
-    licence: str = ""
 
 
 @importers.register("table1")
@@ -84,20 +77,11 @@ class Table1(Importer):
                 f"{source}: no command.csv below it; Table 1 wants one folder a trajectory with command.csv"
             )
         runs = [self._trajectory(folder, _name(folder, source)) for folder in folders]
-        if any(run.targets is None for run in runs):
-            runs = [replace(run, targets=None) for run in runs]
-        numbers = repetitions([(run.session, run.command) for run in runs])
-        runs = [replace(run, repetition=number) for run, number in zip(runs, numbers, strict=True)]
-        period = self.options.sample_period or median_period([run.times for run in runs])
-        return make_dataset(
-            self.options.name,
-            self.options.robot,
-            period,
-            self._split(runs),
-            description=self.options.description,
-            source=self.options.source,
-            licence=self.options.licence,
-        )
+        train, validation = self.options.train, self.options.validation
+        by_folder = None if train or validation else _splits_by_folder([run.id for run in runs])
+        alike = [(run.session, run.command) for run in runs]
+        runs = divided(complete(runs), train, validation, "trajectory", otherwise=by_folder, alike=alike)
+        return self.options.dataset(runs)
 
     def _trajectory(self, folder: Path, name: str) -> Trajectory:
         wheels = self.options.robot.wheel_names
@@ -129,21 +113,6 @@ class Table1(Importer):
             duration=float(times[-1]),
             targets=None if command.targets is None else np.tile(command.targets, (len(times), 1)),
         )
-
-    def _split(self, runs: Sequence[Trajectory]) -> list[Trajectory]:
-        names = [run.id for run in runs]
-        splits: Sequence[Split | None]
-        if self.options.train or self.options.validation:
-            splits = split_by_name(names, self.options.train, self.options.validation, "trajectory")
-        else:
-            by_folder = [_split_in(name) for name in names]
-            splits = by_folder if any(by_folder) else every_second([run.command for run in runs])
-            if any(by_folder) and not all(by_folder):
-                stray = names[by_folder.index(None)]
-                raise DataError(
-                    f"trajectory {stray!r} is in no folder train or validation; move it or give train=PATTERN"
-                )
-        return [replace(run, split=split) for run, split in zip(runs, splits, strict=True) if split is not None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,5 +154,11 @@ def _name(folder: Path, source: Path) -> str:
     return folder.resolve().name if name == "." else name
 
 
-def _split_in(name: str) -> Split | None:
-    return next((split for split in SPLITS if split in name.split("/")), None)
+def _splits_by_folder(names: Sequence[str]) -> list[Split] | None:
+    """The splits by folders called train and validation; None without such folders."""
+    found = [next((split for split in SPLITS if split in name.split("/")), None) for name in names]
+    splits = [split for split in found if split]
+    if splits and len(splits) < len(names):
+        stray = names[found.index(None)]
+        raise DataError(f"trajectory {stray!r} is in no folder train or validation; move it or give train=PATTERN")
+    return splits or None

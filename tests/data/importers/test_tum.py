@@ -73,7 +73,7 @@ def test_a_malformed_row_is_named(tmp_path: Path, row: str, message: str) -> Non
 
 
 def test_a_file_without_poses_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="it has no poses; a row is timestamp tx ty tz qx qy qz qw"):
+    with pytest.raises(DataError, match="it has no rows; a row is timestamp tx ty tz qx qy qz qw"):
         read_tum(write(tmp_path, "# nothing"))
 
 

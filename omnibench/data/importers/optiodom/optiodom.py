@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from omnibench.data.alignment import median_period
-from omnibench.data.dataset import Dataset, Split, Trajectory, make_dataset
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.delimited import NumberTable, read_numbers
 from omnibench.data.importer import Importer
 from omnibench.data.importers.optiodom.session_files import (
@@ -21,7 +21,7 @@ from omnibench.data.importers.optiodom.session_files import (
     read_metadata,
     run_number,
 )
-from omnibench.data.splits import Names, every_second, repetitions, split_by_name
+from omnibench.data.splits import Names, complete, divided
 from omnibench.errors import DataError
 from omnibench.registry import Options, importers
 from omnibench.robot.kinematics import Array, Robot, Wheel
@@ -75,13 +75,15 @@ class Optiodom(Importer):
             raise DataError(f"{source}: no *_metadata.csv below it; name a folder with OptiOdom sessions (data/omni3)")
         robot = self._robot(sessions)
         runs = [run for session in sessions for run in _read_session(session, self.options.log)]
-        if not all(run.angles is not None for run in runs):
-            runs = [replace(run, angles=None) for run in runs]
+        groups = [session.group for session in sessions for _ in session.runs]
+        train, validation = self.options.train, self.options.validation
+        if not train and not validation and len(set(groups)) > 1:
+            train = (min(groups),)
         return make_dataset(
             self.options.name,
             robot,
             median_period([run.pose_times for run in runs]),
-            self._split(runs, [session.group for session in sessions for _ in session.runs]),
+            divided(complete(runs), train, validation, "group", names=groups),
             description=_DESCRIPTION,
             source=self.options.source,
             licence="MIT",
@@ -103,21 +105,6 @@ class Optiodom(Importer):
             for index, (diameter, axle) in enumerate(zip(first.diameters, _AXLES_DEG, strict=True))
         )
         return Robot(name=self.options.robot_name, wheels=tuple(wheels))
-
-    def _split(self, runs: Sequence[Trajectory], groups: Sequence[str]) -> list[Trajectory]:
-        train, validation = self.options.train, self.options.validation
-        splits: Sequence[Split | None]
-        if not train and not validation and len(set(groups)) == 1:
-            splits = every_second([run.command for run in runs])
-        else:
-            first = train or (() if validation else (min(groups),))
-            splits = split_by_name(groups, first, validation, "group")
-        numbers = repetitions([run.command or run.id for run in runs])
-        return [
-            replace(run, split=split, repetition=number if run.command else None)
-            for run, split, number in zip(runs, splits, numbers, strict=True)
-            if split is not None
-        ]
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from omnibench.data.alignment import median_period
-from omnibench.data.dataset import Dataset, Split, Trajectory, make_dataset
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importer import Importer
 from omnibench.data.importers.rosbag.bag import find_bags
 from omnibench.data.importers.rosbag.bag_recording import cut_into_runs, read_recording
 from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
 from omnibench.data.importers.rosbag.scan_stream import RunScans, gather_scans
-from omnibench.data.splits import every_second, repetitions, split_by_name
+from omnibench.data.splits import complete, divided
 from omnibench.errors import DataError
 from omnibench.registry import importers
 from omnibench.robot.model import OdometryModel
@@ -80,20 +79,9 @@ class Rosbag(Importer):
             )
         if unreferenced:
             runs = self._with_placeholders(runs)
-        if any(run.angles is None for run in runs):
-            runs = [replace(run, angles=None) for run in runs]
-        if any(run.pose_covariances is None for run in runs):
-            runs = [replace(run, pose_covariances=None) for run in runs]
-        chosen = self._split(runs)
-        dataset = make_dataset(
-            self.options.name,
-            self.options.robot,
-            self.options.sample_period or median_period([run.times for run in runs]),
-            chosen,
-            description=self.options.description,
-            source=self.options.source,
-            licence=self.options.licence,
-            scans=gather_scans({run.id: scans[run.id] for run in chosen if run.id in scans}),
+        chosen = divided(complete(runs), self.options.train, self.options.validation)
+        dataset = self.options.dataset(
+            chosen, gather_scans({run.id: scans[run.id] for run in chosen if run.id in scans})
         )
         if unreferenced:  # the data set is checked once more when it has its poses
             return replace(dataset, referenced=False, warnings=tuple(warnings))
@@ -104,16 +92,3 @@ class Rosbag(Importer):
         design = OdometryModel.of_design(self.options.robot, "arc")
         poses = design.poses([run.log(run.pose_times) for run in runs])
         return [replace(run, poses=pose) for run, pose in zip(runs, poses, strict=True)]
-
-    def _split(self, runs: Sequence[Trajectory]) -> list[Trajectory]:
-        splits: Sequence[Split | None]
-        if self.options.train or self.options.validation:
-            splits = split_by_name([run.id for run in runs], self.options.train, self.options.validation, "run")
-        else:
-            splits = every_second([run.command for run in runs])
-        numbers = repetitions([run.command or run.id for run in runs])
-        return [
-            replace(run, split=split, repetition=number if run.command else None)
-            for run, split, number in zip(runs, splits, numbers, strict=True)
-            if split is not None
-        ]

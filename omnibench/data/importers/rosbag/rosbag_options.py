@@ -6,18 +6,17 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from omnibench.data.importers.robot_option import RobotOption
+from omnibench.data.importers.recording_options import RecordingOptions
 from omnibench.data.importers.rosbag.message_streams import Use
 from omnibench.data.scans import Mount
 from omnibench.data.splits import Names
-from omnibench.registry import Options
 from omnibench.words import plural
 
 
-class RosbagOptions(Options):
+class RosbagOptions(RecordingOptions):
     """The robot, topics and joints, how the recording is cut into runs, and which of these train and validate."""
 
-    robot: RobotOption = Field(description="mapping as in dataset.yaml, or path of a YAML file")
+    name: str = Field("rosbag", min_length=1, description="name of the data set")
     wheel_topic: str | None = Field(
         None,
         min_length=1,
@@ -58,15 +57,6 @@ class RosbagOptions(Options):
         None, min_length=1, description="each message begins a run; a std_msgs/String names its command"
     )
     window: float | None = Field(None, gt=0, allow_inf_nan=False, description="s; length of the runs of cut: windows")
-    train: Names = Field((), description="patterns of run names that train")
-    validation: Names = Field((), description="patterns of run names that validate")
-    sample_period: float | None = Field(
-        None, gt=0, allow_inf_nan=False, description="s; default: the median of the wheel samples"
-    )
-    name: str = Field("rosbag", min_length=1, description="name of the data set")
-    description: str = Field("", description="description of the data set")
-    source: str = Field("", description="origin of the recording")
-    licence: str = Field("", description="licence of the recording")
 
     @model_validator(mode="after")
     def _fits_together(self) -> RosbagOptions:

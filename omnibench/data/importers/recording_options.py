@@ -1,0 +1,42 @@
+"""Options that importers of recordings by any robot share, and the data set made with them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pydantic import Field
+
+from omnibench.data.alignment import median_period
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.data.importers.robot_option import RobotOption
+from omnibench.data.scans import Scans
+from omnibench.data.splits import Names
+from omnibench.registry import Options
+
+
+class RecordingOptions(Options):
+    """The robot, which runs train and validate, and what the data set says of itself."""
+
+    robot: RobotOption = Field(description="mapping as in dataset.yaml, or path of a YAML file")
+    train: Names = Field((), description="patterns of run names that train")
+    validation: Names = Field((), description="patterns of run names that validate")
+    sample_period: float | None = Field(
+        None, gt=0, allow_inf_nan=False, description="s; default: the median of the wheel samples"
+    )
+    name: str = Field("recording", min_length=1, description="name of the data set")
+    description: str = Field("", description="description of the data set")
+    source: str = Field("", description="origin of the recording")
+    licence: str = Field("", description="licence of the recording")
+
+    def dataset(self, runs: Sequence[Trajectory], scans: Scans | None = None) -> Dataset:
+        """The data set of these runs. DataError as for ``make_dataset``."""
+        return make_dataset(
+            self.name,
+            self.robot,
+            self.sample_period or median_period([run.times for run in runs]),
+            runs,
+            description=self.description,
+            source=self.source,
+            licence=self.licence,
+            scans=scans,
+        )
