@@ -41,8 +41,8 @@ def discover(
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.data.storage import load_dataset
     from omnibench.discover.discover import discover_effects
-    from omnibench.discover.document import discovery_document
     from omnibench.discover.output import DiscoverOptions, check_output, write_discovery
+    from omnibench.discover.result import discovery_document
     from omnibench.progress import Progress
     from omnibench.registry import effects
     from omnibench.robot.calibration import read_calibration

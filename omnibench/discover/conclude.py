@@ -15,7 +15,7 @@ from omnibench.discover.experiments import experiments_for
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit
 from omnibench.discover.held_out.validation_runs import ValidationRuns
-from omnibench.discover.result import Discovery, Extrapolation, HeldOut, NamedEffect, Step, Verdict
+from omnibench.discover.result import Discovery, Extrapolation, HeldOut, NamedEffect, NotLookedFor, Step, Verdict
 from omnibench.discover.selection.detectability import Detectability
 from omnibench.discover.selection.model_selection import Selection
 from omnibench.discover.selection.named_effects import candidates_of
@@ -62,14 +62,16 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
     return Discovery(
         dataset=replace(dataset, trajectories=(*fit.runs, *findings.validation.kept)),
         dataset_hash=dataset.hash,
+        simulated=dataset.simulated,
         verdict=findings.verdict,
         headline=headline,
         effects=effects,
         candidates=candidates_of(findings.selection),
         where=where,
         left=left,
-        absorbed=limits.absorbed,
-        not_looked_for=tuple((name, missing.value) for name, missing in limits.not_looked_for),
+        absorbed=tuple(effect.name for effect in limits.absorbed),
+        measurements=limits.absorbed,
+        not_looked_for=tuple(NotLookedFor(name, missing.value) for name, missing in limits.not_looked_for),
         classes=limits.classes,
         hidden=limits.hidden,
         gap=held_out[0 if needs_session else -1].eq6,

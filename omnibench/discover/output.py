@@ -10,9 +10,8 @@ import numpy as np
 import polars as pl
 
 from omnibench.config import Model, to_json, to_yaml
-from omnibench.discover.document import discovery_document, experiment_file
 from omnibench.discover.report.discovery_report import discovery_report
-from omnibench.discover.result import Discovery
+from omnibench.discover.result import CALIBRATION_FILES, Discovery, discovery_document, experiment_file
 from omnibench.files import (
     RESULTS,
     check_results_folder,
@@ -74,8 +73,8 @@ def _contents(discovery: Discovery, options: DiscoverOptions, folder: Path) -> d
         "config.yaml": f"{_MARK}\n{config}",
         "discovery.json": to_json(discovery_document(discovery, folder)) + "\n",
         "report.html": render(discovery_report(discovery, config)),
-        "model.yaml": to_yaml(discovery.extended),
-        "plain.yaml": to_yaml(discovery.plain),
+        CALIBRATION_FILES["extended"]: to_yaml(discovery.extended),
+        CALIBRATION_FILES["plain"]: to_yaml(discovery.plain),
     }
     texts |= {experiment_file(number): each.config for number, each in enumerate(discovery.experiments, 1)}
     contents = {folder / name: text.encode("utf-8") for name, text in texts.items()}

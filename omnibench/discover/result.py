@@ -1,9 +1,16 @@
-"""The result of a discovery: where odometry and reference disagree, what is missing, how sure, how much better."""
+"""The result of a discovery: where odometry and reference disagree, what is missing, how sure, how much better.
+
+It serialises itself as ``discovery.json``, which ``omnibench discover`` writes and, with --json, prints. SI units.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import ConfigDict, Field, FieldSerializationInfo, field_serializer
+from pydantic.dataclasses import dataclass
+from pydantic_core import to_jsonable_python
 
 from omnibench.data.dataset import Dataset
 from omnibench.fit.least_squares.noise import NoiseEstimate
@@ -12,18 +19,25 @@ from omnibench.robot.effects.effect import Stage
 from omnibench.robot.kinematics import Array
 
 Verdict = Literal["none", "named", "class", "incomplete", "unknown"]
+CALIBRATION_FILES = {"extended": "model.yaml", "plain": "plain.yaml"}
+_NOT_WRITTEN = Field(exclude=True)
+_ChiSquare = Annotated[float, Field(serialization_alias="gain")]
 
 
 @dataclass(frozen=True)
 class EstimatedParameter:
     """A value with its 95 % interval. shape: True if it was chosen among a few values; then it has no interval."""
 
-    name: str
+    name: Annotated[str, _NOT_WRITTEN]
     value: float
     unit: str
     low: float
     high: float
     shape: bool = False
+
+    @field_serializer("low", "high")
+    def _bound_or_none(self, bound: float) -> float | None:
+        return None if self.shape else bound
 
 
 @dataclass(frozen=True)
@@ -42,10 +56,14 @@ class NamedEffect:
     confusable_with: tuple[str, ...]
     physics: str
     source: str
-    chi_square: float
+    chi_square: _ChiSquare
     degrees_of_freedom: int
     in_doubt: str
-    class_weight: float
+    class_weight: Annotated[float, _NOT_WRITTEN]
+
+    @field_serializer("parameters")
+    def _by_name(self, parameters: tuple[EstimatedParameter, ...]) -> dict[str, EstimatedParameter]:
+        return {parameter.name: parameter for parameter in parameters}
 
 
 @dataclass(frozen=True)
@@ -53,7 +71,7 @@ class Candidate:
     """An effect that was tried at one step. chi_square: whitened difference. weight: probability of its name."""
 
     name: str
-    chi_square: float
+    chi_square: _ChiSquare
     degrees_of_freedom: int
     weight: float
 
@@ -83,6 +101,14 @@ class Absorbed:
     name: str
     stage: Stage
     measurement: str
+
+
+@dataclass(frozen=True)
+class NotLookedFor:
+    """An effect that these recordings cannot show, and why."""
+
+    name: str
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -123,14 +149,19 @@ class HeldOut:
     """Errors of both models on runs that no fit has seen.
 
     data: "repetitions" (of the training runs, each fold predicted from the others) or "session" (the validation split).
+    position_m, heading_rad: mean final error before and after.
     """
 
-    data: Literal["repetitions", "session"]
+    data: Annotated[Literal["repetitions", "session"], _NOT_WRITTEN]
     runs: int
     eq6: Gap
     chi2: Gap
-    position_m: tuple[float, float]  # mean final error before and after
+    position_m: tuple[float, float]
     heading_rad: tuple[float, float]
+
+    @field_serializer("position_m", "heading_rad")
+    def _before_and_after(self, errors: tuple[float, float]) -> dict[str, float]:
+        return {"before": errors[0], "after": errors[1]}
 
 
 @dataclass(frozen=True)
@@ -169,43 +200,78 @@ class Experiment:
     config: str
 
 
-@dataclass(frozen=True, eq=False)
+def experiment_file(number: int) -> str:
+    """The name of the file of the experiment of that number, the first being 1."""
+    return f"experiment-{number}.yaml"
+
+
+@dataclass(frozen=True, eq=False, config=ConfigDict(arbitrary_types_allowed=True))
 class Discovery:
     """The result of a discovery.
 
-    plain, extended: calibrations without and with the effects that were found. where, left: what the residuals depend
-    on before and after these. dataset: the data set without outliers; dataset_hash: that of the whole data set.
-    outliers: number of reference poses that were left out of the fits. before, after: residuals (K, 3) of each training
-    run, reference minus odometry in m, m, rad, at pose_times[1:]. whitened_before, whitened_after: these, independent
-    and of unit variance under the noise.
+    where, left: what the residuals depend on before and after the effects that were found. absorbed: names of effects
+    that the matrix reproduces; measurements: what would identify them. extended, plain: calibrations with and without
+    the effects; their files are written in their place. dataset: the data set without outliers; dataset_hash: that of
+    the whole data set. outliers: number of reference poses that were left out of the fits. trajectories: names of the
+    training runs. before, after: residuals (K, 3) of each of these, reference minus odometry in m, m, rad, at
+    pose_times[1:]. whitened_before, whitened_after: these, independent and of unit variance under the noise.
     """
 
-    dataset: Dataset
-    dataset_hash: str
     verdict: Verdict
-    headline: str
     effects: tuple[NamedEffect, ...]
-    candidates: tuple[tuple[Candidate, ...], ...]
     where: tuple[CovariateDependence, ...]
-    left: tuple[CovariateDependence, ...]
-    absorbed: tuple[Absorbed, ...]
-    not_looked_for: tuple[tuple[str, str], ...]  # name and why
-    classes: tuple[tuple[str, ...], ...]
-    hidden: tuple[Hidden, ...]
+    absorbed: tuple[str, ...]
     gap: Gap
     held_out: tuple[HeldOut, ...]
+    extended: Annotated[Calibration, Field(serialization_alias="model")]
+    plain: Annotated[Calibration, Field(serialization_alias="plain_model")]
+    headline: str
+    dataset: Dataset
+    dataset_hash: str
+    simulated: bool
+    left: tuple[CovariateDependence, ...]
+    candidates: tuple[tuple[Candidate, ...], ...]
+    classes: tuple[tuple[str, ...], ...]
+    experiments: tuple[Experiment, ...]  # their configs are files beside discovery.json, too
+    measurements: tuple[Absorbed, ...]
+    not_looked_for: tuple[NotLookedFor, ...]
+    hidden: tuple[Hidden, ...]
     steps: tuple[Step, ...]
-    extrapolations: tuple[Extrapolation, ...]
-    experiments: tuple[Experiment, ...]
+    extrapolations: Annotated[tuple[Extrapolation, ...], Field(serialization_alias="novelties")]
     notes: tuple[str, ...]
     noise: NoiseEstimate
-    outliers: int
+    trajectories: Annotated[tuple[str, ...], Field(serialization_alias="runs")]
     poses: int
-    plain: Calibration
-    extended: Calibration
-    trajectories: tuple[str, ...]
-    before: tuple[Array, ...]
-    after: tuple[Array, ...]
-    whitened_before: tuple[Array, ...]
-    whitened_after: tuple[Array, ...]
+    outliers: int
     seconds: float
+    before: Annotated[tuple[Array, ...], _NOT_WRITTEN]
+    after: Annotated[tuple[Array, ...], _NOT_WRITTEN]
+    whitened_before: Annotated[tuple[Array, ...], _NOT_WRITTEN]
+    whitened_after: Annotated[tuple[Array, ...], _NOT_WRITTEN]
+
+    @field_serializer("held_out")
+    def _by_data(self, held_out: tuple[HeldOut, ...]) -> dict[str, HeldOut]:
+        return {held.data: held for held in held_out}
+
+    @field_serializer("extended", "plain")
+    def _file(self, _: Calibration, info: FieldSerializationInfo) -> str:
+        return str(Path(info.context or "", CALIBRATION_FILES[info.field_name]).resolve())
+
+    @field_serializer("dataset")
+    def _name(self, dataset: Dataset) -> str:
+        return dataset.name
+
+    @field_serializer("trajectories")
+    def _count(self, trajectories: tuple[str, ...]) -> int:
+        return len(trajectories)
+
+    @field_serializer("noise")
+    def _components(self, estimate: NoiseEstimate) -> dict[str, object]:
+        values = vars(estimate).copy()
+        return {"components": values.pop("noise"), **values}
+
+
+def discovery_document(discovery: Discovery, folder: Path) -> dict[str, Any]:
+    """The content of discovery.json. folder: where the calibrations are, or will be."""
+    document: dict[str, Any] = to_jsonable_python(discovery, context=folder)
+    return document

@@ -77,9 +77,9 @@ def test_absorbed_effects_are_listed_and_not_named() -> None:
     lever = ({"name": "lidar_lever_arm", "parameters": {"x": 0.05, "y": -0.03}},)
     found = discover_effects(simulated(lever, repetitions=4))
     assert found.effects == ()
-    assert {"lidar_lever_arm", "lidar_yaw", "reference_scale", "sample_period_scale"} <= {
-        each.name for each in found.absorbed
-    }
+    absorbed = {"lidar_lever_arm", "lidar_yaw", "reference_scale", "sample_period_scale"}
+    assert absorbed <= set(found.absorbed)
+    assert [each.name for each in found.measurements] == list(found.absorbed)
 
 
 def test_a_name_that_is_left_out_is_not_found_under_another_with_confidence() -> None:

@@ -10,7 +10,6 @@ from rich.console import Console
 from rich.table import Table
 
 from omnibench.cli.terminal.tables import folding_table
-from omnibench.discover.document import experiment_file
 from omnibench.discover.report.wording import (
     VERDICTS,
     chance,
@@ -25,7 +24,7 @@ from omnibench.discover.report.wording import (
     with_unit,
     worst_of_each,
 )
-from omnibench.discover.result import Discovery, Gap, NamedEffect
+from omnibench.discover.result import Discovery, Gap, NamedEffect, experiment_file
 from omnibench.report.numbers import fixed, listing
 from omnibench.words import plural
 
@@ -137,7 +136,7 @@ def _remarks(discovery: Discovery) -> Iterator[str]:
     if discovery.classes:
         yield f"These data cannot tell apart: {'; '.join(' or '.join(names) for names in discovery.classes)}."
     if discovery.absorbed:
-        absorbed = listing([effect.name for effect in discovery.absorbed], 12)
+        absorbed = listing(list(discovery.absorbed), 12)
         yield f"Absorbed by any matrix, and so never named: {absorbed}."
     yield from _first(
         extrapolations_in_words(discovery.extrapolations), "warning: not driven in training: ", "such warning"

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from datetime import UTC, datetime
 
-from omnibench.discover.document import experiment_file
 from omnibench.discover.report.evidence_figures import CANDIDATES, GAPS, drawn, hidden_grid
 from omnibench.discover.report.tables import (
     absorbed_table,
@@ -36,7 +35,7 @@ from omnibench.discover.report.wording import (
     parameter_in_words,
     weight_in_words,
 )
-from omnibench.discover.result import Discovery, NamedEffect
+from omnibench.discover.result import Discovery, NamedEffect, experiment_file
 from omnibench.environment import package_versions
 from omnibench.report.blocks import (
     Badge,

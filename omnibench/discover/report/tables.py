@@ -201,7 +201,7 @@ def absorbed_table(discovery: Discovery) -> Table:
     """Effects that a matrix reproduces, and the measurement that would show them."""
     rows = tuple(
         Row((Cell(each.name), Cell(each.stage, STAGES[each.stage]), Cell(each.measurement or NOTHING)))
-        for each in discovery.absorbed
+        for each in discovery.measurements
     )
     return Table(
         "Absorbed: any of these may be there, and no odometry run would show it",
@@ -213,7 +213,7 @@ def absorbed_table(discovery: Discovery) -> Table:
 
 def not_looked_for_table(discovery: Discovery) -> Table:
     """Effects that these recordings cannot show."""
-    rows = tuple(Row((Cell(name), Cell(reason))) for name, reason in discovery.not_looked_for)
+    rows = tuple(Row((Cell(each.name), Cell(each.reason))) for each in discovery.not_looked_for)
     columns = (Column("Effect", numeric=False), Column("Why", numeric=False))
     return Table("Not looked for", columns, rows)
 

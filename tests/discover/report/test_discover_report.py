@@ -172,7 +172,7 @@ def test_what_has_no_name_is_said_with_its_place() -> None:
 
 def test_absorbed_effects_come_with_the_measurement_that_would_tell(report: Page) -> None:
     rows = report.tables["Absorbed: any of these may be there, and no odometry run would show it"][1:]
-    assert {row[0]: row[2] for row in rows} == {each.name: each.measurement for each in named().absorbed}
+    assert {row[0]: row[2] for row in rows} == {each.name: each.measurement for each in named().measurements}
     assert "lidar_yaw" in [row[0] for row in rows]
 
 
@@ -220,7 +220,7 @@ def test_commands_without_a_direction_are_listed_in_rows() -> None:
 def test_hostile_names_stay_words() -> None:
     name = "<script>alert(1)</script>"
     dataset = replace(named().dataset, name=name, description=name)
-    found = replace(named(), dataset=shorn(dataset, command=name), absorbed=(Absorbed(name, "body", name),))
+    found = replace(named(), dataset=shorn(dataset, command=name), measurements=(Absorbed(name, "body", name),))
     told = Page(render(discovery_report(found, name)))
     assert name in told.text
     assert name not in told.html
