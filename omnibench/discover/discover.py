@@ -20,6 +20,7 @@ from omnibench.discover.covariate_dependence import covariate_dependences
 from omnibench.discover.fitting.extend import Extended, extend, without_effects
 from omnibench.discover.fitting.model_fit import Fit, fit_matrix
 from omnibench.discover.fitting.usable_runs import usable_runs
+from omnibench.discover.held_out.cross_validation import random_folds_of_repetitions
 from omnibench.discover.held_out.gaps import compare_held_out
 from omnibench.discover.held_out.validation_runs import validation_runs
 from omnibench.discover.held_out.waterfall import waterfall_steps
@@ -92,9 +93,10 @@ def discover_effects(
     dependences = covariate_dependences(screening, selection, motors)
     effects = named_effects(models, motors)
     verdict = verdict_of(effects, dependences.where, dependences.left)
+    folds = random_folds_of_repetitions(runs, rng)
     term_notes: tuple[str, ...] = ()
     if unknown_term and lacks_a_name(verdict):
-        smooth = add_smooth_term(plain, screening, selection, models)
+        smooth = add_smooth_term(plain, screening, selection, models, folds)
         models, term_notes = smooth.models, (smooth.note,)
         effects = named_effects(models, motors)
 
@@ -102,7 +104,7 @@ def discover_effects(
     extended = models.used
     baseline = without_effects(plain, extended)
     validation = validation_runs(dataset, extended.fit)
-    held_out = compare_held_out(baseline, extended, validation)
+    held_out = compare_held_out(baseline, extended, validation, folds)
     steps = waterfall_steps(plain, baseline, extended, validation.kept)
     extrapolations = extrapolations_of(validation.kept, baseline, models.weighted)
     detectability = detectability_of(screening, models.selection)

@@ -26,13 +26,13 @@ def folds_of_repetitions(runs: Sequence[Trajectory]) -> NDArray[np.intp]:
     return folds
 
 
-def random_folds_of_repetitions(runs: Sequence[Trajectory]) -> NDArray[np.intp]:
+def random_folds_of_repetitions(runs: Sequence[Trajectory], rng: np.random.Generator) -> NDArray[np.intp]:
     """A fold (Z,) for each run: repetitions of a command go to different folds, at random which to which.
 
     In their order, all runs from early in a session would be held out together, and a function of the session's time
     would be extrapolated.
     """
-    folds, rng = folds_of_repetitions(runs), np.random.default_rng(0)
+    folds = folds_of_repetitions(runs)
     for members in grouped([(run.session, run.command) for run in runs]):
         rows = list(members)
         if len(rows) >= _FOLDS:

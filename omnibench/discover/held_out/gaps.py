@@ -7,16 +7,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit, at_runs
 from omnibench.discover.fitting.start_frames import in_start_frames
-from omnibench.discover.held_out.cross_validation import (
-    held_out_residuals,
-    held_out_whitened,
-    random_folds_of_repetitions,
-)
+from omnibench.discover.held_out.cross_validation import held_out_residuals, held_out_whitened
 from omnibench.discover.held_out.validation_runs import ValidationRuns
 from omnibench.discover.result import Gap, HeldOut
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions
@@ -26,10 +23,16 @@ from omnibench.robot.kinematics import Array
 _CLEARLY = 2.0  # standard errors that a gap must measure for a share of it to be said to be closed; chosen
 
 
-def compare_held_out(plain: Extended, extended: Extended, validation: ValidationRuns) -> tuple[HeldOut, ...]:
-    """Errors of plain and extended model on held-out repetitions, and on the validation split if it has runs."""
+def compare_held_out(
+    plain: Extended, extended: Extended, validation: ValidationRuns, folds: NDArray[np.intp]
+) -> tuple[HeldOut, ...]:
+    """Errors of plain and extended model on held-out repetitions, and on the validation split if it has runs.
+
+    folds (Z,): the fold in which each training run is held out.
+    """
     floor = floor_of(extended.fit)
-    held_out = [_compared("repetitions", errors_of_repetitions(plain), errors_of_repetitions(extended), floor)]
+    before, after = (errors_of_repetitions(model, folds) for model in (plain, extended))
+    held_out = [_compared("repetitions", before, after, floor)]
     if validation.kept:
         before, after = (errors_on(model, validation.runs, validation.kept) for model in (plain, extended))
         of_session = floor_of(at_runs(extended.fit, validation.kept))
@@ -48,9 +51,8 @@ class Errors:
     chi2: Array
 
 
-def errors_of_repetitions(extended: Extended) -> Errors:
+def errors_of_repetitions(extended: Extended, folds: NDArray[np.intp]) -> Errors:
     """Errors on the runs of the fit, each predicted from the other folds."""
-    folds = random_folds_of_repetitions(extended.fit.runs)
     finals = np.array([residuals[-1] for residuals in held_out_residuals(extended, folds)])
     white = held_out_whitened(extended, folds)
     return Errors(finals, np.array([float(np.square(residuals).mean()) for residuals in white]))

@@ -10,14 +10,11 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omnibench.discover.fitting.extend import Extended, columns_of, extend
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.held_out.cross_validation import (
-    STANDARD_ERRORS,
-    held_out_chi_square,
-    random_folds_of_repetitions,
-)
+from omnibench.discover.held_out.cross_validation import STANDARD_ERRORS, held_out_chi_square
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Significance
@@ -52,18 +49,20 @@ class _Trial:
     gains: Array
 
 
-def add_smooth_term(plain: Fit, screening: Screening, selection: Selection, models: CompetingModels) -> SmoothTerm:
+def add_smooth_term(
+    plain: Fit, screening: Screening, selection: Selection, models: CompetingModels, folds: NDArray[np.intp]
+) -> SmoothTerm:
     """Add smooth functions of the covariate that the residuals depend on most surely to all competing models.
 
     The residuals are those after the selected effects, if there are any. Matrix, named effects and functions are fitted
     together. They stay only if held-out runs gain. All are of one stage, of several stages the one that gains most:
-    what happens at one stage can be imitated at another, badly.
+    what happens at one stage can be imitated at another, badly. folds (Z,): the fold in which each run is held out.
     """
     stages = surest_bases(screening, selection)
     if not stages:
         return SmoothTerm(models, "No smooth term was tried: nothing that is left depends on what a model could use.")
     covariate = stages[0][0].covariate
-    trials = [trial for bases in stages for trial in _tried(plain, models.used, bases)]
+    trials = [trial for bases in stages for trial in _tried(plain, models.used, bases, folds)]
     if not trials:
         return SmoothTerm(
             models, f"No smooth term was added: no function of the {covariate} is plainly there by itself."
@@ -80,12 +79,12 @@ def add_smooth_term(plain: Fit, screening: Screening, selection: Selection, mode
     return SmoothTerm(replace(models, used=best.used, weighted=((models.weighted[0][0], best.used), *others)), note)
 
 
-def _tried(plain: Fit, base: Extended, bases: Sequence[Basis]) -> Iterator[_Trial]:
+def _tried(plain: Fit, base: Extended, bases: Sequence[Basis], folds: NDArray[np.intp]) -> Iterator[_Trial]:
     """The model with functions of some bases; none where no function gains enough."""
     terms = chosen_functions(base, list(_groups_of(bases, plain.model.robot)))
     if terms:
         used = extend(plain, [*base.groups, *terms])
-        yield _Trial(tuple(terms), used, _held_out_gain(used, len(base.groups)))
+        yield _Trial(tuple(terms), used, _held_out_gain(used, len(base.groups), folds))
 
 
 def surest_bases(screening: Screening, selection: Selection) -> list[list[Basis]]:
@@ -198,13 +197,13 @@ def chosen_functions(base: Extended, groups: Sequence[Group]) -> list[Group]:
     return chosen
 
 
-def _held_out_gain(extended: Extended, named: int) -> Array:
+def _held_out_gain(extended: Extended, named: int, folds: NDArray[np.intp]) -> Array:
     """Chi-square difference (Z,) of each held-out run by all groups after the first ``named``."""
     elements = extended.fit.model.matrix.size
     before = range(elements + sum(len(group.parameters) for group in extended.groups[:named]))
     after = range(elements + len(extended.values))
     data = extended.fit.whitened(extended.columns, extended.residuals_without_effects)
-    return held_out_chi_square(data, before, after, random_folds_of_repetitions(extended.fit.runs))
+    return held_out_chi_square(data, before, after, folds)
 
 
 def _capital(text: str) -> str:

@@ -100,9 +100,20 @@ def _rich() -> tuple[Command, ...]:
     return (*driven, *(Command(0.0, 0.0, turn) for turn in (-0.9, -0.5, -0.25, 0.25, 0.5, 0.9)))
 
 
+def _small() -> tuple[Command, ...]:
+    """A third of the runs, for what repeats a discovery many times."""
+    return tuple(
+        Command(speed, angle, turn)
+        for speed, first in ((0.1, 0.0), (0.3, 1.0))
+        for turn in (-0.35, 0.35)
+        for angle in (first, first + 2.1, first + 4.2)
+    )
+
+
 DESIGNS = {
     "flower": Design(_flower()),
     "rich": Design(_rich(), scattered=True),
+    "small": Design(_small(), scattered=True),
     "sessions": Design(_rich(), sessions=3, scattered=True),
     "precise": Design(_rich(), scattered=True, noise=0.3),  # cameras instead of SLAM
 }

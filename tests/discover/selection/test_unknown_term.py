@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from hidden.experiment import DESIGNS, ROBOT, Command, Design
+from hidden.experiment import ROBOT
 from hidden.sets import Kind, Truth, make_set
 
 from omnibench.discover.discover import discover_effects
@@ -31,15 +31,7 @@ if TYPE_CHECKING:
     from omnibench.data.dataset import Dataset
     from omnibench.discover.result import Discovery
 
-SMALL = Design(
-    tuple(
-        Command(speed, angle, turn)
-        for speed, first in ((0.1, 0.0), (0.3, 1.0))
-        for turn in (-0.35, 0.35)
-        for angle in (first, first + 2.1, first + 4.2)
-    ),
-    scattered=True,
-)
+FOLDS = np.tile(np.arange(5), 12)  # of the 60 runs of a small set
 
 
 def recorded(kind: str, seed: int = 1000) -> tuple[Dataset, Truth]:
@@ -48,11 +40,7 @@ def recorded(kind: str, seed: int = 1000) -> tuple[Dataset, Truth]:
 
 
 def small_set(kind: Kind, effect: str, seed: int) -> tuple[Dataset, Truth]:
-    DESIGNS["small"] = SMALL
-    try:
-        return make_set(kind, effect, 600.0, seed, design="small")
-    finally:
-        del DESIGNS["small"]
+    return make_set(kind, effect, 600.0, seed, design="small")
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +130,7 @@ def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
 ) -> None:
     bare, screening, selection = screened(grooved[0])
     models = with_names(bare, selection, group("heading_drift"))
-    smooth = add_smooth_term(bare.fit, screening, selection, models)
+    smooth = add_smooth_term(bare.fit, screening, selection, models, FOLDS)
     used = smooth.models.used
     assert used.groups[0].name == "heading_drift"
     assert {each.name for each in used.groups[1:]} <= {"smooth_heading", "smooth_course"}
@@ -155,7 +143,7 @@ def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
 def test_nothing_is_added_to_a_model_that_leaves_nothing_of_it(grooved: tuple[Dataset, Truth, Discovery]) -> None:
     bare, screening, selection = screened(grooved[0])
     models = with_names(bare, selection, group("smooth_heading"), group("smooth_course"))
-    smooth = add_smooth_term(bare.fit, screening, selection, models)
+    smooth = add_smooth_term(bare.fit, screening, selection, models, FOLDS)
     assert smooth.models is models
     assert "smooth term" in smooth.note
     assert "was added" in smooth.note or "left out" in smooth.note
