@@ -1,28 +1,52 @@
 """Generic bases: columns by which the residuals may depend on a covariate, with no physics in them.
 
-A basis is a set of small changes of the motion, or of the reported pose, that vary with one covariate: changes along
-the direction of travel, across it and in turning, each times smooth functions of the covariate. A change in turning is
-proportional to the way of the wheels, so that a robot that stands is never changed.
+A basis is a set of small changes of the motion, or of the reported pose, that vary with one covariate. The functions
+are those of the smooth effects (omnibench.robot.effects.smooth) by which such a dependence can be added to a model;
+only for commands, sessions and wheels that differ there is more to try than a model can use.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
-from numpy.polynomial import chebyshev
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.paths import Paths
-from omnibench.robot.effects.effect import Stage
-from omnibench.robot.effects.smooth import lever, surfaces, waves
-from omnibench.robot.effects.smooth_wheels import HARMONICS, hat_functions
+from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Stage
+from omnibench.robot.effects.reference_time import ReferenceTimeOffset
+from omnibench.robot.effects.smooth import (
+    MODES,
+    SmoothCommand,
+    SmoothCourse,
+    SmoothEffect,
+    SmoothElapsedTime,
+    SmoothHeading,
+    SmoothOrderOfRuns,
+    SmoothPatch,
+    SmoothPlace,
+    bump,
+    direction,
+    lever,
+)
+from omnibench.robot.effects.smooth_reference import SmoothMap, SmoothStamps, SmoothStampWave
+from omnibench.robot.effects.smooth_wheels import (
+    HARMONICS,
+    SmoothAcceleration,
+    SmoothWheelAngle,
+    SmoothWheelRate,
+    hat_functions,
+)
+from omnibench.robot.effects.wheel_angle import mean_waves
 from omnibench.robot.kinematics import Array
 
 _ORDERS = 6  # smooth functions of time; chosen
 _FREQUENCIES = 32  # frequencies at which errors of a clock are tried; chosen
 _GRID = 5  # patches along each side of the area; chosen
+_WIDE = 0.7  # radius of a patch, of the distance between two: they cover the area evenly; chosen
+_SEEN = 0.002  # share of the samples that must lie in a patch; chosen
 _NARROW = 0.02  # share of the largest motion: least width of a bump about one motion; chosen
 _SMALL = 1e-9  # range below which a covariate does not vary
 
@@ -47,107 +71,103 @@ class Basis:
 
 def generic_bases(paths: Paths, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:
     """All bases that these recordings allow: of each covariate that varies and was recorded."""
-    modes = _Modes(paths)
-    yield from _elapsed(paths, modes)
-    yield from _heading(paths, modes)
-    yield from _place(paths, modes)
-    yield from _order(paths, modes, trajectories)
+    twists = _Twists(paths)
+    yield from _elapsed(paths, twists)
+    yield from _heading(paths, twists)
+    yield from _place(paths, twists)
+    yield from _order(paths, twists, trajectories)
     yield from _wheel_rate(paths)
     yield from _wheel_angle(paths)
-    yield from _acceleration(paths, modes)
+    yield from _acceleration(paths)
     yield from _stamps(paths)
-    yield from _command(paths, modes, trajectories)
+    yield from _command(paths, twists, trajectories)
 
 
-class _Modes:
-    """Changes (F, 3) of the twist: along the direction of travel, across it, in turning, and of the rotation alone."""
+def _of_effect(
+    effect: MotionEffect | ReferenceEffect,
+    detail: str,
+    columns: Array,
+    shapes: Mapping[str, float] | None = None,
+    *,
+    stage: Stage | None = None,
+    tries: int = 1,
+) -> Basis:
+    """The basis of a smooth effect's columns. stage: where they count as acting, by default where the effect acts."""
+    return Basis(effect.shows_in, stage or effect.stage, detail, columns, tries, effect.name, shapes or {})
+
+
+class _Twists:
+    """Slopes of the poses by changes of the twist in each of the modes in which a smooth effect acts."""
 
     def __init__(self, paths: Paths) -> None:
-        twists = paths.signals.twists
-        nothing = np.zeros(len(twists))
-        self.speed: Array = np.hypot(twists[:, 0], twists[:, 1])
-        self.along = np.column_stack([twists[:, :2], nothing])
-        self.across = np.column_stack([-twists[:, 1], twists[:, 0], nothing])
-        self.turn = np.column_stack([nothing, nothing, np.abs(twists[:, 2]) + self.speed / lever(paths.robot)])
-        self.rotation = np.column_stack([nothing, nothing, twists[:, 2]])
+        self._paths = paths
+        self._changes = {mode: paths.changes(direction(mode, paths.signals)) for mode in MODES}
 
-        self._changes = [paths.changes(mode) for mode in (self.along, self.across, self.turn)]
+    def slopes(self, modes: Sequence[str], shares: Array) -> Array:
+        """Slopes (S, 3, m J) by changes in m modes, each times shares (F, J)."""
+        return np.concatenate([self._paths.respond(self._changes[mode], shares) for mode in modes], axis=2)
 
-    def all_of(self, paths: Paths, shares: Array) -> Array:
-        """Slopes (S, 3, 3 J) by changes along, across and in turning, times shares (F, J)."""
-        return np.concatenate([paths.respond(changes, shares) for changes in self._changes], axis=2)
-
-    def each_of(self, paths: Paths, shares: Array) -> list[Array]:
-        """J slopes (S, 3, 3) by changes along, across and in turning, one for each column of shares (F, J)."""
-        count = shares.shape[1]
-        columns = self.all_of(paths, shares)
-        return [columns[..., column::count] for column in range(count)]
+    def of_effect(
+        self, effect: SmoothEffect, shapes: Mapping[str, float] | None = None, functions: int | None = None
+    ) -> Array:
+        """Slopes by a smooth effect, of its first so many functions, or of all, in each of its modes."""
+        return self.slopes(effect.modes, effect.shares(self._paths.signals, shapes or {})[:, :functions])
 
 
-def _elapsed(paths: Paths, modes: _Modes) -> Iterator[Basis]:
-    elapsed = paths.signals.elapsed
-    longest = max(float(elapsed.max()), _SMALL)
-    columns = modes.all_of(paths, np.cos(np.pi * np.arange(_ORDERS) * elapsed[:, None] / longest))
-    yield Basis("elapsed time", "body", "the time since the start of a run", columns, term="smooth_elapsed_time",
-                shapes={"duration": longest})  # fmt: skip
+def _elapsed(paths: Paths, twists: _Twists) -> Iterator[Basis]:
+    effect, shapes = SmoothElapsedTime(), {"duration": max(float(paths.signals.elapsed.max()), _SMALL)}
+    yield _of_effect(effect, "the time since the start of a run", twists.of_effect(effect, shapes, _ORDERS), shapes)
 
 
-def _heading(paths: Paths, modes: _Modes) -> Iterator[Basis]:
-    heading = paths.middle[:, 2]
-    columns = modes.all_of(paths, waves(heading, (1, 2, 3)))
-    yield Basis("heading", "body", "the robot's heading", columns, term="smooth_heading")
-    twists = paths.signals.twists
-    course = heading + np.arctan2(twists[:, 1], twists[:, 0])
-    steady = [paths.of_velocity(modes.speed[:, None] * np.eye(2)[axis]) for axis in range(2)]
-    turned = [paths.of_twist(mode, waves(course, (1, 2))) for mode in (modes.along, modes.across, modes.turn)]
-    columns = np.concatenate([*steady, *turned], axis=2)
-    yield Basis("heading", "world", "the direction of travel in the world", columns, term="smooth_course")
+def _heading(paths: Paths, twists: _Twists) -> Iterator[Basis]:
+    heading, course = SmoothHeading(), SmoothCourse()
+    yield _of_effect(heading, "the robot's heading", twists.of_effect(heading))
+    speed = np.hypot(paths.signals.twists[:, 0], paths.signals.twists[:, 1])
+    steady = [paths.of_velocity(speed[:, None] * axis) for axis in np.eye(2)]
+    columns = np.concatenate([*steady, twists.of_effect(course)], axis=2)
+    yield _of_effect(course, "the direction of travel in the world", columns, stage="world")
 
 
-def _place(paths: Paths, modes: _Modes) -> Iterator[Basis]:
-    centre = paths.middle[:, :2].mean(axis=0)
-    reach = float(np.abs(paths.middle[:, :2] - centre).max())
+def _place(paths: Paths, twists: _Twists) -> Iterator[Basis]:
+    places = paths.middle[:, :2]
+    centre = places.mean(axis=0)
+    reach = float(np.linalg.norm(places - centre, axis=1).max())
     if reach < _SMALL:
         return
-    inside = (paths.middle[:, :2] - centre) / reach
-    middle = {"centre_x": float(centre[0]), "centre_y": float(centre[1])}
-    area = {**middle, "reach": reach * float(np.linalg.norm(inside, axis=1).max())}
-    yield Basis("place", "body", "where on the floor the robot is", modes.all_of(paths, surfaces(inside)),
-                term="smooth_place", shapes=area)  # fmt: skip
+    area = {"centre_x": float(centre[0]), "centre_y": float(centre[1]), "reach": reach}
+    floor, bent, patch = SmoothPlace(), SmoothMap(), SmoothPatch()
+    yield _of_effect(floor, "where on the floor the robot is", twists.of_effect(floor, area), area)
     starts = np.array([log.start for log in paths.logs])[paths.run]
-    there, first = (surfaces((poses[:, :2] - centre) / reach) for poses in (paths.poses, starts))
-    shifts = (there - first)[:, None, :]
-    columns = np.concatenate([np.eye(3)[None, :, [axis]] * shifts for axis in range(3)], axis=2)
-    yield Basis("place", "reference", "where on the map the reference is read", columns, term="smooth_map", shapes=area)
-    low, high = inside.min(axis=0), inside.max(axis=0)
-    spacing = (high - low) / (_GRID - 1)
-    width = float(max(spacing.max(), _SMALL))
-    bumps, patches = [], []
-    for east in range(_GRID):
-        for north in range(_GRID):
-            away = np.linalg.norm(inside - low - spacing * [east, north], axis=1) / width
-            if (away < 0.7).mean() > 0.002:
-                bumps.append(np.exp(-(away**2) / 0.7**2))
-                x, y = centre + reach * (low + spacing * [east, north])
-                patches.append({"centre_x": float(x), "centre_y": float(y), "radius": 0.7 * width * reach})
-    for columns, shapes in zip(modes.each_of(paths, np.column_stack(bumps)), patches, strict=True):
-        yield Basis("place", "body", "a patch of the floor", columns, len(bumps), "smooth_patch", shapes)
+    there, first = (bent.functions(poses[:, :2], area) for poses in (paths.poses, starts))
+    columns = np.concatenate([axis[:, None] * (there - first)[:, None, :] for axis in np.eye(3)], axis=2)
+    yield _of_effect(bent, "where on the map the reference is read", columns, area)
+    patches = list(_patches(places))
+    for shapes in patches:
+        yield _of_effect(patch, "a patch of the floor", twists.of_effect(patch, shapes), shapes, tries=len(patches))
 
 
-def _order(paths: Paths, modes: _Modes, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:
+def _patches(places: Array) -> Iterator[dict[str, float]]:
+    """Centres and radius of patches on a grid over positions (F, 2), those in which there are positions."""
+    low = places.min(axis=0)
+    spacing = (places.max(axis=0) - low) / (_GRID - 1)
+    radius = _WIDE * max(float(spacing.max()), _SMALL)
+    for steps in product(range(_GRID), repeat=2):
+        x, y = (low + spacing * steps).tolist()
+        patch = {"centre_x": x, "centre_y": y, "radius": radius}
+        if (bump(places, patch) > np.exp(-1)).mean() > _SEEN:
+            yield patch
+
+
+def _order(paths: Paths, twists: _Twists, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:
     time = paths.signals.session_time
     if time is not None and len(paths.logs) > 3:
-        longest = max(float(time.max()), _SMALL)
-        shares = chebyshev.chebvander(2 * time / longest - 1, _ORDERS)[:, 1:]
-        columns = [paths.of_twist(mode, shares) for mode in (modes.along, modes.rotation, modes.turn)]
-        yield Basis("order of runs", "wheel", "the time since the start of the session",
-                    np.concatenate(columns, axis=2), term="smooth_order_of_runs",
-                    shapes={"duration": longest})  # fmt: skip
+        effect, shapes = SmoothOrderOfRuns(), {"duration": max(float(time.max()), _SMALL)}
+        columns = twists.of_effect(effect, shapes, _ORDERS)
+        yield _of_effect(effect, "the time since the start of the session", columns, shapes, stage="wheel")
     sessions = list(dict.fromkeys(run.session for run in trajectories))
     if len(sessions) > 1:
         belongs = np.array([[run.session == name for name in sessions[1:]] for run in trajectories], dtype=float)
-        columns = [paths.of_twist(mode, belongs[paths.owner]) for mode in (modes.along, modes.rotation)]
-        yield Basis("order of runs", "wheel", "the session", np.concatenate(columns, axis=2))
+        yield Basis("order of runs", "wheel", "the session", twists.slopes(("along", "rotation"), belongs[paths.owner]))
 
 
 def _wheel_rate(paths: Paths) -> Iterator[Basis]:
@@ -155,85 +175,72 @@ def _wheel_rate(paths: Paths) -> Iterator[Basis]:
     top = float(np.quantile(np.abs(rates), 0.999))
     if top < _SMALL:
         return
-    changes, shapes = hat_functions(rates, top), {"top": top}
+    effect, shapes, changes = SmoothWheelRate(), {"top": top}, hat_functions(rates, top)
     of_wheels = [paths.of_wheel(wheel, changes[:, wheel]) for wheel in range(rates.shape[1])]
-    yield Basis("wheel rate", "wheel", "how fast the wheels turn", np.sum(of_wheels, axis=0), term="smooth_wheel_rate",
-                shapes=shapes)  # fmt: skip
-    yield Basis("wheel rate", "wheel", "how fast each wheel turns", np.concatenate(of_wheels, axis=2),
-                term="smooth_wheel_rate", shapes=shapes)  # fmt: skip
+    yield _of_effect(effect, "how fast the wheels turn", np.sum(of_wheels, axis=0), shapes)
+    yield _of_effect(effect, "how fast each wheel turns", np.concatenate(of_wheels, axis=2), shapes)
 
 
 def _wheel_angle(paths: Paths) -> Iterator[Basis]:
-    angles = paths.signals.wheel_angles
-    if angles is None:
+    signals, effect = paths.signals, SmoothWheelAngle()
+    if signals.wheel_angles is None:
         return
-    rates = paths.signals.rates
     for harmonic in HARMONICS:
-        half = harmonic / 2 * paths.signals.durations[:, None]
-        mean = np.sin(half * rates) / half  # amplitude of rate times wave, as a mean over a sample
-        columns = [
-            paths.of_wheel(wheel, mean[:, [wheel]] * waves(angles[:, wheel], (harmonic,)))
-            for wheel in range(rates.shape[1])
-        ]
+        wheels = range(signals.rates.shape[1])
+        columns = [paths.of_wheel(wheel, mean_waves(signals, wheel, harmonic)) for wheel in wheels]
         words = f"the angle of the wheels, {harmonic:g} times a turn"
-        yield Basis("wheel angle", "wheel", words, np.concatenate(columns, axis=2), len(HARMONICS),
-                    "smooth_wheel_angle", {"harmonic": harmonic})  # fmt: skip
+        yield _of_effect(effect, words, np.concatenate(columns, axis=2), {"harmonic": harmonic}, tries=len(HARMONICS))
 
 
-def _acceleration(paths: Paths, modes: _Modes) -> Iterator[Basis]:
+def _acceleration(paths: Paths) -> Iterator[Basis]:
     forward, left, angular = paths.signals.accelerations.T
-    size = np.hypot(forward, left)
-    if max(float(size.max()), float(np.abs(angular).max())) < _SMALL:
+    top, turning = float(np.hypot(forward, left).max()), float(np.abs(angular).max())
+    if max(top, turning) < _SMALL:
         return
-    nothing = np.zeros(len(size))
-    straight = np.column_stack([forward, left, nothing])
-    aside = np.column_stack([-left, forward, nothing])
-    about = np.column_stack([nothing, nothing, np.ones(len(size))])
-    one = np.ones((len(size), 1))
-    columns = [
-        paths.of_twist(straight, one),
-        paths.of_twist(aside, one),
-        paths.of_twist(about, np.column_stack([forward, left, angular, size, np.abs(angular)])),
-        paths.of_twist(modes.along, size[:, None]),
-        paths.of_twist(modes.across, size[:, None]),
-        paths.of_twist(modes.rotation, size[:, None]),
-    ]
-    largest = {"top": max(float(size.max()), _SMALL), "top_turning": max(float(np.abs(angular).max()), _SMALL)}
-    yield Basis("acceleration", "body", "how the robot accelerates", np.concatenate(columns, axis=2),
-                term="smooth_acceleration", shapes=largest)  # fmt: skip
+    effect, shapes = SmoothAcceleration(), {"top": max(top, _SMALL), "top_turning": max(turning, _SMALL)}
+    columns = [paths.of_effect(effect, name, values) for name, values in _units(effect, paths, shapes)]
+    yield _of_effect(effect, "how the robot accelerates", np.concatenate(columns, axis=2), shapes)
 
 
 def _stamps(paths: Paths) -> Iterator[Basis]:
-    velocity = _pose_velocity(paths)
     stamps = paths.stamps
-    number = np.concatenate([np.arange(part.stop - part.start) for part in paths.parts])
-    shares = np.column_stack([np.ones(len(stamps)), stamps / stamps.max(), (-1.0) ** number])
-    position, heading = velocity * [1.0, 1.0, 0.0], velocity * [0.0, 0.0, 1.0]
-    columns = [moving[:, :, None] * shares[:, None, :] for moving in (position, heading)]
+    later = paths.of_effect(ReferenceTimeOffset(), "tau", {"tau": 0.0})
+
+    def by_delays(effect: ReferenceEffect, shapes: Mapping[str, float]) -> Array:
+        delays = [effect.delays(stamps, values) for _, values in _units(effect, paths, shapes)]
+        return later * np.stack([[position, position, heading] for position, heading in delays]).T
+
     steps = [np.diff(log.stamps) for log in paths.logs if len(log.stamps) > 1]
     finest = float(np.median(np.concatenate(steps)) if steps else stamps.max())
-    yield Basis("stamps", "reference", "when the reference's poses are stamped", np.concatenate(columns, axis=2),
-                term="smooth_stamps", shapes={"duration": float(stamps.max()), "period": finest})  # fmt: skip
-    if not steps:
-        return
-    frequencies = np.arange(1, _FREQUENCIES + 1) / (2 * finest * _FREQUENCIES)
-    for frequency in frequencies:
-        swings = waves(2 * np.pi * frequency * stamps, (1,))
+    effect, shapes = SmoothStamps(), {"duration": float(stamps.max()), "period": finest}
+    yield _of_effect(effect, "when the reference's poses are stamped", by_delays(effect, shapes), shapes)
+    frequencies = np.arange(1, _FREQUENCIES + 1) / (2 * finest * _FREQUENCIES) if steps else np.zeros(0)
+    wave = SmoothStampWave()
+    for frequency in frequencies.tolist():
         words = f"the stamps' place in a period of {1 / frequency:.2g} s"
-        yield Basis("stamps", "reference", words, velocity[:, :, None] * swings[:, None, :], _FREQUENCIES,
-                    "smooth_stamp_wave", {"frequency": float(frequency)})  # fmt: skip
+        shapes = {"frequency": frequency}
+        yield _of_effect(wave, words, by_delays(wave, shapes), shapes, tries=_FREQUENCIES)
 
 
-def _command(paths: Paths, modes: _Modes, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:
+def _units(
+    effect: MotionEffect | ReferenceEffect, paths: Paths, shapes: Mapping[str, float]
+) -> Iterator[tuple[str, dict[str, float]]]:
+    """Each linear parameter of an effect, and the values in which it is 1 and the others are 0."""
+    names = [each.name for each in effect.parameters(paths.robot) if not each.choices]
+    for name in names:
+        yield name, dict.fromkeys(names, 0.0) | dict(shapes) | {name: 1.0}
+
+
+def _command(paths: Paths, twists: _Twists, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:
     commands = list(dict.fromkeys(run.command for run in trajectories if run.command is not None))
     if len(commands) < 4:
         return
     belongs = np.array([[run.command == command for command in commands] for run in trajectories], dtype=float)
-    twists, of_samples = paths.signals.twists, belongs[paths.owner] > 0
-    motions = np.array([np.median(twists[samples], axis=0) for samples in of_samples.T])
-    of_commands = modes.each_of(paths, belongs[paths.owner])
-    for command, columns, shapes in zip(commands, of_commands, _near_motions(paths, motions), strict=True):
-        yield Basis("command", "body", f"the command {command}", columns, len(commands), "smooth_command", shapes)
+    shares = belongs[paths.owner]
+    motions = np.array([np.median(paths.signals.twists[samples], axis=0) for samples in (shares > 0).T])
+    columns, effect, count = twists.slopes(SmoothCommand.modes, shares), SmoothCommand(), len(commands)
+    for number, (command, shapes) in enumerate(zip(commands, _near_motions(paths, motions), strict=True)):
+        yield _of_effect(effect, f"the command {command}", columns[..., number::count], shapes, tries=count)
 
 
 def _near_motions(paths: Paths, motions: Array) -> Iterator[dict[str, float]]:
@@ -243,16 +250,3 @@ def _near_motions(paths: Paths, motions: Array) -> Iterator[dict[str, float]]:
     least = _SMALL + _NARROW * float(np.linalg.norm(at_wheels, axis=1).max())
     for (forward, left, turn), nearest in zip(motions.tolist(), away.min(axis=1).tolist(), strict=True):
         yield {"vx": forward, "vy": left, "omega": turn, "width": max(nearest / 3, least)}
-
-
-def _pose_velocity(paths: Paths) -> Array:
-    """Velocities (S, 3) of the poses in the world, m/s, m/s, rad/s, means over 100 ms."""
-    velocities = []
-    for log, path in zip(paths.logs, paths.ends, strict=True):
-        times = np.concatenate([[0.0], log.times])
-        after, before = (
-            np.column_stack([np.interp(log.stamps + shift, times, path[:, axis]) for axis in range(3)])
-            for shift in (0.05, -0.05)
-        )
-        velocities.append((after - before) / 0.1)
-    return np.concatenate(velocities)

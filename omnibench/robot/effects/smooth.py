@@ -24,7 +24,7 @@ NO_SOURCE = "fitted to data"
 SURFACES = ("x", "y", "xx", "xy", "yy", "xxx", "xxy", "xyy", "yyy")
 _LARGEST = 0.1  # plausible size of a coefficient, a share of the motion; chosen
 _SLOW = 1e-3  # m/s, below which the direction of travel is ill-defined; chosen
-_MODES = {
+MODES = {
     "along": "along the way",
     "across": "across the way, to the left",
     "turn": "in turning, per way of the wheels",
@@ -40,7 +40,7 @@ def scale(name: str, unit: str, low: float, high: float, usual: float, descripti
 def shared(modes: Sequence[str], labels: Sequence[str], of_what: str) -> tuple[Parameter, ...]:
     """Coefficients ``<mode>_<label>``, each a share of the motion."""
     return tuple(
-        Parameter(f"{mode}_{label}", "1", -_LARGEST, _LARGEST, f"change {_MODES[mode]}, with {label} of {of_what}")
+        Parameter(f"{mode}_{label}", "1", -_LARGEST, _LARGEST, f"change {MODES[mode]}, with {label} of {of_what}")
         for mode in modes
         for label in labels
     )

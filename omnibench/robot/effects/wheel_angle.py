@@ -8,28 +8,38 @@ import numpy as np
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
-from omnibench.robot.effects.per_wheel import of_wheels, one_for_each_wheel
+from omnibench.robot.effects.per_wheel import one_for_each_wheel
+from omnibench.robot.effects.smooth import waves
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals
 
 
-def ripple(signals: Signals, harmonic: float, values: Values) -> Array:
-    """Mean of omega (a cos(n phi) + b sin(n phi)) over each sample (F, N), phi turning at the constant rate omega.
+def mean_waves(signals: Signals, wheel: int, harmonic: float) -> Array:
+    """Means (F, 2) of omega cos(n phi) and omega sin(n phi) of a wheel over each sample; harmonic: n.
 
-    With phi in the middle of a sample of duration d it is (a cos(n phi) + b sin(n phi)) 2 sin(n omega d / 2) / (n d).
+    phi turns at the constant rate omega. With phi in the middle of a sample of duration d the means are cos(n phi) and
+    sin(n phi) times 2 sin(n omega d / 2) / (n d).
+    """
+    assert signals.wheel_angles is not None  # they are needed
+    half = harmonic / 2 * signals.durations
+    amplitude = np.sin(half * signals.rates[:, wheel]) / half
+    means: Array = amplitude[:, None] * waves(signals.wheel_angles[:, wheel], (harmonic,))
+    return means
+
+
+def ripple(signals: Signals, harmonic: float, values: Values) -> Array:
+    """Mean of omega (a cos(n phi) + b sin(n phi)) over each sample (F, N).
+
     harmonic: n. values: a_<wheel> and b_<wheel>.
     """
     assert signals.wheel_angles is not None  # they are needed
     if len(signals.rates) == 1:
         return _ripple_of_one_sample(signals, signals.wheel_angles, harmonic, values)
     added = np.zeros(signals.rates.shape)
-    half = harmonic / 2 * signals.durations
-    amplitudes = np.stack([of_wheels(signals.robot, prefix, values) for prefix in "ab"], axis=1)
-    for wheel, (a, b) in enumerate(amplitudes):
-        if a or b:
-            phase = harmonic * signals.wheel_angles[:, wheel]
-            wave = (a * np.cos(phase) if a else 0.0) + (b * np.sin(phase) if b else 0.0)
-            added[:, wheel] = wave * np.sin(half * signals.rates[:, wheel]) / half
+    for wheel, name in enumerate(signals.robot.wheel_names):
+        amplitudes = np.array([values[f"a_{name}"], values[f"b_{name}"]])
+        if amplitudes.any():
+            added[:, wheel] = mean_waves(signals, wheel, harmonic) @ amplitudes
     return added
 
 
