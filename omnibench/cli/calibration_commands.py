@@ -149,6 +149,9 @@ def certify(
     seconds: Annotated[
         float, typer.Option(min=0.0, help="Stop after this time, in s; the bound proven by then holds.")
     ] = 60.0,
+    parts: Annotated[
+        int | None, typer.Option(min=1, help="Stop after so many parts of the box: a limit that no machine changes.")
+    ] = None,
     plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
@@ -166,7 +169,7 @@ def certify(
     recordings = load_dataset(dataset)
     with ProgressDisplay() as watch:
         certified = certify_optimum(
-            read_calibration(calibration), recordings, box=box, gap=gap, seconds=seconds, watch=watch
+            read_calibration(calibration), recordings, box=box, gap=gap, seconds=seconds, parts=parts, watch=watch
         )
     warn(recordings.warnings)
     if not certified.inside:

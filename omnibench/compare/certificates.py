@@ -52,7 +52,7 @@ def _proof(run: PlannedRun, answers: Sequence[Array]) -> list[BoxCertificate]:
     known = np.stack([problem.start, *answers])
     inside = known[problem.inside(known)]
     best = inside[int(np.nanargmin(problem.values(inside)))]
-    proof = prove(problem, best, gap=choice.gap, seconds=choice.seconds)
+    proof = prove(problem, best, gap=choice.gap, seconds=choice.seconds, parts=choice.parts)
     return [
         BoxCertificate(
             dataset=run.dataset_name,

@@ -49,6 +49,7 @@ class CertificateChoice(Model):
 
     gap: float = Field(1e-3, gt=0, lt=1, description="share of the lowest cost that may stay unproven")
     seconds: float = Field(10.0, gt=0, description="time for each box; what is proven by then is reported")
+    parts: int | None = Field(None, gt=0, description="most parts of each box, the same on every machine")
 
 
 class PublishedResult(Model):

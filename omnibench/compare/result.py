@@ -64,7 +64,7 @@ class BoxCertificate(Model):
     """Proof that no matrix of a box has a training cost below ``lower_bound``.
 
     best_cost: the lowest training cost known in the box. gap: 1 - lower_bound / best_cost. parts: how many parts of the
-    box were examined. finished: False when the config's time ran out before its gap was reached.
+    box were examined. finished: False when the config's time or parts ran out before its gap was reached.
     """
 
     dataset: str

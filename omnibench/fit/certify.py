@@ -1,13 +1,18 @@
 """Certificate of optimality: a proven bound on how much better than a calibration any matrix in a box could be.
 
-Branch and bound on the matrix elements: the box with the lowest bound (bounds/lower_bound.py) is cut in two until no
-box can hold a matrix that is better than the best known one by more than the wanted gap. The bound proven so far holds
-at any time.
+Branch and bound on the matrix elements (Horst and Tuy, Global Optimization, 1996, ch. IV): the parts P that the box is
+cut into have the bounds b(P) of bounds/lower_bound.py, and M is the best matrix that is known. At any time
+
+    min over P of b(P)  <=  least cost in the box  <=  F(M)                                        (C1)
+    gap = 1 - min b(P) / F(M).                                                                     (C2)
+
+The part with the lowest bound, which alone can raise the minimum, is cut in two until the gap is as small as wanted.
 """
 
 from __future__ import annotations
 
 import heapq
+import math
 import time
 from dataclasses import dataclass
 
@@ -23,15 +28,15 @@ from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 
-_NO_ERROR = 1e-9  # m, rad: a smaller cost is rounding, of which no share can be proven
+_NO_ERROR = 1e-9  # m, rad: the error of the quadrature of arcs, which every bound subtracts (bounds/stamp_sums.py)
 
 
 @dataclass(frozen=True, eq=False)
 class Proof:
     """State of the branch and bound: no matrix of the box costs less than ``lower_bound``.
 
-    best_cost, best_vector (n,): the best matrix that is known. boxes: number of boxes bounded so far. finished: False
-    when time ran out.
+    best_cost, best_vector (n,): the best matrix that is known. boxes: number of parts bounded so far. finished: False
+    when time or parts ran out.
     """
 
     lower_bound: float
@@ -74,12 +79,14 @@ def certify_optimum(
     box: Box | None = None,
     gap: float = 1e-3,
     seconds: float = 60.0,
+    parts: int | None = None,
     watch: Reporter = no_progress,
 ) -> CertifiedCalibration:
     """Bound how much better than a calibration any matrix of the box could be, on a data set's training split.
 
     Cost and integration are those of the calibration. box: default the one that was searched, or ``row``.
-    gap: stop when the best known matrix is proven to be this close to the optimum. seconds: stop after this time.
+    gap: stop when the best known matrix is proven to be this close to the optimum. seconds, parts: stop after this time
+    or after so many parts of the box; the number ends a proof at the same place on every machine.
     Raises DataError when the wheels differ, the calibration has effects or the training split is empty, ConfigError for
     a cost that is no sum of norms.
     """
@@ -106,7 +113,7 @@ def certify_optimum(
     vector = calibration.matrix_array.ravel()
     cost = float(problem.values(vector[None])[0])
     inside = bool(problem.inside(vector[None])[0])
-    proof = prove(problem, vector if inside else problem.start, gap=gap, seconds=seconds, watch=watch)
+    proof = prove(problem, vector if inside else problem.start, gap=gap, seconds=seconds, parts=parts, watch=watch)
     return CertifiedCalibration(
         Certificate(
             cost=cost,
@@ -134,11 +141,13 @@ def prove(
     *,
     gap: float = 1e-3,
     seconds: float = 60.0,
+    parts: int | None = None,
     watch: Reporter = no_progress,
 ) -> Proof:
-    """A lower bound of the cost over the problem's box, within ``gap`` of the best cost known unless time runs out.
+    """A lower bound of the cost over the problem's box, within ``gap`` of the best cost known unless the limits end it.
 
-    known (n,): a good vector in the box. ConfigError when the problem has no such bound (see LowerBounds).
+    known (n,): a good vector in the box. seconds, parts: as in certify_optimum. ConfigError when the problem has no
+    such bound (see LowerBounds).
     """
     began = time.perf_counter()
     with one_thread():
@@ -149,12 +158,12 @@ def prove(
         boxes: list[tuple[float, int, Node]] = [(root.bound, 0, root)]
         while True:
             lowest, _, node = boxes[0]
-            proven = min(lowest, best_cost)
+            proven = min(lowest, best_cost)  # Eq. (C1)
             spent = time.perf_counter() - began
-            finished = proven >= (1 - gap) * best_cost or best_cost < _NO_ERROR or not node.looseness.any()
+            finished = proven >= (1 - gap) * best_cost or best_cost < _NO_ERROR or not node.looseness.any()  # Eq. (C2)
             proof = Proof(proven, best_cost, best_vector, count, spent, finished)
             watch(Progress("proof", count, None, "part", best_cost, f"bound {proven:.6f}"))
-            if finished or spent > seconds:
+            if finished or spent > seconds or count >= (parts or math.inf):
                 return proof
             heapq.heappop(boxes)
             for part in bounds.split(node):

@@ -13,7 +13,7 @@ from omnibench.cli.terminal.console import make_console
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.result import ComparisonResult
 
-PROVEN = {"gap": 0.05, "seconds": 30}
+PROVEN = {"gap": 0.05, "seconds": 1e9, "parts": 2000}
 ENTRIES = ["theoretical", "closed_form", {"name": "closed_form", "box": "paper"}, search(), "parametric"]
 
 
@@ -61,6 +61,12 @@ def test_the_report_tells_what_is_proven(tmp_path: Path) -> None:
     text = page(found, tmp_path).text
     assert "What no optimiser can beat" in text
     assert "proven: ≤" in text
+
+
+def test_a_number_of_parts_ends_a_proof_whatever_the_machine(tmp_path: Path) -> None:
+    limited = {"gap": 1e-9, "seconds": 1e9, "parts": 5}
+    found = compared_here(tmp_path / "out", calibrators=["closed_form"], certificate=limited)
+    assert [(certificate.parts, certificate.finished) for certificate in found.certificates] == [(5, False)]
 
 
 def test_nothing_is_proven_where_nobody_asks(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ def print_certificate(console: Console, certified: CertifiedCalibration) -> None
     )
     if certified.held:
         console.print(f"The box holds {', '.join(certified.held)} at the design value.", soft_wrap=True)
-    ended = "" if proof.finished else "; the time was up: with more (--seconds) the bound may rise"
+    ended = "" if proof.finished else "; with more (--seconds, --parts) the bound may rise"
     console.print(
         f"{plural(proof.boxes, 'part')} of the box examined in {certificate.seconds:.1f} s{ended}", soft_wrap=True
     )

@@ -97,7 +97,7 @@ def certificate_table(certificates: Sequence[BoxCertificate]) -> Table:
                 Cell(certificate.box),
                 Cell(significant(certificate.best_cost, 6)),
                 Cell(significant(certificate.lower_bound, 6)),
-                Cell(percent(certificate.gap, 2), "" if certificate.finished else "time was up"),
+                Cell(percent(certificate.gap, 2), "" if certificate.finished else "time or parts ran out"),
                 Cell(count(certificate.parts), seconds(certificate.seconds)),
             )
         )

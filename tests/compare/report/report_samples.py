@@ -55,7 +55,7 @@ def config(**changes: Any) -> CompareConfig:
             "budget": {"evaluations": 2000},
             "calibrators": ["theoretical", "closed_form", {"name": "random_search", "options": {"candidates": 1000}}],
             "seeds": [1, 2],
-            "certificate": {"gap": 0.05, "seconds": 5},
+            "certificate": {"gap": 0.05, "seconds": 1e9, "parts": 2000},
             **changes,
         }
     )
