@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
+from omnibench.errors import DataError
 from omnibench.registry import Options, costs
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
@@ -39,7 +40,10 @@ class Cost(ABC):
         return np.array([self.combine(part, np.zeros(part.shape[1], dtype=np.intp))[0] for part in parts])
 
     def logs(self, trajectories: Sequence[Trajectory]) -> list[WheelLog]:
-        """The wheel logs of the trajectories with this cost's stamps."""
+        """The wheel logs of the trajectories with this cost's stamps. DataError: one has no pose after its start."""
+        for run in trajectories if self.stamps == "reference" else ():
+            if len(run.pose_times) < 2:
+                raise DataError(f"trajectory {run.id} has no reference pose after its start, which {self.name} needs")
         return [t.final_log if self.stamps == "final" else t.reference_log for t in trajectories]
 
     def batch(self, trajectories: Sequence[Trajectory], integration: Integration) -> OdometryBatch:

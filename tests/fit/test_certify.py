@@ -21,8 +21,8 @@ from omnibench.fit.certify import certify_optimum, prove
 from omnibench.fit.cost import Cost, SumOfNorms
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.progress import Progress
 from omnibench.fit.sum_of_norms import SumOfNormsProgram
+from omnibench.progress import Progress
 from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows
 from omnibench.robot.kinematics import Array

@@ -10,7 +10,7 @@ import pytest
 from fit_samples import noisy_trajectories
 
 from omnibench.data.dataset import Trajectory
-from omnibench.errors import UnknownNameError
+from omnibench.errors import DataError, UnknownNameError
 from omnibench.fit.cost import Cost, SumOfNorms
 from omnibench.registry import costs
 from omnibench.robot.kinematics import Array
@@ -121,6 +121,13 @@ def test_the_shares_of_the_stamps_sum_to_one(name: str) -> None:
     trajectory = np.array([0, 0, 0, 1, 2, 2])
     assert cost.shares(trajectory).sum() == pytest.approx(1.0)
     np.testing.assert_allclose(np.bincount(trajectory, cost.shares(trajectory)), [1 / 3] * 3)
+
+
+def test_a_run_without_a_pose_after_its_start_is_refused_by_name_where_the_cost_needs_one() -> None:
+    run = noisy_trajectories()[0]
+    short = replace(run, id="short", pose_times=run.pose_times[:1], poses=run.poses[:1])
+    with pytest.raises(DataError, match="trajectory short has no reference pose after its start, which trajectory"):
+        costs.create("trajectory").batch([run, short], "arc")
 
 
 def test_an_unknown_cost_is_answered_with_the_nearest_and_all() -> None:
