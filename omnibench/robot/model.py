@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -16,8 +16,6 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration, OdometryBatch, OdometryStream, WheelLog
 from omnibench.robot.path import Path
 from omnibench.robot.signals import SignalStream, signals_of
-
-_LAST = 5  # samples whose mean rate continues the path after the last sample; chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,25 +106,10 @@ class OdometryModel:
             assert isinstance(term.effect, ReferenceEffect)
             of_position, of_heading = term.effect.delays(log.stamps, term.values)
             taken, heading_taken = taken - of_position, heading_taken - of_heading
-        path = self._path(_extended(log, max(taken.max(initial=0.0), heading_taken.max(initial=0.0))))
+        path = self._path(log.continued(max(taken.max(initial=0.0), heading_taken.max(initial=0.0))))
         poses = path.poses(taken)
         poses[:, 2] = path.poses(heading_taken)[:, 2]
         for term in self.reference_terms:
             assert isinstance(term.effect, ReferenceEffect)
             poses = term.effect.reported(poses, log.start, term.values)
         return poses
-
-
-def _extended(log: WheelLog, until: float) -> WheelLog:
-    """The log, with one more sample of the last mean rate up to ``until`` (s) if its samples end before."""
-    end = log.times[-1]
-    if until <= end:
-        return log
-    rates = log.rates[-_LAST:].mean(axis=0)
-    angles = log.wheel_angles
-    return replace(
-        log,
-        times=np.append(log.times, until),
-        rates=np.vstack([log.rates, rates]),
-        wheel_angles=None if angles is None else np.vstack([angles, angles[-1] + rates * (until - end)]),
-    )

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -24,6 +24,7 @@ from omnibench.robot.kinematics import Array
 Integration = Literal["euler", "arc"]
 Complex = NDArray[np.complex128]
 
+_LAST = 5  # samples whose mean rate continues a log after its last sample; chosen
 _BLOCK = 120_000  # samples at a time (candidates x samples), so that temporaries stay in the processor's cache
 
 
@@ -44,6 +45,23 @@ class WheelLog:
     wheel_angles: Array | None = None
     started_at: float | None = None
     session: str | None = None
+
+    def continued(self, until: float) -> WheelLog:
+        """The log with one more sample of the last mean rate up to ``until`` (s), where its samples end before.
+
+        The robot drives on after the last sample: a path that stopped there would have a kink.
+        """
+        end = self.times[-1]
+        if until <= end:
+            return self
+        rates = self.rates[-_LAST:].mean(axis=0)
+        angles = self.wheel_angles
+        return replace(
+            self,
+            times=np.append(self.times, until),
+            rates=np.vstack([self.rates, rates]),
+            wheel_angles=None if angles is None else np.vstack([angles, angles[-1] + rates * (until - end)]),
+        )
 
 
 class OdometryBatch:

@@ -11,14 +11,13 @@ from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.model_fit import (
     Fit,
     at_model,
-    matrix_jacobian,
     model_with,
     paths_of,
-    split_runs,
     with_noise,
 )
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.paths import Paths, make_paths
+from omnibench.fit.least_squares.trajectory_fit import split_runs
 from omnibench.fit.least_squares.whitened import Whitened, given
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.term import Term
@@ -86,10 +85,11 @@ def terms_of(groups: Sequence[Group], values: Array) -> list[Term]:
 
 def columns_of(fit: Fit, groups: Sequence[Group]) -> tuple[Array, ...]:
     """Slopes (K, 3, n) of each run's poses by matrix elements and by the effects' parameters, about a fit."""
-    columns = [matrix_jacobian(fit)]
-    if groups:
-        columns += _of_groups(paths_of(fit), groups)
-    return tuple(split_runs(np.concatenate(columns, axis=2), fit.runs))
+    columns = fit.matrix_jacobian()
+    if not groups:
+        return tuple(columns)
+    of_groups = split_runs(np.concatenate(list(_of_groups(paths_of(fit), groups)), axis=2), fit.runs)
+    return tuple(np.concatenate(both, axis=2) for both in zip(columns, of_groups, strict=True))
 
 
 def columns_at(extended: Extended, runs: Sequence[Trajectory]) -> list[Array]:

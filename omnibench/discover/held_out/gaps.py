@@ -16,6 +16,7 @@ from omnibench.discover.fitting.start_frames import in_start_frames
 from omnibench.discover.held_out.cross_validation import held_out_residuals, held_out_whitened
 from omnibench.discover.held_out.validation_runs import ValidationRuns
 from omnibench.discover.result import Gap, HeldOut
+from omnibench.fit.least_squares.noise import whiteners
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions
 from omnibench.fit.least_squares.whitened import whitened
 from omnibench.robot.kinematics import Array
@@ -80,23 +81,19 @@ class Floor:
 def floor_of(fit: Fit) -> Floor | None:
     """The floor of a fit's runs; None where no command is repeated."""
     residuals, slopes = (in_start_frames(fit.runs, values) for values in (fit.nuisance_free_residuals, fit.slopes))
-    differences = differences_between_repetitions(fit.runs, residuals)
+    differences = differences_between_repetitions(fit.runs, residuals, slopes)
     if differences.source != "repetitions":
         return None
-    kinds = [
-        differences_between_repetitions(fit.runs, residuals, [of_run[..., kind] for of_run in slopes]).each
-        for kind in range(3)
-    ]
+    each, known = differences.each, fit.nuisances.estimated
     white = whitened(
-        [each.values for each in differences.each],
-        [np.zeros((*each.values.shape, 0)) for each in differences.each],
-        [each.stamps for each in differences.each],
-        fit.noise.noise,
-        [np.stack([each.companion for each in same], axis=-1) for same in zip(*kinds, strict=True)],
-        fit.nuisances.deviations,
+        [difference.values for difference in each],
+        [np.zeros((*difference.values.shape, 0)) for difference in each],
+        whiteners(fit.noise.noise, [difference.stamps for difference in each]),
+        [difference.slopes[..., known] for difference in each],
+        fit.nuisances.deviations[known],
     )
     return Floor(
-        np.array([float(np.linalg.norm(each.values[-1])) for each in differences.each]),
+        np.array([float(np.linalg.norm(difference.values[-1])) for difference in each]),
         np.array([float(np.square(values).mean()) for values in white.residuals]),
     )
 

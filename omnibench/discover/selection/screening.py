@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.discover.fitting.extend import Extended
-from omnibench.discover.fitting.model_fit import Fit, paths_of, split_runs
+from omnibench.discover.fitting.model_fit import Fit, paths_of
 from omnibench.discover.held_out.cross_validation import folds_of_repetitions, is_confirmed
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.selection.candidate_groups import Groups, make_groups
 from omnibench.discover.selection.encoder_quantisation import EncoderQuantisation
+from omnibench.fit.least_squares.trajectory_fit import split_runs
 from omnibench.fit.least_squares.whitened import Given, Whitened, given
 from omnibench.robot.kinematics import Array
 

@@ -27,19 +27,18 @@ from pydantic import Field, model_validator
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.cost_weights import cost_weightings
-from omnibench.fit.least_squares.gauss_newton import Descent, descend
-from omnibench.fit.least_squares.noise import NoiseEstimate, estimate_noise
+from omnibench.fit.least_squares.gauss_newton import BoxedFit, Descent, descend, first_fit
+from omnibench.fit.least_squares.noise import FIRST_NOISE, NoiseEstimate, estimate_noise, is_near, whiteners
+from omnibench.fit.least_squares.nuisances import TURN, Nuisances
 from omnibench.fit.least_squares.start_noise import separate_start_noise
 from omnibench.fit.least_squares.trajectory_covariance import FitCovariance
-from omnibench.fit.least_squares.trajectory_fit import OFFSET, SLOPE, TURN, Estimate, TrajectoryFit
+from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
-from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
-# First guess of the noise, replaced after one fit: 1 cm or 0.01 rad, and as much again in a second.
-_FIRST = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.01, walk_heading=0.01)
 _MOST_ROUNDS = 10
+_NEAR = 0.01  # share of the largest component of the noise by which components of the same noise differ; chosen
 _STILL = 0.1  # standard errors: a smaller change of the vector ends the rounds of noise and fit; chosen
 
 
@@ -69,23 +68,19 @@ class TrajectoryMLOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryEstimate:
-    """The estimate with its nuisances and covariance.
+    """The estimate with its covariance.
 
-    vector (n,), its covariance (n, n) and degrees_of_freedom. noise: noise model of the reference. start_heading:
-    standard deviation of the start headings, rad. start_corrections (Z, 3): corrections added to the start poses, m, m,
-    rad. clocks (Z, 2): offset (s) and slope of each run's reference clock. trajectories: ids of the Z runs. misfit:
-    evidence in words that the model is wrong, or empty. description: source of the covariance, in words. rounds: number
-    of rounds of noise and fit. settled: True if they converged.
+    vector (n,), its covariance (n, n) and degrees_of_freedom. noise: noise model of the reference. nuisances: of the
+    runs that have reference poses after their start. misfit: evidence in words that the model is wrong, or empty.
+    description: source of the covariance, in words. rounds: number of rounds of noise and fit. settled: True if they
+    converged.
     """
 
     vector: Array
     covariance: Array
     degrees_of_freedom: int
     noise: NoiseEstimate
-    start_heading: float
-    start_corrections: Array
-    clocks: Array
-    trajectories: tuple[str, ...]
+    nuisances: Nuisances
     misfit: str
     description: str
     rounds: int
@@ -116,55 +111,42 @@ class TrajectoryML(Calibrator):
 
     def estimate(self, problem: CalibrationProblem) -> TrajectoryEstimate:
         """Fit and noise estimated in turn until neither changes, then weights and covariance chosen."""
-        fit = TrajectoryFit(problem.trajectories, problem.parameterisation, problem.integration)
-        begin = Estimate(problem.start, np.zeros((len(fit.trajectories), 3)))
-        now = descend(problem, fit, begin, fit.whiteners(_FIRST), self._deviations(0.0), 0.1)
+        fit = first_fit(problem)
+        stamps = fit.trajectories.stamps
+        now = descend(self._with_deviations(fit, 0.0), whiteners(FIRST_NOISE, stamps), 0.1)
         noise: _Noise | None = None
         rounds, settled = 0, False
         while not settled and rounds < _MOST_ROUNDS:
-            before, earlier = now.estimate, noise
-            noise = self._noise(fit, before, earlier)
-            deviations = self._deviations(noise.start_heading)
-            held = Estimate(before.vector, np.where(deviations > 0, before.nuisances, 0.0))
-            now = descend(problem, fit, held, fit.whiteners(noise.estimate.noise), deviations, self.options.tolerance)
-            moved = now.estimate.vector - before.vector
-            still = float(moved @ now.linear.information.sum(axis=0) @ moved) < _STILL**2
-            settled = now.settled and (still or (earlier is not None and noise.is_near(earlier)))
+            before, earlier = now.fit, noise
+            noise = self._noise(before.trajectories, earlier)
+            fit = self._with_deviations(before, noise.start_heading)
+            now = descend(fit, whiteners(noise.estimate.noise, stamps), self.options.tolerance)
+            moved = now.fit.vector - before.vector
+            still = float(moved @ now.data.information @ moved) < _STILL**2
+            settled = now.settled and (still or (earlier is not None and is_near(noise.sizes, earlier.sizes, _NEAR)))
             rounds += 1
         assert noise is not None  # there is at least one round
-        return self._conclude(problem, fit, now, noise, rounds, settled)
+        return self._conclude(now, noise.estimate, rounds, settled)
 
-    def _conclude(
-        self,
-        problem: CalibrationProblem,
-        fit: TrajectoryFit,
-        now: Descent,
-        with_starts: _Noise,
-        rounds: int,
-        settled: bool,
-    ) -> TrajectoryEstimate:
+    def _conclude(self, now: Descent, noise: NoiseEstimate, rounds: int, settled: bool) -> TrajectoryEstimate:
         """The maximum likelihood estimate, or the one weighted by the cost if the model misfits; its covariance."""
-        options, noise = self.options, with_starts.estimate
-        corrections = _start_corrections(fit, now.estimate, noise.noise)
-        covariance = FitCovariance(problem, now.linear, fit.trajectories)
+        options, problem, fit = self.options, now.fit.problem, now.fit.trajectories
+        covariance = FitCovariance(problem, now.data, fit.runs)
         misfit = covariance.scatter.words if covariance.lack_of_fit and covariance.scatter else ""
         by_cost = options.weights == "cost" or (
             options.weights == "auto" and bool(misfit) and options.covariance != "model"
         )
         if by_cost:
-            weightings = cost_weightings(problem.objective, fit.trajectories, fit.residuals(now.estimate))
-            now = descend(problem, fit, now.estimate, weightings, np.zeros(3), options.tolerance)
-            covariance = FitCovariance(problem, now.linear, fit.trajectories)
+            weightings = cost_weightings(problem.objective, fit.runs, fit.residuals)
+            now = descend(now.fit.with_nuisances(fit.nuisances.held()), weightings, options.tolerance)
+            covariance = FitCovariance(problem, now.data, fit.runs)
         matrix, freedom, words = self._covariance(covariance, noise, by_cost)
         return TrajectoryEstimate(
-            vector=now.estimate.vector,
+            vector=now.fit.vector,
             covariance=matrix,
             degrees_of_freedom=freedom,
             noise=noise,
-            start_heading=with_starts.start_heading,
-            start_corrections=corrections,
-            clocks=now.estimate.nuisances[:, [OFFSET, SLOPE]],
-            trajectories=tuple(run.id for run in fit.trajectories),
+            nuisances=fit.nuisances,
             misfit=misfit,
             description=words,
             rounds=rounds,
@@ -182,23 +164,24 @@ class TrajectoryML(Calibrator):
         words = f"{scatter.words}; weighted by the cost" if by_cost else scatter.words
         return scatter.covariance, scatter.degrees_of_freedom, words
 
-    def _deviations(self, start_heading: float) -> Array:
-        """Standard deviations (3,) of the nuisances; 0 for those that are not estimated."""
-        clock = self.options.clock
-        offset = 0.0 if clock == "none" else self.options.clock_offset
-        return np.array([start_heading, offset, self.options.clock_slope if clock == "offset_and_slope" else 0.0])
+    def _with_deviations(self, fit: BoxedFit, start_heading: float) -> BoxedFit:
+        """The fit with the nuisances' standard deviations; those that are not estimated are 0."""
+        clock, offset, slope = self.options.clock, self.options.clock_offset, self.options.clock_slope
+        asked = [start_heading, offset * (clock != "none"), slope * (clock == "offset_and_slope")]
+        deviations = np.array(asked)
+        values = np.where(deviations > 0, fit.trajectories.nuisances.values, 0.0)
+        return fit.with_nuisances(Nuisances(values, deviations))
 
-    def _noise(self, fit: TrajectoryFit, estimate: Estimate, earlier: _Noise | None) -> _Noise:
-        """The noise and the deviation of the start headings, from the residuals of an estimate."""
-        straight = estimate.nuisances.copy()
-        straight[:, TURN] = 0.0
-        estimate = Estimate(estimate.vector, straight)
-        residuals = fit.residuals(estimate)
-        near = None if earlier is None else earlier.estimate.noise
-        noise = estimate_noise(fit.trajectories, residuals, near)
+    def _noise(self, fit: TrajectoryFit, earlier: _Noise | None) -> _Noise:
+        """The noise and the deviation of the start headings, from the residuals of a fit."""
+        values = fit.nuisances.values.copy()
+        values[:, TURN] = 0.0
+        straight = replace(fit, nuisances=replace(fit.nuisances, values=values))
+        noise = estimate_noise(fit.runs, straight.residuals, None if earlier is None else earlier.estimate.noise)
         if self.options.start == "exact":
             return _Noise(noise, 0.0)
-        apart = separate_start_noise(fit.trajectories, residuals, fit.turning(estimate), noise.noise)
+        turning = [slopes[..., TURN] for slopes in straight.slopes]
+        apart = separate_start_noise(fit.runs, straight.residuals, turning, noise.noise)
         least = apart.noise.pose_heading if self.options.start == "noisy" else 0.0
         return _Noise(replace(noise, noise=apart.noise), max(apart.start_heading, least))
 
@@ -210,22 +193,7 @@ class _Noise:
     estimate: NoiseEstimate
     start_heading: float
 
-    def is_near(self, other: _Noise) -> bool:
-        """True if no component differs by more than 1 % of the largest component."""
-        ours, theirs = (
-            np.array([*noise.estimate.noise.model_dump().values(), noise.start_heading]) for noise in (self, other)
-        )
-        return bool((np.abs(ours - theirs) <= 0.01 * np.maximum(ours, theirs).max()).all())
-
-
-def _start_corrections(fit: TrajectoryFit, estimate: Estimate, noise: Noise) -> Array:
-    """Corrections (Z, 3) that are added to the start poses, m, m, rad: the likeliest shift and turn of each run."""
-    corrections = np.zeros((len(fit.trajectories), 3))
-    corrections[:, 2] = estimate.nuisances[:, TURN]
-    if noise.bias_position:
-        weightings = fit.whiteners(noise.model_copy(update={"bias_position": 0.0}))
-        for row, (weigh, errors) in enumerate(zip(weightings, fit.residuals(estimate), strict=True)):
-            ones, residuals = weigh(np.ones_like(errors))[:, :2], weigh(errors)[:, :2]
-            information = noise.bias_position**-2 + np.square(ones).sum(axis=0)
-            corrections[row, :2] = -(ones * residuals).sum(axis=0) / information
-    return corrections
+    @property
+    def sizes(self) -> dict[str, float]:
+        """All standard deviations, by their names."""
+        return {**self.estimate.noise.model_dump(), "start_heading": self.start_heading}

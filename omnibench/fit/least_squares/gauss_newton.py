@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from omnibench.fit.least_squares.trajectory_fit import Estimate, Linearisation, TrajectoryFit, Weighting
+from omnibench.errors import DataError
+from omnibench.fit.least_squares.nuisances import Nuisances, Weighting
+from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
+from omnibench.fit.least_squares.whitened import Whitened
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
 
 _MOST_STEPS = 25  # Gauss-Newton steps; chosen
 _MOST_HALVINGS = 8  # lengths of one step that are tried, each half the one before; chosen
@@ -21,89 +26,123 @@ _NO_GAIN, _NO_SHARE = 1e-2, 1e-5
 
 
 @dataclass(frozen=True, eq=False)
-class Descent:
-    """Result of a descent: the estimate, the fit linearised about it, and settled: True if it has converged."""
+class BoxedFit:
+    """The fit of one vector (n,) of a calibration problem to the problem's runs."""
 
-    estimate: Estimate
-    linear: Linearisation
-    settled: bool
+    problem: CalibrationProblem
+    vector: Array
+    trajectories: TrajectoryFit
+
+    def moved(self, vector: Array, values: Array) -> BoxedFit:
+        """The fit of another vector, with other values (Z, 3) of the nuisances."""
+        fit = self.trajectories
+        model = replace(fit.model, matrix=self.problem.matrix(vector))
+        return BoxedFit(
+            self.problem, vector, replace(fit, model=model, nuisances=replace(fit.nuisances, values=values))
+        )
+
+    def with_nuisances(self, nuisances: Nuisances) -> BoxedFit:
+        """The fit with other nuisances."""
+        return replace(self, trajectories=replace(self.trajectories, nuisances=nuisances))
+
+    @property
+    def columns(self) -> list[Array]:
+        """Derivatives (K, 3, n) of every run's poses by the vector; the matrix is differentiated centrally."""
+        searched, size = self.problem.parameterisation, len(self.vector)
+        steps = 1e-5 * np.maximum(np.abs(searched.start), 1e-3)
+        matrices = searched.matrices(np.concatenate([self.vector + np.diag(steps), self.vector - np.diag(steps)]))
+        slopes = (matrices[:size] - matrices[size:]) / (2 * steps[:, None, None])
+        return [of_run @ slopes.reshape(size, -1).T for of_run in self.trajectories.matrix_jacobian()]
+
+    def linearised(self, weightings: Sequence[Weighting]) -> Whitened:
+        """The fit's columns and residuals, weighted, the nuisances eliminated."""
+        return self.trajectories.linearised(self.columns, weightings)
 
 
-def descend(
-    problem: CalibrationProblem,
-    fit: TrajectoryFit,
-    estimate: Estimate,
-    weightings: Sequence[Weighting],
-    deviations: Array,
-    tolerance: float,
-) -> Descent:
-    """Gauss-Newton steps within the box until a step of the vector is below ``tolerance`` standard errors.
-
-    deviations (3,): standard deviations of the nuisances, 0 for one that is held. The recorded path has a kink at every
-    sample, and so has the objective as a function of a clock's offset. Every run therefore takes the part of its
-    nuisances' step that lowers chi2 most; when that lowers chi2 no more, the vector converges with the nuisances held.
-
-    ``problem.cost`` counts every vector that is tried; a vector whose cost is not finite is rejected.
-    """
-    move = _Move(problem, fit, weightings)
-    linear = fit.linearise(estimate, weightings, deviations)
-    if (deviations > 0).any():
-        for _ in range(_MOST_STEPS):
-            before = float(linear.chi2.sum())
-            lower, size = move.step(estimate, linear, deviations)
-            if lower is None:
-                break
-            estimate = lower
-            linear = fit.linearise(estimate, weightings, deviations)
-            after = float(linear.chi2.sum())
-            if size < tolerance or before - after < _NO_GAIN + _NO_SHARE * after:
-                break
-    settled = False
-    for _ in range(_MOST_STEPS):
-        held = fit.linearise(estimate, weightings, np.zeros(3))
-        lower, size = move.step(estimate, held, np.zeros(3))
-        settled = size < tolerance and lower is not None
-        if lower is None:
-            settled = size < 10 * tolerance and move.is_finite(estimate.vector)  # rounding hides the decrease
-            break
-        estimate = lower
-        if settled:
-            break
-    return Descent(estimate, fit.linearise(estimate, weightings, deviations), settled)
+def first_fit(problem: CalibrationProblem) -> BoxedFit:
+    """The problem's start at the runs that have reference poses after theirs, nuisances 0. DataError without any."""
+    runs = tuple(run for run in problem.trajectories if len(run.pose_times) > 1)
+    if not runs:
+        raise DataError("no trajectory has a reference pose after its start; nothing can be fitted")
+    model = OdometryModel(problem.robot, problem.matrix(problem.start), problem.integration)
+    return BoxedFit(
+        problem, problem.start, TrajectoryFit(model, runs, Nuisances(np.zeros((len(runs), 3)), np.zeros(3)))
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class _Move:
-    """Steps of one fit that lower its chi2 within the box."""
+class Descent:
+    """Result of a descent: the fit, its linearisation, and settled: True if it has converged."""
 
-    problem: CalibrationProblem
-    fit: TrajectoryFit
-    weightings: Sequence[Weighting]
+    fit: BoxedFit
+    data: Whitened
+    settled: bool
 
-    def is_finite(self, vector: Array) -> bool:
-        """True if a vector (n,) has a finite cost."""
-        return bool(np.isfinite(self.problem.cost(vector[None])[0]))
 
-    def step(self, estimate: Estimate, linear: Linearisation, deviations: Array) -> tuple[Estimate | None, float]:
-        """The estimate after one step, None if no part of it lowers chi2, and the step's size in standard errors."""
-        problem, total = self.problem, linear.information.sum(axis=0)
-        whole = bounded_step(problem, estimate.vector, total, linear.scores.sum(axis=0))
-        size = float(np.sqrt(max(whole @ total @ whole, 0.0)))
-        limit = float(linear.chi2.sum()) * (1 + 1e-12)
-        for halvings in range(_MOST_HALVINGS):
-            step = 0.5**halvings * whole
-            vector = np.clip(estimate.vector + step, problem.lower, problem.upper)
-            if not self.is_finite(vector):
-                continue
-            shares = _SHARES if (deviations > 0).any() else (0.0,)
-            nuisance_steps = linear.nuisance_steps(step)
-            trials = [Estimate(vector, estimate.nuisances + share * nuisance_steps) for share in shares]
-            values = np.array([self.fit.chi2(trial, self.weightings, deviations) for trial in trials])
-            best = values.argmin(axis=0)
-            if values.min(axis=0).sum() <= limit:
-                nuisances = np.array([trial.nuisances for trial in trials])[best, np.arange(len(best))]
-                return Estimate(vector, nuisances), size
-        return None, size
+def descend(fit: BoxedFit, weightings: Sequence[Weighting], tolerance: float) -> Descent:
+    """Gauss-Newton steps within the box until a step of the vector is below ``tolerance`` standard errors.
+
+    The recorded path has a kink at every sample, and so has the objective as a function of a clock's offset. Every run
+    therefore takes the part of its nuisances' step that lowers chi2 most; when that lowers chi2 no more, the vector
+    converges with the nuisances held.
+
+    ``problem.cost`` counts every vector that is tried; a vector whose cost is not finite is rejected.
+    """
+    deviations = fit.trajectories.nuisances.deviations
+    if deviations.any():
+        after = float(fit.trajectories.chi_square(weightings).sum())
+        for _ in range(_MOST_STEPS):
+            before = after
+            lower, size = _step(fit, weightings)
+            if lower is None:
+                break
+            fit = lower
+            after = float(fit.trajectories.chi_square(weightings).sum())
+            if size < tolerance or before - after < _NO_GAIN + _NO_SHARE * after:
+                break
+    fit = fit.with_nuisances(fit.trajectories.nuisances.held())
+    settled = False
+    for _ in range(_MOST_STEPS):
+        lower, size = _step(fit, weightings)
+        settled = size < tolerance and lower is not None
+        if lower is None:
+            settled = size < 10 * tolerance and _is_finite(fit)  # rounding hides the decrease
+            break
+        fit = lower
+        if settled:
+            break
+    fit = fit.with_nuisances(replace(fit.trajectories.nuisances, deviations=deviations))
+    return Descent(fit, fit.linearised(weightings), settled)
+
+
+def _is_finite(fit: BoxedFit) -> bool:
+    return bool(np.isfinite(fit.problem.cost(fit.vector[None])[0]))
+
+
+def _step(fit: BoxedFit, weightings: Sequence[Weighting]) -> tuple[BoxedFit | None, float]:
+    """The fit after one step, None if no part of it lowers chi2, and the step's size in standard errors."""
+    problem, runs = fit.problem, fit.trajectories
+    columns = fit.columns
+    data = runs.linearised(columns, weightings)
+    whole = bounded_step(problem, fit.vector, data.information, -data.scores.sum(axis=0))
+    size = math.sqrt(max(float(whole @ data.information @ whole), 0.0))
+    limit = float(runs.chi_square(weightings).sum()) * (1 + 1e-12)
+    shares = _SHARES if runs.nuisances.estimated.any() else (0.0,)
+    free = runs.nuisance_free_residuals
+    for halvings in range(_MOST_HALVINGS):
+        step = 0.5**halvings * whole
+        vector = np.clip(fit.vector + step, problem.lower, problem.upper)
+        if not np.isfinite(problem.cost(vector[None])[0]):
+            continue
+        predicted = [residuals - slopes @ step for residuals, slopes in zip(free, columns, strict=True)]
+        change = runs.likeliest_nuisances(weightings, predicted) - runs.nuisances.values
+        trials = [fit.moved(vector, runs.nuisances.values + share * change) for share in shares]
+        values = np.array([trial.trajectories.chi_square(weightings) for trial in trials])
+        best = values.argmin(axis=0)
+        if values.min(axis=0).sum() <= limit:
+            nuisances = np.array([trial.trajectories.nuisances.values for trial in trials])
+            return fit.moved(vector, nuisances[best, np.arange(len(best))]), size
+    return None, size
 
 
 def bounded_step(problem: CalibrationProblem, vector: Array, information: Array, score: Array) -> Array:

@@ -11,7 +11,7 @@ pose is a bias, exactly.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
-from omnibench.fit.least_squares.repetitions import Difference, differences_between_repetitions
+from omnibench.fit.least_squares.repetitions import Differences, differences_between_repetitions
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
@@ -31,6 +31,8 @@ LEAST_WHITE = 1e-9
 _LOGARITHMS = (np.log(1e-4), np.log(1e2))
 _NO_LOSS = 1e-3  # change of twice the log-likelihood below which a component is set to zero; chosen
 _COORDINATES = (("position", slice(0, 2)), ("heading", slice(2, 3)))
+# First guess of the noise, replaced after one fit: 1 cm or 0.01 rad, and as much again in a second; chosen.
+FIRST_NOISE = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.01, walk_heading=0.01)
 
 
 class Whitener:
@@ -57,6 +59,19 @@ class Whitener:
         split = 2 * differences.shape[1] // 3
         white = [self._position.whiten(differences[:, :split]), self._heading.whiten(differences[:, split:])]
         return np.concatenate(white, axis=1).reshape(residuals.shape)
+
+
+def whiteners(noise: Noise, stamps: Sequence[Array]) -> list[Whitener]:
+    """The whitening of runs with stamps (K,); those with the same stamps share theirs."""
+    made = {times.tobytes(): times for times in stamps}
+    whitener_of = {key: Whitener(noise, times) for key, times in made.items()}
+    return [whitener_of[times.tobytes()] for times in stamps]
+
+
+def is_near(first: Mapping[str, float], second: Mapping[str, float], share: float) -> bool:
+    """True if no standard deviation differs by more than a share of the largest one."""
+    ours, theirs = np.array(list(first.values())), np.array(list(second.values()))
+    return bool((np.abs(ours - theirs) <= share * np.maximum(ours, theirs).max()).all())
 
 
 class _Factor:
@@ -121,21 +136,16 @@ def estimate_noise(
     if not differences.each:
         raise DataError("no trajectory has a reference pose after its start; the noise cannot be estimated")
     return NoiseEstimate(
-        _components(differences.each, near), differences.source, len(differences.each), differences.description
+        _components(differences, near), differences.source, len(differences.each), differences.description
     )
 
 
-def _components(differences: Sequence[Difference], near: Noise | None) -> Noise:
+def _components(differences: Differences, near: Noise | None) -> Noise:
     """The noise model of largest likelihood, position and heading independent."""
-    groups: dict[bytes, tuple[Array, list[Array]]] = {}
-    for difference in differences:
-        groups.setdefault(difference.stamps.tobytes(), (difference.stamps, []))[1].append(difference.values)
+    groups = differences.by_stamps
     components: dict[str, float] = {}
     for name, columns in _COORDINATES:
-        samples = [
-            (stamps, np.stack(values, axis=-1)[:, columns].reshape(len(stamps), -1))
-            for stamps, values in groups.values()
-        ]
+        samples = [(stamps, values[:, columns].reshape(len(stamps), -1)) for stamps, values, _ in groups]
         names = [f"{kind}_{name}" for kind in ("pose", "walk", "bias")]
         start = None if near is None else np.array([getattr(near, component) for component in names])
         components |= dict(zip(names, _most_likely(samples, start), strict=True))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -18,13 +19,13 @@ from omnibench.words import noun_for
 class Difference:
     """A linear combination of runs that is distributed as the noise of one run.
 
-    stamps (K,): s. values (K, 3): m, m, rad. companion (K, 3): mean over these runs of a second quantity, for example
-    the derivatives by the start heading.
+    stamps (K,): s. values (K, 3): m, m, rad. slopes (K, 3, m): mean over these runs of the poses' derivatives by m
+    nuisances.
     """
 
     stamps: Array
     values: Array
-    companion: Array
+    slopes: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,19 +36,32 @@ class Differences:
     source: Literal["repetitions", "within runs"]
     description: str
 
+    @cached_property
+    def by_stamps(self) -> list[tuple[Array, Array, Array]]:
+        """Differences at the same stamps together: stamps (K,), values (K, 3, n) and slopes (K, 3, n, m) of n."""
+        groups = grouped([difference.stamps.tobytes() for difference in self.each])
+        return [
+            (
+                self.each[members[0]].stamps,
+                np.stack([self.each[index].values for index in members], axis=-1),
+                np.stack([self.each[index].slopes for index in members], axis=2),
+            )
+            for members in groups
+        ]
+
 
 def differences_between_repetitions(
-    trajectories: Sequence[Trajectory], residuals: Sequence[Array], companions: Sequence[Array] | None = None
+    trajectories: Sequence[Trajectory], residuals: Sequence[Array], slopes: Sequence[Array] | None = None
 ) -> Differences:
     """Independent differences of residuals (K, 3), given at every trajectory's pose_times[1:].
 
-    companions (K, 3): a second quantity of every trajectory, averaged alongside; default the residuals. Without
-    repeated commands the residuals themselves stand in for the differences.
+    slopes (K, 3, m): derivatives of every trajectory's poses by its nuisances, averaged alongside; default none.
+    Without repeated commands the residuals themselves stand in for the differences.
     """
-    companions = residuals if companions is None else companions
+    slopes = [np.zeros((*residual.shape, 0)) for residual in residuals] if slopes is None else slopes
     runs = [
-        (run.pose_times[1:], np.stack([residual, companion], axis=-1))
-        for run, residual, companion in zip(trajectories, residuals, companions, strict=True)
+        (run.pose_times[1:], np.concatenate([residual[..., None], columns], axis=-1))
+        for run, residual, columns in zip(trajectories, residuals, slopes, strict=True)
     ]
     repeated = repetitions_of_commands(trajectories)
     measured = [[runs[index] for index in members if len(runs[index][0])] for members in repeated.groups]
@@ -57,7 +71,7 @@ def differences_between_repetitions(
             f"({repeated.description}, each within one {repeated.within})"
         )
         return Differences(contrasts, "repetitions", words)
-    whole = tuple(Difference(stamps, values[..., 0], values[..., 1]) for stamps, values in runs if len(stamps))
+    whole = tuple(Difference(stamps, values[..., 0], values[..., 1:]) for stamps, values in runs if len(stamps))
     words = (
         f"the residuals within {len(whole)} {noun_for(len(whole), 'run')}: no command is repeated, so what the model "
         "cannot express counts as noise"
@@ -104,9 +118,9 @@ def _contrasts(runs: list[tuple[Array, Array]]) -> Iterator[Difference]:
     for count in range(1, len(runs)):
         stamps, values = _common(runs[: count + 1])
         if len(stamps):
-            residuals, companions = values[..., 0], values[..., 1]
+            residuals, slopes = values[..., 0], values[..., 1:]
             contrast = (residuals[:-1].mean(axis=0) - residuals[-1]) * np.sqrt(count / (count + 1))
-            yield Difference(stamps, contrast, companions.mean(axis=0))
+            yield Difference(stamps, contrast, slopes.mean(axis=0))
 
 
 def _common(runs: list[tuple[Array, Array]]) -> tuple[Array, Array]:

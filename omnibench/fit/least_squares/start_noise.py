@@ -2,7 +2,8 @@
 
 An error e of a run's start position shifts its poses by e: a bias. An error of its start heading shifts the headings
 by as much, and also turns the path about the start: with u the derivative of the poses by the start heading, the
-covariance of a run grows by deviation^2 u u'. The turned path distinguishes it from a biased heading.
+covariance of a run grows by deviation^2 u u', and the likelihood is that of nuisances.py, Eq. (2), with one nuisance.
+The turned path distinguishes it from a biased heading.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.least_squares.noise import LEAST_WHITE, Whitener
-from omnibench.fit.least_squares.repetitions import Difference, differences_between_repetitions
+from omnibench.fit.least_squares.noise import LEAST_WHITE
+from omnibench.fit.least_squares.nuisances import NuisanceLikelihood
+from omnibench.fit.least_squares.repetitions import Differences, differences_between_repetitions
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
@@ -43,56 +45,34 @@ def separate_start_noise(
     heading; noise: the estimate without start noise, where the search begins. The deviation is 0 unless a likelihood
     ratio test (5 %) rejects that.
     """
-    groups = by_stamps(differences_between_repetitions(trajectories, residuals, turning).each)
+    columns = [of_run[..., None] for of_run in turning]
+    differences = differences_between_repetitions(trajectories, residuals, columns)
     constant = noise.bias_heading
 
     def apart(deviation: float) -> Noise:
         rest = np.sqrt(max(constant**2 - deviation**2, 0.0))
         return noise.model_copy(update={"bias_heading": float(rest)})
 
-    before = _twice_negative_log_likelihood(groups, noise, 0.0)
+    before = _minus_log_likelihood(differences, noise, 0.0)
     first = minimize_scalar(
-        lambda deviation: _twice_negative_log_likelihood(groups, apart(deviation), deviation),
+        lambda deviation: _minus_log_likelihood(differences, apart(deviation), deviation),
         bounds=(0.0, min(max(2 * constant, 4 * noise.pose_heading, 1e-6), _LARGEST)),
         method="bounded",
         options={"xatol": 1e-6},
     )
     if before - float(first.fun) < _CHI_SQUARE / 4:  # fitting the other components again will not add that much
         return StartNoise(noise, 0.0)
-    likeliest, deviation, after = _polished(groups, apart(float(first.x)), float(first.x))
+    likeliest, deviation, after = _polished(differences, apart(float(first.x)), float(first.x))
     return StartNoise(likeliest, deviation) if before - after > _CHI_SQUARE else StartNoise(noise, 0.0)
 
 
-def by_stamps(differences: Sequence[Difference]) -> list[tuple[Array, Array]]:
-    """Differences grouped by their stamps (K,): values (K, 3, n) and companions (K, 3, n) of n, as one (K, 3, 2n)."""
-    groups: dict[bytes, list[Difference]] = {}
-    for difference in differences:
-        groups.setdefault(difference.stamps.tobytes(), []).append(difference)
-    return [
-        (
-            members[0].stamps,
-            np.stack([*(member.values for member in members), *(member.companion for member in members)], axis=-1),
-        )
-        for members in groups.values()
-    ]
+def _minus_log_likelihood(differences: Differences, noise: Noise, deviation: float) -> float:
+    """-2 ln L of the differences, up to a constant: Eq. (2) of nuisances.py."""
+    likelihood = NuisanceLikelihood(differences, noise)
+    return likelihood.noise_part + likelihood(np.array([deviation]))
 
 
-def _twice_negative_log_likelihood(groups: list[tuple[Array, Array]], noise: Noise, deviation: float) -> float:
-    """Twice the negative log-likelihood of the differences, up to a constant."""
-    total = 0.0
-    for stamps, everything in groups:
-        whitener = Whitener(noise, stamps)
-        count = everything.shape[2] // 2
-        white = whitener(everything).reshape(-1, 2 * count)
-        values, columns = white[:, :count], white[:, count:]
-        lengths = 1 + deviation**2 * np.square(columns).sum(axis=0)
-        along = (values * columns).sum(axis=0)
-        total += count * whitener.log_determinant + float(np.log(lengths).sum() + np.square(values).sum())
-        total -= deviation**2 * float((along**2 / lengths).sum())
-    return total
-
-
-def _polished(groups: list[tuple[Array, Array]], noise: Noise, deviation: float) -> tuple[Noise, float, float]:
+def _polished(differences: Differences, noise: Noise, deviation: float) -> tuple[Noise, float, float]:
     """All components estimated together, from a good start: the noise, the deviation and the likelihood there."""
     start = np.array([*(getattr(noise, name) for name in _NAMES), deviation])
     # The search is on a logarithmic scale, where zero cannot be left.
@@ -103,13 +83,13 @@ def _polished(groups: list[tuple[Array, Array]], noise: Noise, deviation: float)
         values = [float(value) for value in start * np.exp(logarithms)]
         return Noise(**dict(zip(_NAMES, values[:6], strict=True))), values[6]
 
-    count = sum(everything[..., 0].size for _, everything in groups)
+    count = sum(difference.values.size for difference in differences.each)
     answer = minimize(
-        lambda logarithms: _twice_negative_log_likelihood(groups, *described(logarithms)) / count,
+        lambda logarithms: _minus_log_likelihood(differences, *described(logarithms)) / count,
         np.zeros(7),
         method="L-BFGS-B",
         bounds=[(-5.0, 5.0)] * 7,
         options={"eps": 1e-5, "ftol": 1e-10},
     )
     likeliest, deviation = described(answer.x)
-    return likeliest, deviation, _twice_negative_log_likelihood(groups, likeliest, deviation)
+    return likeliest, deviation, _minus_log_likelihood(differences, likeliest, deviation)

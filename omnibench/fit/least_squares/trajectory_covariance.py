@@ -10,7 +10,7 @@ from scipy import stats
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.least_squares.repetitions import grouped
-from omnibench.fit.least_squares.trajectory_fit import Linearisation
+from omnibench.fit.least_squares.whitened import Whitened
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.uncertainty.sandwich import Sandwich, Scores, sandwich
 from omnibench.robot.kinematics import Array
@@ -29,12 +29,12 @@ class FitCovariance:
     uncertainty/sandwich.py, None if there are too few runs.
     """
 
-    def __init__(self, problem: CalibrationProblem, linear: Linearisation, trajectories: Sequence[Trajectory]) -> None:
+    def __init__(self, problem: CalibrationProblem, data: Whitened, trajectories: Sequence[Trajectory]) -> None:
         self._free = problem.free
         self._unit = (problem.upper - problem.lower)[problem.free]
         self._size = problem.size
-        scores = linear.scores[:, self._free] * self._unit
-        information = linear.information[:, self._free][:, :, self._free] * np.outer(self._unit, self._unit)
+        scores = data.scores[:, self._free] * self._unit
+        information = data.information_of_runs[:, self._free][:, :, self._free] * np.outer(self._unit, self._unit)
         values, vectors = np.linalg.eigh(information.sum(axis=0))
         known = values > _RANK * values.max(initial=0.0)
         self._roots, self._directions = np.sqrt(values[known]), vectors[:, known]

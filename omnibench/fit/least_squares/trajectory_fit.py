@@ -1,192 +1,128 @@
-"""Weighted least squares of whole reference trajectories, with the nuisances of every run eliminated.
+"""A model at recorded runs, each with nuisances of its own: residuals, their derivatives, and the runs' chi-square.
 
-With r the residuals of a run (odometry minus reference), W their weighting, J their derivatives by the vector, N those
-by the run's nuisances eta, and S the standard deviations that eta is expected to have, a Gauss-Newton step (d, e)
-minimises over all runs
+With r the residuals of a run (reference minus model), W their weighting, J the derivatives of the poses by what is
+fitted, N those by the run's nuisances eta, and S the standard deviations that eta is expected to have, a Gauss-Newton
+step (d, e) minimises over all runs
 
-    |W (r + J d + N e)|^2 + |(eta + e) / S|^2.
+    |W (r - J d - N e)|^2 + |(eta + e) / S|^2.                                                            (1)
 
-For every run e is eliminated by a QR decomposition of (W N, 1/S), so that the step costs hardly more than without it.
+Whatever d is, the nuisances eta + e of a run are those of nuisances.py, Eq. (1), for the residuals r + N eta - J d.
+Eliminated, they leave plain least squares in d, whose columns whitened.py makes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.errors import DataError
-from omnibench.fit.least_squares.noise import Whitener
-from omnibench.fit.parameterisation import Parameterisation
-from omnibench.robot.calibration import Noise
+from omnibench.fit.least_squares.nuisances import (
+    Nuisances,
+    Weighting,
+    likeliest_nuisances,
+    log_of,
+    nuisance_columns,
+)
+from omnibench.fit.least_squares.whitened import Whitened, whitened
 from omnibench.robot.kinematics import Array
-from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
-
-TURN, OFFSET, SLOPE = range(3)
-_LAST = 5  # samples whose mean rate continues the path after the last sample; chosen
-# A function from a run's residuals (K, 3), or their derivatives (K, 3, n), to weighted ones (k, 3) or (k, 3, n).
-Weighting = Callable[[Array], Array]
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import OdometryBatch, WheelLog
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
-    """A vector (n,) and the nuisances of every run (Z, 3).
-
-    Nuisances: correction that is added to the start heading (rad); offset tau (s) and slope s of the reference's clock,
-    by which a pose with stamp t was taken at t - tau - s t on the clock of the wheels. A shift of the start position is
-    no nuisance: it is a bias of the run, which the noise model contains.
-    """
-
-    vector: Array
-    nuisances: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Linearisation:
-    """A fit linearised about an estimate, the nuisances eliminated, run by run.
-
-    chi2 (Z,): shares of the objective. information (Z, n, n): J'V^-1 J. scores (Z, n): J'V^-1 r.
-    """
-
-    chi2: Array
-    information: Array
-    scores: Array
-    _solved: tuple[tuple[Array, Array], ...]
-    _known: NDArray[np.bool_]
-
-    def nuisance_steps(self, step: Array) -> Array:
-        """The steps (Z, 3) of the nuisances that go with a step (n,) of the vector."""
-        steps = np.zeros((len(self.scores), 3))
-        steps[:, self._known] = [-(alone + with_vector @ step) for alone, with_vector in self._solved]
-        return steps
-
-
 class TrajectoryFit:
-    """Residuals between the reference poses of some runs and the odometry of an estimate, and their derivatives.
+    """A model at some runs, at their reference poses after the start. Quantities are lists with one entry a run."""
 
-    trajectories: the runs that have reference poses after their start; DataError when there are none.
-    """
+    model: OdometryModel
+    runs: tuple[Trajectory, ...]
+    nuisances: Nuisances
 
-    def __init__(
-        self, trajectories: Sequence[Trajectory], parameterisation: Parameterisation, integration: Integration
-    ) -> None:
-        self.trajectories = tuple(run for run in trajectories if len(run.pose_times) > 1)
-        if not self.trajectories:
-            raise DataError("no trajectory has a reference pose after its start; nothing can be fitted")
-        self._parameterisation = parameterisation
-        self._integration: Integration = integration
-        self._reference = np.concatenate([run.poses[1:] for run in self.trajectories])
-        ends = np.cumsum([0, *(len(run.pose_times) - 1 for run in self.trajectories)])
-        self._parts = [slice(first, last) for first, last in pairwise(ends)]
-        # Velocities are differences over two samples: the rate of a single one has its full encoder noise.
-        self._period = float(np.median(np.concatenate([np.diff(run.times, prepend=0.0) for run in self.trajectories])))
-        self._plain = self._batch(np.zeros((len(self.trajectories), 3)))
+    @cached_property
+    def logs(self) -> list[WheelLog]:
+        """The wheel logs at the times when the poses were taken, starts turned."""
+        return [log_of(run, values) for run, values in zip(self.runs, self.nuisances.values, strict=True)]
 
-    def residuals(self, estimate: Estimate) -> list[Array]:
-        """Odometry minus reference of every run, (K, 3) in m, m, rad."""
-        errors = self._odometry(estimate).poses(self._matrix(estimate.vector)[None])[0] - self._reference
-        return [errors[part] for part in self._parts]
+    @cached_property
+    def poses(self) -> list[Array]:
+        """The model's poses (K, 3), m, m, rad."""
+        return self.model.reported(self.logs)
 
-    def turning(self, estimate: Estimate) -> list[Array]:
-        """Derivatives (K, 3) of the poses of every run by its start heading."""
-        columns = self._turning(estimate)
-        return [columns[part] for part in self._parts]
+    @cached_property
+    def residuals(self) -> list[Array]:
+        """Reference minus model (K, 3), m, m, rad."""
+        return [run.poses[1:] - modelled for run, modelled in zip(self.runs, self.poses, strict=True)]
 
-    def whiteners(self, noise: Noise) -> list[Weighting]:
-        """The whitening of every run; runs with the same stamps share theirs."""
-        made: dict[bytes, Weighting] = {}
-        for run in self.trajectories:
-            key = run.pose_times.tobytes()
-            if key not in made:
-                made[key] = Whitener(noise, run.pose_times[1:])
-        return [made[run.pose_times.tobytes()] for run in self.trajectories]
+    @property
+    def stamps(self) -> list[Array]:
+        """Times (K,) of the residuals, s."""
+        return [run.pose_times[1:] for run in self.runs]
 
-    def chi2(self, estimate: Estimate, weightings: Sequence[Weighting], deviations: Array) -> Array:
-        """Every run's share (Z,) in the objective at an estimate, with deviations as for ``linearise``."""
-        known = deviations > 0
-        shares: Array = np.square(estimate.nuisances[:, known] / deviations[known]).sum(axis=1)
-        for row, residuals in enumerate(self.residuals(estimate)):
-            shares[row] += float(np.square(weightings[row](residuals)).sum())
-        return shares
+    @cached_property
+    def slopes(self) -> list[Array]:
+        """Derivatives (K, 3, 3) of the model's poses by the nuisances.
 
-    def linearise(self, estimate: Estimate, weightings: Sequence[Weighting], deviations: Array) -> Linearisation:
-        """The fit linearised about an estimate.
-
-        deviations (3,): S, the standard deviations of the nuisances; 0 for one that keeps its value.
+        Velocities are differences over two samples: the rate of a single one has its full encoder noise.
         """
-        size, known = len(estimate.vector), deviations > 0
-        jacobian, columns = self._jacobian(estimate), self._nuisance_columns(estimate, known)
-        expected, scale = estimate.nuisances[:, known] / deviations[known], np.diag(1 / deviations[known])
-        chi2, information, scores, solved = [], [], [], []
-        for row, errors in enumerate(self.residuals(estimate)):
-            part = self._parts[row]
-            everything = weightings[row](np.concatenate([errors[..., None], jacobian[part], columns[part]], axis=-1))
-            white = everything.reshape(-1, everything.shape[-1])
-            residuals, slopes = white[:, 0], white[:, 1 : 1 + size]
-            if known.any():
-                residuals = np.concatenate([residuals, expected[row]])
-                slopes = np.vstack([slopes, np.zeros((len(scale), size))])
-                basis, upper = np.linalg.qr(np.vstack([white[:, 1 + size :], scale]))
-                solved.append((np.linalg.solve(upper, basis.T @ residuals), np.linalg.solve(upper, basis.T @ slopes)))
-                chi2.append(float(residuals @ residuals))
-                residuals = residuals - basis @ (basis.T @ residuals)
-                slopes = slopes - basis @ (basis.T @ slopes)
-            else:
-                solved.append((np.zeros(0), np.zeros((0, size))))
-                chi2.append(float(residuals @ residuals))
-            information.append(slopes.T @ slopes)
-            scores.append(slopes.T @ residuals)
-        return Linearisation(np.array(chi2), np.array(information), np.array(scores), tuple(solved), known)
+        period = float(np.median(np.concatenate([np.diff(run.times, prepend=0.0) for run in self.runs])))
+        later = np.array([0.0, -period, 0.0])
+        after, before = (
+            self.model.reported([log_of(run, values) for run, values in zip(self.runs, moved, strict=True)])
+            for moved in (self.nuisances.values + later, self.nuisances.values - later)
+        )
+        velocities = [(late - early) / (2 * period) for late, early in zip(after, before, strict=True)]
+        paths = [poses - log.start for poses, log in zip(self.poses, self.logs, strict=True)]
+        return [nuisance_columns(*of_run) for of_run in zip(paths, velocities, self.stamps, strict=True)]
 
-    def _matrix(self, vector: Array) -> Array:
-        return self._parameterisation.matrices(vector[None])[0]
+    @property
+    def estimated_slopes(self) -> list[Array]:
+        """Derivatives (K, 3, m) by the m nuisances that are estimated."""
+        known = self.nuisances.estimated
+        if not known.any():
+            return [np.empty((*residuals.shape, 0)) for residuals in self.residuals]
+        return [slopes[..., known] for slopes in self.slopes]
 
-    def _odometry(self, estimate: Estimate) -> OdometryBatch:
-        return self._batch(estimate.nuisances) if estimate.nuisances.any() else self._plain
+    @property
+    def nuisance_free_residuals(self) -> list[Array]:
+        """Residuals (K, 3) if all nuisances that are estimated were 0, to first order."""
+        if not self.nuisances.estimated.any():
+            return self.residuals
+        values = np.where(self.nuisances.estimated, self.nuisances.values, 0.0)
+        return [
+            residuals + slopes @ of_run
+            for residuals, slopes, of_run in zip(self.residuals, self.slopes, values, strict=True)
+        ]
 
-    def _batch(self, nuisances: Array, later: float = 0.0) -> OdometryBatch:
-        """The odometry at the times when the poses were taken, plus ``later`` s."""
-        logs = []
-        for run, (turn, offset, slope) in zip(self.trajectories, nuisances, strict=True):
-            stamps = run.pose_times[1:] * (1 - slope) - offset + later
-            times, rates = run.times, run.rates
-            if stamps[-1] > times[-1]:  # the robot drove on; the path must not stop at the last sample
-                times, rates = np.append(times, stamps[-1]), np.vstack([rates, rates[-_LAST:].mean(axis=0)])
-            logs.append(WheelLog(times, rates, run.start + np.array([0.0, 0.0, turn]), stamps))
-        return OdometryBatch(logs, self._integration)
+    def matrix_jacobian(self) -> list[Array]:
+        """Derivatives (K, 3, 3N) of the poses by the elements of the matrix, row by row."""
+        columns = OdometryBatch(self.logs, self.model.integration).jacobian(self.model.matrix)
+        return split_runs(columns.reshape(len(columns), 3, -1), self.runs)
 
-    def _jacobian(self, estimate: Estimate) -> Array:
-        """Derivatives (S, 3, n) of the poses by the vector; the matrix is differentiated by central differences."""
-        vector, size = estimate.vector, len(estimate.vector)
-        steps = 1e-5 * np.maximum(np.abs(self._parameterisation.start), 1e-3)
-        matrices = self._parameterisation.matrices(np.concatenate([vector + np.diag(steps), vector - np.diag(steps)]))
-        slopes = (matrices[:size] - matrices[size:]) / (2 * steps[:, None, None])
-        by_elements = self._odometry(estimate).jacobian(self._matrix(vector))
-        return by_elements.reshape(len(by_elements), 3, -1) @ slopes.reshape(size, -1).T
+    def chi_square(self, weightings: Sequence[Weighting]) -> Array:
+        """Every run's share (Z,) in the objective, Eq. (1) with d = e = 0."""
+        white = [weigh(residuals) for weigh, residuals in zip(weightings, self.residuals, strict=True)]
+        return self.nuisances.chi_square + [float(np.square(of_run).sum()) for of_run in white]
 
-    def _nuisance_columns(self, estimate: Estimate, known: NDArray[np.bool_]) -> Array:
-        """Derivatives (S, 3, m) of the poses by the m nuisances that are estimated, True in ``known`` (3,)."""
-        columns: list[Array] = []
-        if known[TURN]:
-            columns.append(self._turning(estimate))
-        if known[OFFSET] or known[SLOPE]:
-            matrix = self._matrix(estimate.vector)[None]
-            after, before = (self._batch(estimate.nuisances, sign * self._period).poses(matrix)[0] for sign in (1, -1))
-            velocity = (after - before) / (2 * self._period)
-            if known[OFFSET]:
-                columns.append(-velocity)
-            if known[SLOPE]:
-                stamps = np.concatenate([run.pose_times[1:] for run in self.trajectories])
-                columns.append(-velocity * stamps[:, None])
-        return np.stack(columns, axis=-1) if columns else np.empty((len(self._reference), 3, 0))
+    def linearised(
+        self, columns: Sequence[Array], weightings: Sequence[Weighting], residuals: Sequence[Array] | None = None
+    ) -> Whitened:
+        """Columns (K, 3, p) and residuals of every run, weighted, the nuisances eliminated.
 
-    def _turning(self, estimate: Estimate) -> Array:
-        """Derivatives (S, 3) of the poses by the start heading: the path turns about its start."""
-        odometry = self._odometry(estimate)
-        starts = np.array([run.start for run in self.trajectories])[odometry.trajectory]
-        path = odometry.poses(self._matrix(estimate.vector)[None])[0] - starts
-        return np.stack([-path[:, 1], path[:, 0], np.ones(len(path))], axis=1)
+        residuals: the nuisance-free ones where none are given.
+        """
+        values = self.nuisance_free_residuals if residuals is None else residuals
+        deviations = self.nuisances.deviations[self.nuisances.estimated]
+        return whitened(values, columns, weightings, self.estimated_slopes, deviations)
+
+    def likeliest_nuisances(self, weightings: Sequence[Weighting], residuals: Sequence[Array] | None = None) -> Array:
+        """Nuisances (Z, 3) of largest likelihood for nuisance-free residuals, by default the model's own."""
+        values = self.nuisance_free_residuals if residuals is None else residuals
+        return likeliest_nuisances(values, self.estimated_slopes, weightings, self.nuisances)
+
+
+def split_runs(columns: Array, runs: Sequence[Trajectory]) -> list[Array]:
+    """Values of all poses (S, ...), cut into those of each run (K, ...)."""
+    ends = np.cumsum([len(run.pose_times) - 1 for run in runs])[:-1]
+    return np.split(columns, ends)

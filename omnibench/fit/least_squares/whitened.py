@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.fit.least_squares.noise import Whitener
-from omnibench.robot.calibration import Noise
+from omnibench.fit.least_squares.nuisances import Weighting
 from omnibench.robot.kinematics import Array
 
 _DETERMINED = 1e-6  # share of a direction that must be left beyond other columns for it to count; chosen
@@ -27,38 +26,39 @@ class Whitened:
     information: Array
     scores: Array
 
+    @property
+    def information_of_runs(self) -> Array:
+        """Products (Z, p, p) of the columns of each run."""
+        return np.array([columns.T @ columns for columns in self.columns])
+
     def with_residuals(self, residuals: Sequence[Array]) -> Whitened:
         """These columns with other whitened residuals."""
         return Whitened(tuple(residuals), self.columns, self.information, _scores(self.columns, residuals))
 
 
 def whitened(
-    runs: Sequence[Array],
+    residuals: Sequence[Array],
     columns: Sequence[Array],
-    stamps: Sequence[Array],
-    noise: Noise,
-    nuisances: Sequence[Array],
+    weightings: Sequence[Weighting],
+    slopes: Sequence[Array],
     deviations: Array,
 ) -> Whitened:
-    """Whiten residuals ``runs`` (K, 3) and columns (K, 3, p) of every run, at its stamps (K,).
+    """Whiten residuals (K, 3) and columns (K, 3, p) of every run.
 
-    nuisances: derivatives (K, 3, m) of each run's poses by its nuisances. deviations (m,): their standard deviations,
-    0 for one that is left at 0; they count as noise that all poses of a run share.
+    slopes (K, 3, m): derivatives of each run's poses by its nuisances. deviations (m,): their standard deviations, > 0;
+    they count as noise that all poses of a run share.
     """
-    whiteners: dict[bytes, Whitener] = {}
-    known = deviations > 0
-    residuals, whites = [], []
-    for values, slopes, times, extra in zip(runs, columns, stamps, nuisances, strict=True):
-        key = times.tobytes()
-        if key not in whiteners:
-            whiteners[key] = Whitener(noise, times)
-        everything = np.concatenate([values[..., None], slopes, extra[..., known]], axis=-1)
-        white = whiteners[key](everything).reshape(3 * len(values), -1)
-        count = 1 + slopes.shape[2]
-        free = _without(white[:, :count], white[:, count:] * deviations[known]) if known.any() else white
-        residuals.append(np.ascontiguousarray(free[:, 0]))
-        whites.append(free[:, 1:])
-    return Whitened(tuple(residuals), tuple(whites), _products(whites), _scores(whites, residuals))
+    free_residuals, free_columns = [], []
+    for values, fitted, weigh, extra in zip(residuals, columns, weightings, slopes, strict=True):
+        white = weigh(np.concatenate([values[..., None], fitted, extra], axis=-1))
+        white = white.reshape(-1, white.shape[-1])
+        count = 1 + fitted.shape[2]
+        free = _without(white[:, :count], white[:, count:] * deviations) if len(deviations) else white
+        free_residuals.append(np.ascontiguousarray(free[:, 0]))
+        free_columns.append(free[:, 1:])
+    return Whitened(
+        tuple(free_residuals), tuple(free_columns), _products(free_columns), _scores(free_columns, free_residuals)
+    )
 
 
 def _without(values: Array, nuisances: Array) -> Array:

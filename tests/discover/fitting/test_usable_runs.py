@@ -9,9 +9,9 @@ import pytest
 from discovery_samples import simulated
 
 from omnibench.discover.fitting.model_fit import fit_matrix
-from omnibench.discover.fitting.nuisances import log_of
 from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.errors import DataError
+from omnibench.fit.least_squares.nuisances import log_of
 
 
 def fit_of(runs, dataset):

@@ -9,30 +9,35 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.fit.cost_weights import cost_weightings
-from omnibench.fit.least_squares.gauss_newton import bounded_step
-from omnibench.fit.least_squares.trajectory_fit import OFFSET, SLOPE, TURN, Estimate, TrajectoryFit
+from omnibench.fit.least_squares.gauss_newton import BoxedFit, bounded_step, first_fit
+from omnibench.fit.least_squares.noise import whiteners
+from omnibench.fit.least_squares.nuisances import OFFSET, SLOPE, TURN, Nuisances
 from omnibench.registry import costs
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
 NOISE = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.005, walk_heading=0.005, bias_position=0.01)
 PROBLEM = make_problem()
-FIT = TrajectoryFit(PROBLEM.trajectories, PROBLEM.parameterisation, PROBLEM.integration)
-WEIGHTINGS = FIT.whiteners(NOISE)
-START = Estimate(PROBLEM.start, np.zeros((len(FIT.trajectories), 3)))
+START = first_fit(PROBLEM)
+WEIGHTINGS = whiteners(NOISE, START.trajectories.stamps)
+RUNS = len(START.trajectories.runs)
 
 
-def chi2(estimate: Estimate, deviations: Array) -> float:
-    return float(FIT.chi2(estimate, WEIGHTINGS, deviations).sum())
+def with_deviations(deviations: Array, values: Array | None = None) -> BoxedFit:
+    """The start with nuisances that have these standard deviations."""
+    return START.with_nuisances(Nuisances(np.zeros((RUNS, 3)) if values is None else values, deviations))
+
+
+def chi2(fit: BoxedFit) -> Array:
+    return fit.trajectories.chi_square(WEIGHTINGS)
 
 
 def test_the_scores_are_the_slopes_of_the_objective() -> None:
-    held = np.zeros(3)
-    found = FIT.linearise(START, WEIGHTINGS, held)
-    assert found.chi2.sum() == pytest.approx(chi2(START, held))
+    data = START.linearised(WEIGHTINGS)
+    assert np.square(data.residuals).sum() == pytest.approx(chi2(START).sum())
     for index, step in enumerate(1e-6 * np.eye(PROBLEM.size)):
-        after, before = (chi2(Estimate(PROBLEM.start + sign * step, START.nuisances), held) for sign in (1, -1))
-        assert found.scores.sum(axis=0)[index] == pytest.approx((after - before) / 4e-6, rel=1e-4)
+        after, before = (chi2(START.moved(PROBLEM.start + sign * step, np.zeros((RUNS, 3)))).sum() for sign in (1, -1))
+        assert data.scores.sum(axis=0)[index] == pytest.approx(-(after - before) / 4e-6, rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -43,21 +48,20 @@ def test_the_scores_are_the_slopes_of_the_objective() -> None:
 )
 def test_steps_of_a_nuisance_lead_to_where_no_run_can_do_better(nuisance: int, deviation: float, kinks: float) -> None:
     deviations = np.where(np.arange(3) == nuisance, deviation, 0.0)
-    now = START
+    values = np.zeros((RUNS, 3))
     for _ in range(4):
-        steps = FIT.linearise(now, WEIGHTINGS, deviations).nuisance_steps(np.zeros(PROBLEM.size))
-        now = Estimate(now.vector, now.nuisances + steps)
-    assert not np.delete(now.nuisances, nuisance, axis=1).any()
-    there = FIT.chi2(now, WEIGHTINGS, deviations)
-    assert there.sum() < 0.9 * chi2(START, deviations)
+        values = with_deviations(deviations, values).trajectories.likeliest_nuisances(WEIGHTINGS)
+    assert not np.delete(values, nuisance, axis=1).any()
+    there = chi2(with_deviations(deviations, values))
+    assert there.sum() < 0.9 * chi2(with_deviations(deviations)).sum()
     for away in (-0.05, 0.05):
-        moved = now.nuisances + away * (np.abs(now.nuisances) + deviations)
-        assert (FIT.chi2(Estimate(now.vector, moved), WEIGHTINGS, deviations) > (1 - kinks) * there).all()
+        moved = values + away * (np.abs(values) + deviations)
+        assert (chi2(with_deviations(deviations, moved)) > (1 - kinks) * there).all()
 
 
 def test_what_nuisances_take_up_is_no_information() -> None:
-    held = FIT.linearise(START, WEIGHTINGS, np.zeros(3)).information.sum(axis=0)
-    free = FIT.linearise(START, WEIGHTINGS, np.array([0.05, 0.2, 0.01])).information.sum(axis=0)
+    held = START.linearised(WEIGHTINGS).information
+    free = with_deviations(np.array([0.05, 0.2, 0.01])).linearised(WEIGHTINGS).information
     assert np.linalg.eigvalsh(held - free).min() >= -1e-9 * np.linalg.eigvalsh(held).max()
     assert np.trace(free) < 0.99 * np.trace(held)
 
@@ -82,8 +86,8 @@ def test_a_step_within_the_box_is_the_best_there_is(seed: int, reach: float) -> 
 @pytest.mark.parametrize("name", ["final_pose", "final_position", "final_heading"])
 def test_final_errors_are_weighted_as_the_cost_weighs_them(name: str) -> None:
     cost = costs.create(name)
-    residuals = FIT.residuals(START)
-    weightings = cost_weightings(cost, FIT.trajectories, residuals)
+    residuals = START.trajectories.residuals
+    weightings = cost_weightings(cost, START.trajectories.runs, residuals)
     lengths = np.array([np.linalg.norm(weigh(own)) for weigh, own in zip(weightings, residuals, strict=True)])
     of_each = cost.of_each(np.array([own[-1] for own in residuals]), np.arange(len(residuals)))
     assert lengths / lengths.mean() == pytest.approx(of_each / of_each.mean())
@@ -91,8 +95,8 @@ def test_final_errors_are_weighted_as_the_cost_weighs_them(name: str) -> None:
 
 
 def test_errors_along_the_way_count_the_same_for_every_run_whatever_its_number_of_stamps() -> None:
-    residuals = FIT.residuals(START)
-    weightings = cost_weightings(costs.create("trajectory"), FIT.trajectories, residuals)
+    residuals = START.trajectories.residuals
+    weightings = cost_weightings(costs.create("trajectory"), START.trajectories.runs, residuals)
     squares = [np.square(weigh(own)).sum() for weigh, own in zip(weightings, residuals, strict=True)]
     mean_squares = np.array([np.square(own).sum(axis=1).mean() for own in residuals])
     assert squares == pytest.approx(mean_squares / mean_squares.mean())

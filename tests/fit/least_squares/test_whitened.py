@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import given as cases
 from hypothesis import strategies as st
 
+from omnibench.fit.least_squares.noise import whiteners
 from omnibench.fit.least_squares.whitened import given, whitened
 from omnibench.robot.calibration import Noise
 
@@ -18,7 +19,11 @@ def random_data(seed: int, count: int, deviations: np.ndarray):
     residuals = [rng.normal(0, 0.03, (len(each), 3)) for each in stamps]
     columns = [rng.normal(0, 1, (len(each), 3, 6)) for each in stamps]
     nuisances = [rng.normal(0, 1, (len(each), 3, 3)) for each in stamps]
-    return whitened(residuals, columns, stamps, NOISE, nuisances, deviations), residuals, columns, stamps, nuisances
+    known = deviations > 0
+    data = whitened(
+        residuals, columns, whiteners(NOISE, stamps), [each[..., known] for each in nuisances], deviations[known]
+    )
+    return data, residuals, columns, stamps, nuisances
 
 
 @cases(seed=st.integers(0, 10**6), count=st.integers(2, 6))
