@@ -6,16 +6,19 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails, to_jsonable_python
 
 from omnibench.errors import ConfigError, nearest
 
 M = TypeVar("M", bound=BaseModel)
 
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 CHOSEN = "@"  # marks a union member's tag in a pydantic location; what follows it is no key of the document
 

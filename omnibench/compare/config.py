@@ -7,13 +7,12 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator
 
-from omnibench.config import Model
+from omnibench.config import Model, Positive
 from omnibench.data.dataset import Split
 from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
 from omnibench.fit.problem import Budget
 from omnibench.fit.span import Unidentified
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.config import Positive
 from omnibench.simulate.dataset_source import DatasetSource
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, model_validator
 
-from omnibench.config import Model
+from omnibench.config import Model, NonNegative, Positive
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
@@ -33,12 +33,12 @@ class Scanner(Model):
     rays: int = Field(gt=0, le=100_000, description="ranges of a scan")
     angle_min: FiniteFloat = Field(description="rad, in the scanner's frame, counter-clockwise")
     angle_increment: FiniteFloat = Field(description="rad from ray to ray; negative for clockwise")
-    time_increment: float = Field(0.0, ge=0, allow_inf_nan=False, description="s from ray to ray")
-    range_min: float = Field(0.0, ge=0, allow_inf_nan=False, description="m; shorter ranges are no measurements")
-    range_max: float = Field(gt=0, allow_inf_nan=False, description="m; longer ranges are no measurements")
-    noise: float = Field(0.01, gt=0, allow_inf_nan=False, description="standard deviation of a range, m")
-    far_noise: float = Field(0.03, gt=0, allow_inf_nan=False, description="standard deviation of ranges beyond far, m")
-    far: float = Field(10.0, gt=0, allow_inf_nan=False, description="m")
+    time_increment: NonNegative = Field(0.0, description="s from ray to ray")
+    range_min: NonNegative = Field(0.0, description="m; shorter ranges are no measurements")
+    range_max: Positive = Field(description="m; longer ranges are no measurements")
+    noise: Positive = Field(0.01, description="standard deviation of a range, m")
+    far_noise: Positive = Field(0.03, description="standard deviation of ranges beyond far, m")
+    far: Positive = Field(10.0, description="m")
     mount: Mount = Mount()
 
     @model_validator(mode="after")

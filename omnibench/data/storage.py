@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 from pydantic import Field, model_validator
 
-from omnibench.config import Model, read_yaml, to_yaml, validate
+from omnibench.config import Model, Positive, read_yaml, to_yaml, validate
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, make_dataset
 from omnibench.data.delimited import not_increasing
 from omnibench.data.scan_files import ScansOnDisk, write_scans
@@ -37,7 +37,7 @@ class Header(Model):
     licence: str = ""
     simulated: bool = Field(False, description="true for simulated data")
     robot: Robot
-    sample_period: float = Field(gt=0, allow_inf_nan=False, description="s")
+    sample_period: Positive = Field(description="s")
     wheels: tuple[str, ...] = Field(description="column names: omega_<wheel>")
     scanner: Scanner | None = Field(None, description="the scanner, if there are scans")
 

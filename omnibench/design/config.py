@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Discriminator, Field, FiniteFloat, Tag, field_validator, model_validator
 
-from omnibench.config import Model
+from omnibench.config import Model, NonNegative, Positive
 from omnibench.data.importers.robot_option import RobotOption
 from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import Noise
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.config import MotionGrid, Positive
+from omnibench.simulate.config import MotionGrid
 from omnibench.simulate.dataset_source import DatasetSource
 from omnibench.simulate.flower import Command, grid_of
 from omnibench.words import plural
@@ -55,7 +55,7 @@ class CommandGrid(MotionGrid):
 class SingleCommand(Model):
     """One command."""
 
-    speed: float = Field(ge=0, allow_inf_nan=False, description="m/s")
+    speed: NonNegative = Field(description="m/s")
     direction_deg: FiniteFloat = Field(0.0, description="degrees, in the robot's frame")
     turn_rate: FiniteFloat = Field(0.0, description="rad/s")
     duration: Positive = Field(description="s")

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
-from omnibench.config import Model, read_model, read_yaml, validate
+from omnibench.config import Model, Positive, read_model, read_yaml, validate
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.live.estimation.wheel_input import WheelSettings
 from omnibench.live.frames import Frames
@@ -59,9 +59,7 @@ class LiveConfig(Model):
     description: str = ""
     robots: tuple[RobotConfig, ...] = Field((), description="may be empty for a router")
     fusion: FusionChoice = Field("none", description="of SLAM poses: none, ekf, or its settings")
-    stale_after: float = Field(
-        0.5, gt=0, allow_inf_nan=False, description="no wheel sample for so long makes the health stale, s"
-    )
+    stale_after: Positive = Field(0.5, description="no wheel sample for so long makes the health stale, s")
     profile: Profile = Field("plain", description="plain: plain Zenoh and the DDS bridge; rmw, humble: rmw_zenoh")
     domain: int = Field(0, ge=0, le=232, description="ROS_DOMAIN_ID, for rmw and humble")
     zenoh: SessionConfig = SessionConfig()

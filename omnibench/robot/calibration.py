@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
-from omnibench.config import Model, parse_yaml, read_yaml, to_yaml, validate
+from omnibench.config import Model, NonNegative, Positive, parse_yaml, read_yaml, to_yaml, validate
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import write_text
 from omnibench.robot.effects.term import make_term
@@ -21,8 +21,7 @@ from omnibench.words import plural
 FORMAT: Final = "omnibench-calibration/1"
 _LARGEST_ELEMENT = 1e3  # m or rad per rad of wheel: no wheel is so large
 Row = tuple[FiniteFloat, ...]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Deviation = Annotated[float, Field(ge=0, le=1e3, allow_inf_nan=False)]
+Deviation = Annotated[NonNegative, Field(le=1e3)]
 
 
 class EffectTerm(Model):
@@ -68,7 +67,7 @@ class Calibration(Model):
     name: str
     created: datetime = Field(default_factory=lambda: datetime.now(UTC).replace(microsecond=0))
     robot: Robot
-    sample_period: float = Field(gt=0, allow_inf_nan=False, description="s")
+    sample_period: Positive = Field(description="s")
     matrix: tuple[Row, Row, Row] = Field(description="3 x N: m (rows 1, 2) and rad (row 3) per rad of wheel")
     integration: Integration
     effects: tuple[EffectTerm, ...] = ()

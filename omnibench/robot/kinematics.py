@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, FiniteFloat, field_validator, model_validator
 
 from omnibench.config import Model
 
@@ -28,10 +28,10 @@ class Wheel(Model):
     """
 
     name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_]+$", description="ends the column names: omega_<name>")
-    radius: float = Field(ge=1e-6, le=1e3, allow_inf_nan=False, description="m")
-    distance: float = Field(ge=1e-6, le=1e3, allow_inf_nan=False, description="lever arm about the robot's centre, m")
-    angle: float = Field(allow_inf_nan=False, description="direction of the axle, rad")
-    roller_angle: float = Field(0.0, gt=-1.5, lt=1.5, allow_inf_nan=False, description="0 omni, +-pi/4 mecanum; rad")
+    radius: FiniteFloat = Field(ge=1e-6, le=1e3, description="m")
+    distance: FiniteFloat = Field(ge=1e-6, le=1e3, description="lever arm about the robot's centre, m")
+    angle: FiniteFloat = Field(description="direction of the axle, rad")
+    roller_angle: FiniteFloat = Field(0.0, gt=-1.5, lt=1.5, description="0 omni, +-pi/4 mecanum; rad")
 
     @field_validator("angle")
     @classmethod

@@ -7,15 +7,12 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, FiniteFloat, model_validator
 
-from omnibench.config import Model
+from omnibench.config import Model, NonNegative, Positive
 from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import EffectTerm, Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import Integration
 from omnibench.robot.published_matrices import PUBLISHED
-
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-
 
 _MOST_ROWS = 1e8  # wheel samples and poses; more do not fit into memory
 
@@ -73,15 +70,13 @@ class Session(Model):
 
     seed: int = Field(ge=0)
     distance: Positive = Field(description="length of each run, m")
-    noise_scale: float = Field(1.0, ge=0, allow_inf_nan=False, description="factor on all noise of the reference")
+    noise_scale: NonNegative = Field(1.0, description="factor on all noise of the reference")
 
 
 class MotionGrid(Model):
     """Motion commands: every direction with every rate of turn, at each speed."""
 
-    speeds: tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...] = Field(
-        (0.2,), min_length=1, description="m/s"
-    )
+    speeds: tuple[NonNegative, ...] = Field((0.2,), min_length=1, description="m/s")
     directions_deg: tuple[FiniteFloat, ...] = Field(min_length=1)
     turn_rates: tuple[FiniteFloat, ...] = Field(min_length=1, description="rad/s")
     turn_duration: Positive = Field(6.0, description="duration of turns on the spot, s")
@@ -90,18 +85,13 @@ class MotionGrid(Model):
 class Commands(MotionGrid):
     """Motion commands and the ramps with which they are driven."""
 
-    ramp: float = Field(
-        0.0,
-        ge=0,
-        allow_inf_nan=False,
-        description="time in which wheel rates rise and fall, which is added to the run, s",
-    )
+    ramp: NonNegative = Field(0.0, description="time in which wheel rates rise and fall, which is added to the run, s")
 
 
 class EncoderNoise(Noise):
     """Noise of the encoders, and of the reference poses as in a calibration file."""
 
-    encoder: float = Field(0.0, ge=0, allow_inf_nan=False, description="white noise of each wheel rate, rad/s")
+    encoder: NonNegative = Field(0.0, description="white noise of each wheel rate, rad/s")
 
 
 class FlowerConfig(Model):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, FiniteFloat, model_validator
 
-from omnibench.config import Model
+from omnibench.config import Model, Positive
 from omnibench.robot.kinematics import Array
 
 
@@ -19,44 +19,24 @@ class SlamOptions(Model):
         description="where the search for a scan's pose starts; kept along directions that the scans do not measure",
     )
     deskew: bool = Field(True, description="undo the robot's motion within a scan")
-    search_distance: float = Field(
-        1.0,
-        gt=0,
-        le=10,
-        allow_inf_nan=False,
-        description="m; points farther from the map are not matched in the first search",
+    search_distance: Positive = Field(
+        1.0, le=10, description="m; points farther from the map are not matched in the first search"
     )
-    match_distance: float = Field(
-        0.15,
-        gt=0,
-        le=10,
-        allow_inf_nan=False,
-        description="m; points farther from the map are not matched once the pose is roughly known",
+    match_distance: Positive = Field(
+        0.15, le=10, description="m; points farther from the map are not matched once the pose is roughly known"
     )
-    spacing: float = Field(0.1, gt=0.005, le=1, allow_inf_nan=False, description="m between points of the map")
-    keyframe_distance: float = Field(
-        0.25, gt=0, allow_inf_nan=False, description="m; distance after which a scan adds new surfaces to the map"
+    spacing: FiniteFloat = Field(0.1, gt=0.005, le=1, description="m between points of the map")
+    keyframe_distance: Positive = Field(0.25, description="m; distance after which a scan adds new surfaces to the map")
+    keyframe_angle: Positive = Field(0.2, description="rad; turn after which a scan does so")
+    constrained_position: Positive = Field(
+        0.02, description="m; along directions that a scan measures less precisely, the start is kept"
     )
-    keyframe_angle: float = Field(0.2, gt=0, allow_inf_nan=False, description="rad; turn after which a scan does so")
-    constrained_position: float = Field(
-        0.02,
-        gt=0,
-        allow_inf_nan=False,
-        description="m; along directions that a scan measures less precisely, the start is kept",
+    constrained_heading: Positive = Field(0.01, description="rad; as constrained_position, for the heading")
+    odometry_error: Positive = Field(
+        0.1, description="standard deviation of the odometry's error, as a share of the distance"
     )
-    constrained_heading: float = Field(
-        0.01, gt=0, allow_inf_nan=False, description="rad; as constrained_position, for the heading"
-    )
-    odometry_error: float = Field(
-        0.1,
-        gt=0,
-        allow_inf_nan=False,
-        description="standard deviation of the odometry's error, as a share of the distance",
-    )
-    speed: float = Field(0.5, gt=0, allow_inf_nan=False, description="m/s; greatest speed, for start last_pose")
-    turn_rate: float = Field(
-        1.0, gt=0, allow_inf_nan=False, description="rad/s; greatest rate of turn, for start last_pose"
-    )
+    speed: Positive = Field(0.5, description="m/s; greatest speed, for start last_pose")
+    turn_rate: Positive = Field(1.0, description="rad/s; greatest rate of turn, for start last_pose")
 
     @model_validator(mode="after")
     def _narrows(self) -> SlamOptions:

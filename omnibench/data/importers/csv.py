@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from omnibench.config import Positive
 from omnibench.data.alignment import align, median_period
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.delimited import read_numbers
@@ -46,10 +47,8 @@ class CsvOptions(RecordingOptions):
     wheel_unit: Literal["rad/s", "deg/s", "rpm", "rad", "deg", "ticks", "ticks/sample"] = Field(
         "rad/s", description="rates (.../s, rpm), absolute angles (rad, deg, ticks) or increments (ticks/sample)"
     )
-    ticks_per_turn: float | None = Field(None, gt=0, allow_inf_nan=False, description="of the wheel, gear included")
-    wheel_wrap: float | None = Field(
-        None, gt=0, allow_inf_nan=False, description="absolute angles start again after this many wheel_unit"
-    )
+    ticks_per_turn: Positive | None = Field(None, description="of the wheel, gear included")
+    wheel_wrap: Positive | None = Field(None, description="absolute angles start again after this many wheel_unit")
     wheel_columns: Names = Field((), description="in the robot's order; default omega_, phi_ or ticks_ <wheel>")
     wheel_signs: tuple[Literal[1, -1], ...] = Field((), description="-1 for wheels that count the other way round")
     wheel_time_column: str = "t"

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from pydantic import Field
 
+from omnibench.config import Positive
 from omnibench.data.alignment import median_period
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.importers.robot_option import RobotOption
@@ -20,9 +21,7 @@ class RecordingOptions(Options):
     robot: RobotOption = Field(description="mapping as in dataset.yaml, or path of a YAML file")
     train: Names = Field((), description="patterns of run names that train")
     validation: Names = Field((), description="patterns of run names that validate")
-    sample_period: float | None = Field(
-        None, gt=0, allow_inf_nan=False, description="s; default: the median of the wheel samples"
-    )
+    sample_period: Positive | None = Field(None, description="s; default: the median of the wheel samples")
     name: str = Field("recording", min_length=1, description="name of the data set")
     description: str = Field("", description="description of the data set")
     source: str = Field("", description="origin of the recording")

@@ -24,6 +24,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from omnibench.config import Positive
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.cost_weights import cost_weightings
@@ -49,8 +50,8 @@ class TrajectoryMLOptions(Options):
         "auto", description="start headings of the runs: noisy where repetitions show it, exact, or at least as poses"
     )
     clock: Literal["none", "offset", "offset_and_slope"] = Field("none", description="of the reference, for each run")
-    clock_offset: float = Field(0.2, gt=0, allow_inf_nan=False, description="its expected size, s")
-    clock_slope: float = Field(0.003, gt=0, allow_inf_nan=False, description="its expected size, s per s")
+    clock_offset: Positive = Field(0.2, description="its expected size, s")
+    clock_slope: Positive = Field(0.003, description="its expected size, s per s")
     weights: Literal["auto", "noise", "cost"] = Field(
         "auto", description="of the noise, of the problem's cost, or the latter only where the model misfits"
     )

@@ -6,7 +6,7 @@ from decimal import Decimal, InvalidOperation
 from typing import Final
 
 import yaml
-from pydantic import Field
+from pydantic import Field, FiniteFloat
 from pydantic_core import PydanticSerializationError
 
 from omnibench.config import Model, parse_yaml, validate
@@ -25,11 +25,11 @@ _SCANNER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the fast one 
 class PoseOrder(Model):
     """The content of a ``set_pose`` request: m and rad in the map."""
 
-    x: float = Field(ge=-1e7, le=1e7, allow_inf_nan=False)
-    y: float = Field(ge=-1e7, le=1e7, allow_inf_nan=False)
-    theta: float = Field(ge=-100.0, le=100.0, allow_inf_nan=False)
-    position_sigma: float = Field(0.05, ge=1e-6, le=1e4, allow_inf_nan=False, description="standard deviation, m")
-    heading_sigma: float = Field(0.05, ge=1e-6, le=10.0, allow_inf_nan=False, description="standard deviation, rad")
+    x: FiniteFloat = Field(ge=-1e7, le=1e7)
+    y: FiniteFloat = Field(ge=-1e7, le=1e7)
+    theta: FiniteFloat = Field(ge=-100.0, le=100.0)
+    position_sigma: FiniteFloat = Field(0.05, ge=1e-6, le=1e4, description="standard deviation, m")
+    heading_sigma: FiniteFloat = Field(0.05, ge=1e-6, le=10.0, description="standard deviation, rad")
 
 
 def read_pose(payload: bytes, parameters: dict[str, str]) -> PoseOrder:

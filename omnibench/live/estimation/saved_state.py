@@ -16,7 +16,7 @@ from typing import Annotated
 
 from pydantic import Field, FiniteFloat, ValidationError, model_validator
 
-from omnibench.config import Model, read_model, to_yaml
+from omnibench.config import Model, NonNegative, read_model, to_yaml
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import remove, write_text
 from omnibench.robot.calibration import Calibration, read_calibration
@@ -44,7 +44,7 @@ class SavedState(Model):
     covariance: SavedCovariance
     map_pose: SavedPose | None = None
     map_covariance: SavedCovariance | None = None
-    session_time: float = Field(0.0, ge=0, allow_inf_nan=False)
+    session_time: NonNegative = 0.0
 
     @model_validator(mode="after")
     def _variances_are_not_negative(self) -> SavedState:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from omnibench.config import Model
+from omnibench.config import Model, Positive
 from omnibench.live.estimation.counts import Counts
 from omnibench.live.estimation.wheel_angles import WheelAngles
 from omnibench.live.wire.messages import JointState, MessageError
@@ -39,14 +39,11 @@ class WheelSettings(Model):
 
     joints: tuple[str, ...] | None = Field(None, description="names in the messages, in the robot's order of wheels")
     use: Literal["auto", "positions", "velocities"] = Field("auto", description="auto: positions where there are any")
-    wrap: float | None = Field(
-        None,
-        gt=0,
-        allow_inf_nan=False,
-        description="angle after which angles start again, rad; default: one turn where they seem to",
+    wrap: Positive | None = Field(
+        None, description="angle after which angles start again, rad; default: one turn where they seem to"
     )
-    max_rate: float = Field(100.0, gt=0, allow_inf_nan=False, description="no wheel turns faster, rad/s")
-    max_gap: float = Field(1.0, gt=0, allow_inf_nan=False, description="a longer silence makes the path unknown, s")
+    max_rate: Positive = Field(100.0, description="no wheel turns faster, rad/s")
+    max_gap: Positive = Field(1.0, description="a longer silence makes the path unknown, s")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

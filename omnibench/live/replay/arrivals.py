@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
-from omnibench.config import Model
+from omnibench.config import Model, NonNegative, Positive
 from omnibench.data.dataset import Split
 from omnibench.live.replay.concatenated_drive import LONGEST_PAUSE, ConcatenatedDrive
-from omnibench.robot.calibration import NonNegative
 from omnibench.robot.kinematics import Array
 
 WHEELS, SLAM = 0, 1  # indices in TOPICS_PLAYED
@@ -23,7 +22,6 @@ _SAME_TIME = 1e-6  # s; times that differ by less are equal
 _LATEST_ORIGIN = (2**31 - 10**8) * 10**9  # ns; ROS 2's stamps end at 2^31 s
 
 Share = Annotated[float, Field(ge=0, le=1)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class Channel(Model):

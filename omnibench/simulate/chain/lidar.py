@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from pydantic import Field, FiniteFloat, model_validator
 
-from omnibench.config import Model
+from omnibench.config import Model, NonNegative, Positive
 from omnibench.data.scans import Mount, Scanner, TrajectoryScans
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
@@ -40,11 +40,11 @@ class Lidar(Model):
         270.0, gt=0, le=360, description="degrees, ahead in the middle; rays are field_of_view_deg / rays apart"
     )
     turn_time: float = Field(0.025, ge=0, le=10, description="s for a whole turn of the mirror")
-    range_min: float = Field(0.1, ge=0, allow_inf_nan=False, description="m; nearer walls are not seen")
-    range_max: float = Field(30.0, gt=0, allow_inf_nan=False, description="m; walls farther off are not seen")
+    range_min: NonNegative = Field(0.1, description="m; nearer walls are not seen")
+    range_max: Positive = Field(30.0, description="m; walls farther off are not seen")
     noise: float = Field(0.01, ge=0, le=10, description="standard deviation of a range, m")
     far_noise: float = Field(0.03, ge=0, le=10, description="standard deviation of ranges beyond far, m")
-    far: float = Field(10.0, gt=0, allow_inf_nan=False, description="m")
+    far: Positive = Field(10.0, description="m")
     resolution: float = Field(0.001, ge=1e-6, le=1, description="step of the ranges, m")
     mount: LidarMount = LidarMount()
     period: tuple[float, float] = Field((0.2, 0.3), description="shortest and longest time between scans, s")

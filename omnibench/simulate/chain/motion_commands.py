@@ -12,13 +12,12 @@ from itertools import count
 from typing import Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, FiniteFloat, model_validator
 
-from omnibench.config import Model
+from omnibench.config import Model, NonNegative, Positive
 from omnibench.errors import ConfigError
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 from omnibench.simulate.chain.set_point import SetPoint, SlewLimits
-from omnibench.simulate.config import Positive
 from omnibench.simulate.flower import Command
 
 _NOTHING = 1e-9  # s; a command of a shorter validity is not sent
@@ -45,12 +44,10 @@ class MotionProfile(Model):
 class CommandLink(Model):
     """The link by which commands reach the robot."""
 
-    refresh: float = Field(0.3, ge=0.01, allow_inf_nan=False, description="time from one command to the next, s")
+    refresh: FiniteFloat = Field(0.3, ge=0.01, description="time from one command to the next, s")
     watchdog: Positive = Field(0.5, description="longest validity of a command, s")
     lost: float = Field(0.0, ge=0, le=0.9, description="probability that a command is lost")
-    stalls_at: float | None = Field(
-        None, ge=0, allow_inf_nan=False, description="time of a run from which on no command is sent, s"
-    )
+    stalls_at: NonNegative | None = Field(None, description="time of a run from which on no command is sent, s")
 
     @model_validator(mode="after")
     def _goes_on(self) -> CommandLink:

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from pydantic import Field, model_validator
 
-from omnibench.config import Model
+from omnibench.config import Model, NonNegative, Positive
 from omnibench.errors import ConfigError
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
-from omnibench.simulate.config import Positive
 from omnibench.simulate.flower import Command
 from omnibench.words import plural
 
@@ -32,9 +31,9 @@ class Motor(Model):
     torque_constant: Positive = Field(0.045, description="N m/A, and of the back-EMF V s/rad, at the motor")
     gear_ratio: Positive = Field(50.0, description="turns of the motor per turn of the wheel")
     inertia: Positive = Field(0.5, description="of rotor, gear, wheel and share of the robot, at the wheel, kg m2")
-    static_friction: float = Field(0.6, ge=0, allow_inf_nan=False, description="at the wheel, N m")
-    coulomb_friction: float = Field(0.5, ge=0, allow_inf_nan=False, description="at the wheel, N m")
-    viscous_friction: float = Field(0.1, ge=0, allow_inf_nan=False, description="at the wheel, N m s/rad")
+    static_friction: NonNegative = Field(0.6, description="at the wheel, N m")
+    coulomb_friction: NonNegative = Field(0.5, description="at the wheel, N m")
+    viscous_friction: NonNegative = Field(0.1, description="at the wheel, N m s/rad")
 
     @model_validator(mode="after")
     def _turns(self) -> Motor:
@@ -71,9 +70,9 @@ class Controller(Model):
     turns by no more than a tick in a sample is braked by its short-circuited motor: no voltage, no integral.
     """
 
-    proportional: float = Field(3.0, ge=0, allow_inf_nan=False, description="V per rad/s")
-    integral: float = Field(50.0, ge=0, allow_inf_nan=False, description="V per rad")
-    derivative: float = Field(0.005, ge=0, allow_inf_nan=False, description="V per rad/s2")
+    proportional: NonNegative = Field(3.0, description="V per rad/s")
+    integral: NonNegative = Field(50.0, description="V per rad")
+    derivative: NonNegative = Field(0.005, description="V per rad/s2")
 
     @model_validator(mode="after")
     def _acts(self) -> Controller:

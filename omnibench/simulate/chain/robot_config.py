@@ -7,12 +7,12 @@ from typing import Literal
 
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
-from omnibench.config import Model
+from omnibench.config import Model, Positive
 from omnibench.simulate.chain.floor_plan import RoomPlan
 from omnibench.simulate.chain.lidar import Lidar
 from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile
 from omnibench.simulate.chain.motors import TRUE_STEP, Controller, Encoder, Motor
-from omnibench.simulate.config import MotionGrid, NamedRobot, Positive, Truth
+from omnibench.simulate.config import MotionGrid, NamedRobot, Truth
 from omnibench.slam.slam_options import SlamOptions
 
 _MOST_ANGLES = 1e8  # true wheel angles of all runs; more do not fit into memory

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
+from omnibench.config import NonNegative, Positive
 from omnibench.data.importers.recording_options import RecordingOptions
 from omnibench.data.importers.rosbag.message_streams import Use
 from omnibench.data.scans import Mount
@@ -41,22 +42,18 @@ class RosbagOptions(RecordingOptions):
     )
     joints: Names = Field((), description="in the robot's wheel order; default: those called like the wheels")
     joint_signs: tuple[Literal[1, -1], ...] = Field((), description="-1 for joints that count the other way round")
-    wheel_wrap: float | None = Field(
-        None, gt=0, allow_inf_nan=False, description="positions start again after this many rad"
-    )
+    wheel_wrap: Positive | None = Field(None, description="positions start again after this many rad")
     use: Use = Field("auto", description="positions or velocities of the joints; auto: positions, if they are there")
     cut: Literal["rests", "topic", "windows", "none"] = Field(
         "rests", description="where one run ends and another begins"
     )
-    least_rest: float = Field(0.5, gt=0, allow_inf_nan=False, description="s; shorter rests do not cut")
-    rest_rate: float = Field(
-        0.05, gt=0, allow_inf_nan=False, description="rad/s; wheels that turn slower, over least_rest, rest"
-    )
-    least_run: float = Field(1.0, ge=0, allow_inf_nan=False, description="s; shorter drives are left out")
+    least_rest: Positive = Field(0.5, description="s; shorter rests do not cut")
+    rest_rate: Positive = Field(0.05, description="rad/s; wheels that turn slower, over least_rest, rest")
+    least_run: NonNegative = Field(1.0, description="s; shorter drives are left out")
     cut_topic: str | None = Field(
         None, min_length=1, description="each message begins a run; a std_msgs/String names its command"
     )
-    window: float | None = Field(None, gt=0, allow_inf_nan=False, description="s; length of the runs of cut: windows")
+    window: Positive | None = Field(None, description="s; length of the runs of cut: windows")
 
     @model_validator(mode="after")
     def _fits_together(self) -> RosbagOptions:
