@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Generic, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, Field, FiniteFloat, model_validator
 
 from omnibench.config import Model, NonNegative, Positive
+from omnibench.data.dataset import Split
 from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import EffectTerm, Noise
 from omnibench.robot.kinematics import Robot
@@ -65,11 +66,16 @@ class Truth(Model):
             raise ValueError("truth.published matrices are for three wheels")
 
 
-class Session(Model):
+class RobotSession(Model):
     """One session of recordings: every command, repeated."""
 
     seed: int = Field(ge=0)
-    distance: Positive = Field(description="length of each run, m")
+    distance: Positive = Field(description="commanded length of each run, m")
+
+
+class Session(RobotSession):
+    """One session of recordings: every command, repeated, with noise of the reference."""
+
     noise_scale: NonNegative = Field(1.0, description="factor on all noise of the reference")
 
 
@@ -94,30 +100,52 @@ class EncoderNoise(Noise):
     encoder: NonNegative = Field(0.0, description="white noise of each wheel rate, rad/s")
 
 
-class FlowerConfig(Model):
+S = TypeVar("S", bound=RobotSession)
+
+
+class Experiment(Model, Generic[S]):
+    """What the simulated experiments share: a robot of known truth drives every command in one session or two."""
+
+    generator: str
+    robot: NamedRobot
+    sample_period: Positive = Field(0.01, description="s")
+    commands: MotionGrid
+    repetitions: int = Field(5, gt=0)
+    order: Literal["shuffled", "sorted"] = "shuffled"
+    truth: Truth
+    train: S
+    validation: S | None = None
+
+    @model_validator(mode="after")
+    def _something_moves(self) -> Self:
+        if not any(self.commands.speeds) and not any(self.commands.turn_rates):
+            raise ValueError("commands: no command moves the robot")
+        self.truth.check_wheels(self.robot)
+        return self
+
+    @property
+    def sessions(self) -> dict[Split, S]:
+        """The sessions by the split that they are for."""
+        sessions: dict[Split, S] = {"train": self.train}
+        if self.validation is not None:
+            sessions["validation"] = self.validation
+        return sessions
+
+
+class FlowerConfig(Experiment[Session]):
     """A simulated flower-shaped experiment: constant commands or ramps, wheel rates and reference poses with noise."""
 
     generator: Literal["flower"] = "flower"
-    robot: NamedRobot
-    sample_period: Positive = Field(0.01, description="s")
     pose_period: Positive = Field(0.25, description="time between reference poses, s")
     commands: Commands
-    repetitions: int = Field(5, gt=0)
-    truth: Truth
     integration: Integration = Field("arc", description="how the true robot moves within a sample")
     noise: EncoderNoise = EncoderNoise()
-    train: Session
-    validation: Session | None = None
-    order: Literal["shuffled", "sorted"] = "shuffled"
     start: Literal["fixed", "random"] = Field("fixed", description="at the origin, or anywhere with any heading")
     start_area: Positive = Field(4.0, description="side of the square about the origin for random starts, m")
 
     @model_validator(mode="after")
-    def _something_moves(self) -> FlowerConfig:
-        if not any(self.commands.speeds) and not any(self.commands.turn_rates):
-            raise ValueError("commands: no command moves the robot")
-        self.truth.check_wheels(self.robot)
-        shortest = min(session.distance for session in self._sessions()) / max(*self.commands.speeds, 1e-9)
+    def _can_be_driven(self) -> FlowerConfig:
+        shortest = min(session.distance for session in self.sessions.values()) / max(*self.commands.speeds, 1e-9)
         if math.isfinite(shortest) and shortest < self.sample_period:
             raise ValueError("runs are shorter than one sample; raise distance or lower sample_period")
         if 0.0 in self.commands.speeds:
@@ -137,12 +165,9 @@ class FlowerConfig(Model):
     def _rows(self) -> float:
         """Number of wheel samples and poses of the experiment."""
         chosen = self.commands
-        ways = [session.distance for session in self._sessions()]
+        ways = [session.distance for session in self.sessions.values()]
         driven = [way / speed + chosen.ramp for way in ways for speed in chosen.speeds if speed]
         turns = (chosen.turn_duration + chosen.ramp) * len(ways) * (0.0 in chosen.speeds)
         runs = len(chosen.turn_rates) * self.repetitions
         seconds = runs * (len(chosen.directions_deg) * sum(driven) + turns)
         return seconds / self.sample_period + seconds / self.pose_period
-
-    def _sessions(self) -> list[Session]:
-        return [session for session in (self.train, self.validation) if session is not None]

@@ -44,20 +44,19 @@ def simulate_flower(config: FlowerConfig, name: str = "flower", description: str
 
     ConfigError or DataError in one line: an effect of the truth, or a parameter of one, is not known or is missing.
     """
-    sessions: dict[Split, Session] = {"train": config.train}
-    if config.validation is not None:
-        sessions["validation"] = config.validation
     truth = true_record(
         config.truth,
         config.robot,
         config.sample_period,
-        tuple(sessions),
+        tuple(config.sessions),
         name,
         integration=config.integration,
         noise=config.noise,
     )
     robot = truth.true_robot()
-    trajectories = [run for split, session in sessions.items() for run in _session(config, robot, split, session)]
+    trajectories = [
+        run for split, session in config.sessions.items() for run in _session(config, robot, split, session)
+    ]
     dataset = make_dataset(
         name,
         config.robot,
@@ -120,80 +119,65 @@ def _mean_shares(times: Array, ramp: float) -> Array:
 def _session(config: FlowerConfig, robot: TrueRobot, split: Split, session: Session) -> Iterator[Trajectory]:
     rng = np.random.default_rng(session.seed)
     runs = runs_of(commands_of(config), config.repetitions, config.order, rng)
-    started_at, angles = 0.0, np.zeros(len(config.robot.wheels))
+    started_at = 0.0
+    angles: Array = np.zeros(len(config.robot.wheels))
     for number, (command, repetition) in enumerate(runs, 1):
-        before = _Before(split, started_at, angles)
-        run = _drive(config, robot, command, session, rng, before)
-        yield Trajectory(
-            id=f"{split}-{number:03d}",
-            split=split,
-            command=command.name,
-            repetition=repetition,
-            session=split,
-            started_at=started_at,
-            v=command.speed,
-            alpha=command.direction,
-            omega=command.turn_rate,
-            duration=float(run.times[-1]),
-            distance=command.speed * (float(run.times[-1]) - config.commands.ramp),
-            times=run.times,
-            rates=run.rates,
-            pose_times=run.pose_times,
-            poses=run.poses,
-            angles=run.angles,
-            targets=run.targets,
-        )
+        planned = _Planned(f"{split}-{number:03d}", split, command, repetition, started_at, angles)
+        run, angles = _drive(config, robot, planned, session, rng)
+        yield run
         started_at += float(run.times[-1]) + PAUSE
-        angles = run.angles[-1]
 
 
 @dataclass(frozen=True)
-class _Before:
-    """State at the begin of a run: session, s since its start, and wheel angles (N,), rad."""
+class _Planned:
+    """A run to be driven, s since the start of its session, and the wheel angles (N,) at its begin, rad."""
 
-    session: str
+    id: str
+    split: Split
+    command: Command
+    repetition: int
     started_at: float
     angles: Array
 
 
-@dataclass(frozen=True)
-class _Run:
-    times: Array
-    rates: Array
-    angles: Array
-    targets: Array
-    pose_times: Array
-    poses: Array
-
-
 def _drive(
-    config: FlowerConfig,
-    robot: TrueRobot,
-    command: Command,
-    session: Session,
-    rng: np.random.Generator,
-    before: _Before,
-) -> _Run:
+    config: FlowerConfig, robot: TrueRobot, planned: _Planned, session: Session, rng: np.random.Generator
+) -> tuple[Trajectory, Array]:
     """One run: target rates by the design values, wheel rates by the motors, motion by the true robot.
 
-    Encoders are exact between runs, so that recorded and true wheel angles do not drift apart.
+    Encoders are exact between runs, so that recorded and true wheel angles do not drift apart: the angles (N,) at the
+    run's end are those at which the next one begins.
     """
+    command, ramp = planned.command, config.commands.ramp
     duration = duration_of(command, session, config.commands)
     times, pose_times = stamps_of_run(duration, config.sample_period, config.pose_period)
-    targets = commanded_rates(config.robot, command, times, config.commands.ramp)
+    targets = commanded_rates(config.robot, command, times, ramp)
     start = _start(config, rng)
     driven = robot.driven(times, targets)
     rates = driven + config.noise.encoder * rng.standard_normal(targets.shape)
-    log = robot.log(times, driven, start, pose_times, before.angles, before.started_at, before.session)
+    log = robot.log(times, driven, start, pose_times, planned.angles, planned.started_at, planned.split)
     (poses,) = robot.model.reported([log])
-    return _Run(
+    angles = planned.angles + np.cumsum(rates * config.sample_period, axis=0)
+    run = Trajectory(
+        id=planned.id,
+        split=planned.split,
+        command=command.name,
+        repetition=planned.repetition,
+        session=planned.split,
+        started_at=planned.started_at,
+        v=command.speed,
+        alpha=command.direction,
+        omega=command.turn_rate,
+        duration=float(times[-1]),
+        distance=command.speed * (float(times[-1]) - ramp),
         times=times,
         rates=rates,
-        angles=before.angles + np.cumsum(rates * config.sample_period, axis=0),
-        targets=targets,
         pose_times=pose_times,
         poses=poses + session.noise_scale * reference_noise(config.noise, pose_times, rng),
+        angles=angles,
+        targets=targets,
     )
+    return run, angles[-1]
 
 
 def _start(config: FlowerConfig, rng: np.random.Generator) -> Array:

@@ -12,7 +12,7 @@ from omnibench.simulate.chain.floor_plan import RoomPlan
 from omnibench.simulate.chain.lidar import Lidar
 from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile
 from omnibench.simulate.chain.motors import TRUE_STEP, Controller, Encoder, Motor
-from omnibench.simulate.config import MotionGrid, NamedRobot, Truth
+from omnibench.simulate.config import Experiment, RobotSession
 from omnibench.slam.slam_options import SlamOptions
 
 _MOST_ANGLES = 1e8  # true wheel angles of all runs; more do not fit into memory
@@ -25,26 +25,14 @@ class Placement(Model):
     heading_deg: float = Field(2.0, ge=0, le=180, description="degrees")
 
 
-class RobotSession(Model):
-    """One session of recordings: every command, repeated."""
-
-    seed: int = Field(ge=0)
-    distance: Positive = Field(description="commanded length of each run, m")
-
-
-class RobotConfig(Model):
+class RobotConfig(Experiment[RobotSession]):
     """A simulated robot: commands, motors under PID, encoders, true motion, LIDAR in a room, SLAM."""
 
     generator: Literal["robot"]
-    robot: NamedRobot
     sample_period: Positive = Field(0.01, description="of PID controllers and encoders, s")
-    commands: MotionGrid
     profile: MotionProfile = MotionProfile()
     link: CommandLink = CommandLink()
     settle: float = Field(0.6, ge=0, le=60, description="rest that is recorded after the motion, s")
-    repetitions: int = Field(5, gt=0)
-    order: Literal["shuffled", "sorted"] = "shuffled"
-    truth: Truth
     motor: Motor = Motor()
     controller: Controller = Controller()
     encoder: Encoder = Encoder()
@@ -53,8 +41,6 @@ class RobotConfig(Model):
     placement: Placement = Placement()
     lidar: Lidar = Lidar()
     slam: SlamOptions = SlamOptions()
-    train: RobotSession
-    validation: RobotSession | None = None
 
     @field_validator("sample_period")
     @classmethod
@@ -65,10 +51,7 @@ class RobotConfig(Model):
         return period
 
     @model_validator(mode="after")
-    def _something_moves(self) -> RobotConfig:
-        if not any(self.commands.speeds) and not any(self.commands.turn_rates):
-            raise ValueError("commands: no command moves the robot")
-        self.truth.check_wheels(self.robot)
+    def _can_be_driven(self) -> RobotConfig:
         coarse, fastest = self.encoder.tick / self.sample_period, self.motor.fastest_rate
         if coarse > fastest / 2:
             raise ValueError(
@@ -85,7 +68,7 @@ class RobotConfig(Model):
     def _angles(self) -> float:
         """Approximate number of true wheel angles that are simulated."""
         chosen, profile = self.commands, self.profile
-        sessions = [session for session in (self.train, self.validation) if session is not None]
+        sessions = self.sessions.values()
         seconds = 0.0
         for speed in chosen.speeds:
             directions = len(chosen.directions_deg) if speed else 1

@@ -20,8 +20,9 @@ from omnibench.simulate.chain.floor_plan import FloorPlan, make_plan
 from omnibench.simulate.chain.lidar import PoseTrack, measure_scans, scan_stamps
 from omnibench.simulate.chain.motion_commands import CommandedMotion, command_motion, target_rates
 from omnibench.simulate.chain.motors import TRUE_STEP, check_reach
-from omnibench.simulate.chain.robot_config import Placement, RobotConfig, RobotSession
+from omnibench.simulate.chain.robot_config import Placement, RobotConfig
 from omnibench.simulate.chain.wheel_drive import DrivenRun, drive_session
+from omnibench.simulate.config import RobotSession
 from omnibench.simulate.flower import PAUSE, Command, grid_of, runs_of
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.truth import TrueRobot, true_record
@@ -43,9 +44,7 @@ def simulate_robot(
     plan = make_plan(config.room, f"data set {name}: room")
     commands = grid_of(config.commands)
     check_reach(config.robot, commands, config.motor)
-    sessions: dict[Split, RobotSession] = {"train": config.train}
-    if config.validation is not None:
-        sessions["validation"] = config.validation
+    sessions = config.sessions
     for command in commands:
         for session in sessions.values():
             _check_way(config, plan, command, session)
