@@ -16,7 +16,7 @@ from omnibench.errors import DataError
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.calibrators.closed_form import linear_start
 from omnibench.fit.inspect import inspect_dataset
-from omnibench.fit.span import driven_span
+from omnibench.fit.span import aligned, driven_span, unidentified_directions
 from omnibench.fit.uncertainty.identifiability import Identifiability, identifiability
 from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
 from omnibench.registry import load_plugin_file
@@ -49,6 +49,33 @@ def robotino() -> Dataset:
         pytest.skip(f"the recordings are not at {TABLE}")
     assert load_plugin_file(ROOT / "plugins" / "robotino.py") is None
     return import_dataset("robotino", TABLE)
+
+
+class TestPrecision:
+    """Predicted standard deviations, against those of linear regressions that are known."""
+
+    def test_headings_alone_give_row_3_the_precision_of_a_regression_on_wheel_angles(self) -> None:
+        """With positions that tell nothing, row 3 is m3 in heading = m3.C + noise at every stamp."""
+        rng = np.random.default_rng(1)
+        blurred = np.array([50.0, 50.0, 0.0])
+        runs = [
+            replace(run, poses=run.poses + blurred * rng.standard_normal(run.poses.shape))
+            for run in driven(FLOWER, repetitions=2)
+        ]
+        found = identifiability(ROBOT, runs)
+        information = 0.0
+        for run in runs:
+            angles, stamps = run.rates[0] * run.pose_times[1:, None], run.pose_times[1:]
+            noise = found.noise
+            covariance = noise.pose_heading**2 * np.eye(len(stamps)) + noise.bias_heading**2
+            covariance += noise.walk_heading**2 * np.minimum.outer(stamps, stamps)
+            information = information + angles.T @ np.linalg.solve(covariance, angles)
+        directions = unidentified_directions(ROBOT, driven_span(runs)), aligned(driven_span(runs).strong, ROBOT)
+        basis = np.concatenate(directions)
+        expected = np.sqrt(np.diag(basis @ np.linalg.inv(information) @ basis.T))
+        largest = np.abs(ROBOT.inverse_kinematic_matrix[2]).max()
+        predicted = [each.deviations[2] for each in found.directions if each.deviations is not None]
+        np.testing.assert_allclose(predicted, expected / largest, rtol=1e-3)
 
 
 class TestDirections:

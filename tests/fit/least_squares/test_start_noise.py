@@ -1,0 +1,70 @@
+"""The noise of start headings comes out of the paths that turn about their starts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from omnibench.data.dataset import Trajectory
+from omnibench.fit.least_squares.start_noise import separate_start_noise
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Array
+
+STAMPS = np.array([1.0, 2.0, 3.0, 4.0])
+WHITE = Noise(pose_position=0.01, pose_heading=0.01)
+
+
+def runs_with_residuals(turned: float, biased: float, seed: int = 0) -> tuple[list[Trajectory], list[Array], Array]:
+    """150 runs along x at 1 m/s in pairs of one command, their residuals, and u, derivatives by the start heading.
+
+    turned: standard deviation of the start headings, rad. biased: of the reference's headings alone, rad.
+    """
+    rng = np.random.default_rng(seed)
+    turning = np.column_stack([np.zeros(4), STAMPS, np.ones(4)])
+    times, pose_times = np.array([4.0]), np.append(0.0, STAMPS)
+    runs, residuals = [], []
+    for index in range(150):
+        runs.append(
+            Trajectory(
+                str(index), "train", times, np.zeros((1, 3)), pose_times, np.zeros((5, 3)), str(index // 2), session="s"
+            )
+        )
+        bias = np.array([0.0, 0.0, biased * rng.standard_normal()])
+        residuals.append(0.01 * rng.standard_normal((4, 3)) + turned * rng.standard_normal() * turning + bias)
+    return runs, residuals, turning
+
+
+def test_white_noise_is_told_from_turned_starts_as_by_the_closed_form() -> None:
+    """Of y ~ N(0, s^2 I + d^2 u u') the likeliest d^2 is (mean (u'y)^2 / |u|^2 - s^2) / |u|^2."""
+    runs, residuals, turning = runs_with_residuals(turned=0.02, biased=0.0)
+    found = separate_start_noise(runs, residuals, [turning] * len(runs), WHITE)
+    pairs = [(one - other) / np.sqrt(2) for one, other in zip(residuals[::2], residuals[1::2], strict=True)]
+    squares = np.square(turning).sum()
+    along = np.mean([float((turning * pair).sum()) ** 2 for pair in pairs]) / squares
+    assert found.start_heading == pytest.approx(np.sqrt((along - 0.01**2) / squares), rel=0.01)
+    assert found.noise.pose_position == pytest.approx(0.01, rel=0.1)
+    assert found.noise.pose_heading == pytest.approx(0.01, rel=0.15)
+    assert found.noise.bias_heading < 0.004
+
+
+def test_a_biased_heading_does_not_turn_the_path_and_is_no_turned_start() -> None:
+    runs, residuals, turning = runs_with_residuals(turned=0.0, biased=0.02)
+    noise = WHITE.model_copy(update={"bias_heading": 0.02})
+    found = separate_start_noise(runs, residuals, [turning] * len(runs), noise)
+    assert found.start_heading == 0.0
+    assert found.noise == noise
+
+
+def test_turned_starts_and_biased_headings_are_told_apart() -> None:
+    runs, residuals, turning = runs_with_residuals(turned=0.015, biased=0.03)
+    noise = Noise(pose_position=0.02, pose_heading=0.01, bias_heading=0.03)
+    found = separate_start_noise(runs, residuals, [turning] * len(runs), noise)
+    assert found.start_heading == pytest.approx(0.015, rel=0.2)
+    assert found.noise.bias_heading == pytest.approx(0.03, rel=0.2)
+
+
+def test_exact_starts_are_called_noisy_in_one_set_of_twenty() -> None:
+    """The test's level: with 40 sets, 7 or more false ones have a probability of 0.3 %."""
+    noisy = [runs_with_residuals(0.0, 0.0, seed) for seed in range(40)]
+    found = [separate_start_noise(runs, residuals, [turning] * 150, WHITE) for runs, residuals, turning in noisy]
+    assert sum(each.start_heading > 0 for each in found) < 7
