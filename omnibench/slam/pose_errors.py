@@ -1,9 +1,32 @@
 """Covariance of the poses of SLAM and of the map that they made: a Schmidt-Kalman (consider) filter.
 
-The error of a pose is made of the errors of the keyframes that it was matched to, of the noise of both scans, and,
-along directions that the scan does not determine, of the errors of the pose before it and of the motion since. Errors
-of keyframes and of the motion are kept with their correlations and never corrected. Each is a small motion (3,) of the
-whole run's frame, m, m, rad.
+A consider filter counts errors that it does not correct, with their correlations (Schmidt, Application of state-space
+methods to navigation problems, Adv. Control Systems 3:293, 1966; Jazwinski, Stochastic Processes and Filtering Theory,
+1970, section 8.4; Woodbury and Junkins, On the consider Kalman filter, AIAA 2010-7752). Here these are
+
+    x = (mu, xi_0, ..., xi_m, xi)   with the covariance P,                                        (P1)
+
+mu the error of the motion in units of its standard deviation, the same in the whole run, xi_j that of keyframe j and xi
+that of the last pose. Each xi is a small motion of the whole run's frame (m, m, rad), which moves a pose p by
+
+    dp = D(p) xi,   D(p) = [1 0 -y; 0 1 x; 0 0 1].                                                (P2)
+
+The search for the next pose starts where the motion since the last pose p', with standard deviations s along the
+robot's axes T(p'), leads. Errors of the motion act at its beginning:
+
+    d_start = D(p) xi + D(p) D(p')^-1 T(p') diag(s) mu.                                           (P3)
+
+The scan moves the pose from there by the gain G towards the pose of least squares, p = start + G (p* - start). With
+I_j the part of the information I that lies on surfaces of keyframe j, n the noise of the gradient (covariance S) and K
+its derivative by a twist within the scan, whose standard deviations are k along the robot's axes,
+
+    d_p* = I^-1 (sum_j I_j D(p) xi_j + n + K T(p) diag(k) nu),   cov(nu) = 1                      (P4)
+    d_p  = (1 - G) d_start + W sum_j I_j D(p) xi_j + W (n + K T(p) diag(k) nu),   W = G I^-1.     (P5)
+
+The first two terms are R x, so that the covariance of the pose, and that with all other errors, is
+
+    cov(d_p) = R P R' + W S W' + (W K T diag(k)) (W K T diag(k))'                                 (P6)
+    cov(d_p, x) = R P,   xi = D(p)^-1 d_p.                                                        (P7)
 """
 
 from __future__ import annotations
@@ -13,7 +36,9 @@ import numpy as np
 from omnibench.robot.kinematics import Array
 from omnibench.slam.matching.scan_matching import Match
 
-FLOOR: Array = np.diag([1e-4, 1e-4, 1e-5]) ** 2  # m^2, m^2, rad^2; least covariance that is stated (chosen)
+# m^2, m^2, rad^2: least covariance that is stated, for a start pose that is exact by definition. A hundredth of the
+# variances that poses of SLAM have (slam_study), so that nothing depends on it but that a covariance can be inverted.
+FLOOR: Array = np.diag([1e-4, 1e-4, 1e-5]) ** 2
 
 
 class PoseErrors:
@@ -30,7 +55,7 @@ class PoseErrors:
         self._joint[:3, :3] = np.eye(3)
         self._pose = start
         if moved is not None:
-            row = np.linalg.solve(_deviation(start), _turn(start) * moved)
+            row = np.linalg.solve(_deviation(start), _turn(start) * moved)  # Eq. (P2): xi = D^-1 T diag(s) mu
             self._joint[-3:, :3], self._joint[:3, -3:] = row, row.T
             self._joint[-3:, -3:] = _square(row)
 
@@ -42,16 +67,16 @@ class PoseErrors:
         """
         before, here = _deviation(self._pose), _deviation(match.pose)
         rest = np.eye(3) - match.gain
-        row = np.zeros((3, len(self._joint)))
-        row[:, :3] = rest @ here @ np.linalg.solve(before, _turn(self._pose) * moved)
+        row = np.zeros((3, len(self._joint)))  # R of Eq. (P5)
+        row[:, :3] = rest @ here @ np.linalg.solve(before, _turn(self._pose) * moved)  # Eq. (P3)
         row[:, -3:] = rest @ here
         for keyframe, part in match.by_keyframe.items():
             row[:, 3 + 3 * keyframe : 6 + 3 * keyframe] += match.weight @ part @ here
         noise = match.weight @ match.scatter @ match.weight.T + _square(
             match.weight @ match.delayed @ (_turn(match.pose) * skew)
         )
-        covariance = row @ self._joint @ row.T + noise
-        back = np.linalg.inv(here)
+        covariance = row @ self._joint @ row.T + noise  # Eq. (P6)
+        back = np.linalg.inv(here)  # Eq. (P7)
         across = back @ row @ self._joint[:, :-3]
         self._joint[-3:, :-3], self._joint[:-3, -3:] = across, across.T
         self._joint[-3:, -3:] = back @ covariance @ back.T

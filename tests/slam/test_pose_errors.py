@@ -28,9 +28,8 @@ def test_errors_of_the_motion_are_the_same_in_every_step_and_add_up() -> None:
     gain, moved = 0.75, np.array([0.02, 0.0, 0.0])
     error = 0.0
     for step in range(1, 6):
-        found = errors.step(
-            match_at(np.array([0.1 * step, 0.0, 0.0]), gain * np.eye(3), {0: np.eye(3)}), moved, 0 * moved
-        )
+        match = match_at(np.array([0.1 * step, 0.0, 0.0]), gain * np.eye(3), {0: np.eye(3)})
+        found = errors.step(match, moved, np.zeros(3))
         error = (1 - gain) * (error + 0.02)
         assert found[0, 0] == pytest.approx(error**2 + FLOOR[0, 0], rel=1e-12)
 
@@ -46,7 +45,7 @@ def test_a_pose_that_its_keyframe_determines_errs_as_the_keyframe_does() -> None
 
 
 def test_two_keyframes_share_the_error_by_their_information() -> None:
-    """Keyframe 0 is exact, keyframe 1 has a variance of s^2; with three quarters of the information on it, 9/16 of it."""
+    """Keyframe 0 is exact, keyframe 1 has the variance s^2: with three quarters of the information on it, 9/16 s^2."""
     moved, still = np.array([0.04, 0.0, 0.0]), np.zeros(3)
     errors = PoseErrors(np.zeros(3))
     errors.keep()
