@@ -5,15 +5,14 @@ An example is laid out as the repository is, ``configs`` beside ``plugins``, so 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
+from omnibench.config import Model, read_model
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.files import write_files
 
 
-@dataclass(frozen=True)
-class Example:
+class Example(Model):
     """Something to begin with.
 
     summary: what it is, in one line. files: its files; ``plugins/*`` stands for all plug-ins. commands: what to type
@@ -29,89 +28,11 @@ class Example:
     recording: str = ""
 
 
-EXAMPLES = (
-    Example(
-        "small",
-        "a comparison that is over in seconds (simulated)",
-        ("configs/small.yaml",),
-        ("omnibench compare configs/small.yaml",),
-    ),
-    Example(
-        "apr02",
-        "the paper's comparison: all calibrators, 360 runs (simulated)",
-        ("configs/apr02.yaml", "plugins/*"),
-        ("omnibench compare configs/apr02.yaml",),
-    ),
-    Example(
-        "apr02_robot",
-        "the paper's robot from motion command to SLAM (simulated)",
-        ("configs/apr02_robot.yaml", "plugins/*"),
-        (
-            "omnibench simulate configs/apr02_robot.yaml -o data/chain --truth data/chain_truth --report chain.html",
-            "omnibench compare configs/apr02_robot.yaml",
-        ),
-    ),
-    Example(
-        "hidden_effect",
-        "recordings with a hidden effect, for discover (simulated)",
-        ("configs/hidden_effect.yaml",),
-        (
-            "omnibench simulate configs/hidden_effect.yaml -o data/hidden --truth data/truth",
-            "omnibench discover data/hidden -o found",
-        ),
-    ),
-    Example(
-        "mecanum",
-        "a comparison on four mecanum wheels (simulated)",
-        ("configs/mecanum.yaml", "plugins/*"),
-        ("omnibench compare configs/mecanum.yaml",),
-    ),
-    Example(
-        "design",
-        "which commands are worth driving, without any recording",
-        ("configs/design.yaml",),
-        ("omnibench design configs/design.yaml -o design",),
-    ),
-    Example(
-        "live",
-        "the live node, with a simulated recording played to it",
-        ("configs/live.yaml", "configs/apr02_calibration.yaml", "configs/apr02.yaml"),
-        ("omnibench live configs/live.yaml --replay",),
-    ),
-    Example(
-        "live_fleet",
-        "a node for two robots that connect with certificates",
-        ("configs/live_fleet.yaml", "configs/live_fleet_client.yaml", "configs/apr02_calibration.yaml"),
-        (
-            "omnibench keys configs/keys node apr02 apr03 screen lab --host base.local",
-            "omnibench live configs/live_fleet.yaml",
-        ),
-        "base.local stands for the computer that the node runs on; write its name in live_fleet_client.yaml, too",
-    ),
-    Example(
-        "omni3",
-        "a comparison on a real robot; its recordings are on GitHub",
-        ("configs/omni3.yaml", "plugins/*"),
-        (
-            "git clone https://github.com/sousarbarb/optiodom",
-            "omnibench compare configs/omni3.yaml --data optiodom/data/omni3",
-        ),
-        "the recordings are not part of omnibench: Sousa et al., OptiOdom, 2022",
-    ),
-    Example(
-        "plugins",
-        "calibrators and an importer, each in a file of its own",
-        ("plugins/*",),
-        ("omnibench list", "omnibench plugin check plugins/cmaes.py"),
-    ),
-    Example(
-        "recording",
-        "a small recording, a data set in CSV files (simulated)",
-        ("configs/small.yaml",),
-        ("omnibench inspect data/small", "omnibench calibrate data/small -o calibration.yaml"),
-        recording="data/small",
-    ),
-)
+class _Catalogue(Model):
+    examples: tuple[Example, ...]
+
+
+EXAMPLES = read_model(_Catalogue, Path(__file__).with_name("examples.yaml")).examples
 
 
 def find_example(name: str) -> Example:
