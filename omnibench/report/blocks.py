@@ -20,6 +20,11 @@ class Badge:
     tone: Tone = "plain"
 
 
+def simulated_badge(simulated: bool) -> tuple[Badge, ...]:
+    """The badge of simulated data; nothing for recorded ones."""
+    return (Badge("SIMULATED DATA", "warning"),) if simulated else ()
+
+
 @dataclass(frozen=True)
 class Paragraph:
     """Running text. ``lead`` is set larger, ``note`` smaller."""
@@ -193,4 +198,3 @@ class Document:
     subtitle: str
     sections: tuple[Section, ...]
     badges: tuple[Badge, ...] = ()
-    footer: str = ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
+from omnibench.environment import package_versions
 from omnibench.files import write_text
 from omnibench.report.blocks import Document
 
@@ -31,9 +33,10 @@ def write_document(document: Document, path: Path) -> None:
 
 
 def render(document: Document) -> str:
-    """The HTML of a report."""
+    """The HTML of a report, with the version of omnibench and the time in its footer."""
     template = _environment().get_template("report.html.j2")
-    return template.render(document=document, plot_options=_json(_PLOT_OPTIONS))
+    footer = f"omnibench {package_versions().get('omnibench', '')}, written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
+    return template.render(document=document, plot_options=_json(_PLOT_OPTIONS), footer=footer)
 
 
 @cache

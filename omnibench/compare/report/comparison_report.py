@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 from omnibench.compare.report.cost_tables import cost_section
@@ -34,13 +33,12 @@ from omnibench.report.blocks import (
     Row,
     Section,
     Table,
+    simulated_badge,
 )
 from omnibench.report.numbers import NOTHING, count, fixed, listing
 from omnibench.report.recording.section import has_recording, recording_section
 from omnibench.report.render import write_document
 from omnibench.words import plural
-
-_SIMULATED = Badge("SIMULATED DATA", "warning")
 
 
 def write_report(result: ComparisonResult, path: Path) -> None:
@@ -57,19 +55,24 @@ def comparison_document(result: ComparisonResult) -> Document:
         body = (
             Section("overview", "Overview", (_overview(datasets),)),
             *(
-                Section(f"data-{index}", view.name, (), _sections(view, f"data-{index}-"), _badges(view))
+                Section(
+                    f"data-{index}",
+                    view.name,
+                    sections=_sections(view, f"data-{index}-"),
+                    badges=simulated_badge(view.dataset.simulated),
+                )
                 for index, view in enumerate(datasets, 1)
             ),
         )
     simulated = [view for view in datasets if view.dataset.simulated]
-    badges = (_SIMULATED,) if len(simulated) == len(datasets) else (Badge("SIMULATED AND REAL DATA", "warning"),)
+    badges = simulated_badge(bool(simulated))
+    if simulated and len(simulated) < len(datasets):
+        badges = (Badge("SIMULATED AND REAL DATA", "warning"),)
     return Document(
         title=f"Odometry calibrations compared: {result.config.name}",
         subtitle=result.config.description,
         sections=(*_about(result), *body, _reproduction(result)),
-        badges=badges if simulated else (),
-        footer=f"omnibench {result.environment.versions.get('omnibench', '')}, "
-        f"written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+        badges=badges,
     )
 
 
@@ -111,10 +114,6 @@ def _recording(view: DatasetView) -> tuple[Section, ...]:
         return (recording_section(view.dataset),)
     except DataError as error:
         return (Section("recording", "Recording", (Callout("No pictures", (str(error),), "warning"),)),)
-
-
-def _badges(view: DatasetView) -> tuple[Badge, ...]:
-    return (_SIMULATED,) if view.dataset.simulated else ()
 
 
 def _overview(datasets: list[DatasetView]) -> Table:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from pathlib import Path
 
 from omnibench.design.report.design_figures import efficiency_figure, path_figures, precision_figures
@@ -20,7 +19,6 @@ from omnibench.design.report.design_wording import (
     origin_in_words,
 )
 from omnibench.design.result import Candidate, Design, SetDesign
-from omnibench.environment import package_versions
 from omnibench.report.blocks import (
     Badge,
     Block,
@@ -35,6 +33,7 @@ from omnibench.report.blocks import (
     Row,
     Section,
     Table,
+    simulated_badge,
 )
 from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, significant
 from omnibench.report.render import write_document
@@ -59,14 +58,13 @@ def design_document(design: Design) -> Document:
             Section("basis", "What this rests on", _basis(design)),
         ),
         badges=_badges(design),
-        footer=f"omnibench {package_versions().get('omnibench', '')}, written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     )
 
 
 def _badges(design: Design) -> tuple[Badge, ...]:
     if not design.recorded:
         return (Badge("ASSUMED NOISE, NO RECORDINGS", "warning"),)
-    return (Badge("SIMULATED DATA", "warning"),) if design.simulated else ()
+    return simulated_badge(design.simulated)
 
 
 def _result(design: Design) -> tuple[Block, ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from datetime import UTC, datetime
 
 from omnibench.discover.report.evidence_figures import CANDIDATES, GAPS, drawn, hidden_grid
 from omnibench.discover.report.tables import (
@@ -38,7 +37,6 @@ from omnibench.discover.report.wording import (
 from omnibench.discover.result import Discovery, NamedEffect, experiment_file
 from omnibench.environment import package_versions
 from omnibench.report.blocks import (
-    Badge,
     Block,
     Callout,
     Code,
@@ -48,6 +46,7 @@ from omnibench.report.blocks import (
     Facts,
     Paragraph,
     Section,
+    simulated_badge,
 )
 from omnibench.report.numbers import count, fixed, listing
 from omnibench.words import plural
@@ -67,8 +66,7 @@ def discovery_report(discovery: Discovery, options: str) -> Document:
             better_section(discovery),
             basis_section(discovery, options),
         ),
-        badges=(Badge("SIMULATED DATA", "warning"),) if dataset.simulated else (),
-        footer=f"omnibench {package_versions().get('omnibench', '')}, written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+        badges=simulated_badge(dataset.simulated),
     )
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
 
@@ -13,7 +11,7 @@ import numpy as np
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
-from omnibench.report.blocks import Badge, Block, Callout, Choice, Document, Fact, Facts, Section
+from omnibench.report.blocks import Block, Callout, Choice, Document, Fact, Facts, Section, simulated_badge
 from omnibench.report.numbers import fixed
 from omnibench.report.recording.contents import contents_table
 from omnibench.report.recording.player import player
@@ -26,8 +24,6 @@ from omnibench.report.render import write_document
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.accuracy import SlamAccuracy, slam_accuracy
-
-_SIMULATED = Badge("SIMULATED DATA", "warning")
 
 
 class RoomPlan(Protocol):
@@ -91,8 +87,7 @@ def recording_document(
         title=f"Recording: {dataset.name}",
         subtitle=dataset.description,
         sections=tuple(sections),
-        badges=(_SIMULATED,) if dataset.simulated else (),
-        footer=f"omnibench {version('omnibench')}, written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+        badges=simulated_badge(dataset.simulated),
     )
 
 
