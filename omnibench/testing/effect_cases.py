@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import product
 from typing import Any, get_args
 from unittest import SkipTest
 
@@ -27,6 +28,7 @@ from omnibench.testing.effect_inputs import (
     trial_input,
     trial_poses,
     trial_values,
+    trials,
     without,
 )
 
@@ -88,22 +90,19 @@ class EffectConformance(Conformance):
     def test_shapes_are_those_of_the_contract(self) -> None:
         """Results have the right shape for one sample and many, three wheels and four."""
         effect = self.make()
-        for robot in robots():
-            for values in trial_values(effect, robot):
-                for samples in (1, SAMPLES):
-                    given = trial_input(effect, robot, samples=samples)
-                    for name, result in results(effect, given, values).items():
-                        shape, expected = np.shape(result), _shape(name, effect.stage, given, len(robot.wheels))
-                        require(shape == expected, f"{name} has shape {shape}, expected {expected}")
+        for (robot, values), samples in product(trials(effect), (1, SAMPLES)):
+            given = trial_input(effect, robot, samples=samples)
+            for name, result in results(effect, given, values).items():
+                shape, expected = np.shape(result), _shape(name, effect.stage, given, len(robot.wheels))
+                require(shape == expected, f"{name} has shape {shape}, expected {expected}")
 
     def test_zero_parameters_change_nothing(self) -> None:
         """An effect whose parameters are 0 changes nothing."""
         effect = self.make()
-        for robot in robots():
+        for robot, values in trials(effect):
             given = trial_input(effect, robot)
-            for values in trial_values(effect, robot):
-                largest = float(np.abs(changes(effect, given, without(effect, robot, values))).max())
-                require(largest <= _NOTHING, f"parameters of 0 change something, by {largest:.3g}")
+            largest = float(np.abs(changes(effect, given, without(effect, robot, values))).max())
+            require(largest <= _NOTHING, f"parameters of 0 change something, by {largest:.3g}")
 
     def test_parameters_change_something(self) -> None:
         """It changes something in a varied drive."""
@@ -116,11 +115,9 @@ class EffectConformance(Conformance):
     def test_results_are_finite(self) -> None:
         """Results are finite while the robot drives, drives fast and stands."""
         effect = self.make()
-        for robot in robots():
-            for values in trial_values(effect, robot):
-                for speed in (0.0, 1.0, 20.0):
-                    finite = np.isfinite(changes(effect, trial_input(effect, robot, speed), values)).all()
-                    require(bool(finite), f"a result is not finite where the robot {'drives' if speed else 'stands'}")
+        for (robot, values), speed in product(trials(effect), (0.0, 1.0, 20.0)):
+            finite = np.isfinite(changes(effect, trial_input(effect, robot, speed), values)).all()
+            require(bool(finite), f"a result is not finite where the robot {'drives' if speed else 'stands'}")
 
     def test_it_is_linear_in_its_parameters(self) -> None:
         """Fits and ``discover`` rely on it; parameters with choices are exempt."""
@@ -143,47 +140,39 @@ class EffectConformance(Conformance):
     def test_inputs_are_left_unchanged(self) -> None:
         """Signals, poses and values are not overwritten."""
         effect = self.make()
-        for robot in robots():
+        for robot, values in trials(effect):
             given = trial_input(effect, robot)
-            before = {name: array.copy() for name, array in arrays(given).items()}
-            for values in trial_values(effect, robot):
-                kept = dict(values)
-                results(effect, given, values)
-                same = all(np.array_equal(array, before[name]) for name, array in arrays(given).items())
-                require(same and values == kept, "it changed its arguments; work on copies")
+            before, kept = {name: array.copy() for name, array in arrays(given).items()}, dict(values)
+            results(effect, given, values)
+            same = all(np.array_equal(array, before[name]) for name, array in arrays(given).items())
+            require(same and values == kept, "it changed its arguments; work on copies")
 
     def test_each_sample_is_corrected_by_itself(self) -> None:
         """A sample is corrected the same alone, as in a stream, and in a batch."""
         effect = self.make()
-        for robot in robots():
+        for robot, values in trials(effect):
             given = trial_input(effect, robot)
             if not isinstance(given, Signals) and len(given) == 2:
                 raise SkipTest("only for effects that act in a stream")
-            for values in trial_values(effect, robot):
-                together = changes(effect, given, values)
-                for row in (0, 7, SAMPLES - 1, 3):
-                    alone = changes(effect, one_row(given, row), values)
-                    same = len(alone) == 1 and np.allclose(alone[0], together[row], rtol=1e-9, atol=_NOTHING)
-                    require(
-                        same, f"row {row} differs between a batch and a stream; it must not depend on other samples"
-                    )
+            together = changes(effect, given, values)
+            for row in (0, 7, SAMPLES - 1, 3):
+                alone = changes(effect, one_row(given, row), values)
+                same = len(alone) == 1 and np.allclose(alone[0], together[row], rtol=1e-9, atol=_NOTHING)
+                require(same, f"row {row} differs between a batch and a stream; it must not depend on other samples")
 
     def test_results_are_reproducible(self) -> None:
         """Results are equal in every call and instance, and no global random generator is used."""
-        for robot in robots():
+        for robot, values in trials(self.make()):
             given = trial_input(self.make(), robot)
-            for values in trial_values(self.make(), robot):
-                repeated = []
-                for seed in (1, 2):
-                    with global_random_state(seed):
-                        before = global_random_fingerprint()
-                        effect = self.make()
-                        repeated += [changes(effect, given, values) for _ in range(2)]
-                        require(global_random_fingerprint() == before, "it draws random numbers")
-                require(
-                    all(np.array_equal(repeated[0], result) for result in repeated[1:]),
-                    "its results differ from call to call",
-                )
+            repeated = []
+            for seed in (1, 2):
+                with global_random_state(seed):
+                    before = global_random_fingerprint()
+                    effect = self.make()
+                    repeated += [changes(effect, given, values) for _ in range(2)]
+                    require(global_random_fingerprint() == before, "it draws random numbers")
+            same = all(np.array_equal(repeated[0], result) for result in repeated[1:])
+            require(same, "its results differ from call to call")
 
     def test_needs_names_all_that_is_used(self) -> None:
         """It works on recordings that lack everything which ``needs`` does not name."""
@@ -192,14 +181,12 @@ class EffectConformance(Conformance):
             raise SkipTest("only for effects of motion")
         unused = {"wheel_angles", "session_time", "session", "poses"} - set(effect.needs)
         bare: dict[str, Any] = dict.fromkeys(unused)
-        for robot in robots():
-            signals = replace(driven_signals(robot), **bare)
-            for values in trial_values(effect, robot):
-                try:
-                    effect.correction(signals, values)
-                except (TypeError, AttributeError) as error:
-                    missing = ", ".join(sorted(unused))
-                    require(False, f"without {missing} it raises {type(error).__name__}: {error}; name it in needs")
+        for robot, values in trials(effect):
+            try:
+                effect.correction(replace(driven_signals(robot), **bare), values)
+            except (TypeError, AttributeError) as error:
+                missing = ", ".join(sorted(unused))
+                require(False, f"without {missing} it raises {type(error).__name__}: {error}; name it in needs")
 
     def test_corrected_poses_are_the_true_ones(self) -> None:
         """``corrected`` is the inverse of ``reported``."""
@@ -207,25 +194,23 @@ class EffectConformance(Conformance):
         if not isinstance(effect, ReferenceEffect):
             raise SkipTest("only for effects of the reference")
         poses = trial_poses()
-        for robot in robots():
-            for values in trial_values(effect, robot):
-                back = effect.corrected(effect.reported(poses, poses[0], values), poses[0], values)
-                error = float(np.abs(back - poses).max())
-                require(error <= _ROUNDING, f"corrected(reported(poses)) is off by {error:.3g}")
+        for _, values in trials(effect):
+            back = effect.corrected(effect.reported(poses, poses[0], values), poses[0], values)
+            error = float(np.abs(back - poses).max())
+            require(error <= _ROUNDING, f"corrected(reported(poses)) is off by {error:.3g}")
 
     def test_motors_are_causal(self) -> None:
         """Wheel rates depend on earlier targets only, and are 0 until the first target."""
         effect = self.make()
         if not isinstance(effect, ActuatorEffect):
             raise SkipTest("only for effects of the motors")
-        for robot in robots():
+        for robot, values in trials(effect):
             durations, targets = motor_input(robot)
-            for values in trial_values(effect, robot):
-                early = effect.driven(durations[:50], targets[:50], values)
-                same = np.allclose(early, effect.driven(durations, targets, values)[:50], rtol=1e-9, atol=_NOTHING)
-                require(same, "later targets change earlier wheel rates")
-                still = effect.driven(durations, np.zeros_like(targets), values)
-                require(not np.any(still), "the wheels turn though all targets are 0")
+            early = effect.driven(durations[:50], targets[:50], values)
+            same = np.allclose(early, effect.driven(durations, targets, values)[:50], rtol=1e-9, atol=_NOTHING)
+            require(same, "later targets change earlier wheel rates")
+            still = effect.driven(durations, np.zeros_like(targets), values)
+            require(not np.any(still), "the wheels turn though all targets are 0")
 
 
 def _check_parameter(parameter: Parameter) -> None:

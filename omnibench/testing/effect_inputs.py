@@ -66,6 +66,11 @@ def trial_values(effect: Effect, robot: Robot, seed: int = 0) -> Iterator[Values
         yield {item.name: _choice(item, number) if item.choices else free[item.name] for item in parameters}
 
 
+def trials(effect: Effect) -> Iterator[tuple[Robot, Values]]:
+    """Every trial robot with its trial parameters."""
+    return ((robot, values) for robot in robots() for values in trial_values(effect, robot))
+
+
 def without(effect: Effect, robot: Robot, values: Values) -> Values:
     """The values with every parameter that has no choices set to 0, at which the effect changes nothing."""
     shapes = {item.name for item in effect.parameters(robot, SESSIONS) if item.choices}

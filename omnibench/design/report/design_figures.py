@@ -27,7 +27,6 @@ _UNUSED = LegendItem("unused", "candidates not chosen", "#d4d9df")
 _BASELINE = LegendItem("", "baseline", QUIET, symbol="diamond")
 _STRAIGHT_BELOW = math.radians(2)  # rad: a run that turns by less is drawn as straight (chosen)
 _ROW_DASHES: tuple[Dash, ...] = ("solid", "dash", "dot")
-_ROW_NAMES = ("x (row 1)", "y (row 2)", "heading (row 3)")
 
 
 def path_figures(design: Design) -> FigureGrid:
