@@ -14,7 +14,7 @@ from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.robot.path import Path
 from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar, PoseTrack, measure_scans, scan_stamps
+from omnibench.simulate.chain.lidar import Lidar, measure_scans, scan_stamps
 
 ROBOT = Robot(
     name="APR-02",
@@ -66,7 +66,7 @@ def sample(repetitions: int = 2, duration: float = 3.0, rays: int = 90) -> Sampl
             truth[name] = TruePath(dense, path.poses(dense))
             starts[name] = plan.start + np.array([0.05, -0.03, 0.04]) * rng.standard_normal(3)
             stamps = scan_stamps(lidar, duration, rng)
-            track = PoseTrack(dense, in_room(starts[name], truth[name].poses))
+            track = TruePath(dense, in_room(starts[name], truth[name].poses))
             scans[name] = measure_scans(plan, lidar, track, stamps, rng)
             poses = path.poses(stamps)
             poses[1:] += NOISE * rng.standard_normal(poses[1:].shape)

@@ -21,14 +21,14 @@ _NAME = "poses"
 
 @dataclass(frozen=True, eq=False)
 class TruePath:
-    """True poses of a run from its start on. times (M,): s, from 0 on, dense. poses (M, 3): m, m, rad."""
+    """True poses of a run from its start on. times (M,): s, dense. poses (M, 3): m, m, rad, headings continuous."""
 
     times: Array
     poses: Array
 
     def at(self, stamps: Array) -> Array:
-        """Poses (K, 3) at stamps (K,), s, interpolated by straight lines; the last pose holds after its time."""
-        return np.column_stack([np.interp(stamps, self.times, column) for column in self.poses.T])
+        """Poses (..., 3) at stamps (...), s, interpolated by straight lines; the last pose holds after its time."""
+        return np.stack([np.interp(stamps, self.times, column) for column in self.poses.T], axis=-1)
 
 
 def write_true_poses(folder: Path, paths: Mapping[str, TruePath]) -> None:

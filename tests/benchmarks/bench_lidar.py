@@ -12,22 +12,23 @@ import time
 import numpy as np
 import pytest
 
+from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.chain.floor_plans import PLANS
-from omnibench.simulate.chain.lidar import Lidar, PoseTrack, measure_scans, scan_stamps
+from omnibench.simulate.chain.lidar import Lidar, measure_scans, scan_stamps
 from omnibench.simulate.chain.ray_casting import cast_rays
 
 RUN = 6.5  # s
 RUNS = 190  # of 25 scans: about a session of 180 flower runs
 
 
-def driven(plan: FloorPlan) -> PoseTrack:
+def driven(plan: FloorPlan) -> TruePath:
     times = np.arange(0, RUN, 0.001)
-    return PoseTrack(times, plan.start + np.outer(times, [0.1, 0.05, 0.35]))
+    return TruePath(times, plan.start + np.outer(times, [0.1, 0.05, 0.35]))
 
 
-def plain_numpy(plan: FloorPlan, lidar: Lidar, track: PoseTrack, stamps: Array) -> Array:
+def plain_numpy(plan: FloorPlan, lidar: Lidar, track: TruePath, stamps: Array) -> Array:
     """Distances (S, R) to the nearest walls, scan by scan."""
     starts, edges = plan.segments[:, :2], plan.segments[:, 2:] - plan.segments[:, :2]
     found = np.empty((len(stamps), lidar.rays))

@@ -20,13 +20,14 @@ from functools import partial
 import numpy as np
 
 from omnibench.data.scans import TrajectoryScans
+from omnibench.data.true_poses import TruePath
 from omnibench.processes import one_thread
 from omnibench.robot.kinematics import Array, Robot, Wheel
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.published_matrices import published_matrix
 from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar, PoseTrack, measure_scans, scan_stamps
+from omnibench.simulate.chain.lidar import Lidar, measure_scans, scan_stamps
 from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
 from omnibench.simulate.flower import Command
 from omnibench.slam.slam_options import SlamOptions
@@ -68,10 +69,10 @@ def drive(plan: FloorPlan, lidar: Lidar, command: Command, rng: np.random.Genera
     (path,) = TRUE.poses([log])
     x, y, heading = plan.start + PLACEMENT * rng.standard_normal(3)
     way = (path[:, 0] + 1j * path[:, 1]) * np.exp(1j * heading)
-    track = PoseTrack(fine, np.column_stack([x + way.real, y + way.imag, heading + path[:, 2]]))
+    track = TruePath(fine, np.column_stack([x + way.real, y + way.imag, heading + path[:, 2]]))
     stamps = scan_stamps(lidar, float(motion.times[-1]), rng)
     scans = measure_scans(plan, lidar, track, stamps, rng)
-    return Run(command, log, scans, PoseTrack(fine, path).at(stamps))
+    return Run(command, log, scans, TruePath(fine, path).at(stamps))
 
 
 def flower_command(number: int) -> Command:

@@ -24,7 +24,7 @@ from omnibench.data.true_poses import TruePath, write_true_poses
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar, PoseTrack, measure_scans, scan_stamps
+from omnibench.simulate.chain.lidar import Lidar, measure_scans, scan_stamps
 from omnibench.slam.summary import distances
 from omnibench.testing.synthetic import PERIOD, synthetic_robot, synthetic_trajectories, true_robot
 
@@ -52,7 +52,7 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Driven:
         times = np.arange(0.0, run.times[-1] + 1e-9, 0.002)
         (path,) = model.poses([run.log(times)])
         stamps = scan_stamps(LIDAR, float(run.times[-1]), rng)
-        scans[run.id] = measure_scans(plan, LIDAR, PoseTrack(times, _in_room(plan.start, path)), stamps, rng)
+        scans[run.id] = measure_scans(plan, LIDAR, TruePath(times, _in_room(plan.start, path)), stamps, rng)
         truth[run.id] = TruePath(times, path)
         wrong = run.poses + np.where(run.pose_times[:, None] > 0, [0.03, 0.04, math.radians(1.0)], 0.0)
         runs.append(replace(run, poses=wrong))

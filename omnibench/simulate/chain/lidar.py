@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -11,6 +10,7 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from omnibench.config import Model, NonNegative, Positive
 from omnibench.data.scans import Mount, Scanner, TrajectoryScans
+from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.chain.floor_plan import FloorPlan
@@ -95,18 +95,6 @@ class Lidar(Model):
         )
 
 
-@dataclass(frozen=True, eq=False)
-class PoseTrack:
-    """True poses of the robot. times (M,): increasing, s. poses (M, 3): m, m, rad in the room, headings continuous."""
-
-    times: Array
-    poses: Array
-
-    def at(self, times: Array) -> Array:
-        """Poses (..., 3) at times (...), s, interpolated linearly; before and after the track the robot is at rest."""
-        return np.stack([np.interp(times, self.times, column) for column in self.poses.T], axis=-1)
-
-
 def scan_stamps(lidar: Lidar, end: float, rng: np.random.Generator) -> Array:
     """Stamps (S,) of scans, s, from 0 on at random intervals; the last scan is complete by ``end``.
 
@@ -124,7 +112,7 @@ def scan_stamps(lidar: Lidar, end: float, rng: np.random.Generator) -> Array:
 
 
 def measure_scans(
-    plan: FloorPlan, lidar: Lidar, track: PoseTrack, stamps: Array, rng: np.random.Generator
+    plan: FloorPlan, lidar: Lidar, track: TruePath, stamps: Array, rng: np.random.Generator
 ) -> TrajectoryScans:
     """Scans of a room at stamps (S,), s, which include the latency.
 
@@ -150,7 +138,7 @@ def measure_scans(
     return TrajectoryScans(stamps, np.where(seen, ranges, np.inf).astype(np.float32))
 
 
-def _check_places(plan: FloorPlan, mount: Mount, track: PoseTrack, times: Array) -> None:
+def _check_places(plan: FloorPlan, mount: Mount, track: TruePath, times: Array) -> None:
     x, y, heading = track.at(times).T
     x = x + np.cos(heading) * mount.x - np.sin(heading) * mount.y
     y = y + np.sin(heading) * mount.x + np.cos(heading) * mount.y

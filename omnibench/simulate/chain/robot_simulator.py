@@ -17,7 +17,7 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 from omnibench.simulate.chain.floor_plan import FloorPlan, make_plan
-from omnibench.simulate.chain.lidar import PoseTrack, measure_scans, scan_stamps
+from omnibench.simulate.chain.lidar import measure_scans, scan_stamps
 from omnibench.simulate.chain.motion_commands import CommandedMotion, command_motion, target_rates
 from omnibench.simulate.chain.motors import TRUE_STEP, check_reach
 from omnibench.simulate.chain.robot_config import Placement, RobotConfig
@@ -170,7 +170,7 @@ class _RobotSimulator:
         plan.check_path(_in_room(start, path)[:, :2], log.stamps, config.radius, f"run {run.id}")
         stamps = scan_stamps(config.lidar, float(run.times[-1]), rng)
         try:
-            scans = measure_scans(plan, config.lidar, PoseTrack(log.stamps, _in_room(start, seen)), stamps, rng)
+            scans = measure_scans(plan, config.lidar, TruePath(log.stamps, _in_room(start, seen)), stamps, rng)
         except DataError as error:
             raise DataError(f"run {run.id}: {error}") from None
         every = round(min(config.sample_period, _DENSE) / TRUE_STEP)

@@ -13,10 +13,11 @@ from shapely.geometry import LineString, Point
 
 from omnibench.config import validate
 from omnibench.data.scans import TrajectoryScans
+from omnibench.data.true_poses import TruePath
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar, LidarMount, PoseTrack, measure_scans, scan_stamps
+from omnibench.simulate.chain.lidar import Lidar, LidarMount, measure_scans, scan_stamps
 from omnibench.simulate.chain.ray_casting import cast_rays
 
 EXACT = Lidar(rays=360, noise=0.0, far_noise=0.0, dropouts=0.0, resolution=1e-6)
@@ -29,13 +30,11 @@ def square(half: float, obstacles: tuple[Any, ...] = ()) -> FloorPlan:
     return make_plan(RoomPlan(boundary=boundary, obstacles=obstacles, start=(0, 0, 0)), "room")
 
 
-def standing(x: float, y: float, heading: float) -> PoseTrack:
-    return PoseTrack(np.array([0.0, 1.0]), np.array([[x, y, heading]] * 2))
+def standing(x: float, y: float, heading: float) -> TruePath:
+    return TruePath(np.array([0.0, 1.0]), np.array([[x, y, heading]] * 2))
 
 
-def look(
-    plan: FloorPlan, lidar: Lidar, track: PoseTrack, stamps: Array | None = None, seed: int = 0
-) -> TrajectoryScans:
+def look(plan: FloorPlan, lidar: Lidar, track: TruePath, stamps: Array | None = None, seed: int = 0) -> TrajectoryScans:
     return measure_scans(plan, lidar, track, np.zeros(1) if stamps is None else stamps, np.random.default_rng(seed))
 
 
@@ -125,7 +124,7 @@ def test_each_ray_starts_where_the_robot_then_is(vx: float, vy: float, turn_rate
     lidar = EXACT.model_copy(update={"latency": latency})
     times = np.arange(-300, 1200) * 0.001
     stamps = np.array([0.0, 0.213, 0.5])
-    found = look(square(4), lidar, PoseTrack(times, circling(vx, vy, turn_rate, times)), stamps).ranges
+    found = look(square(4), lidar, TruePath(times, circling(vx, vy, turn_rate, times)), stamps).ranges
     measured = stamps[:, None] - latency + 0.025 * 270 / 360 * np.arange(360) / 360
     x, y, heading = circling(vx, vy, turn_rate, measured.ravel()).T
     x, y = x + 0.1 * np.cos(heading), y + 0.1 * np.sin(heading)
@@ -135,17 +134,17 @@ def test_each_ray_starts_where_the_robot_then_is(vx: float, vy: float, turn_rate
 
 def test_without_distortion_all_rays_start_where_the_robot_is_at_the_stamp() -> None:
     times = np.arange(0, 1000) * 0.001
-    track = PoseTrack(times, circling(0.5, 0.2, 2.0, times))
+    track = TruePath(times, circling(0.5, 0.2, 2.0, times))
     lidar = EXACT.model_copy(update={"distortion": False})
     assert lidar.scanner.time_increment == 0
-    at_rest = PoseTrack(np.zeros(1), track.at(np.array([0.3])))
+    at_rest = TruePath(np.zeros(1), track.at(np.array([0.3])))
     found = look(square(4), lidar, track, np.array([0.3])).ranges
     assert (found == look(square(4), lidar, at_rest).ranges).all()
     assert (found != look(square(4), EXACT, track, np.array([0.3])).ranges).any()
 
 
 def test_a_robot_is_at_rest_before_and_after_its_track() -> None:
-    track = PoseTrack(np.array([0.0, 1.0]), np.array([[0.0, 0, 0], [1, 2, 3]]))
+    track = TruePath(np.array([0.0, 1.0]), np.array([[0.0, 0, 0], [1, 2, 3]]))
     assert track.at(np.array([-1.0, 0.5, 7.0])).tolist() == [[0, 0, 0], [0.5, 1, 1.5], [1, 2, 3]]
 
 
@@ -227,7 +226,7 @@ def test_a_run_too_short_for_a_scan_is_refused() -> None:
 
 
 def test_a_scan_that_sees_nothing_is_refused_with_time_and_place() -> None:
-    track = PoseTrack(np.array([0.0, 1.0]), np.array([[8.9, 0, 0], [0.0, 0, 0]]))
+    track = TruePath(np.array([0.0, 1.0]), np.array([[8.9, 0, 0], [0.0, 0, 0]]))
     with pytest.raises(DataError, match=r"the LIDAR sees nothing at 0\.75 s, the robot at \(2\.2., 0\.00\) m: no wall"):
         look(square(10), Lidar(range_max=5), track, np.array([0.0, 0.25, 0.75]))
 

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar, PoseTrack, measure_scans
+from omnibench.simulate.chain.lidar import Lidar, measure_scans
 from omnibench.slam.matching.lines import Lines, fit_lines
 
 INCREMENT = np.radians(0.25)
@@ -64,7 +65,7 @@ def test_stated_tilts_and_places_are_those_of_noisy_walls(aside: float) -> None:
 def test_no_line_bridges_a_corner(seed: int) -> None:
     plan = make_plan(RoomPlan(boundary=((-3, -2), (3, -2), (3, 2), (-3, 2)), start=(0, 0, 0)), "room")
     lidar = Lidar()
-    track = PoseTrack(np.zeros(1), np.array([[1.0, 0.5, 0.2 + seed]]))
+    track = TruePath(np.zeros(1), np.array([[1.0, 0.5, 0.2 + seed]]))
     (ranges,) = measure_scans(plan, lidar, track, np.zeros(1), np.random.default_rng(seed)).ranges
     seen = np.flatnonzero(np.isfinite(ranges))
     angles = lidar.scanner.angles[seen]

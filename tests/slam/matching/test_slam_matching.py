@@ -11,10 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.data.scans import Ranges
+from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import compose, relative
 from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar, PoseTrack, measure_scans
+from omnibench.simulate.chain.lidar import Lidar, measure_scans
 from omnibench.slam.matching.correspondences import Correspondences
 from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints, noise_factor, scan_points
@@ -35,7 +36,7 @@ def ranges_at(place: Array, twist: Array | None = None, seed: int = 0, lidar: Li
     times = np.linspace(0.0, 0.025, 26)
     still = np.zeros(3) if twist is None else twist
     poses = np.array([compose(compose(plan.start, place), _along(still, time)) for time in times])
-    return measure_scans(plan, lidar, PoseTrack(times, poses), np.zeros(1), np.random.default_rng(seed)).ranges[0]
+    return measure_scans(plan, lidar, TruePath(times, poses), np.zeros(1), np.random.default_rng(seed)).ranges[0]
 
 
 def _along(twist: Array, time: float) -> Array:

@@ -14,9 +14,10 @@ from slam_study import ROBOT, Run, drive, flower_command
 
 from omnibench.data.dataset import Trajectory, make_dataset
 from omnibench.data.scans import Scanner, ScansInMemory, TrajectoryScans
+from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar, PoseTrack, measure_scans
+from omnibench.simulate.chain.lidar import Lidar, measure_scans
 from omnibench.slam.matching.correspondences import Correspondences
 from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints, scan_points
@@ -131,7 +132,7 @@ class TestNearlyRoundRoom:
 
 def scan_of(plan: FloorPlan, seed: int) -> ScanPoints:
     """A noisy scan from the room's start."""
-    track = PoseTrack(np.linspace(0.0, 0.025, 2), np.tile(plan.start, (2, 1)))
+    track = TruePath(np.linspace(0.0, 0.025, 2), np.tile(plan.start, (2, 1)))
     ranges = measure_scans(plan, LIDAR, track, np.zeros(1), np.random.default_rng(seed)).ranges[0]
     return scan_points(ranges, LIDAR.scanner, 1.0, MotionWithinScan.steady(np.zeros(3), 0.025))
 
