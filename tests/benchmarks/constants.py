@@ -26,6 +26,7 @@ from hidden.sets import Kind, make_set
 import omnibench.discover
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
+from omnibench.discover.calibrations import Request
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.result import Discovery
 from omnibench.processes import one_thread
@@ -35,9 +36,9 @@ SURE = 0.95  # weight from which on a name is stated with confidence: the verdic
 # What is the same whatever the constants after the screening are, and what none of those before the end can change.
 FRONT = ("usable_runs", "_start_matrix", "fit_matrix", "screen_plain", "screen_extended", "screen_again", "extend",
          "without_effects")  # fmt: skip
-TAIL = ("validation_runs", "compare_held_out", "waterfall_steps", "extrapolations_of")
+TAIL = ("validation_runs", "compare_held_out", "waterfall_steps", "extrapolations_of", "calibration_of")
 OF_FRONT = ("fitting", "regressors.covariate_bases", "regressors.paths", "regressors.whitened", "selection.screening",
-            "selection.candidate_groups", "selection.encoder_quantisation")  # fmt: skip
+            "selection.candidate_groups", "selection.encoder_quantisation", "conclude")  # fmt: skip
 OF_TAIL = ("held_out", "selection.extrapolation")
 
 
@@ -211,7 +212,7 @@ def _key(argument: Any) -> object:
         return argument.name, tuple(argument.shapes.items()), tuple(each.name for each in argument.parameters)
     if isinstance(argument, np.ndarray):
         return argument.tobytes()
-    return argument if isinstance(argument, str | float | int) else id(argument)
+    return argument if isinstance(argument, str | float | int | Request) else id(argument)
 
 
 def study(one: Set, varied: Sequence[Constant], done: set[tuple[str, str, float]]) -> Iterator[Result]:

@@ -106,14 +106,14 @@ def _compared(data: Literal["repetitions", "session"], before: Errors, after: Er
     return HeldOut(
         data=data,
         runs=len(before.finals),
-        eq6=_gap("eq6", norms[0], norms[1], None if floor is None else floor.eq6),
-        chi2=_gap("chi2", before.chi2, after.chi2, None if floor is None else floor.chi2),
+        eq6=gap_between("eq6", norms[0], norms[1], None if floor is None else floor.eq6),
+        chi2=gap_between("chi2", before.chi2, after.chi2, None if floor is None else floor.chi2),
         position_m=(position[0], position[1]),
         heading_rad=(heading[0], heading[1]),
     )
 
 
-def _gap(metric: Literal["eq6", "chi2"], before: Array, after: Array, floor: Array | None) -> Gap:
+def gap_between(metric: Literal["eq6", "chi2"], before: Array, after: Array, floor: Array | None) -> Gap:
     """The gap between errors (Z,) and a floor (D,); without a floor no share is closed."""
     first, last = float(before.mean()), float(after.mean())
     if floor is None:

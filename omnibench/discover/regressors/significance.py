@@ -67,7 +67,7 @@ class Significance:
     @property
     def surplus_chi_square(self) -> tuple[float, float]:
         """The chi-square difference that the surplus stands for, and its standard deviation by chance."""
-        scatter = float(np.sqrt(2 * self.rank[self.surplus_of]) * self.spread[self.surplus_of])
+        scatter = float(np.sqrt(2 * max(self.rank[self.surplus_of], 1.0)) * self.spread[self.surplus_of])
         return max(self.surplus, 0.0) * scatter, scatter
 
 

@@ -1,0 +1,201 @@
+"""Study of what right and wrong names leave: the numbers in omnibench.discover.selection.evidence.
+
+    python tests/benchmarks/evidence_study.py --out evidence.jsonl [--seeds 2] [--table]
+
+Blind sets with one strong effect, with two, and with one that no catalogue has, as for discover_study.py. Right names
+are taken for granted and fitted. Measured are the share of the non-centrality that generic bases still find beside
+them, as they are and when their forms may differ a little; how much other effects then gain beyond chance, which is
+what the discrepancy of the catalogue's forms makes; and how far effects cancel each other. The same is measured of the
+best wrong names: those that explain most where the right ones are left out. One line of JSON a set, added as it comes.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from hidden.forms import FORMS
+from hidden.outside import OUTSIDE
+from hidden.pairs import PAIRS
+from hidden.sets import LEVELS, Kind, make_set
+from scipy.optimize import minimize
+
+from omnibench.config import Model
+from omnibench.discover.fitting.extend import extend
+from omnibench.discover.fitting.model_fit import fit_matrix
+from omnibench.discover.fitting.usable_runs import usable_runs
+from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.significance import significance_of
+from omnibench.discover.selection.evidence import credibility_of, effect_sets, indices_of, joint_share
+from omnibench.discover.selection.model_selection import ABSORBED
+from omnibench.discover.selection.screening import Screening, screen_again, screen_plain
+from omnibench.fit.least_squares.whitened import Given
+from omnibench.processes import one_thread
+
+FIRST_SEED = 1000  # those below are the exam of discover_study.py
+
+
+class Names(Model):
+    """Names that explain a set. right: they are those that are hidden.
+
+    energy: non-centrality that they explain. left, beyond: shares of the whole that generic bases find beside them, as
+    they are and in slightly different forms. joint: chi-square together over what each makes alone. probability: as
+    stated.
+    """
+
+    right: bool
+    names: tuple[str, ...]
+    energy: float
+    left: float
+    beyond: float
+    joint: float
+    probability: float
+
+
+class Result(Model):
+    """One set. discrepancy: square of the discrepancy per direction of the right names' forms; None without any."""
+
+    kind: str
+    effects: tuple[str, ...]
+    seed: int
+    explained: tuple[Names, ...]
+    discrepancy: float | None
+
+    @property
+    def key(self) -> tuple[str, tuple[str, ...], int]:
+        return self.kind, self.effects, self.seed
+
+
+def sets(seeds: range) -> Iterator[tuple[Kind, tuple[str, ...], int]]:
+    """What is hidden, by seeds."""
+    for seed in seeds:
+        yield from (("single", (name,), seed) for name in FORMS)
+        yield from (("outside", (name,), seed) for name in OUTSIDE)
+        yield from (("pair", pair, seed) for pair in PAIRS)
+
+
+def measured(kind: Kind, effects: tuple[str, ...], seed: int) -> Result:
+    """What right and wrong names leave in one set."""
+    rng = np.random.default_rng(seed)
+    dataset, _ = make_set(kind, effects, LEVELS["strong"], seed)
+    runs = usable_runs(dataset.split("train"))
+    plain = fit_matrix(runs, dataset.robot, dataset.sample_period, dataset.robot.inverse_kinematic_matrix)
+    screening = screen_plain(plain, ())
+    right = _best_shapes(screening, effects) if kind != "outside" else []
+    explained, discrepancy = [], None
+    if right:
+        screening = screen_again(extend(plain, right), screening, ())
+        right = _best_shapes(screening, effects)
+        explained.append(_names(screening, right, rng, right=True))
+        discrepancy = _discrepancy(screening.beyond_matrix(), right, _others(screening, effects))
+    for count in (1, 2):
+        wrong = _largest(screening.beyond_matrix(), _others(screening, effects), count)
+        explained.append(_names(screening, wrong, rng, right=False))
+    return Result(kind=kind, effects=effects, seed=seed, explained=tuple(explained), discrepancy=discrepancy)
+
+
+def _best_shapes(screening: Screening, names: Sequence[str]) -> list[Group]:
+    """The shape of each named effect that explains most."""
+    start = screening.beyond_matrix()
+    return [
+        max((g for g in screening.groups.effects if g.name == name), key=lambda group: start.chi_square(group.index))
+        for name in names
+    ]
+
+
+def _others(screening: Screening, names: Sequence[str]) -> list[Group]:
+    """All other effects that are not absorbed, each in its best shape."""
+    start = screening.beyond_matrix()
+    other = {group.name for group in screening.groups.effects if start.share_left(group.index) > ABSORBED} - set(names)
+    return _best_shapes(screening, sorted(other))
+
+
+def _largest(start: Given, groups: Sequence[Group], count: int) -> list[Group]:
+    """The effects that explain most together."""
+    return list(max(combinations(groups, count), key=lambda some: start.chi_square(indices_of(some))))
+
+
+def _discrepancy(start: Given, right: Sequence[Group], others: Sequence[Group]) -> float:
+    """The mean of (Q / d - 1) / N over the other effects beyond the right ones: delta^2 of Eq. (3) in evidence.py."""
+    after = start.given(indices_of(right))
+    energy = start.chi_square(indices_of(right)) - start.rank(indices_of(right))
+    seen = [(after.chi_square(group.index), after.rank(group.index)) for group in others]
+    return float(np.mean([chi_square / rank - 1 for chi_square, rank in seen if rank])) / energy
+
+
+def _names(screening: Screening, chosen: Sequence[Group], rng: np.random.Generator, *, right: bool) -> Names:
+    data, bases, start = screening.data, screening.groups.bases, screening.beyond_matrix()
+    fitted = screening.index_with(chosen)
+    forms = [index for group in chosen for index in group.forms]
+    left, beyond = (significance_of(data, columns, bases, rng) for columns in (fitted, [*fitted, *forms]))
+    sets_ = effect_sets(start, chosen, len(chosen))
+    credibility = credibility_of(sets_, start, chosen, left, beyond)
+    energy = max(sets_.energy, 1.0)
+    further = beyond.surplus_chi_square[0]
+    return Names(
+        right=right,
+        names=tuple(group.name for group in chosen),
+        energy=energy,
+        left=credibility.left_share,
+        beyond=further / (further + energy),
+        joint=joint_share(start, chosen),
+        probability=credibility.probability,
+    )
+
+
+def print_table(results: Sequence[Result]) -> None:
+    """The figures that evidence.py names."""
+    every = [names for result in results for names in result.explained]
+    squares = [result.discrepancy for result in results if result.discrepancy is not None and result.kind == "single"]
+    print(f"discrepancy, root of the mean over {len(squares)} sets with one effect: {np.sqrt(np.mean(squares)):.3f}")
+    print("   quartiles", np.round(np.sqrt(np.maximum(np.quantile(squares, [0.25, 0.5, 0.75]), 0)), 3))
+    for right in (True, False):
+        for count in (1, 2):
+            some = [names for names in every if names.right == right and len(names.names) == count]
+            print(f"\n{'right' if right else 'wrong'} names, {count} at a time, {len(some)} sets")
+            for field in ("left", "beyond", "joint", "probability"):
+                values = np.array([getattr(names, field) for names in some])
+                deciles = np.quantile(values, [0.1, 0.25, 0.5, 0.75, 0.9])
+                print(f"   {field:12} mean {values.mean():.3f}   10, 25, 50, 75, 90 % {np.round(deciles, 3)}")
+    for count in (1, 2):
+        print(f"\nprior odds of {count} that would make the stated probabilities right here: {fair_odds(every, count)}")
+
+
+def fair_odds(every: Sequence[Names], count: int) -> str:
+    """The factor on the odds of names that makes them likeliest, with its slope: 1 if Bayes factors are as they say."""
+    some = [names for names in every if len(names.names) == count]
+    stated = np.clip([names.probability for names in some], 1e-12, 1 - 1e-12)
+    right, logit = np.array([names.right for names in some]), np.log(stated / (1 - stated))
+
+    def surprise(line: np.ndarray) -> float:
+        return float(np.logaddexp(0.0, np.where(right, -1.0, 1.0) * (line[0] + line[1] * logit)).sum())
+
+    shift, slope = minimize(surprise, [0.0, 1.0], method="Nelder-Mead").x
+    return f"times {np.exp(shift):.2g}, slope {slope:.2f}; {right.sum()} right, {(~right).sum()} wrong"
+
+
+def main() -> None:
+    """Measure the sets that are missing, then print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="file of results, one line of JSON a set")
+    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--table", action="store_true", help="print the table of what is there")
+    arguments = parser.parse_args()
+    lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
+    results = [Result.model_validate_json(line) for line in lines]
+    done = {result.key for result in results}
+    if not arguments.table:
+        with arguments.out.open("a") as file, one_thread():
+            for each in sets(range(FIRST_SEED, FIRST_SEED + arguments.seeds)):
+                if each not in done:
+                    results.append(measured(*each))
+                    file.write(results[-1].model_dump_json() + "\n")
+                    file.flush()
+    print_table(results)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""Fits of a few runs that are put together by hand: what they leave, and what they know, is given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from discovery_samples import APR02
+
+from omnibench.data.dataset import Split, Trajectory
+from omnibench.discover.fitting.extend import Extended
+from omnibench.discover.fitting.model_fit import Fit
+from omnibench.discover.fitting.nuisances import Nuisances
+from omnibench.fit.least_squares.noise import NoiseEstimate
+from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Robot
+from omnibench.robot.model import OdometryModel
+
+ROBOT = Robot.model_validate(APR02)
+MATRIX = ROBOT.inverse_kinematic_matrix
+FORWARD, SIDEWAYS, TURN = np.linalg.pinv(MATRIX).T * np.array([[0.2], [0.2], [0.35]])  # wheel rates, rad/s
+UNIT_NOISE = NoiseEstimate(Noise(pose_position=1.0, pose_heading=1.0), "repetitions", 10, "")
+SECONDS = 4
+
+
+def run_of(rates: np.ndarray, command: str | None = None, name: str = "run", split: Split = "train") -> Trajectory:
+    """A run of 4 s at constant wheel rates, with reference poses at 0, 2 and 4 s where the design values lead."""
+    times = np.arange(1, 10 * SECONDS + 1) / 10
+    run = Trajectory(
+        id=name,
+        split=split,
+        times=times,
+        rates=np.tile(rates, (len(times), 1)),
+        pose_times=np.array([0.0, SECONDS / 2, SECONDS]),
+        poses=np.zeros((3, 3)),
+        command=command,
+        session="s1",
+    )
+    (poses,) = OdometryModel(ROBOT, MATRIX, "arc").reported([run.reference_log])
+    run.poses[1:] = poses
+    return run
+
+
+def extended_of(
+    runs: Sequence[Trajectory],
+    residuals: Sequence[np.ndarray],
+    columns: Sequence[np.ndarray] | None = None,
+    covariance: np.ndarray | None = None,
+    matrix: np.ndarray = MATRIX,
+) -> Extended:
+    """A fit without effects that leaves residuals (2, 3) of each run. columns (2, 3, p): none by default."""
+    count = len(runs)
+    fit = Fit(
+        model=OdometryModel(ROBOT, matrix, "arc", (), 0.1),
+        runs=tuple(runs),
+        nuisances=Nuisances(np.zeros((count, 3)), np.zeros(3)),
+        noise=UNIT_NOISE,
+        residuals=tuple(residuals),
+        slopes=tuple(np.zeros((2, 3, 3)) for _ in runs),
+        jumps=0,
+    )
+    slopes = tuple(columns) if columns is not None else tuple(np.zeros((2, 3, 0)) for _ in runs)
+    covariances = np.zeros((9, 9)) if covariance is None else covariance
+    return Extended(fit, (), fit.whitened(slopes), slopes, np.zeros(0), covariances)

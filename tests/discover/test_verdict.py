@@ -1,0 +1,105 @@
+"""Verdicts and headlines, from the effects that were named and what the residuals depend on."""
+
+from __future__ import annotations
+
+import pytest
+
+from omnibench.discover.result import CovariateDependence, NamedEffect, Verdict
+from omnibench.discover.verdict import headline_of, lacks_a_name, verdict_of
+from omnibench.robot.effects.effect import Stage
+
+
+def effect(
+    name: str = "heading_drift", weight: float = 0.99, confusable: tuple[str, ...] = (), stage: Stage = "body"
+) -> NamedEffect:
+    """A named effect; its class is certain."""
+    class_weight = 0.99 if confusable else weight
+    return NamedEffect(name, stage, weight, (), confusable, "", "", 100.0, 1, "", class_weight)
+
+
+def dependence(p_value: float = 1e-9, stage: Stage = "body", *, within_ticks: bool = False) -> CovariateDependence:
+    words = "the residual depends on the heading" if stage == "body" else "the rates depend on the targets"
+    return CovariateDependence("heading", stage, p_value, 50.0, 3, words, within_ticks)
+
+
+SEEN, CHANCE, TICKS = dependence(), dependence(0.005), dependence(within_ticks=True)
+MOTORS = dependence(stage="actuator")
+LAG = effect("motor_lag", stage="actuator")
+ONE_OF_TWO = effect(weight=0.5, confusable=("floor_drift",))
+
+
+@pytest.mark.parametrize(
+    ("effects", "where", "left", "verdict"),
+    [
+        ((), (), (), "none"),
+        ((), (CHANCE,), (), "none"),
+        ((), (TICKS,), (), "none"),
+        ((), (SEEN,), (SEEN,), "unknown"),
+        ((effect(),), (SEEN,), (), "named"),
+        ((effect(),), (SEEN,), (CHANCE, TICKS), "named"),
+        ((effect(),), (SEEN,), (SEEN,), "incomplete"),
+        ((effect(weight=0.94),), (SEEN,), (), "unknown"),
+        ((effect(), effect("floor_drift", 0.6)), (SEEN,), (), "incomplete"),
+        ((ONE_OF_TWO,), (SEEN,), (), "class"),
+        ((effect("floor_drift"), ONE_OF_TWO), (SEEN,), (SEEN,), "class"),
+    ],
+)
+def test_the_verdict_follows_from_names_and_from_what_is_left(
+    effects: tuple[NamedEffect, ...],
+    where: tuple[CovariateDependence, ...],
+    left: tuple[CovariateDependence, ...],
+    verdict: Verdict,
+) -> None:
+    assert verdict_of(effects, where, left) == verdict
+
+
+@pytest.mark.parametrize(
+    ("effects", "where", "left", "verdict"),
+    [
+        ((), (MOTORS,), (MOTORS,), "none"),  # what a controller does without a name is nothing that the odometry lacks
+        ((LAG,), (MOTORS,), (), "named"),
+        ((LAG,), (MOTORS,), (MOTORS,), "named"),
+        ((LAG,), (MOTORS, SEEN), (SEEN,), "unknown"),  # the motors' name explains nothing of the odometry
+        ((effect(), LAG), (SEEN, MOTORS), (MOTORS,), "named"),
+    ],
+)
+def test_motors_are_judged_by_themselves_and_the_odometry_first(
+    effects: tuple[NamedEffect, ...],
+    where: tuple[CovariateDependence, ...],
+    left: tuple[CovariateDependence, ...],
+    verdict: Verdict,
+) -> None:
+    assert verdict_of(effects, where, left) == verdict
+
+
+def test_a_name_is_lacking_where_something_is_left_or_nothing_explains_it() -> None:
+    assert [name for name in ("none", "named", "class", "incomplete", "unknown") if lacks_a_name(name)] == [
+        "incomplete",
+        "unknown",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("verdict", "effects", "where", "left", "words"),
+    [
+        ("none", (), (), (), ["Nothing is missing", "looks like its noise"]),
+        ("none", (), (MOTORS,), (), ["Nothing is missing in the odometry", "has no name", MOTORS.description]),
+        ("named", (effect(),), (SEEN,), (), ["Missing: heading_drift (99.0 %)", "to within their noise"]),
+        ("named", (effect(weight=0.99999),), (SEEN,), (), ["heading_drift (> 99.9 %)"]),
+        ("named", (LAG,), (MOTORS,), (), ["Nothing is missing in the odometry", "motor_lag (99.0 %)"]),
+        ("incomplete", (effect(),), (SEEN,), (SEEN,), ["Missing: heading_drift", f"left: {SEEN.description}"]),
+        ("class", (ONE_OF_TWO,), (SEEN,), (), ["heading_drift or floor_drift", "cannot tell which"]),
+        ("unknown", (), (SEEN,), (SEEN,), ["the catalogue has no name for", SEEN.description]),
+        ("unknown", (effect(weight=0.7),), (SEEN,), (SEEN,), ["no sure name (heading_drift (70.0 %) at best)"]),
+        ("unknown", (LAG,), (MOTORS, SEEN), (SEEN,), [SEEN.description, "Of the motors: motor_lag"]),
+    ],
+)
+def test_the_headline_says_what_is_missing_and_how_sure(
+    verdict: Verdict,
+    effects: tuple[NamedEffect, ...],
+    where: tuple[CovariateDependence, ...],
+    left: tuple[CovariateDependence, ...],
+    words: list[str],
+) -> None:
+    headline = headline_of(verdict, effects, where, left)
+    assert [each for each in words if each not in headline] == []
