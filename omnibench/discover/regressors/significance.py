@@ -2,8 +2,28 @@
 
 Where nothing is missing, the residuals of a run are as likely as their opposites, whatever their distribution and
 however they are correlated within the run. Flipping the signs of whole runs at random therefore gives the distribution
-of the largest chi-square difference by chance (Westfall and Young 1993). Groups that are plainly significant are taken
-out of the residuals before, so that they do not count as noise.
+of the largest chi-square difference by chance (Westfall and Young, Resampling-based multiple testing, 1993). Groups
+that are plainly significant are taken out of the residuals before, so that they do not count as noise.
+
+With Q the chi-square difference of a group of d columns, v the mean of Q / d under the flips (at least 1) and t the
+number of groups of its kind, of which the best is taken, the evidence of the group by itself is
+
+    z = -log10 P(chi2(d) > Q / v) - log10 t,    at least 0,                                                        (1)
+
+and the evidence of flip b is the largest of all groups, m_b = max z. Of B flips, the chance p of an evidence z is
+
+    p = (1 + number of m_b >= z) / (B + 1)                                                                         (2)
+
+(Davison and Hinkley, Bootstrap methods and their application, 1997, Eq. 4.11). Where hardly any flip reaches z, an
+exponential tail is fitted to the k largest m_b (Knijnenburg et al., "Fewer permutations, more accurate P-values",
+Bioinformatics 25, 2009, with shape 0): z of a single group is -log10 of a uniform number, and so exponential itself.
+With m_(k) the least of these k, by maximum likelihood:
+
+    p = k / B exp(-(z - m_(k)) / s),    s = mean of m_b - m_(k) over the k largest.                                 (3)
+
+How much the group that stands out most explains beyond chance, in standard deviations of a chi-square, is
+
+    surplus = max over groups of w - mean over flips of their max of w,    w = (Q - d v) / (v sqrt(2 d)).          (4)
 """
 
 from __future__ import annotations
@@ -18,8 +38,11 @@ from omnibench.discover.regressors.column_group import Group
 from omnibench.fit.least_squares.whitened import Given, Whitened, given
 from omnibench.robot.kinematics import Array
 
-_FLIPS = 499  # random sign flips; chosen
-_TAIL = 0.1  # share of the flips, the largest, to which an exponential tail is fitted
+_FLIPS = 499  # B; Eq. (3) gives chances smaller than 1 / B (at 5 %, 99 would do: Davison and Hinkley, section 4.2.5)
+_TAIL = (
+    0.1  # k / B: Knijnenburg et al. fit no more than a quarter of the flips; varied in tests/benchmarks/constants.py
+)
+_ENOUGH = 0.25  # share of the k that must reach z for Eq. (2): 12 flips, at least 10 in Knijnenburg et al.
 _PLAIN = 3.0  # -log10 of the chance from which on a group is plainly significant
 _MOST_TAKEN = 3  # groups, at most, that are taken out of the residuals that stand for noise
 
@@ -28,10 +51,9 @@ _MOST_TAKEN = 3  # groups, at most, that are taken out of the residuals that sta
 class Significance:
     """Chi-square differences of G groups and how significant they are.
 
-    chi_square (G,): the differences. rank (G,): degrees of freedom. spread (G,): mean difference by chance per degree
-    of freedom. evidence (G,): -log10 of the chance of the difference for that group alone. chance: the largest evidence
-    of all groups in each random flip, sorted. surplus: the largest difference beyond chance in units of its standard
-    deviation, less what chance makes of that maximum. surplus_of: the group that has it.
+    chi_square (G,): the differences Q. rank (G,): degrees of freedom d. spread (G,): mean difference v by chance per
+    degree of freedom. evidence (G,): z of Eq. (1), without the run that adds most. chance (B,): the largest evidence of
+    all groups in each random flip, sorted. surplus: Eq. (4). surplus_of: the group that has it.
     """
 
     groups: tuple[Group, ...]
@@ -53,11 +75,11 @@ class Significance:
         evidence, chance = float(self.evidence[index]), self.chance
         exceeded = int((chance >= evidence).sum())
         tail = max(int(_TAIL * len(chance)), 1)
-        if exceeded >= tail // 4:
-            return (exceeded + 1) / (len(chance) + 1)
+        if exceeded >= int(_ENOUGH * tail):
+            return (exceeded + 1) / (len(chance) + 1)  # Eq. (2)
         edge = float(chance[-tail])
         scale = max(float((chance[-tail:] - edge).mean()), 1e-3)
-        return float(max(tail / len(chance) * np.exp(-(evidence - edge) / scale), 1e-300))
+        return float(max(tail / len(chance) * np.exp(-(evidence - edge) / scale), 1e-300))  # Eq. (3)
 
     @property
     def best(self) -> int:
@@ -90,7 +112,7 @@ def significance_of(
     chance = _evidence(flipped, rank, spread, tries)
     evidence = _evidence(steady[None], rank, spread, tries)[0]
     scatter = np.sqrt(2 * np.maximum(rank, 1.0)) * spread
-    beyond = (chi_square - rank * spread) / scatter
+    beyond = (chi_square - rank * spread) / scatter  # Eq. (4)
     usual = float(np.mean(((flipped - rank * spread) / scatter).max(axis=1)))
     best = int(beyond.argmax())
     return Significance(
@@ -135,7 +157,7 @@ def _noise_scores(data: Whitened, fitted: list[int], groups: Sequence[Group]) ->
 
 
 def _evidence(chi_square: Array, rank: Array, spread: Array, tries: Array) -> Array:
-    """-log10 of the chance of chi-square differences (B, G), the best of so many tries (Bonferroni); at least 0."""
+    """Evidence z of chi-square differences (B, G), Eq. (1), the best of so many tries (Bonferroni)."""
     scaled, freedom = chi_square / spread, np.maximum(rank, 1.0)
     single = -chi2.logsf(scaled, freedom) / np.log(10)
     evidence: Array = np.where(rank > 0, np.maximum(single - np.log10(tries), 0.0), 0.0)

@@ -1,7 +1,10 @@
 """Model selection: the effects of the catalogue that are missing, by forward selection, and how sure their names are.
 
-A name's weight is its probability against all other effects in its place, the other names given, times the probability
-that what is missing is in the catalogue at all (evidence.py).
+Equations are those of evidence.py. Effects are added one by one, and all that were chosen before are exchangeable: the
+n-th if the surest effect beyond those chosen is no chance (Eq. (3) of significance.py), and all n effects of the set
+with the largest posterior, Eq. (4), gain on runs that are held out. Where a smaller set has a larger posterior, the
+n-th effect is still taken if it explains most of what generic bases find beside the others. A name's weight is its
+probability against all other effects in its place, Eq. (5), times the probability that all names are right, Eq. (9).
 """
 
 from __future__ import annotations
@@ -99,7 +102,7 @@ def _search(screening: Screening, candidates: Sequence[Group], rng: np.random.Ge
     forms = [index for group in chosen for index in group.forms]
     beyond = significance_of(data, [*fitted, *forms], bases, rng)
     sets = effect_sets(start, pool, len(chosen))
-    credibility = credibility_of(sets, start, chosen, left, beyond)
+    credibility = credibility_of(sets, start, chosen, left, beyond)  # Eq. (9)
     share, known = credibility.left_share, credibility.probability
     if known < _CREDIBLE:
         left = significance_of(data, screening.groups.matrix.index, bases, rng)
@@ -127,7 +130,7 @@ def _forward_selection(
         pool += [group for group in _best_shapes(step) if group not in pool]
         if step.p_value(step.best) > CHANCE:
             break
-        best = effect_sets(start, pool, len(chosen) + 1).best
+        best = effect_sets(start, pool, len(chosen) + 1).best  # Eq. (4)
         if len(best) <= len(chosen):
             best = (*chosen, step.groups[step.best])
             if not _explains_what_is_left(screening, chosen, best, rng):
@@ -176,7 +179,7 @@ def _weighed(start: Given, search: _Search, where: Significance) -> Selection:
     weights: dict[str, float] = {}
     for probabilities in of_positions:
         for group, probability in probabilities:
-            weights[group.name] = max(weights.get(group.name, 0.0), search.known * probability)
+            weights[group.name] = max(weights.get(group.name, 0.0), search.known * probability)  # Eq. (9) times (5)
     stand_ins = tuple(
         tuple(other for other, probability in probabilities if other.name != group.name and probability > _CONFUSABLE)
         for group, probabilities in zip(chosen, of_positions, strict=True)
@@ -210,8 +213,8 @@ def _probabilities(
     groups = list(best.values())
     chi_square = np.array([now.chi_square(group.index) for group in groups])
     rank = np.array([now.rank(group.index) for group in groups])
-    evidence = log_evidence(chi_square, rank, float(max((chi_square - rank).max(), 0.0)))
+    evidence = log_evidence(chi_square, rank, float(max((chi_square - rank).max(), 0.0)))  # Eq. (2) and (3)
     evidence -= [np.log(group.tries) for group in groups]
-    likely = np.exp(evidence - evidence.max())
+    likely = np.exp(evidence - evidence.max())  # Eq. (5)
     ordered = sorted(zip(groups, likely / likely.sum(), strict=True), key=lambda pair: -pair[1])
     return [(group, float(probability)) for group, probability in ordered]
