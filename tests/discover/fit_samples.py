@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from discovery_samples import APR02
@@ -10,8 +11,8 @@ from discovery_samples import APR02
 from omnibench.data.dataset import Split, Trajectory
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.fitting.nuisances import Nuisances
 from omnibench.fit.least_squares.noise import NoiseEstimate
+from omnibench.fit.least_squares.nuisances import Nuisances
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
@@ -26,19 +27,10 @@ SECONDS = 4
 def run_of(rates: np.ndarray, command: str | None = None, name: str = "run", split: Split = "train") -> Trajectory:
     """A run of 4 s at constant wheel rates, with reference poses at 0, 2 and 4 s where the design values lead."""
     times = np.arange(1, 10 * SECONDS + 1) / 10
-    run = Trajectory(
-        id=name,
-        split=split,
-        times=times,
-        rates=np.tile(rates, (len(times), 1)),
-        pose_times=np.array([0.0, SECONDS / 2, SECONDS]),
-        poses=np.zeros((3, 3)),
-        command=command,
-        session="s1",
-    )
-    (poses,) = OdometryModel(ROBOT, MATRIX, "arc").reported([run.reference_log])
-    run.poses[1:] = poses
-    return run
+    stamps = np.array([0.0, SECONDS / 2, SECONDS])
+    wheels = np.tile(rates, (len(times), 1))
+    run = Trajectory(name, split, times, wheels, stamps, np.zeros((3, 3)), command=command, session="s1")
+    return _with_residuals(run, np.zeros((2, 3)), MATRIX)
 
 
 def extended_of(
@@ -49,16 +41,15 @@ def extended_of(
     matrix: np.ndarray = MATRIX,
 ) -> Extended:
     """A fit without effects that leaves residuals (2, 3) of each run. columns (2, 3, p): none by default."""
-    count = len(runs)
-    fit = Fit(
-        model=OdometryModel(ROBOT, matrix, "arc", (), 0.1),
-        runs=tuple(runs),
-        nuisances=Nuisances(np.zeros((count, 3)), np.zeros(3)),
-        noise=UNIT_NOISE,
-        residuals=tuple(residuals),
-        slopes=tuple(np.zeros((2, 3, 3)) for _ in runs),
-        jumps=0,
-    )
+    recorded = tuple(_with_residuals(run, left, matrix) for run, left in zip(runs, residuals, strict=True))
+    nuisances = Nuisances(np.zeros((len(runs), 3)), np.zeros(3))
+    fit = Fit(OdometryModel(ROBOT, matrix, "arc", (), 0.1), recorded, nuisances, UNIT_NOISE)
     slopes = tuple(columns) if columns is not None else tuple(np.zeros((2, 3, 0)) for _ in runs)
     covariances = np.zeros((9, 9)) if covariance is None else covariance
     return Extended(fit, (), fit.whitened(slopes), slopes, np.zeros(0), covariances)
+
+
+def _with_residuals(run: Trajectory, residuals: np.ndarray, matrix: np.ndarray) -> Trajectory:
+    """The run with reference poses that lie these residuals (2, 3) beside where the matrix leads."""
+    (poses,) = OdometryModel(ROBOT, matrix, "arc").reported([run.reference_log])
+    return replace(run, poses=np.vstack([run.start, poses + residuals]))
