@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fit_samples import FORWARD, TURN, extended_of, run_of
+from extended_samples import FORWARD, TURN, extended_of, run_of
 
 from omnibench.discover.held_out.gaps import compare_held_out, errors_of_repetitions, floor_of, gap_between
 from omnibench.discover.held_out.validation_runs import ValidationRuns

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fit_samples import FORWARD, MATRIX, SECONDS, SIDEWAYS, TURN, extended_of, run_of
+from extended_samples import FORWARD, MATRIX, SECONDS, SIDEWAYS, TURN, extended_of, run_of
 
 from omnibench.discover.selection.extrapolation import extrapolations_of, training_domain
 
