@@ -15,6 +15,8 @@ from omnibench.fit.span import Unidentified
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.dataset_source import DatasetSource
 
+_LEAST_MEMORY = 256.0  # 10^6 bytes; a worker process has 200 MB before its run begins (measured, RLIMIT_DATA)
+
 
 class CostChoice(Model):
     """The cost that every calibrator minimises."""
@@ -88,6 +90,9 @@ class CompareConfig(Model):
     calibrators: tuple[CalibratorEntry, ...] = Field(min_length=1)
     plugins: tuple[Path, ...] = Field((), description="folders of plug-ins; relative to the config file")
     workers: int | None = Field(None, gt=0, description="processes; default: the processors")
+    memory_mb: float | None = Field(
+        None, ge=_LEAST_MEMORY, description="memory of each run's process, 10^6 bytes; default: no limit"
+    )
     bootstrap: Bootstrap = Bootstrap()
     certificate: CertificateChoice | None = Field(CertificateChoice(), description="null: prove nothing")
     published_results: tuple[PublishedResult, ...] = ()

@@ -17,14 +17,17 @@ from omnibench.compare.report.comparison_report import write_report
 from omnibench.compare.result import ComparisonResult, ScoredRun
 from omnibench.compare.scoring import score
 from omnibench.compare.statistics import design_costs, entry_statistics, is_mean
-from omnibench.compare.store import RunStore
 from omnibench.compare.uncertainties import typical_uncertainties
 from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
 from omnibench.errors import ConfigError, Interrupted, UnknownNameError
+from omnibench.fit.calibrator import RunResult
+from omnibench.jobs.result_store import ResultStore
 from omnibench.processes import one_thread_processes
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import PluginFailure
+from omnibench.simulate.chain.robot_config import RobotConfig
+from omnibench.slam.slam_options import PRELOAD as SLAM_PRELOAD
 
 
 def run_comparison(
@@ -39,11 +42,11 @@ def run_comparison(
     failures = load_calibrators(config)
     with _naming_failed_plugins(failures):
         config = effective_config(config)
-        with one_thread_processes(PRELOAD):  # processes started for simulation serve the calibrators, too
+        with one_thread_processes(_preload(config)):  # processes started for simulation serve the calibrators, too
             datasets = load_datasets(config, progress)
     plan = make_plan(config, datasets)
     folder = prepare_output(config, output)
-    store = RunStore(folder / "runs")
+    store = ResultStore(folder / "runs", RunResult)
     with _resumable(plan, store, folder):
         results = execute(plan, store, progress, config.workers or os.cpu_count() or 1)
         scored = score(plan, results, datasets)
@@ -67,6 +70,12 @@ def run_comparison(
     return result
 
 
+def _preload(config: CompareConfig) -> tuple[str, ...]:
+    """Modules for the processes of calibrators, and for those of SLAM where a robot's scans are simulated."""
+    scans = any(isinstance(source.simulate, RobotConfig) for source in config.datasets.values())
+    return (*PRELOAD, *(SLAM_PRELOAD if scans else ()))
+
+
 @contextmanager
 def _naming_failed_plugins(failures: Sequence[PluginFailure]) -> Iterator[None]:
     """Add the plug-ins that failed to import to an error of an unknown name, which may be one of theirs."""
@@ -77,7 +86,7 @@ def _naming_failed_plugins(failures: Sequence[PluginFailure]) -> Iterator[None]:
 
 
 @contextmanager
-def _resumable(plan: Sequence[PlannedRun], store: RunStore, folder: Path) -> Iterator[None]:
+def _resumable(plan: Sequence[PlannedRun], store: ResultStore[RunResult], folder: Path) -> Iterator[None]:
     """Turn Ctrl-C into an error that says which runs are kept and how to continue."""
     try:
         yield

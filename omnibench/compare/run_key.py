@@ -8,13 +8,13 @@ out, so that a new calibrator does not discard the stored runs of the others; no
 from __future__ import annotations
 
 import hashlib
-import json
 import sys
 from functools import cache
 from pathlib import Path
 
 from omnibench.compare.config import CalibratorEntry, CompareConfig
 from omnibench.data.dataset import Dataset
+from omnibench.jobs.result_store import code_digest, content_key
 from omnibench.registry import calibrators, costs
 
 _PACKAGE = Path(__file__).parents[1]
@@ -24,29 +24,26 @@ _CALIBRATORS = "fit/calibrators/*.py"
 
 
 def run_key(config: CompareConfig, dataset: Dataset, entry: CalibratorEntry, seed: int) -> str:
-    """The key (20 hexadecimal digits) of one entry's run on one data set with one seed."""
-    facts = {
-        "data": dataset.hash,
-        "cost": config.cost.model_dump(mode="json"),
-        "integration": config.integration,
-        "unidentified": config.unidentified,
-        "calibrator": entry.model_dump(mode="json", exclude={"label"}),
-        "box": config.box if isinstance(config.box, str) else config.box.model_dump(mode="json"),
-        "budget": config.budget.model_dump(mode="json"),
-        "seed": seed,
-        "code": named_code(entry, config.cost.name) + _shared_code(),
-    }
-    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:20]
+    """The key of one entry's run on one data set with one seed."""
+    return content_key(
+        {
+            "data": dataset.hash,
+            "cost": config.cost,
+            "integration": config.integration,
+            "unidentified": config.unidentified,
+            "calibrator": entry.model_dump(mode="json", exclude={"label"}),
+            "box": config.box,
+            "budget": config.budget,
+            "seed": seed,
+            "code": named_code(entry, config.cost.name) + _shared_code(),
+        }
+    )
 
 
 def shared_code(package: Path) -> str:
     """Hash of the code that every run uses: paths and contents of the files in ``package``, an omnibench folder."""
     files = {file for pattern in _SHARED for file in package.glob(pattern)} - {*package.glob(_CALIBRATORS)}
-    digest = hashlib.sha256()
-    for file in sorted(files):
-        digest.update(file.relative_to(package).as_posix().encode())
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
-    return digest.hexdigest()
+    return code_digest(package, files)
 
 
 @cache

@@ -23,9 +23,9 @@ class RunProgress:
         """Report that a run begins."""
         self._report(_event(run))
 
-    def moved(self, run: PlannedRun, evaluations: int, best: float) -> None:
-        """Report a run's evaluations so far and its best cost."""
-        self._report(_event(run, evaluations, best))
+    def moved(self, run: PlannedRun, event: Progress) -> None:
+        """Report a run's evaluations so far and its best cost, as it tells them itself."""
+        self._report(_event(run, event.done, event.best))
 
     def ended(self, run: PlannedRun, result: RunResult, reused: bool) -> None:
         """Report the result of a run. reused: it was stored by an earlier comparison."""

@@ -13,9 +13,10 @@ from pydantic import BaseModel
 from omnibench.errors import OmnibenchError, PluginError, one_line
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
+from omnibench.jobs.memory import memory_limit
 from omnibench.registry import AnyOptions, Options, PluginFailure, calibrators
 from omnibench.robot.calibration import Noise
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, JsonArray
 
 
 class Outcome(StrEnum):
@@ -86,15 +87,15 @@ class RunResult:
 
     outcome: Outcome
     reason: str
-    vector: Array | None
-    matrix: Array | None
+    vector: JsonArray | None
+    matrix: JsonArray | None
     cost: float | None
     evaluations: int
     seconds: float
     history: tuple[Improvement, ...]
     at_bounds: tuple[str, ...] = ()
     held: tuple[str, ...] = ()
-    covariance: Array | None = None
+    covariance: JsonArray | None = None
     noise: Noise | None = None
     degrees_of_freedom: int | None = None
 
@@ -147,6 +148,8 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
 
 def describe_error(error: BaseException) -> str:
     """Type and message of an exception, in one line."""
+    if isinstance(error, MemoryError) and (limit := memory_limit()) is not None:
+        return f"out of memory (limit {limit:g} MB)"
     try:
         return one_line(f"{type(error).__name__}: {error}").removesuffix(":")
     except Exception:  # its own __str__ raises

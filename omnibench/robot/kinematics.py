@@ -8,15 +8,26 @@ about the robot's centre, r the radius. A positive rate drives the robot counter
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, FiniteFloat, field_validator, model_validator
+from pydantic import Field, FiniteFloat, PlainSerializer, PlainValidator, field_validator, model_validator
 
 from omnibench.config import Model
 
 Array = NDArray[np.floating[Any]]
+
+
+def _as_lists(array: Array) -> list[Any]:
+    """Nested lists; of texts where JSON has no number for an element."""
+    return (array if np.isfinite(array).all() else array.astype(str)).tolist()
+
+
+# An array as a field that pydantic writes as nested lists and reads back to the last bit.
+JsonArray = Annotated[
+    Array, PlainValidator(lambda values: np.array(values, dtype=float)), PlainSerializer(_as_lists, list[Any])
+]
 
 
 class Wheel(Model):

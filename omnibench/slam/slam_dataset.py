@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.scans import Scanner, TrajectoryScans
-from omnibench.errors import DataError
-from omnibench.processes import in_processes
+from omnibench.errors import DataError, OmnibenchError
+from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
+from omnibench.jobs.local_backends import local_backend
+from omnibench.jobs.result_store import ResultStore, code_digest, content_key
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
@@ -19,7 +25,7 @@ from omnibench.robot.planar import relative
 from omnibench.slam.motion_prior import length, odometry_deviations
 from omnibench.slam.path_warnings import PathWarning, merged_warning
 from omnibench.slam.pose_errors import FLOOR
-from omnibench.slam.slam_options import SlamOptions
+from omnibench.slam.slam_options import PRELOAD, SlamOptions
 from omnibench.slam.slam_run import SlamPath, run_slam
 
 _AT_START = 1e-6  # s; a scan that is nearer to t = 0 counts as taken at t = 0
@@ -48,13 +54,15 @@ def slam_paths(
     *,
     model: OdometryModel | None = None,
     workers: int = 2,
+    folder: Path | None = None,
     watch: Reporter = no_progress,
 ) -> list[SlamPath]:
     """The path of every run by SLAM, from its start pose on.
 
     model: the odometry that the search starts from; default: the robot's design matrix, in arcs. workers: processes;
-    the result does not depend on their number. watch: told of every run that ends. DataError in one line: the data set
-    or one of its runs has no scans, or they are bad.
+    the result does not depend on their number. folder: of the paths that are found already and not searched again;
+    default: a temporary one. watch: told of every run that ends. DataError in one line: the data set or one of its
+    runs has no scans, or they are bad.
     """
     scans = dataset.scans
     if scans is None:
@@ -65,16 +73,43 @@ def slam_paths(
             raise DataError(f"data set {dataset.name}: trajectory {trajectory.id} has no scans; leave it out for SLAM")
     model = model or OdometryModel.of_design(dataset.robot, "arc")
     jobs = (
-        _Job(trajectory, scans.of(trajectory.id), scans.scanner, options, model, dataset.name)
+        _Run(trajectory, scans.of(trajectory.id), scans.scanner, options, model, dataset.name).job()
         for trajectory in dataset.trajectories
     )
-    total = len(dataset.trajectories)
-    paths: list[SlamPath] = []
-    watch(Progress("SLAM", 0, total, "run"))
-    for path in in_processes(_locate, jobs, min(workers, total), preload=__name__):
-        paths.append(path)
-        watch(Progress("SLAM", len(paths), total, "run"))
-    return paths
+    paths = _Paths(dataset, watch)
+    with _store(folder) as store:
+        run_jobs(jobs, store, local_backend(min(workers, len(dataset.trajectories)), PRELOAD), paths)
+    return [paths.found[number] for number in range(len(dataset.trajectories))]
+
+
+@contextmanager
+def _store(folder: Path | None) -> Iterator[ResultStore[SlamPath]]:
+    if folder is not None:
+        yield ResultStore(folder, SlamPath)
+        return
+    with TemporaryDirectory(prefix="omnibench-slam-") as temporary:
+        yield ResultStore(Path(temporary), SlamPath)
+
+
+class _Paths(JobWatch[SlamPath]):
+    """The paths found so far, by the numbers of their runs."""
+
+    def __init__(self, dataset: Dataset, report: Reporter) -> None:
+        self.found: dict[int, SlamPath] = {}
+        self._dataset, self._report = dataset, report
+        self._tell()
+
+    def ended(self, number: int, ending: SlamPath | Failure, reused: bool) -> None:  # noqa: ARG002
+        if isinstance(ending, Failure):
+            run = self._dataset.trajectories[number].id
+            raise ending.error or OmnibenchError(
+                f"data set {self._dataset.name}: trajectory {run}: SLAM: {ending.reason}; is there too little memory?"
+            )
+        self.found[number] = ending
+        self._tell()
+
+    def _tell(self) -> None:
+        self._report(Progress("SLAM", len(self.found), len(self._dataset.trajectories), "run"))
 
 
 def with_paths(dataset: Dataset, paths: Sequence[SlamPath]) -> Dataset:
@@ -94,7 +129,9 @@ def with_paths(dataset: Dataset, paths: Sequence[SlamPath]) -> Dataset:
 
 
 @dataclass(frozen=True, eq=False)
-class _Job:
+class _Run:
+    """A run of the data set called ``dataset``, and how its path is searched."""
+
     trajectory: Trajectory
     scans: TrajectoryScans
     scanner: Scanner
@@ -102,28 +139,49 @@ class _Job:
     model: OdometryModel
     dataset: str
 
+    def job(self) -> Job[SlamPath]:
+        """The search for its path; the key covers all that the path depends on."""
+        model = self.model
+        facts = {
+            "run": self.trajectory,
+            "scans": self.scans,
+            "scanner": self.scanner,
+            "options": self.options,
+            "model": [model.robot, model.matrix, model.integration, model.sample_period],
+            "terms": [[term.name, dict(term.values)] for term in model.terms],
+            "code": _code(),
+        }
+        return Job(content_key(facts), _locate, self)
 
-def _locate(job: _Job) -> SlamPath:
+
+@cache
+def _code() -> str:
+    """Hash of the code that a path depends on."""
+    package = Path(__file__).parents[1]
+    return code_digest(package, (file for room in ("robot", "data", "slam") for file in (package / room).rglob("*.py")))
+
+
+def _locate(run: _Run, _: Reporter) -> SlamPath:
     """The path of one run from t = 0 on."""
-    trajectory = job.trajectory
-    kept = job.scans.times >= -_AT_START
-    scans = TrajectoryScans(np.maximum(job.scans.times[kept], 0.0), job.scans.ranges[kept])
+    trajectory = run.trajectory
+    kept = run.scans.times >= -_AT_START
+    scans = TrajectoryScans(np.maximum(run.scans.times[kept], 0.0), run.scans.ranges[kept])
 
     def odometry(times: Array) -> Array:
         stamps, place = np.unique(times, return_inverse=True)
-        return job.model.poses([trajectory.log(stamps)])[0][place]
+        return run.model.poses([trajectory.log(stamps)])[0][place]
 
     try:
         if not len(scans.times):
             raise DataError("SLAM: no scan at or after t = 0")
         if scans.times[0] <= _AT_START:
-            return run_slam(scans, job.scanner, job.options, trajectory.start, odometry)
+            return run_slam(scans, run.scanner, run.options, trajectory.start, odometry)
         before = _before_first_scan(odometry, float(scans.times[0]))
-        deviations = odometry_deviations(before.driven, job.options.odometry_error)
-        path = run_slam(scans, job.scanner, job.options, before.end, odometry, deviations)
+        deviations = odometry_deviations(before.driven, run.options.odometry_error)
+        path = run_slam(scans, run.scanner, run.options, before.end, odometry, deviations)
         return _from_start(path, trajectory.start, before)
     except DataError as error:
-        raise DataError(f"data set {job.dataset}: trajectory {trajectory.id}: {error}") from None
+        raise DataError(f"data set {run.dataset}: trajectory {trajectory.id}: {error}") from None
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,9 @@ from pydantic import Field, FiniteFloat, model_validator
 from omnibench.config import Model, Positive
 from omnibench.robot.kinematics import Array
 
+# Modules that the processes of SLAM share; the second loads compiled code.
+PRELOAD = ("omnibench.slam.slam_dataset", "omnibench.slam.matching.line_growth")
+
 
 class SlamOptions(Model):
     """Options of SLAM. The defaults suit a robot indoors, up to 0.5 m/s and 1 rad/s with four scans a second."""

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from omnibench.data.dataset import Dataset
 from omnibench.data.storage import check_dataset_folder, load_dataset, save_dataset
 from omnibench.data.true_poses import TruePath, read_true_poses, robot_of_truth
-from omnibench.errors import ConfigError, DataError
+from omnibench.errors import ConfigError, DataError, Interrupted
 from omnibench.files import TableFormat
+from omnibench.jobs.result_store import ResultStore
 from omnibench.progress import Reporter, no_progress
 from omnibench.robot.calibration import read_calibration
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.accuracy import SlamAccuracy, slam_accuracy
 from omnibench.slam.slam_dataset import slam_paths, with_paths
 from omnibench.slam.slam_options import SlamOptions
+from omnibench.slam.slam_run import SlamPath
 from omnibench.slam.summary import SlamSummary, summarise
 
 _WORKERS = 2  # processes
@@ -57,16 +60,24 @@ class SlamRequest:
             raise ConfigError(f"--model {self.model}: is for --start odometry; leave one of the two out")
 
     def run(self, watch: Reporter = no_progress, table_format: TableFormat = "parquet") -> SlamResult:
-        """Find the poses and write the data set. DataError in one line, before the work where that can be."""
+        """Find the poses and write the data set. DataError in one line, before the work where that can be.
+
+        Until the data set is written, the paths found so far are kept in a folder beside it, with which the command
+        goes on when it is run again. Interrupted: Ctrl-C; the message names that folder.
+        """
         recorded = load_dataset(self.dataset)
         truth = self._truth_of(recorded)
         model = self._model_of(recorded)
         if self.output is not None:
             check_dataset_folder(self.output)
-        paths = slam_paths(recorded, self.options, model=model, workers=_workers(model), watch=watch)
-        found = with_paths(recorded, paths)
-        if self.output is not None:
-            save_dataset(found, self.output, table_format)
+        local = _has_local_terms(model)
+        folder = None if local or self.output is None else self.output.with_name(f"{self.output.name}.slam-paths")
+        with _kept(folder, len(recorded.trajectories)):
+            workers = 1 if local else _WORKERS
+            paths = slam_paths(recorded, self.options, model=model, workers=workers, folder=folder, watch=watch)
+            found = with_paths(recorded, paths)
+            if self.output is not None:
+                save_dataset(found, self.output, table_format)
         accuracy = None if truth is None else slam_accuracy(found, truth)
         return SlamResult(found, summarise(recorded, found, paths, accuracy), truth)
 
@@ -91,7 +102,24 @@ class SlamRequest:
         return calibration.model
 
 
-def _workers(model: OdometryModel | None) -> int:
-    """Number of worker processes: one where terms come from plug-ins, whose classes other processes do not know."""
+def _has_local_terms(model: OdometryModel | None) -> bool:
+    """True if terms come from plug-ins, whose classes other processes do not know and no path's key covers."""
     terms = () if model is None else model.terms
-    return _WORKERS if all(type(term.effect).__module__.startswith("omnibench.") for term in terms) else 1
+    return not all(type(term.effect).__module__.startswith("omnibench.") for term in terms)
+
+
+@contextmanager
+def _kept(folder: Path | None, total: int) -> Iterator[None]:
+    """Remove the folder of paths when the block ends well. Interrupted says after Ctrl-C how to go on with them."""
+    if folder is None:
+        yield
+        return
+    try:
+        yield
+    except KeyboardInterrupt:
+        kept = len(list(folder.glob("*.json")))
+        if not kept:
+            raise
+        message = f"interrupted; the paths of {kept} of {total} runs are kept in {folder}: run the command again"
+        raise Interrupted(message) from None
+    ResultStore(folder, SlamPath).remove()

@@ -9,7 +9,7 @@ import numpy as np
 
 from omnibench.data.scans import Ranges, Scanner, TrajectoryScans
 from omnibench.errors import DataError
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, JsonArray
 from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints, noise_factor, scan_points
 from omnibench.slam.matching.scan_matching import Match, refine, search
@@ -34,10 +34,10 @@ class SlamPath:
     matched (S,): share of each scan's points that lie on the map. warnings: what went wrong.
     """
 
-    times: Array
-    poses: Array
-    covariances: Array
-    matched: Array
+    times: JsonArray
+    poses: JsonArray
+    covariances: JsonArray
+    matched: JsonArray
     warnings: tuple[PathWarning, ...] = ()
 
 

@@ -260,11 +260,13 @@ def _places(folder: Path, driven: Driven) -> dict[str, Path]:
     return places | {"DATA": driven.data, "FOUR": folder / "four.yaml"}
 
 
-def test_ctrl_c_leaves_nothing(driven: Driven, tmp_path: Path) -> None:
+def test_after_ctrl_c_the_command_goes_on(
+    command: Command, driven: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = load_dataset(driven.data)
     assert data.scans is not None
     (first,) = data.trajectories[:1]
-    names = [f"{number:04d}" for number in range(150)]
+    names = [f"{number:04d}" for number in range(30)]
     many = replace(
         data,
         trajectories=tuple(replace(first, id=name) for name in names),
@@ -280,12 +282,41 @@ def test_ctrl_c_leaves_nothing(driven: Driven, tmp_path: Path) -> None:
         text=True,
     )
     assert process.stderr is not None
-    assert process.stderr.readline() == "SLAM: 150 runs\n"  # it is at work
-    time.sleep(0.3)
+    while not (kept := len(list((tmp_path / "found.slam-paths").glob("*.json")))):
+        assert process.poll() is None
+        time.sleep(0.01)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
-    assert (process.returncode, out, err) == (130, "", "interrupted\n")
-    assert [file.name for file in tmp_path.iterdir()] == ["many"]
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (130, "")
+    files = {file: file.stat().st_mtime_ns for file in (tmp_path / "found.slam-paths").iterdir()}
+    assert kept <= len(files) < 30
+    paths = f"interrupted; the paths of {len(files)} of 30 runs are kept in found.slam-paths: run the command again"
+    assert err.removeprefix("SLAM: 30 runs\n") == f"{paths}\n"
+    assert {file.name for file in tmp_path.iterdir()} == {"many", "found.slam-paths"}
+    monkeypatch.chdir(tmp_path)
+    run = command("slam", "many", "-o", "found")
+    assert run.returncode == 0, run.stderr
+    assert {file.name for file in tmp_path.iterdir()} == {"many", "found"}
+    poses = {trajectory.poses.tobytes() for trajectory in load_dataset("found").trajectories}
+    assert len(poses) == 1  # of one run, whoever found its path
+
+
+def test_ctrl_c_before_the_first_path_leaves_nothing(driven: Driven, tmp_path: Path) -> None:
+    program = "import os, signal, sys, threading; sys.argv[0] = 'omnibench'; "
+    program += "from omnibench.__main__ import main; import omnibench.cli.app, omnibench.slam.slam_request; "
+    program += "threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start(); main()"
+    run = subprocess.run(
+        [COMMAND[0], "-c", program, "slam", str(driven.data), "-o", "found"],
+        cwd=tmp_path,
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert run.returncode == 130
+    assert [line for line in run.stderr.splitlines() if line][-1] == "interrupted"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_inspect_says_what_scans_there_are(command: Command, driven: Driven) -> None:

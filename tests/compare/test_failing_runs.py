@@ -35,8 +35,10 @@ BODIES = {
     "is_killed": "os.kill(os.getpid(), 9)",
     "closes_everything": "os.closerange(3, 256); time.sleep(60)",
     "leaves_a_thread": "threading.Timer(60, print).start(); return Solution(problem.start, 'here')",
-    "hangs": "problem.cost(problem.start[None]); time.sleep(3600)",
+    "wants_memory": "np.ones(10**9)",
+    "wants_memory_bit_by_bit": "held = [bytes(10**5) for _ in range(10**9)]",
 }
+HANGS = "problem.cost(problem.start[None]); time.sleep(3600)"
 UNMAKEABLE = """
 @calibrators.register("unmakeable")
 class Unmakeable(Calibrator):
@@ -85,9 +87,10 @@ def comparison(tmp_path_factory: pytest.TempPathFactory) -> Compared:
     config = write_config(
         folder,
         plugins=["plugins"],
-        calibrators=["hangs", *WITH_ANSWER, *sorted(WITHOUT_ANSWER - {"hangs"})],  # the longest first
-        budget={"evaluations": 500, "seconds": 0.5},
+        calibrators=[*WITH_ANSWER, *sorted(WITHOUT_ANSWER)],
+        budget={"evaluations": 500, "seconds": 60},
         workers=4,
+        memory_mb=1000,
     )
     run = compared(config, folder / "out")
     return Compared(folder / "out", run, rows(folder / "out"))
@@ -115,12 +118,13 @@ def test_the_others_run(comparison: Compared) -> None:
         ("leaves_the_box", "invalid", "the answer is outside the box (m11, m12, "),
         ("says_nothing", "failed", "calibrate returned NoneType, expected a Solution"),
         ("gives_odd_reasons", "converged", "{'two': 'lines"),
-        ("spoils_the_history", "failed", "AttributeError"),
+        ("spoils_the_history", "failed", "Expected `Improvement`"),
         ("dies", "failed", "the process died without an answer (exit code 3)"),
         ("is_killed", "failed", "the process died without an answer (killed by SIGKILL)"),
         ("closes_everything", "failed", "the process died without an answer"),
         ("leaves_a_thread", "converged", "here"),
-        ("hangs", "time", "ended by force: 0.5 s spent without an answer"),
+        ("wants_memory", "failed", "out of memory (limit 1000 MB)"),
+        ("wants_memory_bit_by_bit", "failed", "out of memory (limit 1000 MB)"),
         ("unmakeable", "failed", "calibrator 'unmakeable' cannot be made: RuntimeError: not today"),
         ("broken", "failed", "cannot be imported: ModuleNotFoundError: No module named 'a_package_that_nobody_has'"),
         ("of_another_name", "failed", "broken.py cannot be imported: ModuleNotFoundError"),
@@ -132,6 +136,19 @@ def test_the_row_has_outcome_and_reason(comparison: Compared, label: str, outcom
     assert row["outcome"] == outcome
     assert reason in row["reason"]
     assert "\n" not in row["reason"]
+
+
+def test_a_run_over_its_time_is_ended_by_force_and_not_repeated(tmp_path: Path) -> None:
+    plugins = write_plugin(tmp_path / "plugins", "hangs", CALIBRATOR.format(name="hangs", body=HANGS))
+    budget = {"evaluations": 500, "seconds": 0.5}
+    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=["hangs"], budget=budget)
+    run = omnibench("compare", config, "--output", tmp_path / "out")
+    row = rows(tmp_path / "out")["hangs"]
+    assert (row["outcome"], row["reason"]) == ("time", "ended by force: 0.5 s spent without an answer")
+    assert (row["train_cost"], row["matrix"]) == (None, None)
+    assert "flower hangs seed 1: time, no answer" in run.stderr
+    again = omnibench("compare", config, "--output", tmp_path / "out")
+    assert "kept from an earlier run" in again.stderr
 
 
 @pytest.mark.parametrize("label", sorted(WITHOUT_ANSWER))

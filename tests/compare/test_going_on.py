@@ -22,8 +22,7 @@ from omnibench.simulate.simulate import simulate_dataset
 
 pytestmark = pytest.mark.usefixtures("registries_as_before")
 
-LONG = {"candidates": 40_000, "batch": 1}
-SEARCHES = ["theoretical", search("first", **LONG), search("second", **LONG), search("third", 400)]
+SEARCHES = ["theoretical", search("first", 40_000, batch=1), search("second", 39_000, batch=1), search("third", 400)]
 
 
 class Stopped(NamedTuple):
@@ -152,15 +151,21 @@ class Asleep(Calibrator):
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGKILL"])
-def test_the_runs_end_with_a_comparison_that_is_killed(name: str, tmp_path: Path) -> None:
+def test_the_runs_end_with_a_comparison_that_is_killed_which_then_goes_on(name: str, tmp_path: Path) -> None:
     plugins = write_plugin(tmp_path / "plugins", "asleep", ASLEEP)
     entries = ["theoretical", "asleep", *SEARCHES[1:3]]
-    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=entries, workers=3)
+    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=entries, workers=4)  # none starts later
     process = started(config, tmp_path / "out")
     process.send_signal(signal.Signals[name])
     _, stderr = process.communicate(timeout=30)
     assert "Traceback" not in stderr
     assert wait_until_gone(process.pid) == []
+    before = files_of(tmp_path / "out" / "runs")
+    write_config(tmp_path, calibrators=["theoretical", search("other")])
+    run = compared(config, tmp_path / "out")
+    assert run.stderr.count("kept from an earlier run") == len(before) == 1
+    assert before.items() <= files_of(tmp_path / "out" / "runs").items()
+    assert [run["outcome"] for run in summary(tmp_path / "out")["runs"]] == ["converged", "budget"]
 
 
 class Watch:

@@ -21,7 +21,8 @@ pytestmark = pytest.mark.usefixtures("registries_as_before")
 PACKAGE = Path(omnibench.__file__).parent
 # Imported by the code of runs, without a say in their results. What has one belongs to the key's files instead.
 NEUTRAL = {
-    "config", "errors", "registry", "files", "environment", "processes", "words", "data.scans", "data.domain_check",
+    "config", "errors", "registry", "files", "environment", "processes", "jobs.memory", "words",
+    "data.scans", "data.domain_check",
 }  # fmt: skip
 
 

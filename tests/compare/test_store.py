@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omnibench.compare.store import RunStore
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import Outcome, RunResult
 from omnibench.fit.problem import Improvement
+from omnibench.jobs.result_store import ResultStore
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 WORDS = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), max_size=20)
@@ -40,8 +40,8 @@ def test_a_result_comes_back_to_the_last_bit(
     steps = tuple(Improvement(*step) for step in history)
     put = RunResult(outcome, reason, vector, matrix, cost, 17, 0.1, steps, tuple(at_bounds), ("m12",))
     with tempfile.TemporaryDirectory() as folder:
-        RunStore(Path(folder)).put("key", put)
-        got = RunStore(Path(folder)).get("key")
+        ResultStore(Path(folder), RunResult).put("key", put)
+        got = ResultStore(Path(folder), RunResult).get("key")
     assert got is not None
     for name in ("outcome", "reason", "cost", "evaluations", "seconds", "history", "at_bounds", "held"):
         assert getattr(got, name) == getattr(put, name)
@@ -51,10 +51,10 @@ def test_a_result_comes_back_to_the_last_bit(
 
 
 def test_a_run_that_is_not_there_is_none(tmp_path: Path) -> None:
-    assert RunStore(tmp_path / "runs").get("key") is None
+    assert ResultStore(tmp_path / "runs", RunResult).get("key") is None
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "runs").write_text("a file")
     with pytest.raises(DataError, match=r"runs/key\.json: cannot be written: .*runs is not a folder"):
-        RunStore(tmp_path / "runs").put("key", RunResult(Outcome.TIME, "", None, None, None, 0, 0.0, ()))
+        ResultStore(tmp_path / "runs", RunResult).put("key", RunResult(Outcome.TIME, "", None, None, None, 0, 0.0, ()))

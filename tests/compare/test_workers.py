@@ -160,7 +160,7 @@ def test_no_more_runs_are_under_way_than_there_are_workers(workers: int, tmp_pat
                 self.most = max(self.most, len(self.now))
 
     count = Count()
-    entries = [search(str(number)) for number in range(4)]
+    entries = [search(str(number), 300 + number) for number in range(4)]
     config = CompareConfig.model_validate(small(calibrators=entries, workers=workers))
     run_comparison(config, tmp_path / "out", count)
     assert (count.most, count.now) == (workers, set())

@@ -28,7 +28,7 @@ BELOW = {
     "testing": {"robot", "data", "fit"},
     "cli": {"robot", "data", "slam", "simulate", "fit", "report", "design", "compare", "discover", "live", "testing"},
 }
-GROUND = {"config", "registry", "errors", "files", "processes", "environment", "words", "progress"}
+GROUND = {"config", "registry", "errors", "files", "processes", "jobs", "environment", "words", "progress"}
 CONVENTIONAL = {"__init__", "config", "output", "result", "tables", "wording"}  # one in a room, the same in each
 
 

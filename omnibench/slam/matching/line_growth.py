@@ -141,3 +141,7 @@ def _straight(fit: _Fit) -> bool:
 def _seen(fit: _Fit, cosine: float, sine: float) -> float:
     inverse = fit[0] * cosine + fit[1] * sine
     return 1.0 / inverse if inverse > 1e-9 else -1.0
+
+
+# Load the compiled code, or compile it, on import: processes that are forked from this one then have it.
+grow_lines(*np.empty((4, 0)), *np.empty((2, 0), dtype=np.int64))

@@ -1,0 +1,79 @@
+"""Results on disk by content: one file a key, so that work can be continued."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from pydantic import BaseModel, TypeAdapter
+
+from omnibench.files import remove, write_text
+
+T = TypeVar("T")
+
+
+def content_key(facts: Mapping[str, Any]) -> str:
+    """The key (20 hexadecimal digits) of all that a result depends on: values, documents, dataclasses and arrays."""
+    return hashlib.sha256(json.dumps(facts, sort_keys=True, default=_plain).encode()).hexdigest()[:20]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if is_dataclass(value):
+        return {field.name: getattr(value, field.name) for field in fields(value)}
+    return [value.dtype.str, value.shape, hashlib.sha256(value.tobytes()).hexdigest()]  # an array
+
+
+def code_digest(package: Path, files: Iterable[Path]) -> str:
+    """Hash of code: paths of the files in ``package`` and their contents."""
+    digest = hashlib.sha256()
+    for file in sorted(files):
+        digest.update(file.relative_to(package).as_posix().encode())
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class ResultStore(Generic[T]):
+    """Results by key, each in a JSON file in ``folder``.
+
+    kind: their class, a dataclass or a document whose fields pydantic can write and read (arrays: ``JsonArray``).
+    """
+
+    folder: Path
+    kind: type[T]
+
+    def get(self, key: str) -> T | None:
+        """The stored result; None where there is none, or its file is damaged."""
+        try:
+            return _adapter(self).validate_json(self.file(key).read_bytes())
+        except (OSError, ValueError):  # ValueError: pydantic's and Unicode's errors, too
+            return None
+
+    def put(self, key: str, result: T) -> None:
+        """Store a result, whole or not at all. DataError when it cannot be written, ValueError for a wrong type."""
+        content = _adapter(self).dump_python(result, mode="json", warnings="error")
+        write_text(self.file(key), json.dumps(content))
+
+    def file(self, key: str) -> Path:
+        """The result's file."""
+        return self.folder / f"{key}.json"
+
+    def remove(self) -> None:
+        """Remove all results, and the folder if nothing else is in it. DataError when the disk refuses."""
+        for file in self.folder.glob("*.json"):
+            remove(file)
+        with suppress(OSError):
+            self.folder.rmdir()
+
+
+@cache
+def _adapter(store: ResultStore[T]) -> TypeAdapter[T]:
+    return TypeAdapter(store.kind)
