@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.extend import Extended
 from omnibench.fit.least_squares.repetitions import grouped
-from omnibench.fit.least_squares.whitened import Whitened
+from omnibench.fit.least_squares.whitened import Given, Whitened
 from omnibench.robot.kinematics import Array
 
 _FOLDS = 5
@@ -53,23 +53,13 @@ def folds_of_commands(runs: Sequence[Trajectory]) -> NDArray[np.intp]:
 def values_of_other_folds(data: Whitened, index: Sequence[int], folds: NDArray[np.intp]) -> Array:
     """Values (Z, n) of the columns ``index``: for each run, those fitted to the runs of all folds but its own."""
     index = list(index)
+    whole = data.information[np.ix_(index, index)]
     values = np.zeros((len(folds), len(index)))
-    of_runs = [columns[:, index] for columns in data.columns]
     for fold in np.unique(folds):
-        train = [columns for columns, other in zip(of_runs, folds, strict=True) if other != fold]
-        stacked = np.concatenate(train) if train else np.zeros((0, len(index)))
-        target = [residuals for residuals, other in zip(data.residuals, folds, strict=True) if other != fold]
-        values[folds == fold] = _solved(stacked, target)
-    return values
-
-
-def _solved(columns: Array, residuals: Sequence[Array]) -> Array:
-    if not len(columns):
-        return np.zeros(columns.shape[1])
-    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    information = (columns / size).T @ (columns / size)
-    score = (columns / size).T @ np.concatenate(list(residuals))
-    values: Array = np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ score / size
+        inside = folds == fold
+        columns = np.concatenate([data.columns[run][:, index] for run in np.flatnonzero(inside)])
+        others = Given(whole - columns.T @ columns, data.scores[~inside][:, index], np.diag(whole))
+        values[inside] = others.estimate(range(len(index)))[0]
     return values
 
 
