@@ -3,7 +3,7 @@
 import sys
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -127,11 +127,7 @@ def evaluate(
     warnings = [*recordings.warnings, *evaluation.warnings]
     warn(warnings)
     if as_json:
-        document: dict[str, Any] = {"dataset": evaluation.dataset, "trajectories": evaluation.trajectories}
-        document["splits"] = {
-            name: errors.model_dump(exclude={"trajectories"}) for name, errors in evaluation.splits.items()
-        }
-        return print_json(document | {"warnings": warnings})
+        return print_json(evaluation.model_dump() | {"warnings": warnings})
     return print_evaluation(make_console(), evaluation)
 
 

@@ -12,6 +12,7 @@ from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.selection.extrapolation import training_domain
 from omnibench.environment import package_versions
 from omnibench.errors import DataError
+from omnibench.fit.evaluate import split_errors
 from omnibench.robot.calibration import Calibration, EffectTerm, Provenance, covariance_rows, matrix_rows
 from omnibench.robot.kinematics import Array
 
@@ -71,11 +72,9 @@ def _cost(extended: Extended, runs: Sequence[Trajectory]) -> float | None:
     if not runs:
         return None
     try:
-        poses = extended.fit.model.reported([run.final_log for run in runs])
+        return split_errors(extended.fit.model, runs).cost
     except DataError:
         return None
-    errors = [np.linalg.norm(run.final_pose - modelled[-1]) for run, modelled in zip(runs, poses, strict=True)]
-    return float(np.mean(errors))
 
 
 def _with_shapes(extended: Extended) -> Array:

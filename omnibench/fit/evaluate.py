@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
+from pydantic import Field
 
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory
@@ -19,7 +19,7 @@ from omnibench.robot.model import OdometryModel
 class SplitErrors(Model):
     """Cost (Eq. 6) and errors of the final pose, on one split."""
 
-    trajectories: int
+    trajectories: int = Field(exclude=True)
     cost: float
     position_mean_m: float
     position_max_m: float
@@ -27,18 +27,18 @@ class SplitErrors(Model):
     heading_max_rad: float
 
 
-@dataclass(frozen=True)
-class Evaluation:
+class Evaluation(Model):
     """Errors of a calibration and of the design values, by split; the split ``all`` is every trajectory.
 
-    warnings: one sentence if runs lie outside the training domain of the calibration's effects.
+    warnings: one sentence if runs lie outside the training domain of the calibration's effects. What is not excluded is
+    the document of ``omnibench evaluate --json``.
     """
 
     dataset: str
-    simulated: bool
+    simulated: bool = Field(exclude=True)
     trajectories: int
     splits: dict[str, SplitErrors]
-    design: dict[str, SplitErrors]
+    design: dict[str, SplitErrors] = Field(exclude=True)
     warnings: tuple[str, ...] = ()
 
 

@@ -172,21 +172,16 @@ def chosen_functions(base: Extended, groups: Sequence[Group]) -> list[Group]:
     limits = _LARGEST * np.array([parameter.high for group in groups for parameter in group.parameters])
     first = data.information.shape[0] - len(owner)
     left = given(data, range(first))
-    scale = 1 / np.sqrt(np.maximum(left.total[first:], 1e-300))
-    information = left.information[first:, first:] * np.outer(scale, scale)
-    score = left.scores[:, first:].sum(axis=0) * scale
     kept: set[int] = set()
     while len(kept) < len(owner):
-        size = np.diag(information)
-        allowed = (size > _DETERMINED) & (np.abs(score) * scale < limits * size)
+        size, score = np.diag(left.information)[first:], left.scores[:, first:].sum(axis=0)
+        allowed = (size > _DETERMINED * left.total[first:]) & (np.abs(score) < limits * size)
         gain = np.where(allowed, np.square(score) / np.maximum(size, 1e-300), 0.0)
         best = int(gain.argmax())
         if gain[best] <= np.log(len(data.scores)):
             break
         kept.add(best)
-        column = information[:, best] / information[best, best]
-        score = score - column * score[best]
-        information = information - np.outer(column, information[best])
+        left = left.given([first + best])
     chosen = []
     for number, group in enumerate(groups):
         names_kept = {names[row] for row in kept if owner[row] == number}
