@@ -1,7 +1,22 @@
 """Detectability: limits of what recordings can tell of effects.
 
 Absorbed effects, classes of effects that look alike, sums of effects that imitate another, and how large an effect
-could still hide.
+could still hide. With I the information of all columns beyond the matrix, the share of the signature of an effect with
+columns i that the columns j of others make is
+
+    a = tr(I_ij I_jj^+ I_ji) / tr(I_ii).                                                                           (1)
+
+What they do not make tells the effect from them with a non-centrality of (1 - a) N, N being its own. By Eq. (2) and (3)
+of evidence.py the log odds approach (1 - a) N / (2 (1 + delta^2 N)), which no size of the effect raises above
+
+    (1 - a) / (2 delta^2).                                                                                         (2)
+
+With b the estimate of a parameter and sigma its standard error, the parameter lies within
+
+    |b| + z(0.975) sigma,                                                                                          (3)
+
+and is found nearly always from z(alpha / (2 G)) sigma + z(0.93) sigma on, as the largest of G effects at the chance
+alpha (Bonferroni).                                                                                                (4)
 """
 
 from __future__ import annotations
@@ -21,11 +36,12 @@ from omnibench.fit.least_squares.whitened import Given, given
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Array
 
-_ALIKE = 0.95  # share of one effect's signature that another makes: they are one class; chosen
-_SUM = 0.98  # share of one effect's signature that several others make together: they imitate it; chosen
-_TOGETHER = 3  # effects that imitate one together, at most; chosen
-_NORMAL_95 = 1.96  # standard errors
-_DETECTED = 5.5  # standard errors from which on an effect is found nearly always
+_ALIKE = 0.95  # a, Eq. (1), of one class: log odds of at most 2.5, Eq. (2), a weight below that of a sure name
+_SUM = 0.98  # a, Eq. (1), of several effects that imitate one: log odds of at most 1, Eq. (2)
+_TOGETHER = 3  # effects that imitate one together, at most: as many as are named together
+_SEARCHED, _FEW = 6, 3  # the effects that make most by themselves, of up to three columns, are put together: 35 sums
+_NORMAL_95 = 1.96  # z(0.975)
+_DETECTED = 5.5  # Eq. (4) for a chance of 0.002 and 30 to 40 effects: 4.0 + 1.5 standard errors
 
 
 @dataclass(frozen=True)
@@ -98,9 +114,9 @@ def _sums(start: Given, visible: Sequence[Group]) -> tuple[tuple[str, tuple[str,
     sums = []
     for group in visible:
         others = sorted(
-            (other for other in visible if other is not group and len(other.index) <= 3),
+            (other for other in visible if other is not group and len(other.index) <= _FEW),
             key=lambda other: -_made_by(start, group, other),
-        )[:6]
+        )[:_SEARCHED]
         if not others or _made_by(start, group, others[0]) > _ALIKE:
             continue
         for count in range(2, _TOGETHER + 1):
@@ -112,7 +128,7 @@ def _sums(start: Given, visible: Sequence[Group]) -> tuple[tuple[str, tuple[str,
 
 
 def _made_by(start: Given, group: Group, *others: Group) -> float:
-    """The share of a group's signature that others make."""
+    """The share a of a group's signature that others make, Eq. (1)."""
     index = [column for other in others for column in other.index]
     rows = list(group.index)
     roots = start.roots(index)
@@ -142,8 +158,8 @@ def _of_parameters(group: Group, values: Array, errors: Array) -> list[Hidden]:
             group.name,
             parameter.name,
             parameter.unit,
-            float(abs(value) + _NORMAL_95 * error),
-            float(_DETECTED * error),
+            float(abs(value) + _NORMAL_95 * error),  # Eq. (3)
+            float(_DETECTED * error),  # Eq. (4)
             max(abs(parameter.low), abs(parameter.high)),
         )
         for parameter, value, error in zip(group.parameters, values, errors, strict=True)

@@ -1,4 +1,15 @@
-"""Extrapolation: motions of held-out runs outside the training domain, and bounds on the predictions there."""
+"""Extrapolation: motions of held-out runs outside the training domain, and bounds on the predictions there.
+
+The models c that the data cannot tell apart have weights w_c, which add up to 1, and predict that a run ends at e_c.
+With S_c the mean square error of the final positions of commands that were held out of the fit of c, and J_c, C_c the
+derivatives of e_c by the numbers of c and their covariance, the mean square error of the prediction is
+
+    V = sum of w_c |e_c - sum of w_c e_c|^2 + sum of w_c (S_c + tr(J_c C_c J_c')).                                  (1)
+
+The circle that holds 95 % of normal errors of variance V / 2 in each coordinate has the radius
+
+    sqrt(-2 ln 0.05) sqrt(V / 2).                                                                                  (2)
+"""
 
 from __future__ import annotations
 
@@ -14,7 +25,7 @@ from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.robot.kinematics import Array
 from omnibench.robot.training_domain import extrapolated_share, motions_of, representatives
 
-_QUANTILE = 2.45  # standard deviations of a coordinate: the radius that holds 95 % of normal positions in the plane
+_QUANTILE = 2.45  # sqrt(-2 ln 0.05), Eq. (2)
 
 
 def training_domain(extended: Extended) -> Array:
@@ -50,11 +61,7 @@ def extrapolations_of(
 
 
 def _bound(runs: Sequence[Trajectory], models: Sequence[tuple[float, Extended]]) -> float:
-    """95 % bound on the error of the final positions, m.
-
-    It follows from the errors of each model on commands that were held out of its fit, the covariance of its numbers,
-    and the scatter between the models.
-    """
+    """95 % bound on the error of the final positions of some runs, m, Eq. (2) with their mean V."""
     weights = np.array([weight for weight, _ in models])
     weights = weights / weights.sum()
     logs = [run.reference_log for run in runs]
@@ -66,5 +73,5 @@ def _bound(runs: Sequence[Trajectory], models: Sequence[tuple[float, Extended]])
         scatter = float(np.mean([np.square(of_run[-1, :2]).sum() for of_run in residuals]))
         for row, columns in enumerate(columns_at(model, runs)):
             last = columns[-1, :2]
-            within[row] += weight * (scatter + float(np.trace(last @ model.covariance @ last.T)))
-    return float(_QUANTILE * np.sqrt(np.mean(between + within) / 2))
+            within[row] += weight * (scatter + float(np.trace(last @ model.covariance @ last.T)))  # Eq. (1)
+    return float(_QUANTILE * np.sqrt(np.mean(between + within) / 2))  # Eq. (2)

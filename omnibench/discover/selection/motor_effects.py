@@ -1,4 +1,12 @@
-"""Effects of the motors: what measured wheel rates differ from their targets by."""
+"""Effects of the motors: what measured wheel rates differ from their targets by.
+
+With f(b) the changes of the rates by all selected effects, e the rates less their targets and J the derivatives of f,
+the parameters minimise |e - f(b)|^2. Their covariance is that of the scatter between the Z runs z, with n parameters,
+
+    (J'J)^+ (sum over runs of s_z s_z') (J'J)^+ Z / (Z - n),    s_z = J_z' (e_z - f_z)                             (1)
+
+(MacKinnon and White, "Some heteroskedasticity-consistent covariance matrix estimators", J. Econometrics 29, 1985).
+"""
 
 from __future__ import annotations
 
@@ -20,6 +28,8 @@ from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect
 from omnibench.robot.kinematics import Array, Robot
 
+_MEDIAN = 0.6745  # standard deviations: the median of the size of a normal number
+_LEAST = 0.1  # share of the mean difference of neighbouring samples that the noise is at least: ramps take few samples
 _STEP = 0.2  # share of the plausible range: step of a parameter for its slope; chosen
 _KNOTS = 7  # knots of the functions of target rates; chosen
 _ORDERS = 5  # orders of the functions of time; chosen
@@ -76,7 +86,7 @@ def _targets(run: Trajectory) -> Array:
 def _noise_of(errors: Sequence[Array]) -> float:
     """White noise of the rates, rad/s, from the differences of neighbouring samples: ramps and offsets do not count."""
     steps = np.concatenate([np.diff(of_run, axis=0).ravel() for of_run in errors])
-    return max(float(np.median(np.abs(steps))) / 0.6745 / np.sqrt(2), float(np.abs(steps).mean()) / 10, _EQUAL)
+    return max(float(np.median(np.abs(steps))) / _MEDIAN / np.sqrt(2), _LEAST * float(np.abs(steps).mean()), _EQUAL)
 
 
 def _groups(runs: Sequence[Trajectory], robot: Robot, without: Sequence[str]) -> tuple[Groups, list[Array]]:
@@ -167,5 +177,5 @@ def _fitted(runs: Sequence[Trajectory], errors: Sequence[Array], chosen: Sequenc
     ends = np.cumsum([of_run.size for of_run in errors])[:-1]
     of_runs = zip(np.split(answer.jac, ends), np.split(answer.fun, ends), strict=True)
     scores = np.array([slopes.T @ remaining for slopes, remaining in of_runs])
-    covariance = bread @ scores.T @ scores @ bread * len(runs) / max(len(runs) - len(parameters), 1)
+    covariance = bread @ scores.T @ scores @ bread * len(runs) / max(len(runs) - len(parameters), 1)  # Eq. (1)
     return answer.x * scale, covariance * np.outer(scale, scale)
