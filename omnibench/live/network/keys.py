@@ -1,4 +1,7 @@
-"""Making a certificate authority for tests and small fleets, and certificates signed by it."""
+"""Making a certificate authority for tests and small fleets, and certificates signed by it.
+
+By cryptography itself: trustme gives its authorities a fixed validity, and certificates purposes and names of its own.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ import secrets
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
@@ -25,6 +28,17 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _RESERVED: Final = ("ca", "users")
 _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
 _CLOCK_TOLERANCE: Final = timedelta(hours=1)  # certificates are valid since so long ago, as clocks differ; chosen
+_KEY_USAGES: Final = (
+    *("digital_signature", "content_commitment", "key_encipherment", "data_encipherment", "key_agreement"),
+    *("key_cert_sign", "crl_sign", "encipher_only", "decipher_only"),
+)
+
+
+class _Pair(NamedTuple):
+    """A certificate and its private key."""
+
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePrivateKey
 
 
 def make_keys(
@@ -48,18 +62,16 @@ def make_keys(
     """
     _check(names, days)
     until = datetime.now(UTC) + timedelta(days=days)
-    new_authority = overwrite or not (folder / "ca.pem").exists()
-    contents: dict[Path, bytes] = {}
-    if new_authority:
-        authority, authority_key = _authority(until)
-        contents[folder / "ca.pem"] = authority.public_bytes(Encoding.PEM)
-        contents[folder / "ca.key"] = _pem(authority_key)
+    made: dict[str, _Pair] = {}
+    if overwrite or not (folder / "ca.pem").exists():
+        made["ca"] = authority = _new_authority(until)
     else:
-        authority, authority_key = _existing_authority(folder)
-    for name in names:
-        certificate, key = _member(name, hosts, min(until, authority.not_valid_after_utc), authority, authority_key)
+        authority = _existing_authority(folder)
+    made |= {name: _member(name, hosts, until, authority) for name in names}
+    contents: dict[Path, bytes] = {}
+    for name, (certificate, key) in made.items():
         contents[folder / f"{name}.pem"] = certificate.public_bytes(Encoding.PEM)
-        contents[folder / f"{name}.key"] = _pem(key)
+        contents[folder / f"{name}.key"] = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
     if users:
         contents |= _passwords(folder, names, keep=not overwrite)
     existing = [path for path in contents if path.exists() and path.name != "users.txt"]
@@ -82,64 +94,48 @@ def _check(names: Sequence[str], days: int) -> None:
         raise ConfigError(f"{days} days: a certificate is valid for 1 to 36500 days")
 
 
-def _authority(until: datetime) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = _common_name(f"omnibench test CA {secrets.token_hex(4)}")  # distinguishes two authorities
-    builder = (
-        _builder(name, name, key, until)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_key_usage(key_cert_sign=True, crl_sign=True), critical=True)
+def _new_authority(until: datetime) -> _Pair:
+    extensions = (
+        (x509.BasicConstraints(ca=True, path_length=0), True),
+        (_key_usage("key_cert_sign", "crl_sign"), True),
     )
-    return builder.sign(key, hashes.SHA256()), key
+    return _signed(f"omnibench test CA {secrets.token_hex(4)}", until, extensions)  # the number tells two CAs apart
 
 
-def _member(
-    name: str,
-    hosts: Sequence[str],
-    until: datetime,
-    authority: x509.Certificate,
-    authority_key: ec.EllipticCurvePrivateKey,
-) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    key = ec.generate_private_key(ec.SECP256R1())
-    alternatives = [_general_name(host) for host in dict.fromkeys((*_LOOPBACK, *hosts))]
-    purposes = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
-    issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority_key.public_key())
-    builder = (
-        _builder(_common_name(name), authority.subject, key, until)
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_key_usage(digital_signature=True), critical=True)
-        .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
-        .add_extension(x509.SubjectAlternativeName(alternatives), critical=False)
-        .add_extension(issuer, critical=False)
+def _member(name: str, hosts: Sequence[str], until: datetime, authority: _Pair) -> _Pair:
+    extensions = (
+        (x509.BasicConstraints(ca=False, path_length=None), True),
+        (_key_usage("digital_signature"), True),
+        (x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]), False),
+        (x509.SubjectAlternativeName([_general_name(host) for host in dict.fromkeys((*_LOOPBACK, *hosts))]), False),
+        (x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()), False),
     )
-    return builder.sign(authority_key, hashes.SHA256()), key
+    return _signed(name, min(until, authority.certificate.not_valid_after_utc), extensions, authority)
 
 
-def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, until: datetime
-) -> x509.CertificateBuilder:
-    return (
+def _signed(
+    name: str, until: datetime, extensions: Sequence[tuple[x509.ExtensionType, bool]], authority: _Pair | None = None
+) -> _Pair:
+    """A new key with its certificate, signed by the authority or by itself. extensions: with whether each is critical."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
-        .issuer_name(issuer)
+        .issuer_name(authority.certificate.subject if authority else subject)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(datetime.now(UTC) - _CLOCK_TOLERANCE)
         .not_valid_after(until)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )
+    for extension, critical in extensions:
+        builder = builder.add_extension(extension, critical)
+    return _Pair(builder.sign(authority.key if authority else key, hashes.SHA256()), key)
 
 
-def _key_usage(**granted: bool) -> x509.KeyUsage:
-    names = (
-        *("digital_signature", "content_commitment", "key_encipherment", "data_encipherment", "key_agreement"),
-        *("key_cert_sign", "crl_sign", "encipher_only", "decipher_only"),
-    )
-    return x509.KeyUsage(**{name: granted.get(name, False) for name in names})
-
-
-def _common_name(name: str) -> x509.Name:
-    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+def _key_usage(*granted: str) -> x509.KeyUsage:
+    return x509.KeyUsage(**{name: name in granted for name in _KEY_USAGES})
 
 
 def _general_name(host: str) -> x509.GeneralName:
@@ -153,18 +149,14 @@ def _general_name(host: str) -> x509.GeneralName:
         raise ConfigError(f"{host!r} is neither a host's name nor an address") from None
 
 
-def _existing_authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+def _existing_authority(folder: Path) -> _Pair:
     certificate = read_certificate(folder / "ca.pem")
     if not (folder / "ca.key").exists():
         raise ConfigError(f"{folder}/ca.key is missing, without which ca.pem cannot sign; choose another folder")
     key = read_key(folder / "ca.key")
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
         raise ConfigError(f"{folder}/ca.key is not the key of ca.pem; choose another folder")
-    return certificate, key
-
-
-def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
-    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    return _Pair(certificate, key)
 
 
 def _passwords(folder: Path, names: Sequence[str], *, keep: bool) -> dict[Path, bytes]:
