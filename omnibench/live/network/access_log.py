@@ -1,7 +1,9 @@
 """A log of refused access, read from Zenoh's own log: Zenoh has no other way to report whom it refuses.
 
-Zenoh writes its log to file descriptor 1 only, and logs refused messages only together with all allowed ones.
-Therefore descriptor 1 is a pipe while access is logged: a thread reads it, picks the refusals and passes on all else.
+eclipse-zenoh 1.10 writes its log to file descriptor 1 only (the callback for log records of Zenoh's Rust and C
+interfaces is missing in Python; events of transports and links tell of accepted connections alone), and logs refused
+messages only together with all allowed ones. Therefore descriptor 1 is a pipe while access is logged: a thread reads
+it, picks the refusals and passes on all else.
 """
 
 from __future__ import annotations
@@ -15,11 +17,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Final, TextIO
+from typing import Final
 
 import zenoh
 
 from omnibench.errors import one_line
+from omnibench.live.network.rate_limiter import RateLimiter
 from omnibench.live.network.session_config import SessionConfig
 
 LOG = logging.getLogger("omnibench.live")
@@ -41,10 +44,11 @@ _REASONS: Final = (  # Zenoh's words when a user is refused, and their meaning
 _CONSEQUENCES: Final = ("Unknown subscriber", "Unknown queryable", "Unknown token")
 """Errors that follow a refusal: the peer undeclares something that was refused when it was declared."""
 _IDENTITIES: Final = (("CertCommonName", "certificate"), ("Username", "user"))
+_PORT = re.compile(r":\d+\b")  # each connection of a peer has another one
+_COLOUR = re.compile(r"\x1b\[[\d;]*m")
 _PIPE_SIZE: Final = 1 << 20
 _READ_PERIOD: Final = 0.02  # s between two reads of the pipe; many lines at a time cost less than one by one
-_REPEAT_PERIOD: Final = 10.0  # s in which the same refusal is logged once; chosen
-_MOST_LINES: Final = 20  # refusals logged in that time; chosen
+_MOST_LINES: Final = 20  # refusals logged in the period of the rate limiter; chosen
 _MOST_PEERS: Final = 10_000  # peers whose addresses and names are kept; a node runs for long
 
 _one_at_a_time = threading.Lock()
@@ -67,7 +71,7 @@ def log_refused_access(config: SessionConfig) -> Iterator[AccessLog]:
         return
     try:
         with _descriptor_1_read_by(access_log.read):
-            _start_log(_FILTER + (_ACCESS_FILTER if config.access is not None else ""))
+            zenoh.init_log_from_env_or(_FILTER + (_ACCESS_FILTER if config.access is not None else ""))
             yield access_log
     finally:
         _one_at_a_time.release()
@@ -79,16 +83,15 @@ class AccessLog:
     def __init__(self, warn: Callable[[str], None]) -> None:
         self.count = 0
         self._warn = warn
-        self._logged: set[str] = set()  # since _period_start
-        self._suppressed = 0  # since _period_start
-        self._period_start = 0.0
+        self._limiter = RateLimiter(most=_MOST_LINES)
+        self._suppressed = 0  # refusals that were not logged, since the last line that counts them
         self._decisions: dict[str, re.Match[str]] = {}  # thread -> the last refusal that it logged
         self._addresses: dict[str, str] = {}  # thread, or Zenoh's id of a peer -> the peer's address
         self._names: dict[str, str] = {}  # Zenoh's id of a peer -> its certificate or user
 
     def read(self, line: str) -> bool:
         """True if the line is one of Zenoh's log; a refusal in it is logged."""
-        parts = _LINE.fullmatch(line)
+        parts = _LINE.fullmatch(_COLOUR.sub("", line))
         if parts is None:
             return False
         target, thread, text = parts["target"], parts["thread"], parts["text"]
@@ -124,16 +127,12 @@ class AccessLog:
 
     def _refuse(self, text: str, *, refused: bool = True) -> None:
         self.count += refused
-        now = time.monotonic()
-        if now - self._period_start > _REPEAT_PERIOD:
-            if self._suppressed:
-                self._warn(f"refused: {self._suppressed} more in the last {now - self._period_start:.0f} s")
-            self._logged, self._period_start, self._suppressed = set(), now, 0
-        without_port = re.sub(r":\d+\b", "", text)  # each connection of a peer has another port
-        if without_port in self._logged or len(self._logged) >= _MOST_LINES:
+        if not self._limiter.allows(_PORT.sub("", text)):
             self._suppressed += 1
             return
-        self._logged.add(without_port)
+        if self._suppressed and self._limiter.allows("more"):
+            self._warn(f"refused: {self._suppressed} more like those before")
+            self._suppressed = 0
         self._warn(one_line(f"refused: {text}" if refused else text))
 
 
@@ -157,34 +156,20 @@ def _described(decision: re.Match[str]) -> str:
     return {"Put": "write", "Delete": "delete", "Query": "ask", "Reply": "answer for"}.get(action, action.lower())
 
 
-def _start_log(directives: str) -> None:
-    """Start Zenoh's log without colours."""
-    before = os.environ.get("NO_COLOR")
-    os.environ["NO_COLOR"] = "1"
-    try:
-        zenoh.init_log_from_env_or(directives)
-    finally:
-        if before is None:
-            del os.environ["NO_COLOR"]
-        else:
-            os.environ["NO_COLOR"] = before
-
-
 @contextmanager
 def _descriptor_1_read_by(take: Callable[[str], bool]) -> Iterator[None]:
     """Give ``take`` each line that is written to descriptor 1, and pass on those for which it returns False.
 
     Python's own output bypasses the pipe.
     """
-    sys.stdout.flush()
-    outside, (reading, writing) = os.dup(1), os.pipe()
+    stdout, outside, (reading, writing) = sys.stdout, os.dup(1), os.pipe()
+    stdout.flush()
     with suppress(OSError, AttributeError):
         fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
-    stdout, replaced = sys.stdout, _is_descriptor_1(sys.stdout)
-    if replaced:
-        sys.stdout = os.fdopen(
-            os.dup(outside), "w", encoding=stdout.encoding, errors=stdout.errors, buffering=1 if stdout.isatty() else -1
-        )
+    with suppress(OSError, ValueError):  # a stream without a file stays as it is
+        if stdout.fileno() == 1:
+            lines = 1 if stdout.isatty() else -1
+            sys.stdout = os.fdopen(outside, "w", lines, stdout.encoding, stdout.errors, closefd=False)
     os.dup2(writing, 1)
     os.close(writing)
     thread = threading.Thread(target=_read, args=(reading, outside, take), name="zenoh log", daemon=True)
@@ -192,41 +177,34 @@ def _descriptor_1_read_by(take: Callable[[str], bool]) -> Iterator[None]:
     try:
         yield
     finally:
-        if replaced:
-            sys.stdout.flush()
-            sys.stdout.close()
-            sys.stdout = stdout
-        else:
-            sys.stdout.flush()
+        sys.stdout.flush()
+        sys.stdout = stdout
         os.dup2(outside, 1)  # closes the pipe's last writer, which ends the thread
         thread.join(timeout=1.0)
         os.close(outside)
-
-
-def _is_descriptor_1(stream: TextIO) -> bool:
-    try:
-        return stream.fileno() == 1
-    except (OSError, ValueError):  # a stream without a file
-        return False
 
 
 def _read(reading: int, outside: int, take: Callable[[str], bool]) -> None:
     rest = b""
     while chunk := os.read(reading, _PIPE_SIZE):
         *lines, rest = (rest + chunk).split(b"\n")
-        for line in lines:
-            if b" is authorized to " in line:  # most lines, skipped cheaply
-                continue
-            try:
-                is_zenohs = take(line.decode(errors="replace"))
-            except Exception:  # reading must go on, whatever the line is: a full pipe would stop Zenoh
-                LOG.exception("a line of Zenoh's log could not be read")
-                continue
-            if not is_zenohs:
-                with suppress(OSError):  # nobody reads the program's output any more
-                    os.write(outside, line + b"\n")
+        _pass_on(b"".join(line + b"\n" for line in lines if not _taken(line, take)), outside)
         time.sleep(_READ_PERIOD)
     os.close(reading)
-    if rest:
-        with suppress(OSError):
-            os.write(outside, rest)
+    _pass_on(rest, outside)
+
+
+def _taken(line: bytes, take: Callable[[str], bool]) -> bool:
+    """True if a line is one of Zenoh's log. Reading goes on whatever the line is: a full pipe would stop Zenoh."""
+    if b" is authorized to " in line:  # most lines, skipped cheaply
+        return True
+    try:
+        return take(line.decode(errors="replace"))
+    except Exception:
+        LOG.exception("a line of Zenoh's log could not be read")
+        return True
+
+
+def _pass_on(content: bytes, outside: int) -> None:
+    with suppress(OSError):  # nobody reads the program's output any more
+        os.write(outside, content)

@@ -11,18 +11,22 @@ PERIOD: Final = 10.0  # s between two lines of the same kind; chosen
 
 
 class RateLimiter:
-    """Allows one line of each kind every ``period`` s (infinity: one in all). Safe to call from any thread."""
+    """Allows one line of each kind in ``period`` s (infinity: one in all), and ``most`` lines of all kinds together.
 
-    def __init__(self, period: float = PERIOD) -> None:
-        self._period = period
-        self._last: dict[str, float] = {}  # kind -> when a line was last allowed
+    Safe to call from any thread.
+    """
+
+    def __init__(self, period: float = PERIOD, most: float = math.inf) -> None:
+        self._period, self._most = period, most
+        self._last: dict[str, float] = {}  # kind -> when a line was allowed, within the period
         self._lock = threading.Lock()
 
     def allows(self, kind: str) -> bool:
-        """True if a line of this kind may be logged now, which then counts as logged. Kinds are kept for ever."""
+        """True if a line of this kind may be logged now, which then counts as logged."""
         now = time.monotonic()
         with self._lock:
-            if now - self._last.get(kind, -math.inf) < self._period:
+            self._last = {other: at for other, at in self._last.items() if now - at < self._period}
+            if kind in self._last or len(self._last) >= self._most:
                 return False
             self._last[kind] = now
             return True
