@@ -25,6 +25,11 @@ class Mount(Model):
     y: FiniteFloat = Field(0.0, description="m, left")
     yaw: FiniteFloat = Field(0.0, description="rad, counter-clockwise")
 
+    @property
+    def pose(self) -> Array:
+        """(3,): m, m, rad."""
+        return np.array([self.x, self.y, self.yaw])
+
 
 class Scanner(Model):
     """A planar scanner: ray i points to angle_min + i angle_increment and is measured i time_increment late."""

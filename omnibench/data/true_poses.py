@@ -27,7 +27,7 @@ class TruePath:
     poses: Array
 
     def at(self, stamps: Array) -> Array:
-        """Poses (..., 3) at stamps (...), s, interpolated by straight lines; the last pose holds after its time."""
+        """Poses (..., 3) at stamps (...), s, interpolated by straight lines; before and after the path it rests."""
         return np.stack([np.interp(stamps, self.times, column) for column in self.poses.T], axis=-1)
 
 

@@ -18,6 +18,7 @@ from omnibench.fit.uncertainty.information import information_of_runs
 from omnibench.fit.uncertainty.physical import is_invertible, matrix_slopes
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.planar import relative
 
 USES: tuple[Use, ...] = get_args(Use)
 _PATH_POINTS = 160  # points that a path is drawn with
@@ -133,9 +134,7 @@ def evenly(noise: Noise) -> Noise:
 def _described(candidate: CandidateRun, robot: Robot) -> Candidate:
     first = candidate.runs[0]
     picks = np.unique(np.linspace(0, len(first.poses) - 1, _PATH_POINTS).round().astype(int))
-    x, y, heading = (first.poses[picks] - first.start).T
-    turn = np.exp(-1j * first.start[2]) * (x + 1j * y)
-    path = np.round(np.column_stack([turn.real, turn.imag, heading]), 5)
+    path = np.round(relative(first.start, first.poses[picks]), 5)
     known = first.v is not None and first.alpha is not None and first.omega is not None
     radii = np.array([wheel.radius for wheel in robot.wheels])
     rolled = [

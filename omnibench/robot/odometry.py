@@ -76,7 +76,7 @@ class OdometryBatch:
     def __init__(self, logs: Sequence[WheelLog], integration: Integration) -> None:
         self.integration: Integration = integration
         self.trajectory = np.repeat(np.arange(len(logs)), [len(log.stamps) for log in logs])
-        located = [_locate(log) for log in logs]
+        located = [locate(log.times, log.stamps) for log in logs]
         self._sample = np.concatenate([sample for sample, _ in located])
         share = np.concatenate([share for _, share in located])
         counts = [int(sample[-1]) + 1 for sample, _ in located]
@@ -246,11 +246,11 @@ def advance(pose: Array, moved: Array, integration: Integration) -> Array:
     return np.array([x + moved_x * cosine - moved_y * sine, y + moved_x * sine + moved_y * cosine, heading + turned])
 
 
-def _locate(log: WheelLog) -> tuple[NDArray[np.intp], Array]:
-    """For each stamp (S,) the sample that contains it and the share of that sample before it."""
-    sample = np.minimum(np.searchsorted(log.times, log.stamps), len(log.times) - 1)
-    begin = np.where(sample > 0, log.times[sample - 1], 0.0)
-    share = np.clip((log.stamps - begin) / (log.times[sample] - begin), 0.0, 1.0)
+def locate(times: Array, stamps: Array) -> tuple[NDArray[np.intp], Array]:
+    """For each stamp (S,) the sample that contains it and the share of it before then. times (F,): samples' ends."""
+    sample = np.minimum(np.searchsorted(times, stamps), len(times) - 1)
+    begin = np.where(sample > 0, times[sample - 1], 0.0)
+    share = np.clip((stamps - begin) / (times[sample] - begin), 0.0, 1.0)
     return sample, share
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from omnibench.robot.kinematics import Array
-from omnibench.robot.odometry import Complex, Integration
+from omnibench.robot.odometry import Complex, Integration, locate
 
 
 class Path:
@@ -25,14 +27,23 @@ class Path:
         steps = self._steps(moved, self._headings[:-1]) + self._drift
         self._positions: Complex = complex(start[0], start[1]) + np.concatenate([[0.0], np.cumsum(steps)])
 
+    @cached_property
+    def ends(self) -> Array:
+        """Poses (F + 1, 3) at the start and at the end of each sample."""
+        return np.column_stack([self._positions.real, self._positions.imag, self._headings])
+
+    @property
+    def middles(self) -> Array:
+        """Means (F, 3) of the poses before and after each sample."""
+        middles: Array = (self.ends[1:] + self.ends[:-1]) / 2
+        return middles
+
     def poses(self, stamps: Array) -> Array:
         """Poses (S, 3) in m, m, rad at stamps (S,) in s, in any order; headings are not wrapped.
 
         Before t = 0 it is the start pose, after the last sample the pose at its end.
         """
-        sample = np.minimum(np.searchsorted(self._times, stamps), len(self._times) - 1)
-        begin = np.where(sample > 0, self._times[sample - 1], 0.0)
-        share = np.clip((stamps - begin) / (self._times[sample] - begin), 0.0, 1.0)
+        sample, share = locate(self._times, stamps)
         piece = share[:, None] * self._moved[sample]
         heading = self._headings[sample]
         position = self._positions[sample] + self._steps(piece, heading) + share * self._drift[sample]

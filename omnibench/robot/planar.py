@@ -1,4 +1,7 @@
-"""Algebra of planar poses (x, y, heading), m, m, rad. Headings are not wrapped."""
+"""Algebra of planar poses (x, y, heading), m, m, rad. Headings are not wrapped.
+
+Of arrays (..., 3) every pose is taken with its counterpart, by NumPy's rules of broadcasting.
+"""
 
 from __future__ import annotations
 
@@ -7,26 +10,44 @@ import math
 import numpy as np
 
 from omnibench.robot.kinematics import Array
-from omnibench.robot.odometry import advance
+
+
+def rotation(angle: float) -> Array:
+    """Matrix (3, 3) that turns a pose's or a twist's (x, y, heading) counter-clockwise by an angle, rad."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+
+
+def rotated(vectors: Array, angles: Array | float) -> Array:
+    """Vectors (..., 2), turned counter-clockwise by angles (...), rad; of vectors (..., 3) the first two elements."""
+    cosine, sine = np.cos(angles), np.sin(angles)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
+
+
+def placed(pose: Array, points: Array) -> Array:
+    """Points (..., 2) given in the frame of a pose (..., 3), in the frame of the pose's parent."""
+    return pose[..., :2] + rotated(points, pose[..., 2])
+
+
+def seen_from(pose: Array, points: Array) -> Array:
+    """Points (..., 2) as seen from a pose (..., 3): the inverse of ``placed``."""
+    return rotated(points[..., :2] - pose[..., :2], -pose[..., 2])
 
 
 def compose(first: Array, second: Array) -> Array:
-    """Composition (3,) of two poses: ``second``, given in the frame ``first``, in the frame of ``first``'s parent."""
-    return advance(first, second, "euler")
+    """Composition (..., 3) of poses: ``second``, given in the frame ``first``, in the frame of ``first``'s parent."""
+    return np.concatenate([placed(first, second), (first + second)[..., 2:]], axis=-1)
 
 
 def relative(first: Array, second: Array) -> Array:
-    """``second`` as seen from ``first`` (3,), the inverse of composition: compose(first, relative) is ``second``."""
-    x, y, heading = (second - first).tolist()
-    cosine, sine = math.cos(first[2]), math.sin(first[2])
-    return np.array([cosine * x + sine * y, -sine * x + cosine * y, heading])
+    """``second`` (..., 3) as seen from ``first``, so that compose(first, relative(first, second)) is ``second``."""
+    return np.concatenate([seen_from(first, second), (second - first)[..., 2:]], axis=-1)
 
 
 def moved_to(start: Array, poses: Array) -> Array:
     """A path (K, 3), K >= 1, moved rigidly so that it begins at the pose ``start`` (3,)."""
-    first, turn = poses[0], start[2] - poses[0, 2]
-    path = ((poses[:, 0] - first[0]) + 1j * (poses[:, 1] - first[1])) * np.exp(1j * turn)
-    return np.column_stack([start[0] + path.real, start[1] + path.imag, poses[:, 2] + turn])
+    return compose(start, relative(poses[0], poses))
 
 
 def unit_twist(motion: Array) -> Array:
@@ -35,10 +56,9 @@ def unit_twist(motion: Array) -> Array:
     motion (..., 3): the pose after it as seen from before, m, m, rad. ``advance`` by arcs is the inverse. Beyond half a
     turn the twist grows without bound towards a whole turn; it is limited to the length of half a turn.
     """
-    half = motion[..., 2] / 2
+    half = motion[..., 2:] / 2
     longer = 1 / np.sinc(np.minimum(np.abs(half), np.pi / 2) / np.pi)
-    way = (motion[..., 0] + 1j * motion[..., 1]) * longer * np.exp(-1j * half)
-    return np.stack([way.real, way.imag, motion[..., 2]], axis=-1)
+    return np.concatenate([rotated(motion, -half[..., 0]) * longer, motion[..., 2:]], axis=-1)
 
 
 def correction(in_map: Array, in_odom: Array) -> Array:

@@ -10,6 +10,7 @@ import numpy as np
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog, advance
 from omnibench.robot.path import Path
+from omnibench.robot.planar import compose
 
 STILL = 1e-3  # rad/s: a slower wheel counts as standing; chosen
 _SMOOTHING = 0.05  # s, time constant of the smoothed twist whose derivative is the acceleration; chosen
@@ -70,7 +71,7 @@ def signals_of(
         wheel_angles=None if log.wheel_angles is None else log.wheel_angles - log.rates * (durations / 2)[:, None],
         session_time=None if log.started_at is None else log.started_at + elapsed,
         session=log.session,
-        poses=_middles(log, twists * durations[:, None]) if with_poses else None,
+        poses=Path(log.times, log.start, twists * durations[:, None], "arc").middles if with_poses else None,
     )
 
 
@@ -132,6 +133,9 @@ class SignalStream:
             vx, vy, _ = twist.tolist()
             step = math.hypot(vx, vy) * duration
             self._way += step
+        poses = self.move(twist * duration)
+        if poses is not None and frame_heading:
+            poses = compose(np.array([0.0, 0.0, frame_heading]), poses)
         elapsed, session_time, travelled, durations = np.array(
             [[middle], [self._session_time + middle], [self._way - step / 2], [duration]]
         )
@@ -146,29 +150,13 @@ class SignalStream:
             (self._angles - turned / 2)[None],
             session_time,
             self._session,
-            _turned(self.move(twist * duration), frame_heading),
+            poses,
         )
 
 
 def smoothing_share(sample_period: float) -> float:
     """The weight a of a new twist in the smoothed one."""
     return -math.expm1(-sample_period / _SMOOTHING)
-
-
-def _middles(log: WheelLog, moved: Array) -> Array:
-    """Means (F, 3) of the poses before and after each sample that moved the robot by (F, 3)."""
-    ends = Path(log.times, log.start, moved, "arc").poses(log.times)
-    middles: Array = (ends + np.vstack([log.start, ends[:-1]])) / 2
-    return middles
-
-
-def _turned(poses: Array | None, angle: float) -> Array | None:
-    """Poses (F, 3) rotated about the origin by an angle, rad."""
-    if poses is None or not angle:
-        return poses
-    cosine, sine = math.cos(angle), math.sin(angle)
-    x, y, heading = poses.T
-    return np.column_stack([cosine * x - sine * y, sine * x + cosine * y, heading + angle])
 
 
 def _travelled(rates: Array, steps: Array) -> Array:

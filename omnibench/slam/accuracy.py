@@ -14,7 +14,7 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import moved_to
+from omnibench.robot.planar import moved_to, rotated
 
 _SINGULAR = 1e-14  # share of the largest variance below which a covariance counts as singular
 
@@ -111,8 +111,7 @@ def run_errors(trajectory: Trajectory, truth: TruePath) -> RunErrors:
     errors[:, 2] -= 2 * np.pi * np.round(errors[:, 2] / (2 * np.pi))
     covariances = trajectory.pose_covariances
     nees = None if covariances is None else _nees(errors, covariances[1:])
-    turned = (errors[:, 0] + 1j * errors[:, 1]) * np.exp(-1j * true[:, 2])
-    in_robot = np.column_stack([turned.real, turned.imag, errors[:, 2]])
+    in_robot = np.column_stack([rotated(errors, -true[:, 2]), errors[:, 2]])
     return RunErrors(times, np.interp(times, truth.times, way), in_robot, nees)
 
 

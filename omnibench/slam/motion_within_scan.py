@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import unit_twist
+from omnibench.robot.planar import relative, unit_twist
 
 _AROUND = 0.25  # s of odometry besides the scan's own time that the fit takes in (chosen)
 _INSTANT = 0.02  # s between the odometry poses of the fit (chosen)
@@ -83,6 +83,4 @@ def _powers(delays: Array, count: int) -> Array:
 
 def _since(first: Array, poses: Array) -> Array:
     """Poses (S, n, 3) as motions since the poses (S, 3)."""
-    moved = poses - first[:, None]
-    way = (moved[..., 0] + 1j * moved[..., 1]) * np.exp(-1j * first[:, None, 2])
-    return unit_twist(np.stack([way.real, way.imag, moved[..., 2]], axis=-1))
+    return unit_twist(relative(first[:, None], poses))

@@ -34,6 +34,7 @@ from __future__ import annotations
 import numpy as np
 
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import rotation
 from omnibench.slam.matching.scan_matching import Match
 
 # m^2, m^2, rad^2: least covariance that is stated, for a start pose that is exact by definition. A hundredth of the
@@ -55,7 +56,7 @@ class PoseErrors:
         self._joint[:3, :3] = np.eye(3)
         self._pose = start
         if moved is not None:
-            row = np.linalg.solve(_deviation(start), _turn(start) * moved)  # Eq. (P2): xi = D^-1 T diag(s) mu
+            row = np.linalg.solve(_deviation(start), rotation(start[2]) * moved)  # Eq. (P2): xi = D^-1 T diag(s) mu
             self._joint[-3:, :3], self._joint[:3, -3:] = row, row.T
             self._joint[-3:, -3:] = _square(row)
 
@@ -68,12 +69,12 @@ class PoseErrors:
         before, here = _deviation(self._pose), _deviation(match.pose)
         rest = np.eye(3) - match.gain
         row = np.zeros((3, len(self._joint)))  # R of Eq. (P5)
-        row[:, :3] = rest @ here @ np.linalg.solve(before, _turn(self._pose) * moved)  # Eq. (P3)
+        row[:, :3] = rest @ here @ np.linalg.solve(before, rotation(self._pose[2]) * moved)  # Eq. (P3)
         row[:, -3:] = rest @ here
         for keyframe, part in match.by_keyframe.items():
             row[:, 3 + 3 * keyframe : 6 + 3 * keyframe] += match.weight @ part @ here
         noise = match.weight @ match.scatter @ match.weight.T + _square(
-            match.weight @ match.delayed @ (_turn(match.pose) * skew)
+            match.weight @ match.delayed @ (rotation(match.pose[2]) * skew)
         )
         covariance = row @ self._joint @ row.T + noise  # Eq. (P6)
         back = np.linalg.inv(here)  # Eq. (P7)
@@ -105,7 +106,9 @@ class PoseErrors:
         self._joint = self._joint[np.ix_(every, every)]
         if skewed is not None:
             kept = slice(size - 3, size)
-            self._joint[kept, kept] += _square(np.linalg.solve(_deviation(self._pose), _turn(self._pose) * skewed))
+            self._joint[kept, kept] += _square(
+                np.linalg.solve(_deviation(self._pose), rotation(self._pose[2]) * skewed)
+            )
 
     def merge_oldest(self) -> None:
         """Remove keyframe 0; the next one, whose error is larger, stands for it."""
@@ -115,12 +118,6 @@ class PoseErrors:
 
 def _square(matrix: Array) -> Array:
     return matrix @ matrix.T
-
-
-def _turn(pose: Array) -> Array:
-    """Rotation (3, 3) from the robot's axes to those of the run's frame."""
-    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
-    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _deviation(pose: Array) -> Array:

@@ -8,6 +8,7 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import rotation
 
 
 def in_start_frames(runs: Sequence[Trajectory], values: Sequence[Array]) -> list[Array]:
@@ -17,7 +18,5 @@ def in_start_frames(runs: Sequence[Trajectory], values: Sequence[Array]) -> list
     """
     turned = []
     for run, of_run in zip(runs, values, strict=True):
-        cosine, sine = np.cos(run.start[2]), np.sin(run.start[2])
-        turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-        turned.append(np.einsum("ij,kj...->ki...", turn, of_run))
+        turned.append(np.einsum("ij,kj...->ki...", rotation(-run.start[2]), of_run))
     return turned

@@ -23,6 +23,7 @@ from omnibench.errors import PluginError
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
+from omnibench.robot.path import Path
 from omnibench.robot.signals import Signals, signals_of
 
 _STEP = 0.1  # share of the plausible range: step of a reference effect's parameter for its slope; chosen
@@ -148,12 +149,16 @@ def make_paths(robot: Robot, matrix: Array, logs: Sequence[WheelLog], sample_per
     order = sorted(range(len(logs)), key=lambda index: str(logs[index].session))
     assert order == list(range(len(logs))), "runs come by session"
     of_runs = [signals_of(log, robot, matrix, sample_period) for log in logs]
-    ends, middles = zip(*(_path(log, signals) for log, signals in zip(logs, of_runs, strict=True)), strict=True)
+    paths = [
+        Path(log.times, log.start, signals.twists * signals.durations[:, None], "arc")
+        for log, signals in zip(logs, of_runs, strict=True)
+    ]
+    ends = [path.ends for path in paths]
     counts = [len(log.times) for log in logs]
     owner = np.repeat(np.arange(len(logs)), counts)
     edges = np.cumsum([0, *(len(log.stamps) for log in logs)])
     parts = tuple(slice(int(low), int(high)) for low, high in pairwise(edges))
-    middle = np.concatenate(middles)
+    middle = np.concatenate([path.middles for path in paths])
     signals = replace(_joined(of_runs), poses=middle)
     sums, poses = _sums(logs, ends)
     run = np.repeat(np.arange(len(logs)), np.diff(edges))
@@ -176,17 +181,6 @@ def make_paths(robot: Robot, matrix: Array, logs: Sequence[WheelLog], sample_per
         _turns=turns,
         _lever=poses[:, :2] - starts[run, :2],
     )
-
-
-def _path(log: WheelLog, signals: Signals) -> tuple[Array, Array]:
-    """Poses of the start and of the ends of the samples (F + 1, 3), and of their middles (F, 3)."""
-    moved = signals.twists * signals.durations[:, None]
-    heading = log.start[2] + np.concatenate([[0.0], np.cumsum(moved[:, 2])])
-    middle = (heading[1:] + heading[:-1]) / 2
-    steps = (moved[:, 0] + 1j * moved[:, 1]) * np.sinc(moved[:, 2] / (2 * np.pi)) * np.exp(1j * middle)
-    path = log.start[0] + 1j * log.start[1] + np.concatenate([[0.0], np.cumsum(steps)])
-    between = (path[1:] + path[:-1]) / 2
-    return np.column_stack([path.real, path.imag, heading]), np.column_stack([between.real, between.imag, middle])
 
 
 def _along(times: Array, ends: Array, values: Array) -> Array:

@@ -21,6 +21,7 @@ from omnibench.discover.result import Discovery
 from omnibench.fit.least_squares.noise import Whitener
 from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import relative, rotation
 
 # Standard deviations that hold 95 % of a normal distribution, on a line and in the plane.
 NORMAL_95 = 1.96
@@ -88,8 +89,8 @@ class Residuals:
             ends, finals, variances = [], [], []
             for index in members:
                 run = self.runs[index]
-                ends.append(_seen_from(run.start, run.final_pose - run.start))
-                finals.append([_seen_from(run.start, own[index][-1]) for own in self.each])
+                ends.append(relative(run.start, run.final_pose))
+                finals.append([rotation(-run.start[2]) @ own[index][-1] for own in self.each])
                 variances.append(self.deviations(run.pose_times[-1:])[0] ** 2)
             error: Array = np.sqrt(np.sum(variances, axis=0)) / len(members)
             end: Array = np.mean(ends, axis=0)
@@ -183,10 +184,3 @@ def shares(values: Array, edges: Sequence[float] | Array) -> Array:
     bins = np.where(values == edges[-1], len(edges) - 2, bins)
     found: Array = (bins[:, None] == np.arange(len(edges) - 1)).astype(float)
     return found
-
-
-def _seen_from(start: Array, difference: Array) -> Array:
-    """A difference of poses in the frame of a start pose."""
-    cosine, sine = math.cos(start[2]), math.sin(start[2])
-    x, y, turned = difference
-    return np.array([cosine * x + sine * y, -sine * x + cosine * y, turned])

@@ -16,6 +16,7 @@ from omnibench.discover.report.residuals import NORMAL_95, Residuals
 from omnibench.report.blocks import FigureGrid
 from omnibench.report.numbers import fixed
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import rotated
 from omnibench.words import plural
 
 _TIMES = 14  # times at which the mean residual is drawn (chosen)
@@ -143,11 +144,7 @@ def _means(residuals: Residuals, members: Sequence[int], style: ModelStyle, time
         run = residuals.runs[index]
         stamps = run.pose_times[1:]
         own = residuals.each[style.index][index]
-        course = _courses(run)
-        cosine, sine = np.cos(course), np.sin(course)
-        turned = np.column_stack(
-            [cosine * own[:, 0] + sine * own[:, 1], -sine * own[:, 0] + cosine * own[:, 1], own[:, 2]]
-        )
+        turned = np.column_stack([rotated(own, -_courses(run)), own[:, 2]])
         nearest = np.abs(stamps[:, None] - times).argmin(axis=0)
         total += np.where((stamps[-1] >= times - 1e-6)[:, None], turned[nearest], 0.0)
     return total / _running(residuals, members, times)[:, None]

@@ -22,6 +22,7 @@ from omnibench.discover.fitting.model_fit import Fit
 from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.fit.least_squares.whitened import given
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import rotated
 
 _FEWEST = 50  # samples in which a wheel turns: that so many are multiples by chance has a probability below 0.002^50
 _FINEST = 10_000  # ticks in the largest sample: a finer one is 0.01 % of the motion, less than a wheel slips
@@ -104,6 +105,6 @@ def _quarter_ticks(run: Trajectory, poses: Array, matrix: Array, ticks: Array) -
 def _turned(wheel: Array, place: Sequence[float], poses: Array) -> Array:
     """Changes (K, 3) of later poses by a radian more of a wheel (3,), its column of the matrix, at a place."""
     x, y, heading = place
-    step = complex(wheel[0], wheel[1]) * np.exp(1j * heading)
-    moved = step + 1j * wheel[2] * ((poses[:, 0] - x) + 1j * (poses[:, 1] - y))
-    return np.column_stack([moved.real, moved.imag, np.full(len(poses), wheel[2])])
+    step = rotated(wheel, heading)
+    turn = wheel[2] * np.column_stack([y - poses[:, 1], poses[:, 0] - x])
+    return np.column_stack([step + turn, np.full(len(poses), wheel[2])])

@@ -116,7 +116,7 @@ def _member(name: str, hosts: Sequence[str], until: datetime, authority: _Pair) 
 def _signed(
     name: str, until: datetime, extensions: Sequence[tuple[x509.ExtensionType, bool]], authority: _Pair | None = None
 ) -> _Pair:
-    """A new key with its certificate, signed by the authority or by itself. extensions: with whether each is critical."""
+    """A new key and its certificate, signed by the authority or by itself. extensions: with their being critical."""
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     builder = (

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from omnibench.errors import ConfigError, DataError
 from omnibench.live.replay.played_recording import Recording
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
-from omnibench.robot.planar import moved_to, relative
+from omnibench.robot.planar import compose, moved_to, relative, rotation
 
 FULL_TURN = 2 * np.pi
 LONGEST_PAUSE = 3600.0  # s between two runs; chosen
@@ -234,18 +235,14 @@ def _covariances(runs: Sequence[Trajectory], starts: Array, measured: Sequence[N
     for run, start, chosen in zip(runs, starts, measured, strict=True):
         if run.pose_covariances is None:
             return None
-        angle = start[2] - run.start[2]
-        turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+        turn = rotation(start[2] - run.start[2])
         parts.append(turn @ run.pose_covariances[chosen] @ turn.T)
     return np.concatenate(parts)
 
 
 def _composed(first: Array, moves: Array) -> Array:
     """Start poses (R, 3) of consecutive relative motions ``moves`` (R, 3), the first of which starts at ``first``."""
-    headings = first[2] + np.concatenate([[0.0], np.cumsum(moves[:-1, 2])])
-    steps = (moves[:-1, 0] + 1j * moves[:-1, 1]) * np.exp(1j * headings[:-1])
-    path = complex(first[0], first[1]) + np.concatenate([[0.0], np.cumsum(steps)])
-    return np.column_stack([path.real, path.imag, headings])
+    return np.array(list(accumulate(moves[:-1], compose, initial=first)))
 
 
 def _given_start_poses(dataset: Dataset, start_poses: Array, moves: Array) -> Array:

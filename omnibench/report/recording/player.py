@@ -20,11 +20,11 @@ from omnibench.report.recording.drawing import (
     SCANS_ITEM,
     TRUTH_ITEM,
 )
-from omnibench.report.recording.room_figures import in_frame_of
-from omnibench.report.recording.scan_points import evenly, poses_at, scan_points, scanner_poses
+from omnibench.report.recording.scan_points import evenly, poses_at, scan_points
 from omnibench.report.style import INK
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.planar import compose, placed
 
 _FRAMES = 240  # frames drawn of a run (chosen: steps of the slider that can be told apart)
 _MEAN_OVER = 0.1  # s; wheel rates are means over this time before each frame
@@ -63,7 +63,7 @@ def _run(
     times = np.linspace(0.0, end, min(_FRAMES, max(2, round(end / 0.02) + 1)))
     poses = poses_at(run, times)
     (driven,) = odometry.poses([run.log(times)])
-    true_poses = None if truth is None else in_frame_of(run.start, truth.at(times))
+    true_poses = None if truth is None else placed(run.start, truth.at(times))
     scans = _scans(dataset, run)
     rates = _means(run, run.rates, times)
     targets = None if run.targets is None else _means(run, run.targets, times)
@@ -96,7 +96,7 @@ def _scans(dataset: Dataset, run: Trajectory) -> list[dict[str, Any]]:
     documents = []
     for scan in evenly(len(scans.times), _SCANS):
         stamp = scans.times[scan]
-        origin = scanner_poses(poses_at(run, stamp), scanner)
+        origin = compose(poses_at(run, stamp), scanner.mount.pose)
         points = scan_points(run, scanner, scans, int(scan), stride)
         documents.append(
             {"t": round(float(stamp), 4), "from": _rounded(origin[:2]), "points": _rounded(points.ravel())}

@@ -25,6 +25,7 @@ from omnibench.report.style import plan
 from omnibench.report.traces import START, joined, line, marks, path
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.planar import placed, seen_from
 from omnibench.words import plural
 
 # How much one figure draws (chosen: more cannot be told apart on a screen).
@@ -43,7 +44,7 @@ def all_runs(dataset: Dataset, shown: Trajectory, outlines: Sequence[Array]) -> 
     outlines: the walls of the floor plan as seen from that start, closed (n, 2) each, m; empty where not known.
     """
     runs = [dataset.trajectories[index] for index in evenly(len(dataset.trajectories), _RUNS)]
-    flower = joined([_from_start(run, _thin(run.poses)) for run in runs])
+    flower = joined([seen_from(run.start, _thin(run.poses)) for run in runs])
     paths = [line(REFERENCE_ITEM, 1.0, *flower.T, opacity=0.75), _start(np.zeros(2))]
     number = plural(len(dataset.trajectories), "run")
     close = Figure(f"{number} from one start", _map(paths), "Reference paths of all runs from one start, close up", 500)
@@ -53,7 +54,7 @@ def all_runs(dataset: Dataset, shown: Trajectory, outlines: Sequence[Array]) -> 
     items = [REFERENCE_ITEM, *_room_items(dataset, outlines)]
     if dataset.scans is None:
         return FigureGrid((close,), tuple(items), 1, words)
-    points = _from_start(shown, thinned(run_points(dataset, shown), _POINTS))
+    points = seen_from(shown.start, thinned(run_points(dataset, shown), _POINTS))
     room = Figure(
         f"The runs in the room that {shown.id} saw",
         _map([*_plan(outlines), marks(SCANS_ITEM, 2.5, *points.T, opacity=0.6), *paths]),
@@ -78,7 +79,7 @@ def one_run(
     ]
     items = [REFERENCE_ITEM, ODOMETRY_ITEM]
     if truth is not None:
-        true_poses = in_frame_of(trajectory.start, truth.poses)
+        true_poses = placed(trajectory.start, truth.poses)
         lines.append(path(TRUTH_ITEM, _thin(true_poses), 1.6))
         items.append(TRUTH_ITEM)
     ellipses, words = _ellipses(trajectory, driven)
@@ -111,13 +112,6 @@ def run_points(dataset: Dataset, trajectory: Trajectory) -> Array:
     return np.vstack([scan_points(trajectory, scanner, scans, int(scan)) for scan in picks])
 
 
-def in_frame_of(start: Array, points: Array) -> Array:
-    """Points (n, 2): points (n, 2 or more) given relative to a start pose (3,), in the frame of that pose."""
-    cosine, sine = math.cos(start[2]), math.sin(start[2])
-    seen: Array = points[:, :2] @ np.array([[cosine, sine], [-sine, cosine]]) + start[:2]
-    return seen
-
-
 def _ellipses(trajectory: Trajectory, driven: Array) -> tuple[list[go.Scatter], str]:
     """95 % ellipses of a few positions, enlarged until they can be seen, and the sentence that says so."""
     covariances = trajectory.pose_covariances
@@ -143,14 +137,6 @@ def _ellipses(trajectory: Trajectory, driven: Array) -> tuple[list[go.Scatter], 
         f"Ellipses: 95 % of the position by the reference's covariance, {size}; the largest half axis is "
         f"{1e3 * largest:.3g} mm."
     )
-
-
-def _from_start(trajectory: Trajectory, points: Array) -> Array:
-    """Points (n, 2): points (n, 2 or more) relative to the start pose of the run."""
-    x, y, heading = trajectory.start
-    cosine, sine = math.cos(heading), math.sin(heading)
-    seen: Array = (points[:, :2] - (x, y)) @ np.array([[cosine, -sine], [sine, cosine]])
-    return seen
 
 
 def _thin(poses: Array) -> Array:

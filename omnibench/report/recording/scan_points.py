@@ -7,6 +7,7 @@ import numpy as np
 from omnibench.data.dataset import Trajectory
 from omnibench.data.scans import Scanner, TrajectoryScans
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import compose
 
 _GOES_ON = 0.1  # s of motion after the last pose: longer than a scan takes
 
@@ -23,21 +24,11 @@ def poses_at(trajectory: Trajectory, times: Array) -> Array:
     return np.stack([np.interp(times, stamps, column) for column in poses.T], axis=-1)
 
 
-def scanner_poses(poses: Array, scanner: Scanner) -> Array:
-    """Poses (..., 3) of the scanner on a robot at ``poses`` (..., 3)."""
-    mount = scanner.mount
-    x, y, heading = np.moveaxis(poses, -1, 0)
-    cosine, sine = np.cos(heading), np.sin(heading)
-    return np.stack(
-        [x + mount.x * cosine - mount.y * sine, y + mount.x * sine + mount.y * cosine, heading + mount.yaw], axis=-1
-    )
-
-
 def scan_points(trajectory: Trajectory, scanner: Scanner, scans: TrajectoryScans, scan: int, stride: int = 1) -> Array:
     """Points (n, 2) of one scan, m; each ray starts at the reference pose of the time at which it was measured."""
     ranges = scans.ranges[scan, ::stride].astype(float)
     seen = scanner.valid(scans.ranges[scan, ::stride])
-    poses = scanner_poses(poses_at(trajectory, scans.times[scan] + scanner.delays[::stride][seen]), scanner)
+    poses = compose(poses_at(trajectory, scans.times[scan] + scanner.delays[::stride][seen]), scanner.mount.pose)
     directions = poses[:, 2] + scanner.angles[::stride][seen]
     points: Array = poses[:, :2] + ranges[seen, None] * np.column_stack([np.cos(directions), np.sin(directions)])
     return points

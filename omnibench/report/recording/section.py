@@ -15,7 +15,7 @@ from omnibench.report.blocks import Block, Callout, Choice, Document, Fact, Fact
 from omnibench.report.numbers import fixed
 from omnibench.report.recording.contents import contents_table
 from omnibench.report.recording.player import player
-from omnibench.report.recording.room_figures import all_runs, in_frame_of, one_run
+from omnibench.report.recording.room_figures import all_runs, one_run
 from omnibench.report.recording.runs import representative_runs
 from omnibench.report.recording.slam_figures import error_figures
 from omnibench.report.recording.slam_tables import accuracy_blocks
@@ -23,6 +23,7 @@ from omnibench.report.recording.wheel_figures import wheel_rates
 from omnibench.report.render import write_document
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.planar import placed, seen_from
 from omnibench.slam.accuracy import SlamAccuracy, slam_accuracy
 
 
@@ -132,7 +133,7 @@ def _pictures(
     runs = representative_runs(dataset)
     odometry = OdometryModel.of_design(dataset.robot, "arc")
     from_start = {run.id: _outlines(plan, starts.get(run.id)) for run in runs.values()}
-    placed = {run.id: [in_frame_of(run.start, outline) for outline in from_start[run.id]] for run in runs.values()}
+    placed = {run.id: [placed(run.start, outline) for outline in from_start[run.id]] for run in runs.values()}
     first = next(iter(runs.values()))
     rooms: dict[str, tuple[Block, ...]] = {
         name: (one_run(dataset, run, odometry, truth.get(run.id), placed[run.id]),) for name, run in runs.items()
@@ -163,7 +164,4 @@ def _outlines(plan: RoomPlan | None, start: Array | None) -> list[Array]:
     """The walls of a floor plan relative to a start pose (3,) in it (default: its own), closed (n, 2) each, m."""
     if plan is None:
         return []
-    x, y, heading = plan.start if start is None else start
-    cosine, sine = np.cos(heading), np.sin(heading)
-    turn = np.array([[cosine, -sine], [sine, cosine]])
-    return [(outline - (x, y)) @ turn for outline in plan.outlines]
+    return [seen_from(plan.start if start is None else start, outline) for outline in plan.outlines]

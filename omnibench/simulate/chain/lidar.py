@@ -13,6 +13,7 @@ from omnibench.data.scans import Mount, Scanner, TrajectoryScans
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import compose
 from omnibench.simulate.chain.floor_plan import FloorPlan
 
 _SHORTEST_PERIOD = 0.001  # s between scans; a shorter one is a mistake of units
@@ -139,9 +140,7 @@ def measure_scans(
 
 
 def _check_places(plan: FloorPlan, mount: Mount, track: TruePath, times: Array) -> None:
-    x, y, heading = track.at(times).T
-    x = x + np.cos(heading) * mount.x - np.sin(heading) * mount.y
-    y = y + np.sin(heading) * mount.x + np.cos(heading) * mount.y
+    x, y, _ = compose(track.at(times), mount.pose).T
     for row in np.flatnonzero(~shapely.contains_xy(plan.free, x, y))[:1]:
         place = plan.place_of(np.array([x[row], y[row]]))
         raise DataError(

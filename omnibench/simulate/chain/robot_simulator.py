@@ -16,6 +16,8 @@ from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
+from omnibench.robot.path import Path
+from omnibench.robot.planar import compose
 from omnibench.simulate.chain.floor_plan import FloorPlan, make_plan
 from omnibench.simulate.chain.lidar import measure_scans, scan_stamps
 from omnibench.simulate.chain.motion_commands import CommandedMotion, command_motion, target_rates
@@ -78,11 +80,8 @@ def _check_way(config: RobotConfig, plan: FloorPlan, command: Command, session: 
     if not command.speed:
         return
     times = np.linspace(0.0, session.distance / command.speed, max(2, math.ceil(session.distance / _STEP)))
-    turned = 1j * command.turn_rate * times
-    way = np.expm1(turned) / (1j * command.turn_rate) if command.turn_rate else times.astype(complex)
-    way *= complex(command.twist[0], command.twist[1])
-    poses = np.column_stack([way.real, way.imag, turned.imag])
-    plan.check_path(_in_room(plan.start, poses)[:, :2], times, config.radius, f"command {command.name}")
+    path = Path(times[-1:], plan.start, times[-1] * command.twist[None], "arc")
+    plan.check_path(path.poses(times)[:, :2], times, config.radius, f"command {command.name}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,10 +166,10 @@ class _RobotSimulator:
         (path,) = self.robot.model.poses([log])
         (seen,) = self.robot.model.reported([log])  # the LIDAR's poses: with the effects on the reference
         start = _placed(plan.start, config.placement, rng)
-        plan.check_path(_in_room(start, path)[:, :2], log.stamps, config.radius, f"run {run.id}")
+        plan.check_path(compose(start, path)[:, :2], log.stamps, config.radius, f"run {run.id}")
         stamps = scan_stamps(config.lidar, float(run.times[-1]), rng)
         try:
-            scans = measure_scans(plan, config.lidar, TruePath(log.stamps, _in_room(start, seen)), stamps, rng)
+            scans = measure_scans(plan, config.lidar, TruePath(log.stamps, compose(start, seen)), stamps, rng)
         except DataError as error:
             raise DataError(f"run {run.id}: {error}") from None
         every = round(min(config.sample_period, _DENSE) / TRUE_STEP)
@@ -223,9 +222,3 @@ def _placed(mark: Array, placement: Placement, rng: np.random.Generator) -> Arra
     """True start pose (3,) of a robot that is put on its mark by hand."""
     spread = [placement.position, placement.position, math.radians(placement.heading_deg)]
     return mark + spread * rng.standard_normal(3)
-
-
-def _in_room(start: Array, poses: Array) -> Array:
-    """Poses (K, 3) in the room's frame of a path that starts at ``start`` (3,)."""
-    path = (poses[:, 0] + 1j * poses[:, 1]) * np.exp(1j * start[2])
-    return np.column_stack([start[0] + path.real, start[1] + path.imag, start[2] + poses[:, 2]])

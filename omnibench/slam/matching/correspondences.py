@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import rotation
 from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints
 
@@ -23,8 +24,7 @@ class Correspondences:
     """
 
     def __init__(self, surroundings: ScanMap, scan: ScanPoints, pose: Array) -> None:
-        cosine, sine = np.cos(pose[2]), np.sin(pose[2])
-        turn = np.array([[cosine, sine], [-sine, cosine]])
+        turn = rotation(pose[2])[:2, :2].T
         # Points that lie on no line mislead at corners and edges.
         straight = np.flatnonzero((scan.line >= 0) & surroundings.is_usable)
         seen = scan.points[straight] @ turn  # from the robot, along the axes of the run's frame
@@ -75,8 +75,7 @@ class Correspondences:
         distances, slopes, normals_seen = self._distances[chosen], self._slopes[chosen], self._seen_normals[chosen]
         rises = predicted = 0.0
         for moved in (step, -step):
-            cosine, sine = np.cos(moved[2]), np.sin(moved[2])
-            turn = np.array([[cosine, sine], [-sine, cosine]])
+            turn = rotation(moved[2])[:2, :2].T
             points = self._pose[:2] + moved[:2] + seen @ turn
             index, apart = self._surroundings.nearest(points)
             surface = self._surroundings.surface

@@ -14,6 +14,7 @@ import small_gicp
 from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import rotation
 from omnibench.slam.matching.lines import Lines
 
 _CROSS = 1e-3  # m between the points of a cross
@@ -104,9 +105,8 @@ class ScanMap:
 
         distance: m; a point farther than that from the map is not matched.
         """
-        cosine, sine = np.cos(start[2]), np.sin(start[2])
         guess = np.eye(4)
-        guess[:2, :2] = [[cosine, -sine], [sine, cosine]]
+        guess[:2, :2] = rotation(start[2])[:2, :2]
         guess[:2, 3] = start[:2]
         result = small_gicp.align(
             self._cloud,
@@ -130,8 +130,7 @@ class ScanMap:
         place = np.arange(len(line)) - np.repeat(np.cumsum(counts) - counts, counts)
         along = ((2 * place + 1) / counts[line] - 1) * lines.half_lengths[line]
         tangents = np.column_stack([-lines.normals[:, 1], lines.normals[:, 0]])[line]
-        cosine, sine = np.cos(pose[2]), np.sin(pose[2])
-        turn = np.array([[cosine, sine], [-sine, cosine]])
+        turn = rotation(pose[2])[:2, :2].T
         return Surface(
             centres=pose[:2] + (lines.centres[line] + along[:, None] * tangents) @ turn,
             normals=lines.normals[line] @ turn,

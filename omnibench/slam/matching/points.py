@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from omnibench.data.scans import Ranges, Scanner
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import rotated
 from omnibench.slam.matching.lines import Lines, fit_lines
 from omnibench.slam.motion_within_scan import MotionWithinScan
 
@@ -35,9 +36,9 @@ class ScanPoints:
         lines = replace(
             self.lines,
             centres=_moved(self.lines.centres, line_motions),
-            normals=_turned(self.lines.normals, line_motions[:, 2]),
+            normals=rotated(self.lines.normals, line_motions[:, 2]),
         )
-        return replace(self, points=_moved(self.points, motions), rays=_turned(self.rays, motions[:, 2]), lines=lines)
+        return replace(self, points=_moved(self.points, motions), rays=rotated(self.rays, motions[:, 2]), lines=lines)
 
 
 def scan_points(ranges: Ranges, scanner: Scanner, noise_factor: float, within: MotionWithinScan) -> ScanPoints:
@@ -55,7 +56,7 @@ def scan_points(ranges: Ranges, scanner: Scanner, noise_factor: float, within: M
     points = _moved(mount + distances[:, None] * directions, motions)
     lines, line = fit_lines(points - mount, deviations, delays, returned)
     lines = replace(lines, centres=lines.centres + mount)
-    return ScanPoints(points, _turned(directions, motions[:, 2]), delays, deviations, lines, line)
+    return ScanPoints(points, rotated(directions, motions[:, 2]), delays, deviations, lines, line)
 
 
 def noise_factor(ranges: Ranges, scanner: Scanner) -> float:
@@ -74,13 +75,7 @@ def noise_factor(ranges: Ranges, scanner: Scanner) -> float:
     return max(1.0, float(np.median(np.abs(second_differences[whole]) / expected)) / 0.6745)
 
 
-def _turned(vectors: Array, angles: Array | float) -> Array:
-    cosine, sine = np.cos(angles), np.sin(angles)
-    x, y = vectors[:, 0], vectors[:, 1]
-    return np.column_stack([cosine * x - sine * y, sine * x + cosine * y])
-
-
 def _moved(points: Array, motions: Array) -> Array:
     """Points (n, 2) that were seen after motions (n, 3), in the frame from before the motions."""
     half = motions[:, 2] / 2
-    return _turned(points, motions[:, 2]) + np.sinc(half / np.pi)[:, None] * _turned(motions[:, :2], half)
+    return rotated(points, motions[:, 2]) + np.sinc(half / np.pi)[:, None] * rotated(motions[:, :2], half)
