@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
 from pydantic_core import ErrorDetails, to_jsonable_python
 
 from omnibench.errors import ConfigError, nearest
@@ -27,6 +27,21 @@ class Model(BaseModel):
     """Base of every document that omnibench reads: unknown keys are refused, instances are immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def folder_of(info: ValidationInfo) -> Path | None:
+    """The folder of the file that is being read as a model; None for a document from elsewhere."""
+    folder: Path | None = (info.context or {}).get("folder")
+    return folder
+
+
+def _from_folder(path: Path, info: ValidationInfo) -> Path:
+    folder = folder_of(info)
+    return path if folder is None else (folder / path).resolve()
+
+
+# A path in a document, relative to the document's file; absolute once the file is read.
+RelativePath = Annotated[Path, AfterValidator(_from_folder)]
 
 
 class _Loader(yaml.SafeLoader):
@@ -102,18 +117,21 @@ def parse_settings(settings: Iterable[str] | None) -> dict[str, Any]:
 
 def read_model(model: type[M], path: Path) -> M:
     """A YAML file as ``model``; ConfigError names file, key and the nearest known key."""
-    return validate(model, read_yaml(path), str(path))
+    return validate(model, read_yaml(path), str(path), path.resolve().parent)
 
 
-def validate(model: type[M], data: Any, where: str) -> M:
-    """``data`` as ``model``; ConfigError with ``where`` in front names the first fault."""
+def validate(model: type[M], data: Any, where: str, folder: Path | None = None) -> M:
+    """``data`` as ``model``; ConfigError with ``where`` in front names the first fault.
+
+    folder: from which relative paths start; default: they stay relative.
+    """
     empty = data is None
     if empty:
         data = {}
     if not isinstance(data, Mapping | BaseModel):
         raise ConfigError(f"{where}: expected keys and values, found {type(data).__name__}")
     try:
-        return model.model_validate(data)
+        return model.model_validate(data, context={"folder": folder})
     except ValidationError as error:
         raise ConfigError(f"{where}: {'is empty: ' if empty else ''}{_describe(model, error)}") from None
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, field_validator
 
-from omnibench.config import Model, Positive
+from omnibench.config import Model, Positive, RelativePath
 from omnibench.data.dataset import Split
 from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
 from omnibench.fit.problem import Budget
@@ -88,7 +87,7 @@ class CompareConfig(Model):
     budget: Budget = Budget()
     seeds: tuple[int, ...] = Field((1,), min_length=1, description="one run of every search for each")
     calibrators: tuple[CalibratorEntry, ...] = Field(min_length=1)
-    plugins: tuple[Path, ...] = Field((), description="folders of plug-ins; relative to the config file")
+    plugins: tuple[RelativePath, ...] = Field((), description="folders of plug-ins; relative to the config file")
     workers: int | None = Field(None, gt=0, description="processes; default: the processors")
     memory_mb: float | None = Field(
         None, ge=_LEAST_MEMORY, description="memory of each run's process, 10^6 bytes; default: no limit"

@@ -25,10 +25,4 @@ def read_compare_config(path: Path | str, data: Mapping[str, Path] | None = None
         if name not in sources:
             raise UnknownNameError("data set", name, sources, str(path))
         sources[name] = sources[name].at(location.resolve())
-    folder = path.resolve().parent
-    return config.model_copy(
-        update={
-            "datasets": {name: source.relative_to(folder) for name, source in sources.items()},
-            "plugins": tuple((folder / plugin).resolve() for plugin in config.plugins),
-        }
-    )
+    return config.model_copy(update={"datasets": sources})

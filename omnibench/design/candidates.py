@@ -90,8 +90,8 @@ def read_candidates(
         return candidates_of_dataset(load_dataset(path), integration or "arc", str(path))
     content = read_yaml(path)
     if isinstance(content, Mapping) and "datasets" in content:
-        compared = validate(ComparedData, content, str(path))
-        return _candidates_of_comparison(compared, path.resolve().parent, dataset, integration, str(path))
+        compared = validate(ComparedData, content, str(path), path.resolve().parent)
+        return _candidates_of_comparison(compared, dataset, integration, str(path))
     _no_choice(dataset, path)
     config = validate(DesignConfig, content, str(path))
     return candidates_of_config(
@@ -214,14 +214,14 @@ def candidates_of_simulation(
 
 
 def _candidates_of_comparison(
-    config: ComparedData, folder: Path, name: str | None, integration: Integration | None, place: str
+    config: ComparedData, name: str | None, integration: Integration | None, place: str
 ) -> CandidatePool:
     if name is not None and name not in config.datasets:
         raise UnknownNameError("data set", name, config.datasets, place)
     if name is None and len(config.datasets) > 1:
         raise ConfigError(f"{place}: it has several data sets; choose one with --dataset: {', '.join(config.datasets)}")
     name = name or next(iter(config.datasets))
-    source = config.datasets[name].relative_to(folder)
+    source = config.datasets[name]
     chosen = integration or config.integration
     if isinstance(source.simulate, RobotConfig):
         raise ConfigError(

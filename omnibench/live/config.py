@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
-from omnibench.config import Model, Positive, read_model, read_yaml, validate
+from omnibench.config import Model, Positive, RelativePath, read_model, read_yaml, validate
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.live.estimation.wheel_input import WheelSettings
 from omnibench.live.frames import Frames
@@ -34,7 +34,7 @@ class RobotConfig(Model):
     """One robot of a node."""
 
     name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", description="begins its topics: <name>/odom")
-    calibration: Path = Field(description="calibration file")
+    calibration: RelativePath = Field(description="calibration file")
     wheels: WheelSettings = WheelSettings()
     fusion: FusionChoice | None = Field(None, description="default: the node's")
     frames: FramesChoice | None = Field(
@@ -48,7 +48,9 @@ class RobotConfig(Model):
 class ReplaySource(ReplayConfig):
     """Recording that ``--replay`` plays unless another one is named, and how it is played."""
 
-    dataset: Path | None = Field(None, description="a data set folder, or a comparison's config with a simulated one")
+    dataset: RelativePath | None = Field(
+        None, description="a data set folder, or a comparison's config with a simulated one"
+    )
     robot: str | None = Field(None, description="whose messages are played; default: the first robot")
 
 
@@ -63,9 +65,9 @@ class LiveConfig(Model):
     profile: Profile = Field("plain", description="plain: plain Zenoh and the DDS bridge; rmw, humble: rmw_zenoh")
     domain: int = Field(0, ge=0, le=232, description="ROS_DOMAIN_ID, for rmw and humble")
     zenoh: SessionConfig = SessionConfig()
-    plugins: tuple[Path, ...] = Field((), description="folders of effects that calibrations name")
-    state: Path | None = Field(None, description="folder in which pose and calibration outlive the node")
-    record: Path | None = Field(None, description="MCAP file to record to")
+    plugins: tuple[RelativePath, ...] = Field((), description="folders of effects that calibrations name")
+    state: RelativePath | None = Field(None, description="folder in which pose and calibration outlive the node")
+    record: RelativePath | None = Field(None, description="MCAP file to record to")
     foxglove: bool | int = Field(False, description="serve Foxglove's WebSocket on loopback; a number is the port")
     replay: ReplaySource = ReplaySource()
 
@@ -111,24 +113,7 @@ class LiveConfig(Model):
 
 def read_live_config(path: Path | str) -> LiveConfig:
     """Read a node's config; paths in it start from its folder. ConfigError in one line."""
-    path = Path(path)
-    config = read_model(LiveConfig, path)
-    folder = path.resolve().parent
-
-    def there(value: Path | None) -> Path | None:
-        return None if value is None else folder / value
-
-    changes: dict[str, Any] = {
-        "robots": tuple(
-            robot.model_copy(update={"calibration": folder / robot.calibration}) for robot in config.robots
-        ),
-        "zenoh": config.zenoh.relative_to(folder),
-        "plugins": tuple(folder / plugin for plugin in config.plugins),
-        "state": there(config.state),
-        "record": there(config.record),
-        "replay": config.replay.model_copy(update={"dataset": there(config.replay.dataset)}),
-    }
-    return config.model_copy(update=changes)
+    return read_model(LiveConfig, Path(path))
 
 
 class ClientConfig(Model):
@@ -146,8 +131,7 @@ def read_client_config(path: Path | str) -> ClientConfig:
     if isinstance(content, dict) and "robots" in content:
         node = read_live_config(path)
         return ClientConfig(zenoh=client_session(node.zenoh), profile=node.profile, domain=node.domain)
-    config = validate(ClientConfig, content, str(path))
-    return config.model_copy(update={"zenoh": config.zenoh.relative_to(path.resolve().parent)})
+    return validate(ClientConfig, content, str(path), path.resolve().parent)
 
 
 def client_session(node: SessionConfig) -> SessionConfig:

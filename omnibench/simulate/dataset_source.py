@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
-from omnibench.config import Model
+from omnibench.config import Model, RelativePath, folder_of
 from omnibench.data.dataset import Dataset
 from omnibench.data.storage import load_dataset
 from omnibench.progress import Reporter, no_progress
@@ -19,8 +19,14 @@ class ImportSource(Model):
     """Recordings that an importer reads."""
 
     format: str = Field(description="an importer, see omnibench list")
-    source: Path = Field(description="file or folder; relative to the config file")
+    source: RelativePath = Field(description="file or folder; relative to the config file")
     options: dict[str, Any] = {}
+
+    @field_validator("options")
+    @classmethod
+    def _files_start_from_the_config(cls, options: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        folder = folder_of(info)
+        return {key: value if folder is None else _absolute_option(value, folder) for key, value in options.items()}
 
 
 class DatasetSource(Model):
@@ -28,7 +34,7 @@ class DatasetSource(Model):
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_by_name=True, validate_by_alias=True)
 
-    path: Path | None = Field(None, description="a data set folder; relative to the config file")
+    path: RelativePath | None = Field(None, description="a data set folder; relative to the config file")
     simulate: SimulatedConfig | None = None
     import_: ImportSource | None = Field(default=None, alias="import")
 
@@ -44,18 +50,6 @@ class DatasetSource(Model):
         if self.import_ is not None and not (location / "dataset.yaml").is_file():
             return self.model_copy(update={"import_": self.import_.model_copy(update={"source": location})})
         return DatasetSource(path=location)
-
-    def relative_to(self, folder: Path) -> DatasetSource:
-        """The source with its paths, which start from ``folder``, made absolute."""
-        if self.path is not None:
-            return self.model_copy(update={"path": (folder / self.path).resolve()})
-        if self.import_ is not None:
-            update = {
-                "source": (folder / self.import_.source).resolve(),
-                "options": {key: _absolute_option(value, folder) for key, value in self.import_.options.items()},
-            }
-            return self.model_copy(update={"import_": self.import_.model_copy(update=update)})
-        return self
 
     def load(self, name: str, description: str = "", progress: Reporter = no_progress) -> Dataset:
         """Read, import or simulate the data set. name, description: of a simulated one. OmnibenchError in one line."""

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field
 
-from omnibench.config import Model, parse_yaml, read_yaml, validate
+from omnibench.config import Model, RelativePath, parse_yaml, read_yaml, validate
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import effects
@@ -34,7 +34,7 @@ class SimulationConfig(Model):
     name: str = ""
     description: str = ""
     notes: tuple[str, ...] = Field((), description="remarks for readers of the report")
-    plugins: tuple[Path, ...] = Field((), description="folders of effects; relative to the config file")
+    plugins: tuple[RelativePath, ...] = Field((), description="folders of effects; relative to the config file")
     datasets: dict[Annotated[str, Field(min_length=1, max_length=60)], _Source]
 
 
@@ -82,12 +82,10 @@ def read_simulation(path: Path | str, dataset: str | None = None) -> SimulationS
     if not isinstance(content, dict) or "datasets" not in content:
         raise ConfigError(f"{path}: no data sets in it; name a data set folder or a comparison's config")
     model = _Comparison if "calibrators" in content else SimulationConfig
-    config = validate(model, content, str(path))
+    config = validate(model, content, str(path), path.resolve().parent)
     sources = {name: source.simulate for name, source in config.datasets.items()}
     name, chosen = _chosen(sources, dataset, str(path))
-    folder = path.resolve().parent
-    plugins = tuple((folder / each).resolve() for each in config.plugins)
-    return SimulationSource(name, chosen, config.description, plugins)
+    return SimulationSource(name, chosen, config.description, config.plugins)
 
 
 def check_effect_options(given: Sequence[str]) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import AfterValidator, Field, SecretStr, field_validator, model_validator
 
-from omnibench.config import Model, read_model
+from omnibench.config import Model, RelativePath, read_model
 
 Mode = Literal["router", "peer", "client"]
 
@@ -57,7 +57,9 @@ class User(Model):
 
     name: str = Field(min_length=1)
     password: SecretStr | None = Field(None, description="in plain text; a file or an environment variable is safer")
-    password_file: Path | None = Field(None, description="its first line is the password; relative to the config file")
+    password_file: RelativePath | None = Field(
+        None, description="its first line is the password; relative to the config file"
+    )
     password_env: str | None = Field(None, description="environment variable that holds the password")
 
     @model_validator(mode="after")
@@ -72,9 +74,9 @@ class User(Model):
 class Tls(Model):
     """Certificates in PEM, as ``omnibench keys`` makes them; paths are relative to the config file."""
 
-    ca: Path = Field(description="certificate of the authority (CA) that signed the others")
-    certificate: Path | None = Field(None, description="our certificate")
-    key: Path | None = Field(None, description="the private key of our certificate")
+    ca: RelativePath = Field(description="certificate of the authority (CA) that signed the others")
+    certificate: RelativePath | None = Field(None, description="our certificate")
+    key: RelativePath | None = Field(None, description="the private key of our certificate")
     mutual: bool = Field(True, description="clients must show a certificate too")
     verify_name: bool = Field(True, description="the router's certificate must name the host that we connect to")
 
@@ -154,7 +156,7 @@ class SessionConfig(Model):
     wait: float = Field(0.0, ge=0, le=86400, description="how long to wait for a router that is not running yet, s")
     scouting: bool = Field(False, description="find other sessions by multicast and gossip")
     user: User | None = Field(None, description="our name and password at a router that asks for users")
-    users_file: Path | None = Field(None, description="users that may connect to us: lines of user:password")
+    users_file: RelativePath | None = Field(None, description="users that may connect to us: lines of user:password")
     tls: Tls | None = None
     access: Access | None = Field(None, description="access rights at this router; default: all may do everything")
     extra: dict[str, Any] = Field({}, description="settings of Zenoh itself, as transport/link/tx/lease: 3000")
@@ -215,21 +217,7 @@ class SessionConfig(Model):
     def _protocol(self) -> str:
         return "tls" if self.tls else "tcp"
 
-    def relative_to(self, folder: Path) -> SessionConfig:
-        """This config with its paths, which are relative to ``folder``, made absolute."""
-        changes: dict[str, Any] = {}
-        if self.users_file:
-            changes["users_file"] = folder / self.users_file
-        if self.user and self.user.password_file:
-            changes["user"] = self.user.model_copy(update={"password_file": folder / self.user.password_file})
-        if self.tls:
-            files = {name: getattr(self.tls, name) for name in ("ca", "certificate", "key")}
-            changes["tls"] = self.tls.model_copy(
-                update={name: folder / file for name, file in files.items() if file is not None}
-            )
-        return self.model_copy(update=changes)
-
 
 def read_session_config(path: Path) -> SessionConfig:
     """Read a session's config from a file; its paths are relative to the file. ConfigError in one line."""
-    return read_model(SessionConfig, path).relative_to(path.resolve().parent)
+    return read_model(SessionConfig, path)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -18,8 +19,8 @@ from sessions import free_port, until
 
 from omnibench.config import to_yaml, validate
 from omnibench.errors import ConfigError
-from omnibench.live.network.session import open_session
-from omnibench.live.network.session_config import SessionConfig, User
+from omnibench.live.network.session import open_session, zenoh_config
+from omnibench.live.network.session_config import SessionConfig, User, read_session_config
 
 
 @pytest.fixture
@@ -142,16 +143,20 @@ def test_clients_come_back_soon_after_the_router_was_gone(address: str) -> None:
         first.close()
         until(lambda: not (one.info.routers_zid() or two.info.routers_zid()), "the clients to notice")
         with open_session(router(address), "router"):
-            began, count_before = time.monotonic(), len(samples)
+            count_before = len(samples)
             publish_until(one, "key", lambda: len(samples) > count_before)
-            assert time.monotonic() - began < 3.0  # 0.5 s; Zenoh's own settings may take 4 s
+
+
+def test_a_client_tries_to_connect_twice_a_second(address: str) -> None:
+    settings = json.loads(str(zenoh_config(client(address))))
+    assert settings["connect"]["retry"]["period_max_ms"] == 500  # Zenoh's own is 4 s
 
 
 def test_a_client_waits_for_its_router_when_asked_to(address: str) -> None:
     opened: list[zenoh.Session] = []
     late = threading.Timer(0.3, lambda: opened.append(open_session(router(address), "router")))
     late.start()
-    with open_session(client(address, wait=10.0), "client") as session:
+    with open_session(client(address, wait=60.0), "client") as session:
         assert session.info.routers_zid()
     late.join()
     opened[0].close()
@@ -199,7 +204,7 @@ def test_a_frozen_subscriber_holds_up_nobody(address: str) -> None:
             if sent % 5 == 4:
                 time.sleep(0.001)
         until(lambda: len(samples) == count, "messages at the healthy subscriber")
-    assert max(durations) < 0.5  # s; blocking would take 5 s once, and then drop the frozen one
+    assert max(durations) < 2.5  # s; blocking would take 5 s once, and then drop the frozen one
 
 
 class TestOneClearLine:
@@ -321,9 +326,9 @@ def test_a_key_expression_that_is_none_is_refused(address: str, tmp_path: Path) 
 
 def test_paths_start_from_the_config_files_folder(tmp_path: Path) -> None:
     files = {"ca": "keys/ca.pem", "certificate": "/etc/node.pem", "key": "keys/node.key"}
-    there = config(tls=files, users_file="users.txt", user={"name": "me", "password_file": "me.password"}).relative_to(
-        tmp_path
-    )
+    given = {"tls": files, "users_file": "users.txt", "user": {"name": "me", "password_file": "me.password"}}
+    (tmp_path / "session.yaml").write_text(json.dumps(given))
+    there = read_session_config(tmp_path / "session.yaml")
     assert there.tls is not None
     assert there.user is not None
     assert there.tls.ca == tmp_path / "keys/ca.pem"
