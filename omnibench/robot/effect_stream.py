@@ -32,24 +32,14 @@ class EffectStream(OdometryStream):
         self._needs_poses = any("poses" in term.effect.needs for term in self._terms)
         self._left_at: Array | None = None
 
-    def step(self, rates: Array, duration: float, wheel_angles: Array | None = None) -> Array:
-        rates = np.asarray(rates)
-        if duration > 0:
-            return self._take(rates, duration, wheel_angles)
-        return self._take_at_once(rates * duration, wheel_angles)
-
     def drive(self, angles: Array, duration: float | None = None, wheel_angles: Array | None = None) -> Array:
         if duration is None:
             raise ValueError("a model with effects needs the duration of every sample")
-        angles = np.asarray(angles)
-        if duration > 0:
-            return self._take(angles / duration, duration, wheel_angles)
-        return self._take_at_once(angles, wheel_angles)
-
-    def _take(self, rates: Array, duration: float, wheel_angles: Array | None) -> Array:
-        """Advance by one sample of mean wheel rates (N,) rad/s over a duration > 0 s, with all effects."""
+        angles = np.asarray(angles, dtype=float)
+        if duration <= 0:
+            return self._take_at_once(angles, wheel_angles)
         self._follow()
-        signals = self._signals.next(np.asarray(rates, dtype=float), duration, wheel_angles, self.frame_heading)
+        signals = self._signals.next(angles / duration, duration, wheel_angles, self.frame_heading)
         twists, drift = corrected_twists(self._terms, signals, self.matrix)
         before, moved = self.pose, twists[0] * duration
         self.pose = advance(before, moved, self.integration)

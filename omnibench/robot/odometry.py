@@ -201,7 +201,7 @@ class OdometryBatch:
 
 
 class OdometryStream:
-    """Odometry one sample at a time: ``step`` and ``drive`` advance ``pose`` (3,) in m, m, rad.
+    """Odometry one sample at a time: ``drive`` advances ``pose`` (3,) in m, m, rad.
 
     moved (3,): the last sample's motion in the robot's frame, m, m, rad. frame_heading: the heading of the stream's
     frame in the reference's, rad; effects of the world act along the axes of the reference.
@@ -214,18 +214,11 @@ class OdometryStream:
         self.moved = np.zeros(3)
         self.frame_heading = 0.0
 
-    def step(self, rates: Array, duration: float, wheel_angles: Array | None = None) -> Array:
-        """Advance by one sample of mean wheel rates (N,) rad/s over ``duration`` s; the new pose.
-
-        wheel_angles (N,): absolute, at the sample's end, rad; where they are not known they are counted from 0.
-        """
-        return self.drive(np.asarray(rates) * duration, duration, wheel_angles)
-
     def drive(self, angles: Array, duration: float | None = None, wheel_angles: Array | None = None) -> Array:  # noqa: ARG002
         """Advance by one sample in which the wheels turned by ``angles`` (N,) rad; the new pose.
 
-        duration (s) and wheel_angles are those of ``step``; only effects use them. ValueError: the model has effects,
-        and the duration is missing.
+        Only effects use the rest: duration: s. wheel_angles (N,): absolute, at the sample's end, rad; where they are
+        not known they are counted from 0. ValueError: the model has effects, and the duration is missing.
         """
         self.moved = self.matrix @ angles
         self.pose = advance(self.pose, self.moved, self.integration)

@@ -101,4 +101,4 @@ def streamed(stream: OdometryStream, log: WheelLog) -> np.ndarray:
     assert log.wheel_angles is not None
     durations = np.diff(log.times, prepend=0.0)
     samples = zip(log.rates, durations, log.wheel_angles, strict=True)
-    return np.array([stream.step(rates, duration, angles) for rates, duration, angles in samples])
+    return np.array([stream.drive(rates * duration, duration, angles) for rates, duration, angles in samples])

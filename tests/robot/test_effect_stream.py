@@ -15,6 +15,7 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryStream, WheelLog, advance
 
 BOTH: tuple[Integration, ...] = ("euler", "arc")
+TENTHS = np.full(3, 0.1)  # rad
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -50,7 +51,7 @@ def test_moved_leads_from_pose_to_pose(seed: int) -> None:
     stream.frame_heading = 0.7
     for rates, duration in zip(log.rates, np.diff(log.times, prepend=0.0), strict=True):
         before = stream.pose
-        after = stream.step(rates, duration)
+        after = stream.drive(rates * duration, duration)
         np.testing.assert_allclose(advance(before, stream.moved, "arc"), after, rtol=0, atol=1e-12)
 
 
@@ -66,44 +67,33 @@ def test_the_floor_drifts_in_the_references_frame() -> None:
     np.testing.assert_allclose(turned + log.start[:2], in_map[:, :2], rtol=0, atol=1e-12)
 
 
-@given(seed=seeds)
-def test_driven_angles_are_rates_over_the_duration(seed: int) -> None:
-    log = a_drive(seed, 20)
-    chosen = model(*mixture(seed, APR_02))
-    by_rates, by_angles = stream_of(chosen, log), stream_of(chosen, log)
-    for rates, duration in zip(log.rates, np.diff(log.times, prepend=0.0), strict=True):
-        by_rates.step(rates, duration)
-        by_angles.drive(rates * duration, duration)
-    np.testing.assert_allclose(by_angles.pose, by_rates.pose, rtol=0, atol=1e-12)
-
-
 def test_angles_that_are_not_told_are_counted_from_zero() -> None:
     chosen, log = model(a_term("wheel_eccentricity", APR_02)), at_every_sample(a_drive(5))
     counted = replace(log, wheel_angles=np.cumsum(log.rates * np.diff(log.times, prepend=0.0)[:, None], axis=0))
     stream = stream_of(chosen, log)
     for rates, duration in zip(log.rates, np.diff(log.times, prepend=0.0), strict=True):
-        stream.step(rates, duration)
+        stream.drive(rates * duration, duration)
     np.testing.assert_allclose(stream.pose, chosen.poses([counted])[0][-1], rtol=0, atol=1e-12)
 
 
 def test_without_a_session_it_is_one_that_no_calibration_knows() -> None:
     worn, plain = model(term("tyre_wear", radius_morning=0.01)).stream(), model().stream()
-    np.testing.assert_allclose(worn.step(np.ones(3), 0.1), plain.step(np.ones(3), 0.1), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(worn.drive(TENTHS, 0.1), plain.drive(TENTHS, 0.1), rtol=0, atol=1e-15)
 
 
 def test_session_time_begins_where_it_is_told() -> None:
     warm = model(term("thermal_radius_drift", k=1e-5))
     late = warm.stream(session_time=1000.0)
-    late.step(np.ones(3), 0.1)
+    late.drive(TENTHS, 0.1)
     np.testing.assert_allclose(late.moved, 1.010_000_5 * (warm.matrix @ np.ones(3)) * 0.1, rtol=0, atol=1e-14)
 
 
 def test_a_motion_that_takes_no_time_is_the_matrix_alone() -> None:
     stream = model(term("heading_drift", b=0.005), term("acceleration_slip", k=0.1)).stream()
-    stream.step(np.ones(3), 0.1)
+    stream.drive(TENTHS, 0.1)
     stream.drive(np.array([0.1, 0.2, 0.3]), 0.0)
     np.testing.assert_allclose(stream.moved, APR_02.inverse_kinematic_matrix @ [0.1, 0.2, 0.3], rtol=1e-15)
-    assert np.isfinite(stream.step(np.ones(3), 0.1)).all()
+    assert np.isfinite(stream.drive(TENTHS, 0.1)).all()
 
 
 def test_effects_ask_for_the_duration() -> None:
@@ -113,4 +103,4 @@ def test_effects_ask_for_the_duration() -> None:
 
 def test_without_effects_of_motion_it_needs_no_duration() -> None:
     for chosen in (model(), model(term("lidar_yaw", beta=0.01))):
-        np.testing.assert_array_equal(chosen.stream().drive(np.ones(3)), model().stream().step(np.ones(3), 1.0))
+        np.testing.assert_array_equal(chosen.stream().drive(np.ones(3)), model().stream().drive(np.ones(3), 1.0))

@@ -189,7 +189,7 @@ def test_actuator_effects_do_nothing_to_odometry() -> None:
     log = a_drive(1)
     told = model(term("motor_lag", tau=0.1), term("motor_gain", g=0.05), term("motor_dead_band", band=0.1))
     np.testing.assert_array_equal(told.reported([log])[0], model().poses([log])[0])
-    np.testing.assert_array_equal(told.stream().step(np.ones(3), 0.1), model().stream().step(np.ones(3), 0.1))
+    np.testing.assert_array_equal(told.stream().drive(np.ones(3), 0.1), model().stream().drive(np.ones(3), 0.1))
 
 
 def test_a_model_with_effects_needs_the_sample_period() -> None:

@@ -64,7 +64,7 @@ def streamed(log: WheelLog, matrix: Array, integration: Integration) -> Array:
     for stamp in log.stamps:
         stream, before = OdometryStream(matrix, integration, log.start), 0.0
         for time, rates in zip(log.times, log.rates, strict=True):
-            stream.step(rates, min(time, stamp) - before)
+            stream.drive(rates * (min(time, stamp) - before))
             before = min(time, stamp)
         poses.append(stream.pose)
     return np.array(poses)
@@ -287,5 +287,5 @@ def test_a_models_stream_starts_at_the_origin_unless_told() -> None:
 
 def test_a_stream_does_not_change_the_start_it_was_given() -> None:
     start = np.zeros(3)
-    OdometryStream(MATRIX, "arc", start).step(np.ones(3), 0.1)
+    OdometryStream(MATRIX, "arc", start).drive(np.ones(3))
     np.testing.assert_array_equal(start, np.zeros(3))

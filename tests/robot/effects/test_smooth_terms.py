@@ -104,7 +104,7 @@ def test_a_stream_that_is_put_elsewhere_has_its_poses_from_there_on() -> None:
     log = at_every_sample(a_drive(3))
     chosen = model(a_term("smooth_place", APR_02, 3))
     stream = chosen.stream(np.zeros(3), log.session, log.started_at or 0.0)
-    stream.step(np.ones(3), 0.1)
+    stream.drive(np.full(3, 0.1), 0.1)
     stream.pose = log.start.copy()
     np.testing.assert_allclose(streamed(stream, log), chosen.poses([log])[0], rtol=0, atol=1e-12)
 
@@ -113,7 +113,7 @@ def test_a_motion_that_takes_no_time_moves_the_uncorrected_path_as_well() -> Non
     chosen = model(make_term("smooth_heading", usual("smooth_heading") | {"along_sin1": 0.1}, APR_02))
     stream, quarter = chosen.stream(), np.linalg.solve(chosen.matrix, [0.0, 0.0, math.pi / 2])
     stream.drive(quarter, 0.0)
-    stream.step(np.linalg.solve(chosen.matrix, [0.5, 0.0, 0.0]), 0.1)
+    stream.drive(np.linalg.solve(chosen.matrix, [0.05, 0.0, 0.0]), 0.1)
     np.testing.assert_allclose(stream.moved, [0.055, 0.0, 0.0], atol=1e-12)
 
 
@@ -128,7 +128,7 @@ def test_the_heading_is_the_references_in_a_stream_whose_frame_is_turned() -> No
     chosen = model(make_term("smooth_heading", usual("smooth_heading") | {"along_sin1": 0.1}, APR_02))
     stream = chosen.stream()
     stream.frame_heading = math.pi / 2
-    stream.step(np.linalg.solve(chosen.matrix, [0.5, 0.0, 0.0]), 0.1)
+    stream.drive(np.linalg.solve(chosen.matrix, [0.05, 0.0, 0.0]), 0.1)
     np.testing.assert_allclose(stream.moved, [0.055, 0.0, 0.0], atol=1e-12)
 
 

@@ -213,7 +213,7 @@ class TestCHeader:
         export = export_calibration(calibration(matrix=matrix, integration=integration), "c_header")
         poses = run_header(export, tmp_path, "apr02", samples)
         stream = OdometryStream(matrix, integration, np.array([1.0, -2.0, 3.0]))
-        expected = np.array([stream.step(row[:3], row[3]) for row in samples])
+        expected = np.array([stream.drive(row[:3] * row[3]) for row in samples])
         np.testing.assert_allclose(poses, expected, rtol=0, atol=1e-12)
 
     @needs_compiler
@@ -233,7 +233,7 @@ class TestCHeader:
         assert export.file_name == "robot_4_wheeler_gr_e_1_odometry.h"
         poses = run_header(export, tmp_path, "robot_4_wheeler_gr_e_1", np.array([[1.0, 2, 3, 4, 0.5]]))
         stream = OdometryStream(mecanum.inverse_kinematic_matrix, "arc", np.array([1.0, -2.0, 3.0]))
-        np.testing.assert_allclose(poses[0], stream.step(np.array([1.0, 2, 3, 4]), 0.5), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(poses[0], stream.drive(np.array([0.5, 1, 1.5, 2])), rtol=0, atol=1e-12)
 
     def test_the_matrix_reads_back_to_the_bit(self) -> None:
         matrix = published_matrix("palacin2023_eq8")
