@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from omnibench.words import plural
+
+
+def _anomaly(noun: str, rest: str) -> Any:
+    """A counter of what should not happen, with its words in messages: a noun, and what follows it."""
+    return field(default=0, metadata={"words": (noun, rest)})
 
 
 @dataclass(slots=True)
@@ -13,30 +19,30 @@ class Counts:
     """Counters since the start, in the order in which diagnostics show them."""
 
     samples: int = 0  # wheel samples taken
-    missing: int = 0  # wheel samples that never came, by the stamps of those that did
-    irregular: int = 0  # periods off the mean by a quarter or more, missing samples aside
-    duplicates: int = 0  # samples with a stamp that was taken already
-    late: int = 0  # samples out of order: a newer one had been taken
-    gaps: int = 0  # silences longer than max_gap
-    clock_jumps: int = 0  # the stamps went on somewhere else
-    bad_stamps: int = 0  # stamps far from the last one, which the next ones did not confirm
+    missing: int = _anomaly("wheel sample", "missing")  # it never came, by the stamps of those that did
+    irregular: int = _anomaly("wheel sample", "at irregular times")  # off the mean period by a quarter or more
+    duplicates: int = _anomaly("wheel sample", "twice")  # its stamp was taken already
+    late: int = _anomaly("wheel sample", "out of order")  # a newer one had been taken
+    gaps: int = _anomaly("gap", "longer than max_gap")
+    clock_jumps: int = _anomaly("jump", "of the wheel samples' clock")  # the stamps went on somewhere else
+    bad_stamps: int = _anomaly("wheel sample", "with an unlikely stamp")  # which the next ones did not confirm
     wraps: int = 0  # angles that started again after a turn of the counter
-    counter_restarts: int = 0  # angles that started again elsewhere, or moved faster than max_rate
-    not_finite: int = 0  # NaN or infinity among angles and rates
-    too_fast: int = 0  # samples with rates beyond max_rate
-    wrong_joints: int = 0  # a wheel is not among the names, or has neither angle nor rate
-    undecodable: int = 0  # wheel messages that are no sensor_msgs/JointState
+    counter_restarts: int = _anomaly("restart", "of a wheel's counter")  # elsewhere, or it moved faster than max_rate
+    not_finite: int = _anomaly("wheel sample", "not finite")  # NaN or infinity among angles and rates
+    too_fast: int = _anomaly("wheel sample", "faster than max_rate")
+    wrong_joints: int = _anomaly("wheel sample", "without all wheels")  # by name, or without angle and rate
+    undecodable: int = _anomaly("wheel message", "undecodable")  # no sensor_msgs/JointState
     poses: int = 0  # SLAM poses that were fused
-    pose_rejected: int = 0  # SLAM poses too far from the expected one, by the gate
-    pose_too_late: int = 0  # older than the history
-    pose_ahead: int = 0  # stamps in the future, or more than can wait for their wheel samples
-    pose_duplicates: int = 0
-    pose_invalid: int = 0  # not finite, no covariance, wrong frame
-    pose_undecodable: int = 0  # not a geometry_msgs/PoseWithCovarianceStamped
-    reacquired: int = 0  # times that the filter gave up its pose for SLAM's
+    pose_rejected: int = _anomaly("pose", "refused by the gate")  # too far from the expected one
+    pose_too_late: int = _anomaly("pose", "older than the history")
+    pose_ahead: int = _anomaly("pose", "ahead of the wheel samples")  # or more than can wait for them
+    pose_duplicates: int = _anomaly("pose", "twice")
+    pose_invalid: int = _anomaly("pose", "invalid")  # not finite, no covariance, wrong frame
+    pose_undecodable: int = _anomaly("pose message", "undecodable")  # no geometry_msgs/PoseWithCovarianceStamped
+    reacquired: int = _anomaly("restart", "of the filter at SLAM's pose")  # it gave up its own
     swaps: int = 0  # calibrations taken
-    swaps_refused: int = 0
-    failures: int = 0  # errors of omnibench itself while it took a message; each is logged
+    swaps_refused: int = _anomaly("calibration", "refused")
+    failures: int = _anomaly("error", "of omnibench")  # while it took a message; each is logged
 
     def as_dict(self) -> dict[str, int]:
         """Names and values."""
@@ -44,33 +50,10 @@ class Counts:
 
     def anomalies(self) -> dict[str, int]:
         """The counters above 0 of what should not happen."""
-        usual = ("samples", "poses", "swaps", "wraps")
-        return {name: value for name, value in self.as_dict().items() if value and name not in usual}
+        return {name: value for name, value in self.as_dict().items() if value and name in _WORDS}
 
 
-_WORDS = {  # noun, and what follows it, of the counters in ``Counts.anomalies``
-    "missing": ("wheel sample", "missing"),
-    "irregular": ("wheel sample", "at irregular times"),
-    "duplicates": ("wheel sample", "twice"),
-    "late": ("wheel sample", "out of order"),
-    "gaps": ("gap", "longer than max_gap"),
-    "clock_jumps": ("jump", "of the wheel samples' clock"),
-    "bad_stamps": ("wheel sample", "with an unlikely stamp"),
-    "counter_restarts": ("restart", "of a wheel's counter"),
-    "not_finite": ("wheel sample", "not finite"),
-    "too_fast": ("wheel sample", "faster than max_rate"),
-    "wrong_joints": ("wheel sample", "without all wheels"),
-    "undecodable": ("wheel message", "undecodable"),
-    "pose_rejected": ("pose", "refused by the gate"),
-    "pose_too_late": ("pose", "older than the history"),
-    "pose_ahead": ("pose", "ahead of the wheel samples"),
-    "pose_duplicates": ("pose", "twice"),
-    "pose_invalid": ("pose", "invalid"),
-    "pose_undecodable": ("pose message", "undecodable"),
-    "reacquired": ("restart", "of the filter at SLAM's pose"),
-    "swaps_refused": ("calibration", "refused"),
-    "failures": ("error", "of omnibench"),
-}
+_WORDS = {item.name: item.metadata["words"] for item in fields(Counts) if item.metadata}
 
 
 def anomalies_in_words(anomalies: Mapping[str, int]) -> str:
