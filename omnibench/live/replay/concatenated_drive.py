@@ -88,19 +88,18 @@ def concatenate_runs(
     starts = _composed(runs[0].start, moves)
     if start_poses is not None:
         starts = _given_start_poses(dataset, np.asarray(start_poses, dtype=float), moves)
-    rests = [_rest_samples(run, pause, dataset.sample_period) for run in runs]
-    lengths = [run.times[-1] + count * dataset.sample_period for run, count in zip(runs, rests, strict=True)]
-    begins = np.concatenate([[0.0], np.cumsum(lengths)[:-1]])
-    rests[-1] = 0  # the drive ends with its last run
+    resting = [*(_rest_samples(run, pause, dataset.sample_period) for run in runs[:-1]), 0]
+    legs = [_with_rest(run, rest, dataset.sample_period) for run, rest in zip(runs, resting, strict=True)]
+    begins = np.concatenate([[0.0], np.cumsum([leg.times[-1] for leg in legs[:-1]])])
     measured = [run.pose_times > 0 for run in runs]
     measured[0] = np.ones(len(runs[0].pose_times), dtype=bool)
     return ConcatenatedDrive(
         robot=dataset.robot,
         ids=tuple(run.id for run in runs),
-        wheel_times=_wheel_times(runs, rests, begins, dataset.sample_period),
-        angles=_angles(runs, rests),
-        rates=_rates(runs, rests),
-        run=np.repeat(np.arange(len(runs)), _samples(runs, rests)),
+        wheel_times=np.concatenate([[0.0], *(begin + leg.times for begin, leg in zip(begins, legs, strict=True))]),
+        angles=_continuous_angles(legs),
+        rates=np.concatenate([np.zeros((1, len(dataset.robot.wheels))), *(leg.rates for leg in legs)]),
+        run=np.repeat(np.arange(len(legs)), [1 + len(legs[0].times), *(len(leg.times) for leg in legs[1:])]),
         slam_times=np.concatenate([b + run.pose_times[m] for b, run, m in zip(begins, runs, measured, strict=True)]),
         slam_poses=np.concatenate(
             [moved_to(start, run.poses)[m] for start, run, m in zip(starts, runs, measured, strict=True)]
@@ -191,41 +190,29 @@ def _rest_samples(run: Trajectory, pause: float, period: float) -> int:
     return max(0, int(np.ceil(missing))) + round(pause / period)
 
 
-def _samples(runs: Sequence[Trajectory], rests: Sequence[int]) -> list[int]:
-    """Number of samples of each run with the standstill after it; the first run has the baseline too."""
-    counts = [len(run.times) + rest for run, rest in zip(runs, rests, strict=True)]
-    return [counts[0] + 1, *counts[1:]]
+def _with_rest(run: Trajectory, rest: int, period: float) -> Trajectory:
+    """A run with samples of standstill after it, and with its rates integrated where no angles were recorded."""
+    still, angles = np.zeros((rest, run.rates.shape[1])), run.angles
+    if angles is None:
+        angles = np.cumsum(run.rates * np.diff(run.times, prepend=0.0)[:, None], axis=0)
+    return replace(
+        run,
+        times=np.append(run.times, run.times[-1] + period * np.arange(1, rest + 1)),
+        rates=np.vstack([run.rates, still]),
+        angles=np.vstack([angles, angles[-1] + still]),
+        targets=None,
+    )
 
 
-def _wheel_times(runs: Sequence[Trajectory], rests: Sequence[int], begins: Array, period: float) -> Array:
-    parts: list[Array] = [np.zeros(1)]
-    for run, rest, begin in zip(runs, rests, begins, strict=True):
-        parts += [begin + run.times, begin + run.times[-1] + period * np.arange(1, rest + 1)]
-    return np.concatenate(parts)
-
-
-def _rates(runs: Sequence[Trajectory], rests: Sequence[int]) -> Array:
-    wheels = runs[0].rates.shape[1]
-    parts: list[Array] = [np.zeros((1, wheels))]
-    for run, rest in zip(runs, rests, strict=True):
-        parts += [run.rates, np.zeros((rest, wheels))]
-    return np.concatenate(parts)
-
-
-def _angles(runs: Sequence[Trajectory], rests: Sequence[int]) -> Array:
-    """Recorded wheel angles, or integrated rates without them, made continuous from run to run."""
+def _continuous_angles(legs: Sequence[Trajectory]) -> Array:
+    """Wheel angles (n, N) at the baseline and at all samples, made continuous from run to run."""
     parts: list[Array] = []
-    last: Array | None = None
-    for run, rest in zip(runs, rests, strict=True):
-        steps = run.rates * np.diff(run.times, prepend=0.0)[:, None]
-        angles = np.cumsum(steps, axis=0) if run.angles is None else run.angles
-        before = angles[0] - steps[0]
-        if last is None:
+    for leg in legs:
+        assert leg.angles is not None  # recorded or integrated
+        before = leg.angles[0] - leg.rates[0] * leg.times[0]
+        if not parts:
             parts.append(before[None])
-        else:
-            angles = angles + (last - before)
-        last = angles[-1]
-        parts += [angles, np.tile(last, (rest, 1))]
+        parts.append(leg.angles + (parts[-1][-1] - before))
     return np.concatenate(parts)
 
 
