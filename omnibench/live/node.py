@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from functools import partial
 
 from omnibench.errors import ConfigError
+from omnibench.live.closing import Closing
 from omnibench.live.config import LiveConfig
 from omnibench.live.control.query_server import QueryServer
 from omnibench.live.control.robot_info import robot_info
@@ -26,10 +27,10 @@ from omnibench.live.wire.topics import GraphNode, KeySpace
 from omnibench.registry import load_plugins
 
 LOG = logging.getLogger("omnibench.live")
-_PRESENCE_TIMEOUT = 0.5  # s to wait for the tokens of robots of other nodes
+_PRESENCE_TIMEOUT = 2.0  # s, at most, for the tokens of other nodes' robots, which mostly come at once; chosen
 
 
-class LiveNode:
+class LiveNode(Closing):
     """Runs from its construction until ``close``; does all that its config says, ``record`` and ``foxglove`` included.
 
     remember: use the config's ``state``, if it has one; a replay starts afresh. ConfigError or DataError: it cannot
@@ -63,12 +64,6 @@ class LiveNode:
     def close(self) -> None:
         """Take no more requests, then no more messages; write the robots' states; complete the recording; leave."""
         self._started.close()
-
-    def __enter__(self) -> LiveNode:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def health(self, robot: str) -> Health:
         """A robot's health now."""

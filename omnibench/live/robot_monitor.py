@@ -8,16 +8,17 @@ import time
 from collections import deque
 from dataclasses import fields
 from threading import Event, Lock
-from types import TracebackType
 from typing import Any, Final
 
 import zenoh
-from zenoh.handlers import Callback
 
 from omnibench.errors import DataError
+from omnibench.live.closing import Closing
 from omnibench.live.estimation.counts import Counts
+from omnibench.live.network.callbacks import direct
 from omnibench.live.network.presence import Presence, checked_robot, nothing_received
 from omnibench.live.robot_status import HealthSummary, OdometryStatus, RobotStatus
+from omnibench.live.stopping import wait_until
 from omnibench.live.wire.messages import DIAGNOSTICS, ODOMETRY, MessageError, Odometry
 from omnibench.live.wire.topics import KeySpace
 
@@ -30,7 +31,7 @@ _LEVELS: Final = ("ok", "warning", "error", "stale")  # names of DiagnosticStatu
 _COUNTERS: Final = frozenset(item.name for item in fields(Counts))
 
 
-class RobotMonitor:
+class RobotMonitor(Closing):
     """Listens to one robot, or to all if ``robot`` is None; a context manager.
 
     ConfigError: no robot can have this name.
@@ -47,9 +48,8 @@ class RobotMonitor:
         self._presence = Presence(session)
         names = robot or "*"
         self._subscribers = [self._subscribe(keys.expression(names, topic), topic) for topic in ("odom", _FUSED)]
-        take_diagnostics: Any = Callback(self._take_diagnostics, indirect=False)
         expression = keys.expression(names, "diagnostics")
-        self._subscribers.append(session.declare_subscriber(expression, take_diagnostics))
+        self._subscribers.append(session.declare_subscriber(expression, direct(self._take_diagnostics)))
 
     @property
     def alive(self) -> tuple[str, ...]:
@@ -80,26 +80,18 @@ class RobotMonitor:
 
     def wait_until_present(self, stop: Event, patience: float) -> None:
         """Wait until the robot is alive or sends odometry, or ``stop`` is set; DataError after ``patience`` s."""
-        deadline = time.monotonic() + patience
-        while not any(status.presence == "alive" or status.odom or status.filtered for status in self.statuses()):
-            if time.monotonic() > deadline:
-                raise DataError(nothing_received(self._robot or "*", patience, self.alive))
-            if stop.wait(0.02):
-                return
+
+        def present() -> bool:
+            return any(status.presence == "alive" or status.odom or status.filtered for status in self.statuses())
+
+        if not wait_until(present, patience, stop, 0.02) and not stop.is_set():
+            raise DataError(nothing_received(self._robot or "*", patience, self.alive))
 
     def close(self) -> None:
         """Stop listening."""
         self._presence.close()
         for subscriber in self._subscribers:
             subscriber.undeclare()
-
-    def __enter__(self) -> RobotMonitor:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _subscribe(self, expression: str, topic: str) -> zenoh.Subscriber[None]:
         def take_odometry(sample: zenoh.Sample) -> None:
@@ -109,14 +101,11 @@ class RobotMonitor:
                     stream = self._streams.setdefault(key, _Stream())
                 stream.take(sample.payload.to_bytes())
 
-        direct: Any = Callback(take_odometry, indirect=False)
-        return self._session.declare_subscriber(expression, direct)
+        return self._session.declare_subscriber(expression, direct(take_odometry))
 
     def _query_health(self) -> None:
-        take_answer: Any = Callback(self._take_answer, indirect=False)
-        self._session.get(
-            f"omnibench/{self._robot or '*'}/health", take_answer, target=zenoh.QueryTarget.ALL, timeout=_QUERY_PERIOD
-        )
+        key = f"omnibench/{self._robot or '*'}/health"
+        self._session.get(key, direct(self._take_answer), target=zenoh.QueryTarget.ALL, timeout=_QUERY_PERIOD)
 
     def _take_answer(self, reply: zenoh.Reply) -> None:
         if reply.ok is None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 import time
 
-from omnibench.errors import ConfigError
 from omnibench.live.config import LiveConfig, RobotConfig
 from omnibench.live.estimation.saved_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.robot.calibration import Calibration, read_calibration
+from omnibench.live.estimation.wheel_input import check_joints
+from omnibench.robot.calibration import read_calibration
 
 LOG = logging.getLogger("omnibench.live")
 
@@ -20,7 +20,9 @@ def make_tracker(config: LiveConfig, robot: RobotConfig, memory: RobotMemory | N
     ConfigError or DataError: the calibration cannot be read, or the joints are not one for each wheel.
     """
     calibration = read_calibration(robot.calibration) if memory is None else memory.calibration(robot.calibration)
-    _check_joints(robot, calibration)
+    if robot.wheels.joints is not None:
+        wheels = calibration.robot.wheel_names
+        check_joints(robot.wheels.joints, wheels, f"robot {robot.name!r}: wheels.joints")
     tracker = RobotTracker(
         robot.name,
         calibration,
@@ -36,12 +38,3 @@ def make_tracker(config: LiveConfig, robot: RobotConfig, memory: RobotMemory | N
         x, y, _ = saved.pose
         LOG.info("%s: goes on at x %.3f m, y %.3f m of odom", robot.name, x, y)
     return tracker
-
-
-def _check_joints(robot: RobotConfig, calibration: Calibration) -> None:
-    joints, wheels = robot.wheels.joints, calibration.robot.wheel_names
-    if joints is not None and (len(joints) != len(wheels) or len(set(joints)) < len(joints)):
-        raise ConfigError(
-            f"robot {robot.name!r}: wheels.joints: {', '.join(joints) or 'none'}; name one joint, and a different one, "
-            f"for each of the wheels {', '.join(wheels)}"
-        )

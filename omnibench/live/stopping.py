@@ -1,4 +1,4 @@
-"""Stopping a command that runs until a signal or a time limit."""
+"""Stopping a command that runs until a signal, a time limit or an event."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 
@@ -35,6 +35,18 @@ def stop_on_signals() -> Iterator[threading.Event]:
         yield stop
     finally:
         restore()
+
+
+def wait_until(
+    condition: Callable[[], bool], seconds: float, stop: threading.Event | None = None, period: float = 0.01
+) -> bool:
+    """True once a condition holds, which is tried every ``period`` s; False after ``seconds`` or if ``stop`` is set."""
+    deadline = time.monotonic() + seconds
+    stop = stop or threading.Event()
+    while not condition():
+        if time.monotonic() >= deadline or stop.wait(period):
+            return False
+    return True
 
 
 def ticks(stop: threading.Event, period: float, seconds: float | None = None) -> Iterator[float]:

@@ -13,13 +13,13 @@ from typing import Any, Final, cast
 
 import numpy as np
 import zenoh
-from zenoh.handlers import Callback
 
 from omnibench.config import Model, to_json
 from omnibench.errors import ConfigError, DataError, OmnibenchError, one_line
 from omnibench.live.control.orders import read_pose, read_sent_calibration, read_time
 from omnibench.live.estimation.saved_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
+from omnibench.live.network.callbacks import direct
 from omnibench.live.network.rate_limiter import RateLimiter
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
@@ -75,10 +75,10 @@ class QueryServer:
 
         # declared one by one, so that access control can tell them apart
         services: list[Any] = [
-            session.declare_queryable(f"omnibench/{name}/{service}", _direct(handler(service)))
+            session.declare_queryable(f"omnibench/{name}/{service}", direct(handler(service)))
             for service in _READING + _ORDERS
         ]
-        put = _direct(lambda sample: self._take_sample(name, sample))
+        put = direct(lambda sample: self._take_sample(name, sample))
         return [*services, session.declare_subscriber(f"omnibench/{name}/calibration", put)]
 
     def _take_query(self, name: str, service: str, query: zenoh.Query) -> None:
@@ -202,10 +202,6 @@ class QueryServer:
             LOG.warning("%s: calibration %r runs, but not after a restart: %s", name, calibration.name, error)
             return str(error)
         return None
-
-
-def _direct(callback: Callable[[Any], None]) -> Any:
-    return Callback(callback, indirect=False)
 
 
 def _size(content: zenoh.ZBytes | None) -> int:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from omnibench.config import Model, Positive
+from omnibench.errors import ConfigError
 from omnibench.live.estimation.counts import Counts
 from omnibench.live.estimation.wheel_angles import WheelAngles
 from omnibench.live.wire.messages import JointState, MessageError
@@ -44,6 +45,15 @@ class WheelSettings(Model):
     )
     max_rate: Positive = Field(100.0, description="no wheel turns faster, rad/s")
     max_gap: Positive = Field(1.0, description="a longer silence makes the path unknown, s")
+
+
+def check_joints(joints: Sequence[str], wheels: Sequence[str], where: str) -> None:
+    """ConfigError that begins with ``where``: the joints are not one, and a different one, for each wheel."""
+    if len(joints) != len(wheels) or len(set(joints)) < len(joints):
+        raise ConfigError(
+            f"{where}: {', '.join(joints) or 'none'}; name one joint, and a different one, "
+            f"for each of the wheels {', '.join(wheels)}"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,7 +9,7 @@ from typing import Final
 
 from omnibench.live.network.session_config import SessionConfig, Tls, address_of
 
-_TIMEOUT: Final = 2.0  # s to wait for a TCP connection; chosen
+_TIMEOUT: Final = 2.0  # s to wait for a TCP connection, and for a word of TLS; chosen
 _ALERTS: Final = {  # ends of OpenSSL's reasons when the other side refuses our certificate, and what to do
     "CERTIFICATE_REQUIRED": "it asks for a certificate; give tls: certificate, key and mutual: true",
     "HANDSHAKE_FAILURE": "it asks for a certificate; give tls: certificate, key and mutual: true",
@@ -81,7 +81,7 @@ def _why_not_tls(connection: socket.socket, host: str, tls: Tls) -> str | None:
         if tls.certificate is not None and tls.mutual:
             context.load_cert_chain(tls.certificate, tls.key)
         with context.wrap_socket(connection, server_hostname=host) as encrypted:
-            encrypted.settimeout(0.5)  # with TLS 1.3 a refusal comes after the handshake
+            encrypted.settimeout(_TIMEOUT)  # with TLS 1.3 a refusal comes after the handshake
             encrypted.recv(1)
     except ssl.SSLCertVerificationError as error:
         return f"we refuse its certificate: {error.verify_message.rstrip('.')}; check tls: ca ({tls.ca})"
@@ -99,7 +99,7 @@ def _why_not_tls(connection: socket.socket, host: str, tls: Tls) -> str | None:
 def _speaks_tls(connection: socket.socket) -> bool:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    connection.settimeout(0.5)
+    connection.settimeout(_TIMEOUT)
     try:
         context.wrap_socket(connection).close()
     except ssl.SSLError as error:

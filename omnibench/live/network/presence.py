@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from threading import Lock
-from typing import Any, Final
+from typing import Final
 
 import zenoh
-from zenoh.handlers import Callback
 
 from omnibench.errors import ConfigError, nearest
+from omnibench.live.network.callbacks import direct
 
 _ALIVE: Final = "omnibench/*/alive"
 _NAME = re.compile(r"[^\s/*$?#@]+")
@@ -45,8 +45,7 @@ class Presence:
     def __init__(self, session: zenoh.Session) -> None:
         self._is_alive: dict[str, bool] = {}
         self._lock = Lock()
-        direct: Any = Callback(self._changed, indirect=False)
-        self._subscriber = session.liveliness().declare_subscriber(_ALIVE, direct, history=True)
+        self._subscriber = session.liveliness().declare_subscriber(_ALIVE, direct(self._changed), history=True)
 
     @property
     def alive(self) -> tuple[str, ...]:

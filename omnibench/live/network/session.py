@@ -6,7 +6,6 @@ import json
 import logging
 import os
 import re
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +17,7 @@ from omnibench.live.network.access import access_control
 from omnibench.live.network.diagnosis import why_not_connected, why_not_listening
 from omnibench.live.network.session_config import Access, SessionConfig, Tls, User
 from omnibench.live.network.tls_files import check_files, common_name
+from omnibench.live.stopping import wait_until
 
 LOG = logging.getLogger("omnibench.live")
 
@@ -159,13 +159,13 @@ def _lines(path: Path, what: str) -> list[str]:
 
 def _check_connected(session: zenoh.Session, config: SessionConfig) -> None:
     """ConfigError: no connection. Zenoh opens a router or peer even if it is refused, and retries for ever."""
-    if not config.connecting:
-        return
-    deadline = time.monotonic() + (0.0 if config.mode == "client" else max(_CONNECT_TIMEOUT, config.wait))
-    while not (session.info.routers_zid() or session.info.peers_zid()):
-        if time.monotonic() >= deadline:
-            raise ConfigError(why_not_connected(config))
-        time.sleep(0.01)
+    patience = 0.0 if config.mode == "client" else max(_CONNECT_TIMEOUT, config.wait)
+    if config.connecting and not wait_until(lambda: _is_connected(session), patience):
+        raise ConfigError(why_not_connected(config))
+
+
+def _is_connected(session: zenoh.Session) -> bool:
+    return bool(session.info.routers_zid() or session.info.peers_zid())
 
 
 def _why_not_open(config: SessionConfig, error: zenoh.ZError) -> str:

@@ -16,6 +16,7 @@ from omnibench.live.node import LiveNode, load_effects
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_recording, concatenated_truth
 from omnibench.live.replay.played_recording import Recording
 from omnibench.live.replay.replay_player import Player, PlayReport
+from omnibench.live.stopping import wait_until
 from omnibench.live.wire.messages import Odometry
 from omnibench.live.wire.subscriber import Subscription, subscribe
 from omnibench.live.wire.topics import GraphNode
@@ -144,14 +145,12 @@ def demonstrate(
 def _wait_for_the_last(
     odometry: _Collector, fused: _Collector | None, node: LiveNode, robot: str, stop: threading.Event
 ) -> None:
-    pause = threading.Event()
-    for _ in range(int(_LAST_MESSAGES / 0.02)):
+    def all_arrived() -> bool:
         taken = node.health(robot).counts["samples"]
         arrived = len(odometry.stamps) >= taken and (fused is None or len(fused.stamps) >= taken)
-        if pause.wait(0.02 if not arrived else 0.1) or stop.is_set():
-            return
-        if arrived and node.health(robot).counts["samples"] == taken:
-            return
+        return arrived and not stop.wait(0.1) and node.health(robot).counts["samples"] == taken
+
+    wait_until(all_arrived, _LAST_MESSAGES, stop, 0.02)
 
 
 def _evaluated(

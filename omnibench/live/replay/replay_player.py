@@ -13,6 +13,7 @@ import zenoh
 from numpy.typing import NDArray
 
 from omnibench.errors import ConfigError, OmnibenchError
+from omnibench.live.estimation.wheel_input import check_joints
 from omnibench.live.network.presence import checked_robot
 from omnibench.live.replay.arrivals import (
     TOPICS_PLAYED,
@@ -20,26 +21,15 @@ from omnibench.live.replay.arrivals import (
     PoseDeviation,
     ReplayConfig,
     SlamChannel,
-    WheelChannel,
     make_schedule,
 )
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive
+from omnibench.live.stopping import wait_until
 from omnibench.live.wire.messages import JointState, PoseEstimate
 from omnibench.live.wire.topics import GraphNode
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
-
-__all__ = [
-    "Event",
-    "PlayReport",
-    "Player",
-    "PoseDeviation",
-    "ReplayConfig",
-    "SlamChannel",
-    "WheelChannel",
-    "events",
-]
 
 MAP = "map"
 _LEAST_DEVIATION = 1e-4  # m, rad; least standard deviation, so that no covariance is singular; chosen
@@ -81,7 +71,8 @@ class _Messages:
     ) -> None:
         self._drive = drive
         self._origin = config.stamp_origin
-        self._joints = _joint_names(drive, names)
+        self._joints = tuple(drive.robot.wheel_names if names is None else names)
+        check_joints(self._joints, drive.robot.wheel_names, "joints")
         self._schedule = make_schedule(drive, config)
         self._sampled, self._posed = (_nanoseconds(times) for times in (drive.wheel_times, drive.slam_times))
         self._covariances = _pose_covariances(drive, config.slam, noise)
@@ -194,16 +185,12 @@ class Player:
         """Wait until the wheel samples have a subscriber, and then up to _SLAM_WAIT s for one of the SLAM poses."""
         wheels, slam = (self._publishers[topic] for topic in TOPICS_PLAYED)
         wait = self._config.wait
-        deadline = time.perf_counter() + wait
-        while wait and not wheels.matched and not stop.wait(0.01):
-            if time.perf_counter() > deadline:
-                raise ConfigError(
-                    f"nobody subscribes to {wheels.key} after {wait:g} s; start omnibench live for robot "
-                    f"{self._robot}, check robot, profile and endpoint of both, or wait longer"
-                )
-        deadline = time.perf_counter() + min(wait, _SLAM_WAIT)
-        while not slam.matched and time.perf_counter() < deadline and not stop.wait(0.01):
-            pass
+        if wait and not wait_until(lambda: wheels.matched, wait, stop) and not stop.is_set():
+            raise ConfigError(
+                f"nobody subscribes to {wheels.key} after {wait:g} s; start omnibench live for robot "
+                f"{self._robot}, check robot, profile and endpoint of both, or wait longer"
+            )
+        wait_until(lambda: slam.matched, min(wait, _SLAM_WAIT), stop)
 
 
 def _nanoseconds(times: Array) -> NDArray[np.int64]:
@@ -225,12 +212,3 @@ def _pose_covariances(drive: ConcatenatedDrive, slam: SlamChannel, noise: Noise 
     deviations = np.maximum(np.column_stack([position, position, heading]), _LEAST_DEVIATION)
     covariances: Array = deviations[:, :, None] ** 2 * np.eye(3)
     return covariances
-
-
-def _joint_names(drive: ConcatenatedDrive, names: Sequence[str] | None) -> tuple[str, ...]:
-    joints, wheels = tuple(drive.robot.wheel_names if names is None else names), drive.robot.wheel_names
-    if len(joints) != len(wheels) or len(set(joints)) != len(joints):
-        raise ConfigError(
-            f"joints {', '.join(joints) or '(none)'}: name one for each of the wheels {', '.join(wheels)}"
-        )
-    return joints

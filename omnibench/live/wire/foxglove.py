@@ -6,12 +6,12 @@ import errno
 import socket
 import time
 from collections.abc import Sequence
-from types import TracebackType
 from typing import TYPE_CHECKING, Final
 
 import zenoh
 
 from omnibench.errors import ConfigError
+from omnibench.live.closing import Closing
 from omnibench.live.wire.topic_listener import Arrival, TopicListener
 from omnibench.live.wire.topics import TOPICS, KeySpace
 
@@ -22,7 +22,7 @@ PORT: Final = 8765  # the application's default
 STOPPING_S: Final = 5.0  # how long ``close`` waits for its port; without load it is free after some milliseconds
 
 
-class FoxgloveServer:
+class FoxgloveServer(Closing):
     """Serves the topics given to ``forward`` on ``host`` and ``port`` (0: any free port), until ``close``.
 
     By default only programs on this machine can connect, because the protocol has no password. A client that is too
@@ -78,14 +78,6 @@ class FoxgloveServer:
         end = time.monotonic() + STOPPING_S
         while _in_use(self._host, self._port) and time.monotonic() < end:
             time.sleep(0.002)
-
-    def __enter__(self) -> FoxgloveServer:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _forward(self, arrival: Arrival) -> None:
         channel = self._channels.get(arrival.name)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from types import TracebackType
 from typing import Final, get_args
 
 import zenoh
@@ -14,7 +14,9 @@ from zenoh.handlers import FifoChannel, RingChannel
 
 from omnibench.config import validate
 from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.live.closing import Closing
 from omnibench.live.network.presence import checked_robot
+from omnibench.live.network.rate_limiter import RateLimiter
 from omnibench.live.network.session import open_session
 from omnibench.live.network.session_config import SessionConfig
 from omnibench.live.wire.messages import ODOMETRY, MessageError, Odometry
@@ -74,7 +76,7 @@ def subscribe(
     return Subscription(session.declare_subscriber(key, channel), callback, own_session)
 
 
-class Subscription:
+class Subscription(Closing):
     """A stream of odometry messages: iterate over it, or get the ``latest``; a context manager.
 
     received: messages decoded so far. undecodable: messages skipped because they were not odometry. callback_errors:
@@ -94,7 +96,7 @@ class Subscription:
         self._channel = subscriber.handler  # readers wait in the channel, so that the subscriber can be closed
         self._session = session
         self._callback = callback
-        self._kinds: set[type[Exception]] = set()
+        self._log_limiter = RateLimiter(math.inf)
         self._closing = threading.Lock()  # Zenoh does not allow two threads to close at once
         self._closed = False
         self._thread: threading.Thread | None = None
@@ -136,14 +138,6 @@ class Subscription:
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
 
-    def __enter__(self) -> Subscription:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def _messages(self) -> Iterator[Odometry]:
         while True:
             try:
@@ -171,6 +165,5 @@ class Subscription:
                 callback(message)
             except Exception as error:  # the user's code may raise anything
                 self.callback_errors += 1
-                if type(error) not in self._kinds:
-                    self._kinds.add(type(error))
-                    _log.exception("the callback raised; further %s are only counted", type(error).__name__)
+                if self._log_limiter.allows(kind := type(error).__name__):
+                    _log.exception("the callback raised; further %s are only counted", kind)

@@ -7,12 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from threading import Lock
-from typing import Any
 
 import zenoh
-from zenoh.handlers import Callback
 
 from omnibench.errors import UnknownNameError
+from omnibench.live.network.callbacks import direct
 from omnibench.live.network.presence import checked_robot
 from omnibench.live.wire.topics import TOPICS, KeySpace, topic_name
 
@@ -52,8 +51,8 @@ class TopicListener:
         self.topics = {name: topic for name, (_, topic) in sources.items()}  # all robots share tf
         self._subscribers: list[zenoh.Subscriber[None]] = []
         for name, (robot, topic) in sources.items():
-            direct: Any = Callback(partial(self._take, name, topic), indirect=False)
-            self._subscribers.append(session.declare_subscriber(keys.expression(robot, topic), direct))
+            expression, take = keys.expression(robot, topic), partial(self._take, name, topic)
+            self._subscribers.append(session.declare_subscriber(expression, direct(take)))
 
     def close(self) -> None:
         """Stop listening; ``consume`` is not called after this."""

@@ -15,8 +15,8 @@ from typing import Any, Final, Generic, Literal, TypeVar
 
 import xxhash
 import zenoh
-from zenoh.handlers import Callback
 
+from omnibench.live.network.callbacks import direct
 from omnibench.live.wire.messages import DIAGNOSTICS, JOINT_STATE, POSE_ESTIMATE, MessageType
 from omnibench.live.wire.outputs import OUTPUTS
 
@@ -91,8 +91,7 @@ class GraphNode:
     def subscribe(self, robot: str, topic: str, callback: Callable[[zenoh.Sample], None]) -> zenoh.Subscriber[None]:
         """Call ``callback`` with each sample of a robot's topic, in Zenoh's thread: it must be quick."""
         self._token("MS", next(self._numbers), robot, topic)
-        direct: Any = Callback(callback, indirect=False)
-        return self.session.declare_subscriber(self.keys.expression(robot, topic), direct)
+        return self.session.declare_subscriber(self.keys.expression(robot, topic), direct(callback))
 
     def _token(self, kind: str, number: int, robot: str = "", topic: str = "") -> str:
         """Declare a liveliness token of rmw_zenoh and return its key; an empty text in the profile ``plain``."""

@@ -17,8 +17,9 @@ from replayed import DRIVE, arrivals, config, of, played, same, taken
 
 from omnibench.config import parse_yaml, to_yaml, validate
 from omnibench.errors import ConfigError
+from omnibench.live.replay.arrivals import ReplayConfig
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive
-from omnibench.live.replay.replay_player import ReplayConfig, events
+from omnibench.live.replay.replay_player import events
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
@@ -117,7 +118,7 @@ class TestEvents:
 
     @pytest.mark.parametrize("names", [("left", "right"), ("left", "left", "rear"), ()])
     def test_names_that_are_not_one_for_each_wheel_are_refused(self, names: tuple[str, ...]) -> None:
-        with pytest.raises(ConfigError, match="name one for each of the wheels a, b, c"):
+        with pytest.raises(ConfigError, match="name one joint, and a different one, for each of the wheels a, b, c"):
             events(DRIVE, config(), names=names)
 
     def test_stamps_begin_with_the_time_of_the_replay_unless_given(self) -> None:
