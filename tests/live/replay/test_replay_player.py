@@ -222,7 +222,7 @@ class TestStopping:
 
         thread = threading.Thread(target=interrupt_once_it_plays)
         thread.start()
-        report = player(loopback, speed=0.01).play()
+        report = player(loopback, speed=0.05).play()
         thread.join()
         assert not report.complete
         assert node.count > 0
