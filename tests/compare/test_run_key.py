@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("registries_as_before")
 PACKAGE = Path(omnibench.__file__).parent
 # Imported by the code of runs, without a say in their results. What has one belongs to the key's files instead.
 NEUTRAL = {
-    "config", "errors", "registry", "files", "environment", "processes", "jobs.memory", "words",
+    "config", "errors", "registry", "files", "environment", "processes", "progress", "jobs.memory", "words",
     "data.scans", "data.domain_check",
 }  # fmt: skip
 
