@@ -21,7 +21,6 @@ from omnibench.discover.selection.model_selection import Selection
 from omnibench.discover.selection.named_effects import candidates_of
 from omnibench.discover.selection.screening import Screening
 from omnibench.discover.verdict import headline_of
-from omnibench.fit.least_squares.noise import Whitener
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
@@ -96,9 +95,7 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
 
 def _whitened(fit: Fit, residuals: Sequence[Array]) -> tuple[Array, ...]:
     """Residuals (K, 3) of the fit's runs, independent and of unit variance under its noise."""
-    return tuple(
-        Whitener(fit.noise.noise, run.pose_times[1:])(of_run) for run, of_run in zip(fit.runs, residuals, strict=True)
-    )
+    return tuple(whiten(of_run) for whiten, of_run in zip(fit.weightings, residuals, strict=True))
 
 
 def _warnings(held_out: Sequence[HeldOut]) -> Iterator[str]:

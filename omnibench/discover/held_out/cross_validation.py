@@ -68,7 +68,7 @@ def held_out_residuals(extended: Extended, folds: NDArray[np.intp]) -> list[Arra
 
     Nothing is fitted to the run itself, nor are its nuisances.
     """
-    values = _values_of_others(extended, folds)
+    values = values_of_other_folds(extended.data, range(len(extended.data.information)), folds)
     return [
         residuals - columns @ value
         for residuals, columns, value in zip(
@@ -77,35 +77,20 @@ def held_out_residuals(extended: Extended, folds: NDArray[np.intp]) -> list[Arra
     ]
 
 
-def held_out_whitened(extended: Extended, folds: NDArray[np.intp]) -> list[Array]:
-    """Whitened residuals (k,) of each run by the model fitted to all folds but the run's own."""
-    values = _values_of_others(extended, folds)
-    return [
-        residuals - columns @ value
-        for residuals, columns, value in zip(extended.data.residuals, extended.data.columns, values, strict=True)
-    ]
-
-
-def _values_of_others(extended: Extended, folds: NDArray[np.intp]) -> Array:
-    return values_of_other_folds(extended.data, range(extended.data.information.shape[0]), folds)
+def held_out_squares(data: Whitened, index: Sequence[int], folds: NDArray[np.intp]) -> Array:
+    """Chi-square (Z,) of each run by the columns ``index`` as fitted to all folds but the run's own."""
+    values = values_of_other_folds(data, index, folds)
+    of_runs = zip(data.residuals, data.columns, values, strict=True)
+    left = [residuals - columns[:, list(index)] @ value for residuals, columns, value in of_runs]
+    return np.array([float(np.square(of_run).sum()) for of_run in left])
 
 
 def held_out_chi_square(data: Whitened, before: Sequence[int], after: Sequence[int], folds: NDArray[np.intp]) -> Array:
     """Chi-square difference (Z,) of each run between the columns ``before`` and ``after``, its fold held out."""
-    return _chi_square(data, before, folds) - _chi_square(data, after, folds)
+    return held_out_squares(data, before, folds) - held_out_squares(data, after, folds)
 
 
 def is_confirmed(data: Whitened, before: Sequence[int], new: Sequence[int], folds: NDArray[np.intp]) -> bool:
     """True if the columns ``new`` lower the chi-square of held-out runs beyond ``before``, by two standard errors."""
     gains = held_out_chi_square(data, before, [*before, *new], folds)
     return float(gains.mean()) > STANDARD_ERRORS * float(gains.std()) / np.sqrt(len(gains))
-
-
-def _chi_square(data: Whitened, index: Sequence[int], folds: NDArray[np.intp]) -> Array:
-    values = values_of_other_folds(data, index, folds)
-    return np.array(
-        [
-            float(np.square(residuals - columns[:, list(index)] @ value).sum())
-            for residuals, columns, value in zip(data.residuals, data.columns, values, strict=True)
-        ]
-    )

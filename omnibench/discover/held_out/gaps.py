@@ -13,7 +13,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit, at_runs
 from omnibench.discover.fitting.start_frames import in_start_frames
-from omnibench.discover.held_out.cross_validation import held_out_residuals, held_out_whitened
+from omnibench.discover.held_out.cross_validation import held_out_residuals, held_out_squares
 from omnibench.discover.held_out.validation_runs import ValidationRuns
 from omnibench.discover.result import Gap, HeldOut
 from omnibench.fit.least_squares.noise import whiteners
@@ -55,8 +55,8 @@ class Errors:
 def errors_of_repetitions(extended: Extended, folds: NDArray[np.intp]) -> Errors:
     """Errors on the runs of the fit, each predicted from the other folds."""
     finals = np.array([residuals[-1] for residuals in held_out_residuals(extended, folds)])
-    white = held_out_whitened(extended, folds)
-    return Errors(finals, np.array([float(np.square(residuals).mean()) for residuals in white]))
+    squares = held_out_squares(extended.data, range(len(extended.data.information)), folds)
+    return Errors(finals, squares / [len(residuals) for residuals in extended.data.residuals])
 
 
 def errors_on(extended: Extended, runs: Sequence[Trajectory], without_jumps: Sequence[Trajectory]) -> Errors:

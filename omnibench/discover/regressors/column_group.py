@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -30,3 +30,12 @@ class Group:
     tries: int = 1
     forms: tuple[int, ...] = ()
     basis: Basis | None = None
+
+
+def best_shapes(groups: Sequence[Group], chi_square: Sequence[float]) -> list[int]:
+    """For each name the index of its group with the largest chi-square difference, in the order of the names."""
+    best: dict[str, int] = {}
+    for index, group in enumerate(groups):
+        if chi_square[index] > chi_square[best.setdefault(group.name, index)]:
+            best[group.name] = index
+    return list(best.values())

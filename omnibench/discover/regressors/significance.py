@@ -34,7 +34,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.column_group import Group, best_shapes
 from omnibench.fit.least_squares.whitened import Given, Whitened, given
 from omnibench.robot.kinematics import Array
 
@@ -85,6 +85,14 @@ class Significance:
     def best(self) -> int:
         """Index of the most significant group."""
         return int(self.evidence.argmax())
+
+    @property
+    def best_shapes(self) -> list[int]:
+        """For each name the index of its group with the largest chi-square difference, of those that have any rank."""
+        known = np.flatnonzero(self.rank).tolist()
+        return [
+            known[index] for index in best_shapes([self.groups[row] for row in known], self.chi_square[known].tolist())
+        ]
 
     @property
     def surplus_chi_square(self) -> tuple[float, float]:

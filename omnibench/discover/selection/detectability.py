@@ -27,7 +27,7 @@ from itertools import combinations
 
 import numpy as np
 
-from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.column_group import Group, best_shapes
 from omnibench.discover.result import Absorbed, Hidden
 from omnibench.discover.selection.candidate_groups import Missing
 from omnibench.discover.selection.model_selection import ABSORBED, Selection
@@ -89,13 +89,8 @@ def _absorbed(screening: Screening, start: Given) -> tuple[Absorbed, ...]:
 def _visible(screening: Screening) -> list[Group]:
     """One group for each effect that is not absorbed: the shape with the largest chi-square difference."""
     start = screening.beyond_matrix()
-    best: dict[str, Group] = {}
-    for group in screening.groups.effects:
-        if start.share_left(group.index) < ABSORBED:
-            continue
-        if group.name not in best or start.chi_square(group.index) > start.chi_square(best[group.name].index):
-            best[group.name] = group
-    return list(best.values())
+    tellable = [group for group in screening.groups.effects if start.share_left(group.index) >= ABSORBED]
+    return [tellable[index] for index in best_shapes(tellable, [start.chi_square(each.index) for each in tellable])]
 
 
 def _classes(start: Given, visible: Sequence[Group]) -> tuple[tuple[str, ...], ...]:

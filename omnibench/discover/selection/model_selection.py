@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.column_group import Group, best_shapes
 from omnibench.discover.regressors.significance import Significance, significance_of
 from omnibench.discover.selection.evidence import (
     credibility_of,
@@ -127,7 +127,7 @@ def _forward_selection(
             break
         step = significance_of(screening.data, screening.index_with(chosen), others, rng)
         steps.append(step)
-        pool += [group for group in _best_shapes(step) if group not in pool]
+        pool += [step.groups[index] for index in step.best_shapes if step.groups[index] not in pool]
         if step.p_value(step.best) > CHANCE:
             break
         best = effect_sets(start, pool, len(chosen) + 1).best  # Eq. (4)
@@ -163,15 +163,6 @@ def _within_quantisation(screening: Screening, groups: Sequence[Group]) -> set[s
     return {group.name for group in groups if start.chi_square(group.index) <= screening.quantisation_chi_square(group)}
 
 
-def _best_shapes(step: Significance) -> list[Group]:
-    """The shape of each effect with the largest chi-square difference."""
-    best: dict[str, tuple[float, Group]] = {}
-    for group, chi_square, rank in zip(step.groups, step.chi_square, step.rank, strict=True):
-        if rank and (group.name not in best or chi_square > best[group.name][0]):
-            best[group.name] = (float(chi_square), group)
-    return [group for _, group in best.values()]
-
-
 def _weighed(start: Given, search: _Search, where: Significance) -> Selection:
     """The selection that a search leads to, with the weights of all names."""
     chosen = tuple(sorted(search.chosen, key=lambda group: -start.chi_square(group.index)))
@@ -203,14 +194,9 @@ def _probabilities(
     """Effects that could stand at one position among the chosen ones, the others given, with their probabilities."""
     others = [group for index, group in enumerate(chosen) if index != position]
     now = start.given(indices_of(others))
-    best: dict[str, Group] = {chosen[position].name: chosen[position]}
-    for group in pool:
-        taken = best.get(group.name)
-        if group.name not in names_of(chosen) and (
-            taken is None or now.chi_square(group.index) > now.chi_square(taken.index)
-        ):
-            best[group.name] = group
-    groups = list(best.values())
+    further = [group for group in pool if group.name not in names_of(chosen)]
+    best = best_shapes(further, [now.chi_square(group.index) for group in further])
+    groups = [chosen[position], *(further[index] for index in best)]
     chi_square = np.array([now.chi_square(group.index) for group in groups])
     rank = np.array([now.rank(group.index) for group in groups])
     evidence = log_evidence(chi_square, rank, float(max((chi_square - rank).max(), 0.0)))  # Eq. (2) and (3)

@@ -92,9 +92,9 @@ def _shapes(group: Group, robot: Robot) -> list[EstimatedParameter]:
 
 
 def _candidates(step: Significance, selection: Selection) -> tuple[Candidate, ...]:
-    best: dict[str, Candidate] = {}
-    for group, chi_square, rank in zip(step.groups, step.chi_square, step.rank, strict=True):
-        if rank and (group.name not in best or chi_square > best[group.name].chi_square):
-            weight = selection.weights.get(group.name, 0.0)
-            best[group.name] = Candidate(group.name, float(chi_square), int(rank), weight)
-    return tuple(sorted(best.values(), key=lambda candidate: -candidate.chi_square))
+    ordered = sorted(step.best_shapes, key=lambda index: -step.chi_square[index])
+    names = [step.groups[index].name for index in ordered]
+    return tuple(
+        Candidate(name, float(step.chi_square[index]), int(step.rank[index]), selection.weights.get(name, 0.0))
+        for name, index in zip(names, ordered, strict=True)
+    )
