@@ -32,7 +32,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from omnibench.discover.regressors.column_group import Group, best_shapes
 from omnibench.fit.least_squares.whitened import Given, Whitened, given
@@ -167,6 +167,7 @@ def _noise_scores(data: Whitened, fitted: list[int], groups: Sequence[Group]) ->
 def _evidence(chi_square: Array, rank: Array, spread: Array, tries: Array) -> Array:
     """Evidence z of chi-square differences (B, G), Eq. (1), the best of so many tries (Bonferroni)."""
     scaled, freedom = chi_square / spread, np.maximum(rank, 1.0)
-    single = -chi2.logsf(scaled, freedom) / np.log(10)
+    with np.errstate(divide="ignore"):
+        single = -np.log10(chdtrc(freedom, scaled))
     evidence: Array = np.where(rank > 0, np.maximum(single - np.log10(tries), 0.0), 0.0)
     return evidence

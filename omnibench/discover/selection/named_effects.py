@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.significance import Significance
@@ -41,7 +41,7 @@ def _effects(
 ) -> tuple[NamedEffect, ...]:
     """The chosen effects. first: the row of the covariance at which their parameters begin."""
     deviations = np.sqrt(np.diag(covariance))[first:]
-    quantile = float(stats.t.ppf(0.975, max(runs - len(deviations) - first, 1)))
+    quantile = float(stdtrit(max(runs - len(deviations) - first, 1), 0.975))
     tried = {
         group.name: (chi_square, rank)
         for step in selection.steps[::-1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri, fdtrc
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
@@ -79,7 +79,7 @@ class FitCovariance:
         values = np.linalg.eigvalsh(whitened.T @ self._scatter.covariance @ whitened)
         total = float(values.sum())
         freedom = self._scatter.degrees_of_freedom * total**2 / float(np.square(values).sum())
-        return total / len(values) > float(stats.chi2.isf(_CHANCE, freedom)) / freedom
+        return total / len(values) > float(chdtri(freedom, _CHANCE)) / freedom
 
     def _whole(self, covariance: Array) -> Array:
         """A covariance of the free elements, in units of the box, as one (n, n) of the vector."""
@@ -108,4 +108,4 @@ def _chance_of_misfit(scores: Array, information: Array, trajectories: Sequence[
     if between_freedom <= 0 or within_freedom <= 0 or within <= 0:
         return 1.0
     ratio = (between / between_freedom) / (within / within_freedom)
-    return float(stats.f.sf(ratio, between_freedom, within_freedom))
+    return float(fdtrc(between_freedom, within_freedom, ratio))

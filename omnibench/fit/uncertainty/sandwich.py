@@ -6,7 +6,7 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtri
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
@@ -124,7 +124,7 @@ def sandwich(scores: Scores) -> Sandwich:
     for name, members in _clusterings(runs):
         between = _between(members, scores, bread)
         ratio = float(np.trace(between) / np.trace(within))
-        unlikely = float(stats.f.isf(_CHANCE, _effective(between, len(members) - 1), _effective(within, freedom)))
+        unlikely = float(fdtri(_effective(between, len(members) - 1), _effective(within, freedom), 1 - _CHANCE))
         if ratio > max(unlikely, largest):
             largest, clusters = ratio, members
             spread = _wider(within, between)

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import stdtrit
 
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import RunResult
@@ -220,4 +220,4 @@ def _parameters(
 
 def _quantile(freedom: int | None) -> float:
     """Half-width of the interval in standard deviations: quantile of Student's t, or normal without ``freedom``."""
-    return float(stats.t.isf((1 - _INTERVAL) / 2, freedom or _MANY))
+    return -float(stdtrit(freedom or _MANY, (1 - _INTERVAL) / 2))

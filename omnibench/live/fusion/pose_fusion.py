@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 from pydantic import Field
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from omnibench.config import Model
 from omnibench.live.estimation.counts import Counts
@@ -57,7 +57,7 @@ class Fusion:
         self._timeline = timeline
         self._counts = counts
         self._filter = PoseFilter(np.zeros(3), _NOWHERE)
-        self._limit = float(chi2.ppf(settings.gate, 3))
+        self._limit = 2.0 * float(gammaincinv(3 / 2, settings.gate))  # quantile of chi2 with 3 degrees of freedom
         self._rejections = Rejections(settings.reacquire_after, self._limit)
         self._waiting: deque[PoseMeasurement] = deque()
         self._since = _EVER  # ns; poses measured before are too late, as the pose was set then
