@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import resource
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 import yaml
+from shared_results import made_once, shared_folder
 
+from omnibench import registry
 from omnibench.__main__ import main
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.result import ComparisonResult
@@ -34,7 +39,7 @@ from omnibench.registry import Options, calibrators
 
 
 def omnibench(
-    *arguments: object, cwd: Path | None = None, timeout: float = 120, **others: Any
+    *arguments: object, cwd: Path | None = None, timeout: float = 300, **others: Any
 ) -> subprocess.CompletedProcess[str]:
     """Run one command to its end; what it printed."""
     return subprocess.run(
@@ -58,8 +63,9 @@ def compared(config: Path, output: Path, *arguments: object) -> subprocess.Compl
 
 
 def compared_here(output: Path, **changes: Any) -> ComparisonResult:
-    """Run the small comparison with ``changes``, in this process, which is faster."""
-    return run_comparison(CompareConfig.model_validate(small(**changes)), output)
+    """Run the small comparison with ``changes``, in this process, which is faster; plug-ins are loaded for it only."""
+    with registries_restored():
+        return run_comparison(CompareConfig.model_validate(small(**changes)), output)
 
 
 def assert_refused(run: Printed | subprocess.CompletedProcess[str], *parts: str) -> None:
@@ -126,6 +132,21 @@ def write_plugin(folder: Path, name: str, body: str) -> Path:
     return folder
 
 
+@contextmanager
+def registries_restored() -> Iterator[None]:
+    """Forget after the block what was registered or loaded in it: a plug-in file that changed is loaded again."""
+    for each in registry.REGISTRIES:
+        each.entries()  # what is built in stays
+    entries, loaded = [dict(each._entries) for each in registry.REGISTRIES], dict(registry._loaded)
+    try:
+        yield
+    finally:
+        for each, kept in zip(registry.REGISTRIES, entries, strict=True):
+            each._entries = kept
+        registry._loaded.clear()
+        registry._loaded.update(loaded)
+
+
 def summary(output: Path) -> dict[str, Any]:
     """The content of a comparison's summary.json."""
     content: dict[str, Any] = json.loads((output / "summary.json").read_text(encoding="utf-8"))
@@ -162,6 +183,28 @@ def commands_of_this_process(capfd: pytest.CaptureFixture[str], monkeypatch: pyt
     return command
 
 
+def run_here(*arguments: object, cwd: Path) -> Printed:
+    """Run one command in this process and the folder ``cwd``: for results that the tests of a module share."""
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+        patch.chdir(cwd)
+        patch.setattr(sys, "argv", ["omnibench", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+    return Printed(int(ended.value.code or 0), out.getvalue(), err.getvalue())
+
+
+@contextmanager
+def disk_that_takes(size: int) -> Iterator[None]:
+    """A disk that takes no file of this process larger than ``size`` bytes, captured output among them."""
+    _, hard = limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
 class Prepared(NamedTuple):
     """A small config, its data set and truth, and a calibration."""
 
@@ -171,8 +214,10 @@ class Prepared(NamedTuple):
     calibration: Path
 
 
-def prepare(folder: Path) -> Prepared:
-    """Make a config, a data set, its truth and a calibration in ``folder``, by the commands themselves."""
+@made_once
+def prepare() -> Prepared:
+    """Make a config, a data set, its truth and a calibration, by the commands themselves."""
+    folder = shared_folder() / "prepared"
     config = write_config(folder)
     data, truth, calibration = folder / "data", folder / "truth", folder / "calibration.yaml"
     for arguments in (("simulate", config, "-o", data, "--truth", truth), ("calibrate", data, "-o", calibration)):

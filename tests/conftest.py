@@ -2,33 +2,47 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import signal
+import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from commands import Command, Prepared, commands_of_this_process, prepare
+import real_recordings
+import shared_results
+from commands import Command, Prepared, commands_of_this_process, prepare, registries_restored
 from hypothesis import settings
 
-from omnibench import registry
+from omnibench.data.dataset import Dataset
 
 # The machine may be busy. What does not land shall be at fault itself, and not an example that this run alone drew:
 # new ones are looked for with --hypothesis-profile explore.
-settings.register_profile("omnibench", deadline=None, derandomize=True)
-settings.register_profile("explore", deadline=None, max_examples=1000, print_blob=True)
+settings.register_profile("omnibench", deadline=None, derandomize=True, max_examples=40)
+settings.register_profile("explore", deadline=None, max_examples=500, print_blob=True)
 settings.load_profile("omnibench")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Make the folder of results that all workers share, and let commands hear Ctrl-C.
+
+    Workers inherit the folder's name, and commands what this process does with Ctrl-C, which it would ignore if the
+    suite was started in the background.
+    """
+    with suppress(ValueError):  # not in the main thread
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if not hasattr(config, "workerinput"):
+        os.environ[shared_results.FOLDER] = folder = tempfile.mkdtemp(prefix="omnibench-tests-")
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
 
 
 @pytest.fixture
 def registries_as_before() -> Iterator[None]:
     """What a test registers or loads is gone after it."""
-    for each in registry.REGISTRIES:
-        each.entries()  # what is built in stays
-    entries, loaded = [dict(each._entries) for each in registry.REGISTRIES], dict(registry._loaded)
-    yield
-    for each, kept in zip(registry.REGISTRIES, entries, strict=True):
-        each._entries = kept
-    registry._loaded.clear()
-    registry._loaded.update(loaded)
+    with registries_restored():
+        yield
 
 
 @pytest.fixture
@@ -38,7 +52,19 @@ def command(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, 
     return commands_of_this_process(capfd, monkeypatch)
 
 
-@pytest.fixture(scope="module")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
-    """What commands need to work on: a config, a data set, a calibration."""
-    return prepare(tmp_path_factory.mktemp("prepared"))
+@pytest.fixture(scope="session")
+def prepared() -> Prepared:
+    """What commands need to work on: a config, a data set, a calibration. All tests share them: change a copy."""
+    return prepare()
+
+
+@pytest.fixture(scope="session")
+def omni3() -> Dataset:
+    """OptiOdom's recordings of a robot on three wheels."""
+    return real_recordings.omni3()
+
+
+@pytest.fixture(scope="session")
+def robotino() -> Dataset:
+    """Recordings of a Robotino."""
+    return real_recordings.robotino()

@@ -28,7 +28,8 @@ from omnibench.robot.calibration import read_calibration, write_calibration
 def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated data set, its calibration, and a node's config for it."""
     folder = tmp_path_factory.mktemp("live")
-    prepared = prepare(folder)
+    prepared = prepare()
+    shutil.copytree(prepared.config.parent, folder, dirs_exist_ok=True)
     config = {
         "robots": [{"name": "apr", "calibration": prepared.calibration.name}],
         "fusion": "ekf",
@@ -77,7 +78,9 @@ def test_ctrl_c_ends_a_replay_with_what_it_has_shown(workplace: Path) -> None:
     assert "Traceback" not in said
 
 
-def test_a_recording_goes_out_and_comes_back_as_a_calibration_that_is_swapped_in(workplace: Path) -> None:
+def test_a_recording_goes_out_and_comes_back_as_a_calibration_that_is_swapped_in(
+    command: InProcess, workplace: Path
+) -> None:
     """record -> import -> calibrate -> swap, with the real commands."""
     config, mcap = workplace / "node.yaml", workplace / "drive.mcap"
     with Command("live", config) as node:
@@ -91,18 +94,18 @@ def test_a_recording_goes_out_and_comes_back_as_a_calibration_that_is_swapped_in
             assert played.returncode == 0, played.stderr
             _, said = recorder.stop()
         assert recorder.process.returncode == 0, said
-        imported = omnibench(
+        imported = command(
             *("import", "rosbag", mcap, "-o", workplace / "back", "--set", f"robot={workplace / 'calibration.yaml'}")
         )
         assert imported.returncode == 0, imported.stderr
         assert len(load_dataset(workplace / "back").trajectories) == 12
-        fitted = omnibench("calibrate", workplace / "back", "-o", workplace / "again.yaml")
+        fitted = command("calibrate", workplace / "back", "-o", workplace / "again.yaml")
         assert fitted.returncode == 0, fitted.stderr
         again = read_calibration(workplace / "again.yaml")
         np.testing.assert_allclose(
             again.matrix_array, read_calibration(workplace / "calibration.yaml").matrix_array, atol=0.004
         )
-        swapped = omnibench("swap", "apr", workplace / "again.yaml", "--connect", endpoint(config))
+        swapped = command("swap", "apr", workplace / "again.yaml", "--connect", endpoint(config))
         assert swapped.returncode == 0, swapped.stderr
         assert swapped.stdout == f"apr: {again.name} runs\n"
         assert "begins with the old calibration" in swapped.stderr  # the config has no state
@@ -111,7 +114,7 @@ def test_a_recording_goes_out_and_comes_back_as_a_calibration_that_is_swapped_in
             ("apr", CONFIGS / "live.yaml", "is this a calibration file?"),
             ("apz", workplace / "again.yaml", "did you mean 'apr'?"),
         ):
-            assert_refused(omnibench("swap", name, file, "--connect", endpoint(config)), reason)
+            assert_refused(command("swap", name, file, "--connect", endpoint(config)), reason)
         session.close()
         assert node.process.poll() is None
 
@@ -149,10 +152,12 @@ def test_keys_for_a_fleet_are_one_command(command: InProcess, tmp_path: Path) ->
     assert_refused(command("keys", tmp_path / "keys", "apr02"), "apr02.pem", "is there already")
 
 
-def test_a_robot_of_a_fleet_cannot_write_for_another_and_the_node_logs_it(workplace: Path, tmp_path: Path) -> None:
+def test_a_robot_of_a_fleet_cannot_write_for_another_and_the_node_logs_it(
+    command: InProcess, workplace: Path, tmp_path: Path
+) -> None:
     """The project's own configs, on loopback: certificates, node, rightful robot, intruder."""
     port = free_port()
-    made = omnibench("keys", tmp_path / "keys", "node", "apr02", "apr03", "screen", "lab")
+    made = command("keys", tmp_path / "keys", "node", "apr02", "apr03", "screen", "lab")
     assert made.returncode == 0, made.stderr
     for name in ("live_fleet.yaml", "live_fleet_client.yaml"):
         text = (CONFIGS / name).read_text().replace("0.0.0.0:7447", f"127.0.0.1:{port}")

@@ -7,23 +7,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import permutations, product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from commands import CONFIGS
 
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.registry import load_plugin_file
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
-from omnibench.slam.import_dataset import import_dataset
 
-ROOT = Path(__file__).resolve().parents[2]
-RECORDINGS = ROOT.parent / "shared" / "data"
 RPM = 2 * math.pi / 60
 Change = Callable[[Trajectory], Trajectory]
 
@@ -46,7 +42,7 @@ MOTIONS = {
 @cache
 def recorded(motion: str = "flower", robot: str = "apr02", sparse: bool = False) -> Dataset:
     """One simulated run of every command, off the design and noisy; with the first and last pose only if sparse."""
-    content = yaml.safe_load((ROOT / "configs" / f"{robot}.yaml").read_text())
+    content = yaml.safe_load((CONFIGS / f"{robot}.yaml").read_text())
     (dataset,) = content["datasets"].values()
     settings = {**dataset["simulate"], "repetitions": 1, "validation": None}
     if robot == "apr02":
@@ -220,26 +216,14 @@ def test_a_robot_a_quarter_off_its_design_gives_no_warning(scale: float) -> None
     assert warnings_of(recorded("straight runs only"), rates(lambda values: values * scale)) == ""
 
 
-@pytest.mark.parametrize(("importer", "folder"), [("optiodom", "optiodom/omni3"), ("robotino", "robotino")])
-def test_real_recordings_give_no_warning(importer: str, folder: str) -> None:
-    if not (RECORDINGS / folder).is_dir():
-        pytest.skip(f"the recordings are not at {RECORDINGS / folder}")
-    assert load_plugin_file(ROOT / "plugins" / "robotino.py") is None
-    dataset = import_dataset(importer, RECORDINGS / folder)
+@pytest.mark.parametrize("recorded", ["omni3", "robotino"])
+def test_real_recordings_give_no_warning(recorded: str, request: pytest.FixtureRequest) -> None:
+    dataset = request.getfixturevalue(recorded)
     few = replace(dataset, trajectories=dataset.trajectories[::4])
     assert warnings_of(few) == ""
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_wrong_units_of_a_real_robot_are_named(mistake: str) -> None:
-    folder = RECORDINGS / "optiodom" / "omni3"
-    if not folder.is_dir():
-        pytest.skip(f"the recordings are not at {folder}")
+def test_wrong_units_of_a_real_robot_are_named(mistake: str, omni3: Dataset) -> None:
     change, warning = MISTAKES[mistake]
-    assert warnings_of(real_omni3(folder), change) == warning
-
-
-@cache
-def real_omni3(folder: Path) -> Dataset:
-    dataset = import_dataset("optiodom", folder)
-    return replace(dataset, trajectories=dataset.trajectories[::8])
+    assert warnings_of(replace(omni3, trajectories=omni3.trajectories[::8]), change) == warning

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +10,7 @@ from fit_samples import noisy_trajectories
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.fit.inspect import Inspection, inspect_dataset
-from omnibench.slam.import_dataset import import_dataset
 from omnibench.testing.synthetic import synthetic_robot
-
-RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "data" / "optiodom" / "omni3"
 
 
 def dataset(runs: list[Trajectory], wheels: int = 3) -> Dataset:
@@ -143,10 +139,8 @@ def test_warnings_of_the_data_set_are_passed_on() -> None:
     assert inspect_dataset(dataset(millimetres)).warnings == ("positions look like mm; x and y must be m",)
 
 
-def test_a_real_recording_of_hours_is_inspected() -> None:
-    if not RECORDINGS.is_dir():
-        pytest.skip(f"the recordings are not at {RECORDINGS}")
-    inspection = inspect_dataset(import_dataset("optiodom", RECORDINGS))
+def test_a_real_recording_of_hours_is_inspected(omni3: Dataset) -> None:
+    inspection = inspect_dataset(omni3)
     assert inspection.trajectories == 67
     assert inspection.driven_directions == 3
     assert inspection.findings == ()

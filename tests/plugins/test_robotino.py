@@ -18,10 +18,6 @@ from omnibench.slam.import_dataset import import_dataset
 
 ROOT = Path(__file__).resolve().parents[2]
 PLUGIN = ROOT / "plugins" / "robotino.py"
-RECORDINGS = ROOT.parent / "shared" / "data" / "robotino"
-needs_recordings = pytest.mark.skipif(
-    not RECORDINGS.is_dir(), reason=f"the Robotino recordings are not at {RECORDINGS}"
-)
 
 COLUMNS = "t;xsetspeed;ysetspeed;setvel;m1setvel;m2setvel;m3setvel;m1pos;m2pos;m3pos;xpos;ypos;ang"
 
@@ -31,18 +27,12 @@ def _loaded() -> None:
     assert load_plugin_file(PLUGIN) is None
 
 
-@pytest.fixture(scope="module")
-def robotino() -> Dataset:
-    return import_dataset("robotino", RECORDINGS)
-
-
 def test_the_registry_knows_the_plugin_and_its_file() -> None:
     entry = importers.entry("robotino")
     assert entry.origin == str(PLUGIN)
     assert entry.summary.startswith("Festo Robotino v2")
 
 
-@needs_recordings
 class TestRecordings:
     def test_all_72_directions_are_read_and_every_second_validates(self, robotino: Dataset) -> None:
         assert (len(robotino.split("train")), len(robotino.split("validation"))) == (36, 36)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from real_recordings import OMNI3
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.storage import load_dataset, save_dataset
@@ -16,14 +17,8 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
 from omnibench.slam.import_dataset import import_dataset
 
-OMNI3 = Path(__file__).resolve().parents[4] / "shared" / "data" / "optiodom" / "omni3"
 needs_recordings = pytest.mark.skipif(not OMNI3.is_dir(), reason=f"the OptiOdom recordings are not at {OMNI3}")
 TICK = 2 * math.pi / (12 * 1024)
-
-
-@pytest.fixture(scope="module")
-def omni3() -> Dataset:
-    return import_dataset("optiodom", OMNI3)
 
 
 def final_errors(matrix: Array, runs: tuple[Trajectory, ...]) -> tuple[float, float]:

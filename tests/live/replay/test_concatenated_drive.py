@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,9 +26,7 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 from omnibench.simulate.config import EncoderNoise
-from omnibench.slam.import_dataset import import_dataset
 
-OMNI3 = Path(__file__).resolve().parents[4] / "shared" / "data" / "optiodom" / "omni3"
 seeds = st.integers(0, 2**32 - 1)
 pauses = st.sampled_from([0.0, 0.1, 1.0])
 
@@ -338,16 +335,10 @@ class TestMistakes:
 
 
 @pytest.fixture(scope="module")
-def omni3() -> Dataset:
-    return import_dataset("optiodom", OMNI3)
-
-
-@pytest.fixture(scope="module")
 def drive(omni3: Dataset) -> ConcatenatedDrive:
     return concatenate_runs(omni3)
 
 
-@pytest.mark.skipif(not OMNI3.is_dir(), reason=f"the OptiOdom recordings are not at {OMNI3}")
 class TestRealRecordings:
     def test_all_runs_are_concatenated_session_by_session(self, omni3: Dataset, drive: ConcatenatedDrive) -> None:
         sessions = {run.id: run.session for run in omni3.trajectories}
