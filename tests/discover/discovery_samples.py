@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cache
 from typing import Any
+
+from shared_results import made_once
 
 from omnibench.data.dataset import Dataset
 from omnibench.discover.discover import discover_effects
@@ -51,22 +52,34 @@ def shorn(dataset: Dataset, **values: Any) -> Dataset:
     return replace(dataset, trajectories=tuple(replace(run, **values) for run in dataset.trajectories))
 
 
-@cache
+@made_once
 def named() -> Discovery:
     """A strong effect that the catalogue has."""
     return discover_effects(simulated())
 
 
-@cache
+@made_once
+def repeated() -> Discovery:
+    """The same effect in twice as many repetitions."""
+    return discover_effects(simulated(repetitions=4))
+
+
+@made_once
 def nothing() -> Discovery:
     """Noise alone."""
     return discover_effects(simulated(()))
 
 
-@cache
+@made_once
 def nameless() -> Discovery:
     """A strong effect that is left out of the catalogue."""
     return discover_effects(simulated(), without=("rotation_translation_coupling",))
+
+
+@made_once
+def lagging() -> Discovery:
+    """Motors that lag behind their targets by 0.15 s."""
+    return discover_effects(simulated(({"name": "motor_lag", "parameters": {"tau": 0.15}},)))
 
 
 def incomplete() -> Discovery:

@@ -6,25 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from discovery_samples import COUPLING, simulated
+from discovery_samples import COUPLING, lagging, nameless, nothing, repeated, simulated
 
+from omnibench.data.dataset import Dataset
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.result import Discovery
 from omnibench.errors import UnknownNameError
 from omnibench.fit.evaluate import evaluate
 from omnibench.robot.calibration import read_calibration, write_calibration
 from omnibench.simulate.source import read_simulation
-from omnibench.slam.import_dataset import import_dataset
-
-OMNI3 = Path(__file__).parents[2].parent / "shared" / "data" / "optiodom" / "omni3"
 
 
-@pytest.fixture(scope="module")
-def coupling() -> Discovery:
-    return discover_effects(simulated(repetitions=4))
-
-
-def test_a_hidden_effect_is_named_with_its_parameters(coupling: Discovery) -> None:
+def test_a_hidden_effect_is_named_with_its_parameters() -> None:
+    coupling = repeated()
     assert coupling.verdict == "named"
     (effect,) = coupling.effects
     assert effect.name == "rotation_translation_coupling"
@@ -34,7 +28,8 @@ def test_a_hidden_effect_is_named_with_its_parameters(coupling: Discovery) -> No
     assert {each.name: each.value for each in effect.parameters} == pytest.approx(truth, rel=0.03)
 
 
-def test_the_gap_on_the_held_out_session_closes(coupling: Discovery) -> None:
+def test_the_gap_on_the_held_out_session_closes() -> None:
+    coupling = repeated()
     session = coupling.held_out[-1]
     assert session.data == "session"
     assert session.chi2.closed is not None
@@ -42,7 +37,8 @@ def test_the_gap_on_the_held_out_session_closes(coupling: Discovery) -> None:
     assert coupling.steps[-1].held_out < coupling.steps[0].held_out
 
 
-def test_the_extended_calibration_runs_what_was_found(coupling: Discovery, tmp_path: Path) -> None:
+def test_the_extended_calibration_runs_what_was_found(tmp_path: Path) -> None:
+    coupling = repeated()
     write_calibration(coupling.extended, tmp_path / "model.yaml")
     model = read_calibration(tmp_path / "model.yaml")
     assert [term.name for term in model.effects] == ["rotation_translation_coupling"]
@@ -51,7 +47,8 @@ def test_the_extended_calibration_runs_what_was_found(coupling: Discovery, tmp_p
     assert cost["extended"] < 0.7 * cost["plain"]
 
 
-def test_the_validation_split_changes_nothing_that_is_found(coupling: Discovery) -> None:
+def test_the_validation_split_changes_nothing_that_is_found() -> None:
+    coupling = repeated()
     other = simulated(repetitions=4, validation={"seed": 77, "distance": 0.6, "noise_scale": 5.0})
     again = discover_effects(other)
     assert [(each.name, each.parameters) for each in again.effects] == [
@@ -61,7 +58,7 @@ def test_the_validation_split_changes_nothing_that_is_found(coupling: Discovery)
 
 
 def test_nothing_is_named_where_nothing_is_hidden_and_limits_are_told() -> None:
-    found = discover_effects(simulated((), repetitions=4))
+    found = nothing()
     assert (found.verdict, found.effects) == ("none", ())
     assert {"heading_drift", "wheel_eccentricity"} <= {each.name for each in found.hidden}
     assert all(each.limit > 0 for each in found.hidden)
@@ -69,13 +66,13 @@ def test_nothing_is_named_where_nothing_is_hidden_and_limits_are_told() -> None:
 
 def test_neither_euler_steps_nor_arcs_are_taken_for_centripetal_slip() -> None:
     for integration in ("euler", "arc"):
-        found = discover_effects(simulated((), repetitions=4, integration=integration, sample_period=0.01))
+        found = discover_effects(simulated((), validation=None, integration=integration, sample_period=0.01))
         assert "centripetal_slip" not in [effect.name for effect in found.effects if effect.weight >= 0.95]
 
 
 def test_absorbed_effects_are_listed_and_not_named() -> None:
     lever = ({"name": "lidar_lever_arm", "parameters": {"x": 0.05, "y": -0.03}},)
-    found = discover_effects(simulated(lever, repetitions=4))
+    found = discover_effects(simulated(lever, validation=None))
     assert found.effects == ()
     absorbed = {"lidar_lever_arm", "lidar_yaw", "reference_scale", "sample_period_scale"}
     assert absorbed <= set(found.absorbed)
@@ -83,7 +80,7 @@ def test_absorbed_effects_are_listed_and_not_named() -> None:
 
 
 def test_a_name_that_is_left_out_is_not_found_under_another_with_confidence() -> None:
-    found = discover_effects(simulated(repetitions=4), without=["rotation_translation_coupling"])
+    found = nameless()
     assert found.verdict in ("unknown", "class")
     assert all(effect.weight < 0.95 for effect in found.effects)
 
@@ -94,39 +91,38 @@ def test_an_unknown_name_among_those_to_leave_out_gets_the_nearest() -> None:
 
 
 def test_every_stage_that_was_recorded_is_looked_at() -> None:
-    lag = ({"name": "motor_lag", "parameters": {"tau": 0.15}},)
-    found = discover_effects(simulated(lag, repetitions=4))
+    found = lagging()
     assert [(effect.name, effect.stage) for effect in found.effects] == [("motor_lag", "actuator")]
     (tau,) = found.effects[0].parameters
     assert tau.low < 0.15 < tau.high
 
 
 @pytest.fixture(scope="module")
-def omni3() -> Discovery:
-    if not OMNI3.is_dir():
-        pytest.skip(f"no recordings in {OMNI3}")
-    dataset = import_dataset("optiodom", OMNI3, {"train": "circular", "validation": "square"})
-    return discover_effects(dataset)
+def recorded(omni3: Dataset) -> Discovery:
+    """What is discovered in circles, and on squares held out."""
+    return discover_effects(omni3)
 
 
-def test_what_a_real_robot_lacks_is_found_on_circles_and_holds_on_squares(omni3: Discovery) -> None:
-    assert omni3.verdict in ("named", "class", "incomplete")
-    names = {omni3.effects[0].name, *omni3.effects[0].confusable_with}
+def test_what_a_real_robot_lacks_is_found_on_circles_and_holds_on_squares(recorded: Discovery) -> None:
+    assert recorded.verdict in ("named", "class", "incomplete")
+    names = {recorded.effects[0].name, *recorded.effects[0].confusable_with}
     assert "wheel_dead_zone" in names
-    square = omni3.held_out[-1]
+    square = recorded.held_out[-1]
     assert square.position_m[1] <= 0.045
     assert np.degrees(square.heading_rad[1]) <= 1.8
 
 
-def test_squares_are_told_to_hold_motions_that_circles_had_not(omni3: Discovery) -> None:
-    assert omni3.extrapolations
-    assert all(each.after_m > omni3.held_out[-1].position_m[1] for each in omni3.extrapolations)
-    assert any("turning on the spot" in each.description for each in omni3.extrapolations)
+def test_squares_are_told_to_hold_motions_that_circles_had_not(recorded: Discovery) -> None:
+    assert recorded.extrapolations
+    assert all(each.after_m > recorded.held_out[-1].position_m[1] for each in recorded.extrapolations)
+    assert any("turning on the spot" in each.description for each in recorded.extrapolations)
 
 
-def test_the_experiment_that_tells_a_class_apart_does_so_when_it_is_simulated(omni3: Discovery, tmp_path: Path) -> None:
-    assert omni3.experiments
-    (tmp_path / "experiment.yaml").write_text(omni3.experiments[0].config)
+def test_the_experiment_that_tells_a_class_apart_does_so_when_it_is_simulated(
+    recorded: Discovery, tmp_path: Path
+) -> None:
+    assert recorded.experiments
+    (tmp_path / "experiment.yaml").write_text(recorded.experiments[0].config)
     found = discover_effects(read_simulation(tmp_path / "experiment.yaml").simulate().dataset)
-    assert found.effects[0].name == omni3.effects[0].name
+    assert found.effects[0].name == recorded.effects[0].name
     assert found.effects[0].weight >= 0.95

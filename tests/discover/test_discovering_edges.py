@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from discovery_samples import DELAY, shorn, simulated
+from discovery_samples import DELAY, named, repeated, shorn, simulated
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.discover import discover_effects
@@ -41,7 +41,7 @@ def test_start_headings_that_scatter_are_not_taken_for_clocks_and_hide_no_delay(
 
 
 def test_without_repetitions_no_gap_is_said_to_be_closed() -> None:
-    found = discover_effects(shorn(simulated(repetitions=4), command=None))
+    found = discover_effects(shorn(simulated(), command=None))
     assert [effect.name for effect in found.effects] == ["rotation_translation_coupling"]
     assert all(gap.closed is None for each in found.held_out for gap in (each.eq6, each.chi2))
     assert any("Without repetitions" in note for note in found.notes)
@@ -57,8 +57,8 @@ def test_results_do_not_depend_on_where_and_in_which_heading_runs_start() -> Non
         return replace(run, poses=np.column_stack([cosine * x - sine * y + shift[0], sine * x + cosine * y + shift[1],
                                                    heading + angle]))  # fmt: skip
 
-    here = simulated(repetitions=4, validation=None)
-    found, elsewhere = discover_effects(here), discover_effects(with_runs(here, moved))
+    found = repeated()
+    elsewhere = discover_effects(with_runs(simulated(repetitions=4), moved))
     assert elsewhere.noise.noise.model_dump() == pytest.approx(found.noise.noise.model_dump(), rel=1e-3, abs=1e-6)
     assert elsewhere.gap.floor == pytest.approx(found.gap.floor, rel=1e-3)
     ours, theirs = ([each.value for each in own.effects[0].parameters] for own in (found, elsewhere))
@@ -67,7 +67,7 @@ def test_results_do_not_depend_on_where_and_in_which_heading_runs_start() -> Non
 
 def test_errors_are_those_that_evaluate_finds() -> None:
     rng = np.random.default_rng(8)
-    dataset = with_runs(simulated(repetitions=4), lambda run: turned(run, rng.normal(0, 0.02)))
+    dataset = with_runs(simulated(), lambda run: turned(run, rng.normal(0, 0.02)))
     found = discover_effects(dataset)
     model = found.extended.model
     finals = [run.final_pose - model.reported([run.final_log])[0][-1] for run in dataset.split("validation")]
@@ -93,13 +93,13 @@ def test_final_poses_alone_are_enough_to_look_at() -> None:
     def ends(run: Trajectory) -> Trajectory:
         return replace(run, pose_times=run.pose_times[[0, -1]], poses=run.poses[[0, -1]])
 
-    found = discover_effects(with_runs(simulated(repetitions=4), ends))
+    found = discover_effects(with_runs(simulated(validation=None), ends))
     assert [effect.name for effect in found.effects] == ["rotation_translation_coupling"]
 
 
 def test_validation_runs_that_lack_what_an_effect_needs_are_left_out() -> None:
     wheel = ({"name": "wheel_eccentricity", "parameters": {"a_a": 0.03, "b_b": -0.03}},)
-    dataset = simulated(wheel, repetitions=4)
+    dataset = simulated(wheel)
     found = discover_effects(
         with_runs(dataset, lambda run: replace(run, angles=None) if run.split == "validation" else run)
     )
@@ -114,12 +114,10 @@ def test_a_robot_that_stands_is_refused_in_one_line() -> None:
 
 
 def test_targets_that_were_never_filled_switch_off_the_motors_only() -> None:
-    found = discover_effects(with_runs(simulated(repetitions=4), lambda run: replace(run, targets=0 * run.rates)))
+    found = discover_effects(with_runs(simulated(validation=None), lambda run: replace(run, targets=0 * run.rates)))
     assert [effect.stage for effect in found.effects] == ["body"]
 
 
 def test_a_calibration_with_effects_is_no_start() -> None:
-    dataset = simulated(repetitions=4)
-    found = discover_effects(dataset)
     with pytest.raises(DataError, match="plain"):
-        discover_effects(dataset, calibration=found.extended)
+        discover_effects(simulated(), calibration=named().extended)

@@ -13,25 +13,12 @@ from omnibench.fit.least_squares.whitened import Given
 from omnibench.progress import Progress
 from omnibench.robot.odometry import OdometryBatch
 
-
-def test_steps_are_announced_in_order_and_confirming_comes_only_with_an_effect() -> None:
-    with_effect: list[Progress] = []
-    without_effect: list[Progress] = []
-    discover.discover_effects(simulated(validation=None), watch=with_effect.append)
-    discover.discover_effects(simulated((), validation=None), watch=without_effect.append)
-    confirming = "looking again, now that the noise is known better"
-    stages = [
-        "fitting the plain matrix",
-        "looking where it fails, and at the catalogue",
-        confirming,
-        "looking at the motors",
-        "comparing on runs that were held out",
-    ]
-    for events, begun in ((with_effect, stages), (without_effect, [stage for stage in stages if stage != confirming])):
-        assert events == [event for stage in begun for event in (Progress(stage), Progress(stage, result=""))]
+SMALL: dict[str, Any] = {"commands": {"directions_deg": [0, 120, 240], "turn_rates": [-0.35, 0.35], "ramp": 0.3}}
 
 
-def test_what_concludes_fits_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_come_in_order_confirming_only_with_an_effect_and_what_concludes_fits_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     conclude = discover.conclude
 
     def refuse(*_: Any) -> None:
@@ -44,4 +31,17 @@ def test_what_concludes_fits_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
             return conclude(*args)
 
     monkeypatch.setattr(discover, "conclude", conclude_without_fits)
-    assert discover.discover_effects(simulated()).verdict == "named"
+    with_effect: list[Progress] = []
+    without_effect: list[Progress] = []
+    assert discover.discover_effects(simulated(**SMALL), watch=with_effect.append).verdict == "named"
+    discover.discover_effects(simulated((), **SMALL), watch=without_effect.append)
+    confirming = "looking again, now that the noise is known better"
+    stages = [
+        "fitting the plain matrix",
+        "looking where it fails, and at the catalogue",
+        confirming,
+        "looking at the motors",
+        "comparing on runs that were held out",
+    ]
+    for events, begun in ((with_effect, stages), (without_effect, [stage for stage in stages if stage != confirming])):
+        assert events == [event for stage in begun for event in (Progress(stage), Progress(stage, result=""))]

@@ -110,10 +110,12 @@ def _small() -> tuple[Command, ...]:
     )
 
 
+_ON_THE_SPOT = (Command(0.0, 0.0, -0.9), Command(0.0, 0.0, 0.5))
 DESIGNS = {
     "flower": Design(_flower()),
     "rich": Design(_rich(), scattered=True),
     "small": Design(_small(), scattered=True),
+    "small_sessions": Design((*_small(), *_ON_THE_SPOT), sessions=3, scattered=True),
     "sessions": Design(_rich(), sessions=3, scattered=True),
     "precise": Design(_rich(), scattered=True, noise=0.3),  # cameras instead of SLAM
 }

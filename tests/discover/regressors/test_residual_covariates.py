@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from discovery_samples import DELAY, ECCENTRICITY, Effects, named, nothing, simulated
+from discovery_samples import DELAY, ECCENTRICITY, lagging, named, nothing, simulated
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -160,8 +160,7 @@ def test_a_panel_without_any_known_value_is_empty() -> None:
 
 
 def test_motors_are_drawn_less_what_their_effects_explain() -> None:
-    lag: Effects = ({"name": "motor_lag", "parameters": {"tau": 0.15}},)
-    found = discover_effects(simulated(lag))
+    found = lagging()
     assert [effect.name for effect in found.effects] == ["motor_lag"]
     drawn = motor_grid(found, Residuals(found).runs)
     assert drawn is not None

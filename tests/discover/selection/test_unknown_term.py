@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from discovery_samples import nameless, simulated
 from hidden.experiment import ROBOT
-from hidden.sets import Kind, Truth, make_set
+from hidden.sets import Truth, make_set
 
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.fitting.extend import Extended, extend
@@ -34,19 +35,28 @@ if TYPE_CHECKING:
 FOLDS = np.tile(np.arange(5), 12)  # of the 60 runs of a small set
 
 
-def recorded(kind: str, seed: int = 1000) -> tuple[Dataset, Truth]:
+def recorded(kind: str) -> tuple[Dataset, Truth]:
     """60 + 60 runs with an effect that no catalogue has, of a non-centrality of 600."""
-    return small_set("outside", kind, seed)
-
-
-def small_set(kind: Kind, effect: str, seed: int) -> tuple[Dataset, Truth]:
-    return make_set(kind, effect, 600.0, seed, design="small")
+    return make_set("outside", kind, 600.0, 1000, design="small")
 
 
 @pytest.fixture(scope="module")
 def grooved() -> tuple[Dataset, Truth, Discovery]:
     dataset, truth = recorded("turning_by_heading")
     return dataset, truth, discover_effects(dataset, unknown_term=True)
+
+
+@pytest.fixture(scope="module")
+def bare(grooved: tuple[Dataset, Truth, Discovery]) -> Extended:
+    """Their plain fit."""
+    return plain(grooved[0])
+
+
+@pytest.fixture(scope="module")
+def screened(bare: Extended) -> tuple[Screening, Selection]:
+    """Their screening, and what is selected after it."""
+    screening = screen_plain(bare.fit, ())
+    return screening, select_effects(screening, np.random.default_rng(0))
 
 
 def error(calibration: Calibration, dataset: Dataset, truth: Truth, found: Discovery) -> float:
@@ -92,15 +102,15 @@ def test_the_calibration_file_predicts_the_same(grooved: tuple[Dataset, Truth, D
     np.testing.assert_array_equal(again, found.extended.model.reported([log])[0])
 
 
-def test_it_is_added_only_when_asked_for(grooved: tuple[Dataset, Truth, Discovery]) -> None:
-    found = discover_effects(grooved[0])
+def test_it_is_added_only_when_asked_for() -> None:
+    found = nameless()
+    assert found.verdict == "unknown"
     assert found.extended.effects == ()
     assert not any("smooth" in note for note in found.notes)
 
 
 def test_where_nothing_is_missing_none_is_tried() -> None:
-    dataset, _ = small_set("null", "", 1003)
-    found = discover_effects(dataset, unknown_term=True)
+    found = discover_effects(simulated(()), unknown_term=True)
     assert found.verdict == "none"
     assert found.extended.effects == ()
     assert not any("smooth" in note for note in found.notes)
@@ -113,22 +123,22 @@ def test_of_two_waves_the_one_that_is_there_is_chosen() -> None:
     assert largest.shapes["harmonic"] == 2
 
 
-def test_functions_that_are_not_chosen_are_zero(grooved: tuple[Dataset, Truth, Discovery]) -> None:
-    (found,) = chosen_functions(plain(grooved[0]), [group("smooth_heading")])
+def test_functions_that_are_not_chosen_are_zero(bare: Extended) -> None:
+    (found,) = chosen_functions(bare, [group("smooth_heading")])
     chosen = {each.name for each in found.parameters}
     assert chosen & {"turn_cos2", "turn_sin2"}  # what is there
-    every = {each.name for each in effects.create("smooth_heading").parameters(grooved[0].robot)}
+    every = {each.name for each in effects.create("smooth_heading").parameters(ROBOT)}
     assert found.shapes == dict.fromkeys(every - chosen, 0.0)
 
 
-def test_a_function_that_the_matrix_explains_is_not_chosen(grooved: tuple[Dataset, Truth, Discovery]) -> None:
-    assert chosen_functions(plain(grooved[0]), [group("smooth_elapsed_time", duration=1e6)]) == []  # cosines of 0
+def test_a_function_that_the_matrix_explains_is_not_chosen(bare: Extended) -> None:
+    assert chosen_functions(bare, [group("smooth_elapsed_time", duration=1e6)]) == []  # cosines of 0
 
 
 def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
-    grooved: tuple[Dataset, Truth, Discovery],
+    bare: Extended, screened: tuple[Screening, Selection]
 ) -> None:
-    bare, screening, selection = screened(grooved[0])
+    screening, selection = screened
     models = with_names(bare, selection, group("heading_drift"))
     smooth = add_smooth_term(bare.fit, screening, selection, models, FOLDS)
     used = smooth.models.used
@@ -140,8 +150,10 @@ def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
     assert calibrated["heading_drift"]["b"] == used.values[0]
 
 
-def test_nothing_is_added_to_a_model_that_leaves_nothing_of_it(grooved: tuple[Dataset, Truth, Discovery]) -> None:
-    bare, screening, selection = screened(grooved[0])
+def test_nothing_is_added_to_a_model_that_leaves_nothing_of_it(
+    bare: Extended, screened: tuple[Screening, Selection]
+) -> None:
+    screening, selection = screened
     models = with_names(bare, selection, group("smooth_heading"), group("smooth_course"))
     smooth = add_smooth_term(bare.fit, screening, selection, models, FOLDS)
     assert smooth.models is models
@@ -162,12 +174,6 @@ def plain(dataset: Dataset) -> Extended:
     runs = usable_runs(dataset.split("train"))
     start = dataset.robot.inverse_kinematic_matrix
     return extend(fit_matrix(runs, dataset.robot, dataset.sample_period, start), ())
-
-
-def screened(dataset: Dataset) -> tuple[Extended, Screening, Selection]:
-    bare = plain(dataset)
-    screening = screen_plain(bare.fit, ())
-    return bare, screening, select_effects(screening, np.random.default_rng(0))
 
 
 def with_names(bare: Extended, selection: Selection, *groups: Group) -> CompetingModels:
