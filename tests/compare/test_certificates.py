@@ -57,7 +57,7 @@ def test_the_terminal_tells_what_is_proven(result: ComparisonResult, capsys: pyt
 
 
 def test_the_report_tells_what_is_proven(tmp_path: Path) -> None:
-    found = run(config())
+    found = run(config(certificate=PROVEN))
     text = page(found, tmp_path).text
     assert "What no optimiser can beat" in text
     assert "proven: ≤" in text

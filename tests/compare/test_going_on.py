@@ -11,9 +11,24 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from commands import COMMAND, ENVIRONMENT, compared, flower, search, small, summary, write_config, write_plugin
+from commands import (
+    COMMAND,
+    ENVIRONMENT,
+    compared,
+    compared_here,
+    flower,
+    omnibench,
+    registries_restored,
+    search,
+    small,
+    summary,
+    write_config,
+    write_plugin,
+)
 
 from omnibench.compare.config import CompareConfig
+from omnibench.compare.effective_config import effective_config
+from omnibench.compare.plan import load_datasets, make_plan
 from omnibench.compare.run import run_comparison
 from omnibench.data.storage import save_dataset
 from omnibench.progress import Progress
@@ -22,13 +37,38 @@ from omnibench.simulate.simulate import simulate_dataset
 
 pytestmark = pytest.mark.usefixtures("registries_as_before")
 
-SEARCHES = ["theoretical", search("first", 40_000, batch=1), search("second", 39_000, batch=1), search("third", 400)]
+# Ends soon after its file is there, and not before: what Ctrl-C finds under way.
+WAITING = """
+@calibrators.register("waiting")
+class Waiting(Calibrator):
+    "Waits for a file, then scales the start by random numbers."
+
+    class Options(Options):
+        number: int = 1
+
+    def calibrate(self, problem):
+        while not os.path.exists({file!r}):
+            time.sleep(0.01)
+        return Solution(problem.start * (1 + 0.001 * problem.rng.random(problem.size)), "scaled", converged=False)
+"""
+ENTRIES = [
+    "theoretical",
+    "waiting",
+    {"name": "waiting", "label": "second", "options": {"number": 2}},
+    search("third", 400),
+]
+
+
+def waiting(folder: Path) -> dict[str, Any]:
+    """Changes of the small comparison that let it wait for the file ``go`` of the folder in its second run."""
+    plugins = write_plugin(folder / "plugins", "waiting", WAITING.format(file=str(folder / "go")))
+    return {"plugins": [str(plugins)], "calibrators": ENTRIES}
 
 
 class Stopped(NamedTuple):
     """A comparison that Ctrl-C ended: what it printed, and the files that were there then."""
 
-    config: Path
+    folder: Path
     output: Path
     returncode: int
     stderr: str
@@ -54,7 +94,7 @@ def started(config: Path, output: Path) -> subprocess.Popen[str]:
     )
     assert process.stderr is not None
     assert process.stderr.readline() == "comparing: 4 runs\n"
-    assert process.stderr.readline().startswith("[1/4] flower ")
+    assert next(line for line in process.stderr if line.startswith("[1/4] flower "))
     return process
 
 
@@ -74,12 +114,10 @@ def wait_until_gone(group: int) -> list[str]:
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory: pytest.TempPathFactory) -> Stopped:
     folder = tmp_path_factory.mktemp("stopped")
-    config = write_config(folder, calibrators=SEARCHES, budget={"evaluations": 40_000}, workers=1)
-    process = started(config, folder / "out")
-    time.sleep(0.3)  # into the next run
+    process = started(write_config(folder, **waiting(folder), workers=1), folder / "out")
     os.killpg(process.pid, signal.SIGINT)
-    _, stderr = process.communicate(timeout=30)
-    return Stopped(config, folder / "out", process.returncode, stderr, process.pid, files_of(folder / "out"))
+    _, stderr = process.communicate(timeout=60)
+    return Stopped(folder, folder / "out", process.returncode, stderr, process.pid, files_of(folder / "out"))
 
 
 def test_ctrl_c_exits_with_130(stopped: Stopped) -> None:
@@ -103,13 +141,15 @@ def test_ctrl_c_leaves_whole_files_only(stopped: Stopped) -> None:
 def test_going_on_keeps_what_had_ended_and_gives_what_an_uninterrupted_comparison_gives(
     stopped: Stopped, tmp_path: Path
 ) -> None:
-    run = compared(stopped.config, stopped.output)
+    (stopped.folder / "go").touch()
+    run = compared(stopped.folder / "small.yaml", stopped.output)
     (line,) = (line for line in run.stderr.splitlines() if "kept from an earlier run" in line)
     assert "theoretical seed 1: converged, cost 0.138732, 1 evaluation, " in line
     after = files_of(stopped.output)
     kept = {name: content for name, content in stopped.files.items() if name.startswith("runs/")}
     assert kept == {name: after[name] for name in kept}
-    compared(stopped.config, tmp_path / "whole", "--data", whole_data(tmp_path))
+    data = {"flower": {"path": str(whole_data(tmp_path))}}
+    compared_here(tmp_path / "whole", **waiting(stopped.folder), datasets=data)
     assert without_seconds(stopped.output) == without_seconds(tmp_path / "whole")
 
 
@@ -124,18 +164,9 @@ def without_seconds(output: Path) -> list[dict[str, Any]]:
 
 
 def test_ctrl_c_before_the_first_run_ends_in_one_line(tmp_path: Path) -> None:
-    config = write_config(tmp_path, calibrators=SEARCHES)
-    program = "import os, signal, sys, threading; sys.argv[0] = 'omnibench'; "
-    program += "from omnibench.__main__ import main; import omnibench.cli.app; "
-    program += "threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start(); main()"
-    run = subprocess.run(
-        [COMMAND[0], "-c", program, "compare", str(config), "--output", str(tmp_path / "out")],
-        env=ENVIRONMENT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    plugins = write_plugin(tmp_path / "plugins", "impatient", "import signal\nsignal.raise_signal(signal.SIGINT)\n")
+    config = write_config(tmp_path, plugins=[str(plugins)])
+    run = omnibench("compare", config, "--output", tmp_path / "out")
     assert run.returncode == 130
     assert [line.split(";")[0] for line in run.stderr.splitlines() if line] == ["interrupted"]
 
@@ -145,6 +176,9 @@ ASLEEP = """
 class Asleep(Calibrator):
     "Does not look whether anybody waits for it."
 
+    class Options(Options):
+        number: int = 1
+
     def calibrate(self, problem):
         time.sleep(300)
 """
@@ -153,7 +187,8 @@ class Asleep(Calibrator):
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGKILL"])
 def test_the_runs_end_with_a_comparison_that_is_killed_which_then_goes_on(name: str, tmp_path: Path) -> None:
     plugins = write_plugin(tmp_path / "plugins", "asleep", ASLEEP)
-    entries = ["theoretical", "asleep", *SEARCHES[1:3]]
+    others = [{"name": "asleep", "label": f"{number}", "options": {"number": number}} for number in (2, 3)]
+    entries = ["theoretical", "asleep", *others]
     config = write_config(tmp_path, plugins=[str(plugins)], calibrators=entries, workers=4)  # none starts later
     process = started(config, tmp_path / "out")
     process.send_signal(signal.Signals[name])
@@ -212,11 +247,17 @@ def test_nothing_is_run_again_when_nothing_changed(output: Path) -> None:
     assert summary(output)["runs"] == rows
 
 
+def test_only_what_is_new_is_run(output: Path) -> None:
+    entries = ["theoretical", {"name": "closed_form", "label": "another name"}, search(candidates=301)]
+    assert ran_and_kept(output, calibrators=entries) == ({"search 1"}, {"theoretical 1", "another name 1"})
+
+
 @pytest.mark.parametrize(
-    ("changes", "ran"),
+    ("changes", "new"),
     [
         ({"calibrators": ["theoretical", "closed_form", search(candidates=301)]}, {"search 1"}),
         ({"calibrators": ["theoretical", {"name": "closed_form", "box": "paper", "label": "c"}, search()]}, {"c 1"}),
+        ({"calibrators": ["theoretical", "closed_form", search("another name")]}, set()),
         ({"seeds": [1, 2]}, {"search 2"}),
         ({"budget": {"evaluations": 2001, "seconds": 60}}, ALL),
         ({"cost": "final_position"}, ALL),
@@ -226,23 +267,20 @@ def test_nothing_is_run_again_when_nothing_changed(output: Path) -> None:
     ],
     ids=lambda value: ", ".join(sorted(value)) or "nothing",
 )
-def test_only_what_a_change_touches_is_run_again(output: Path, changes: dict[str, Any], ran: set[str]) -> None:
-    assert ran_and_kept(output, **changes)[0] == ran
+def test_only_runs_that_a_change_touches_are_new(once: Path, changes: dict[str, Any], new: set[str]) -> None:
+    config = CompareConfig.model_validate(small(**changes))
+    plan = make_plan(effective_config(config), load_datasets(config))
+    assert {f"{run.label} {run.seed}" for run in plan if not (once / "runs" / f"{run.key}.json").exists()} == new
 
 
-def test_a_new_label_is_no_new_run(output: Path) -> None:
-    ran, kept = ran_and_kept(output, calibrators=["theoretical", "closed_form", search("another name")])
-    assert (ran, kept) == (set(), {"theoretical 1", "closed_form 1", "another name 1"})
-
-
-@pytest.mark.parametrize("damage", [b"", b"{", b"\xff\xfe", b'{"outcome": "converged"}'])
-def test_a_damaged_run_is_run_again(output: Path, damage: bytes) -> None:
-    whole = {file.name: file.read_bytes() for file in (output / "runs").iterdir()}
-    (damaged := next((output / "runs").iterdir())).write_bytes(damage)
-    ran, kept = ran_and_kept(output)
-    assert (len(ran), len(kept)) == (1, 2)
-    assert len(damaged.read_bytes()) > len(damage)
-    assert {file.name for file in (output / "runs").iterdir()} == set(whole)
+def test_damaged_runs_are_run_again(output: Path) -> None:
+    files = sorted((output / "runs").iterdir())
+    damages = (b"", b"\xff\xfe", b'{"outcome": "converged"}')
+    for file, damage in zip(files, damages, strict=True):
+        file.write_bytes(damage)
+    assert ran_and_kept(output) == (ALL, set())
+    assert sorted((output / "runs").iterdir()) == files
+    assert min(len(file.read_bytes()) for file in files) > 100
 
 
 PLUGIN = """
@@ -255,25 +293,19 @@ class Mine(Calibrator):
 """
 
 
-def test_a_changed_plugin_is_run_again_and_the_others_are_not(tmp_path: Path) -> None:
-    plugins = write_plugin(tmp_path / "plugins", "mine", PLUGIN.format(factor=1.0))
-    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=["theoretical", "mine"])
-    compared(config, tmp_path / "out")
-    write_plugin(plugins, "mine", PLUGIN.format(factor=1.01))
-    run = compared(config, tmp_path / "out")
-    assert run.stderr.count("kept from an earlier run") == 1
-    mine = next(run for run in summary(tmp_path / "out")["runs"] if run["label"] == "mine")
-    assert mine["train_cost"] != mine["theoretical_train_cost"]
-
-
-def test_a_plugin_that_is_repaired_is_run(tmp_path: Path) -> None:
-    plugins = write_plugin(tmp_path / "plugins", "mine", PLUGIN.format(factor="a_name_that_is_not_there"))
-    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=["theoretical", "mine"])
-    compared(config, tmp_path / "out")
-    assert [run["outcome"] for run in summary(tmp_path / "out")["runs"]] == ["converged", "failed"]
-    write_plugin(plugins, "mine", PLUGIN.format(factor=1.0))
-    compared(config, tmp_path / "out")
-    assert [run["outcome"] for run in summary(tmp_path / "out")["runs"]] == ["converged", "converged"]
+def test_a_plugin_that_is_repaired_or_changed_is_run_again_and_the_others_are_not(tmp_path: Path) -> None:
+    costs = []
+    for factor, outcome in (("a_name_that_is_not_there", "failed"), ("1.0", "converged"), ("1.01", "converged")):
+        plugins = write_plugin(tmp_path / "plugins", "mine", PLUGIN.format(factor=factor))
+        changes: dict[str, Any] = {"plugins": [str(plugins)], "calibrators": ["theoretical", "mine"]}
+        with registries_restored():
+            ran, _ = ran_and_kept(tmp_path / "out", **changes)
+        assert ran == ({"mine 1"} if costs else {"mine 1", "theoretical 1"})
+        theoretical, mine = summary(tmp_path / "out")["runs"]
+        assert (theoretical["outcome"], mine["outcome"]) == ("converged", outcome)
+        costs.append(mine["train_cost"])
+    assert costs[0] is None
+    assert costs[1] != costs[2]
 
 
 def test_the_same_seed_gives_the_same_results_with_any_number_of_workers(tmp_path: Path) -> None:

@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import json
 import resource
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
-from commands import assert_refused, compared, compared_here, flower, omnibench, search, small, summary, write_config
+from commands import (
+    Command,
+    assert_refused,
+    compared,
+    compared_here,
+    disk_that_takes,
+    flower,
+    omnibench,
+    search,
+    small,
+    summary,
+    write_config,
+)
 
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.effective_config import effective_config
@@ -222,57 +233,61 @@ def test_a_folder_that_holds_something_else_is_left_alone(name: str, tmp_path: P
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [(name, "mine: precious\n")]
 
 
-def test_the_folder_of_the_config_itself_is_no_place_for_results(tmp_path: Path) -> None:
+def test_the_folder_of_the_config_itself_is_no_place_for_results(command: Command, tmp_path: Path) -> None:
     config = write_config(tmp_path)
     before = config.read_text()
-    assert_refused(omnibench("compare", config, "--output", tmp_path), "holds other files")
+    assert_refused(command("compare", config, "--output", tmp_path), "holds other files")
     assert config.read_text() == before
 
 
-def test_the_folder_of_another_comparison_is_left_alone(output: Path, tmp_path: Path) -> None:
+def test_the_folder_of_another_comparison_is_left_alone(command: Command, output: Path, tmp_path: Path) -> None:
     before = summary(output)
-    run = omnibench("compare", write_config(tmp_path, name="another"), "--output", output)
+    run = command("compare", write_config(tmp_path, name="another"), "--output", output)
     assert_refused(run, "holds the comparison 'small'; name another folder for 'another'")
     assert summary(output) == before
 
 
-def test_a_file_in_place_of_a_folder_is_refused(tmp_path: Path) -> None:
+def test_a_file_in_place_of_a_folder_is_refused(command: Command, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
-    run = omnibench("compare", write_config(tmp_path / "c"), "--output", tmp_path / "file")
+    run = command("compare", write_config(tmp_path / "c"), "--output", tmp_path / "file")
     assert_refused(run, str(tmp_path / "file"), "is a file; name a folder for the results")
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_a_folder_below_a_file_is_refused(tmp_path: Path) -> None:
+def test_a_folder_below_a_file_is_refused(command: Command, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
-    run = omnibench("compare", write_config(tmp_path / "c"), "--output", tmp_path / "file" / "deep" / "er")
+    run = command("compare", write_config(tmp_path / "c"), "--output", tmp_path / "file" / "deep" / "er")
     assert_refused(run, "cannot be written", "is not a folder; choose another place")
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def at_most(size: int) -> Callable[[], None]:
-    """For a process: the disk takes no file larger than ``size`` bytes."""
-    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
 
-
-@pytest.mark.parametrize(("size", "file"), [(100, "config.yaml"), (3000, "summary.json"), (20_000, "report.html")])
-def test_a_full_disk_is_one_line_and_loses_no_run(size: int, file: str, tmp_path: Path) -> None:
     output = tmp_path / "out"
-    run = omnibench("compare", write_config(tmp_path), "--output", output, preexec_fn=at_most(size))
-    assert run.returncode == 2
-    assert "Traceback" not in run.stderr
-    complaint = f"error: {output / file}: cannot be written: File too large; free space or choose another place"
-    assert run.stderr.splitlines()[-1] == complaint
+    run = omnibench("compare", write_config(tmp_path), "--output", output, preexec_fn=limited)
+    assert (run.returncode, run.stdout) == (2, "")
+    advice = "cannot be written: File too large; free space or choose another place"
+    assert run.stderr == f"error: {output / 'config.yaml'}: {advice}\n"
+    assert [file for file in output.rglob("*") if file.is_file()] == []
+
+
+@pytest.mark.parametrize(("size", "file"), [(3000, "summary.json"), (20_000, "report.html")])
+def test_a_disk_that_is_full_after_the_runs_loses_none(size: int, file: str, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    with (
+        disk_that_takes(size),
+        pytest.raises(DataError, match=rf"{file}: cannot be written: File too large; free space"),
+    ):
+        compared_here(output)
     assert not (output / file).exists()
     assert not list(output.rglob(".*"))
-    assert len(list((output / "runs").glob("*.json"))) == (0 if file == "config.yaml" else 3)
+    assert len(list((output / "runs").glob("*.json"))) == 3
 
 
-def test_a_run_that_the_disk_does_not_take_is_one_line(tmp_path: Path) -> None:
+def test_a_run_that_the_disk_does_not_take_ends_the_comparison(tmp_path: Path) -> None:
     entry = {"name": "genetic", "options": {"generations": 100}}  # whose history is longer than the config
-    config = write_config(tmp_path, calibrators=["theoretical", entry], budget={"evaluations": 20_000}, workers=1)
-    run = omnibench("compare", config, "--output", tmp_path / "out", preexec_fn=at_most(2500))
-    assert run.returncode == 2
-    assert "Traceback" not in run.stderr
-    assert f"error: {tmp_path / 'out' / 'runs'}" in run.stderr.splitlines()[-1]
+    with disk_that_takes(2500), pytest.raises(DataError, match=r"runs/\w+\.json: cannot be written: File too large"):
+        compared_here(tmp_path / "out", calibrators=["theoretical", entry], budget={"evaluations": 20_000}, workers=1)
     assert len(list((tmp_path / "out" / "runs").iterdir())) == 1

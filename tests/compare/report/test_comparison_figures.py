@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from report_samples import APR02, config, flower, run
+from report_samples import APR02, config, flower, run, usual
 
 from omnibench.compare.report.matrices import differences
 from omnibench.compare.report.path_figures import chosen_trajectories
@@ -60,7 +60,7 @@ def test_a_command_is_described_as_the_paper_writes_it() -> None:
 
 @pytest.fixture(scope="module")
 def view():
-    (found,) = views(run(config()))
+    (found,) = views(usual())
     return found
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from report_page import Page
-from report_samples import APR02, config, flower, page, run, statistics
+from report_samples import APR02, config, flower, page, run, statistics, usual
 
 from omnibench.compare.result import ComparisonResult, Interval
 from omnibench.robot.kinematics import Robot
@@ -16,8 +16,7 @@ from omnibench.robot.kinematics import Robot
 
 @pytest.fixture(scope="module")
 def result() -> ComparisonResult:
-    """Two calibrators and the design values, on a simulated flower."""
-    return run(config())
+    return usual()
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from omnibench.report.blocks import Callout
 
 @pytest.fixture(scope="module")
 def result() -> ComparisonResult:
-    return run(config(calibrators=["theoretical", "closed_form"], seeds=[1], certificate=None))
+    return run(config(calibrators=["theoretical", "closed_form"], seeds=[1]))
 
 
 def with_published(result: ComparisonResult, *published: dict[str, Any], **changes: Any) -> DatasetView:
@@ -111,7 +111,7 @@ def test_the_scatter_of_repetitions_is_what_noise_alone_makes() -> None:
     noise = {"pose_position": 0.005, "pose_heading": 0.005}
     truth = {"published": "palacin2023_eq8"}
     many = flower(noise=noise, truth=truth, repetitions=40)
-    result = run(config(datasets={"f": {"simulate": many}}, calibrators=["closed_form"], seeds=[1], certificate=None))
+    result = run(config(datasets={"f": {"simulate": many}}, calibrators=["closed_form"], seeds=[1]))
     told = reasons(with_published(result, scaled(result, 1, 1)))
     scatter = float(told.split("repetitions of one command end ")[1].split(" from")[0])
     # The mean norm of three normal errors of 5 mm or mrad each.
@@ -121,7 +121,7 @@ def test_the_scatter_of_repetitions_is_what_noise_alone_makes() -> None:
 
 def test_data_without_repetitions_say_that_their_noise_cannot_be_told() -> None:
     once = {"f": {"simulate": flower(repetitions=1)}}
-    result = run(config(datasets=once, calibrators=["closed_form"], seeds=[1], certificate=None))
+    result = run(config(datasets=once, calibrators=["closed_form"], seeds=[1]))
     assert "cannot be told from the data" in reasons(with_published(result, scaled(result, 1, 1)))
 
 
