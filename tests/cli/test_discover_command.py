@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 from dataclasses import replace
@@ -134,25 +135,30 @@ def test_somebody_elses_folder_is_refused_before_any_work(command: Command, data
     assert_refused(command("discover", data, "--output", "mine/notes.txt"), "is a file")
 
 
-def test_an_earlier_discovery_is_replaced_with_all_its_files(tmp_path: Path) -> None:
-    folder = tmp_path / "out"
-    write_discovery(replace(named(), experiments=(EXPERIMENT, EXPERIMENT)), OPTIONS, folder)
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a discovery with two experiments."""
+    folder = tmp_path_factory.mktemp("written") / "out"
+    return write_discovery(replace(named(), experiments=(EXPERIMENT, EXPERIMENT)), OPTIONS, folder)
+
+
+def test_an_earlier_discovery_is_replaced_with_all_its_files(written: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(written, tmp_path / "out")
     assert (folder / "experiment-2.yaml").read_text(encoding="utf-8") == EXPERIMENT.config
     write_discovery(replace(nothing(), experiments=(EXPERIMENT,)), OPTIONS, folder)
     assert {path.name for path in folder.iterdir()} == {*FILES, "experiment-1.yaml"}
     assert json.loads((folder / "discovery.json").read_text(encoding="utf-8"))["verdict"] == "none"
 
 
-def test_a_disk_that_refuses_one_file_leaves_all_as_they_were(tmp_path: Path) -> None:
-    folder = tmp_path / "out"
-    write_discovery(named(), OPTIONS, folder)
+def test_a_disk_that_refuses_one_file_leaves_all_as_they_were(written: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(written, tmp_path / "out")
     (folder / "report.html").unlink()
     (folder / "report.html").mkdir()
     before = (folder / "discovery.json").read_bytes()
     with pytest.raises(DataError, match=r"report\.html: cannot be written"):
         write_discovery(nothing(), OPTIONS, folder)
     assert (folder / "discovery.json").read_bytes() == before
-    assert {path.name for path in folder.iterdir()} == FILES
+    assert {path.name for path in folder.iterdir()} == {*FILES, "experiment-1.yaml", "experiment-2.yaml"}
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
@@ -161,10 +167,9 @@ def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
         write_discovery(nothing(), OPTIONS, tmp_path / "file" / "out")
 
 
-def test_every_pose_has_a_row_with_its_residuals(tmp_path: Path) -> None:
+def test_every_pose_has_a_row_with_its_residuals(written: Path) -> None:
     found = named()
-    write_discovery(found, OPTIONS, tmp_path)
-    table = pl.read_parquet(tmp_path / "residuals.parquet")
+    table = pl.read_parquet(written / "residuals.parquet")
     assert len(table) == found.poses
     first = table.filter(pl.col("trajectory") == found.trajectories[0])
     assert first["before_heading_rad"].to_list() == found.before[0][:, 2].tolist()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import resource
+import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +17,9 @@ from commands import (
     Command,
     Prepared,
     assert_refused,
+    disk_that_takes,
     omnibench,
+    run_here,
 )
 
 from omnibench.data.storage import load_dataset
@@ -102,6 +106,14 @@ def test_a_mistake_is_one_line_and_exit_code_2(
     assert_refused(command(*map(placed, arguments)), *parts)
 
 
+@pytest.fixture(scope="module")
+def as_csv(prepared: Prepared, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data set in tables that an editor can damage."""
+    folder = tmp_path_factory.mktemp("csv")
+    assert run_here("simulate", prepared.config, "-o", "data", "--format", "csv", cwd=folder).returncode == 0
+    return folder / "data"
+
+
 @pytest.mark.parametrize(
     ("table", "damage", "part"),
     [
@@ -117,9 +129,15 @@ def test_a_mistake_is_one_line_and_exit_code_2(
     ],
 )
 def test_a_reading_rule_reaches_the_user_as_one_line(
-    table: str, damage: Callable[[str], str], part: str, command: Command, prepared: Prepared, tmp_path: Path
+    table: str,
+    damage: Callable[[str], str],
+    part: str,
+    command: Command,
+    prepared: Prepared,
+    as_csv: Path,
+    tmp_path: Path,
 ) -> None:
-    assert command("simulate", prepared.config, "-o", tmp_path / "data", "--format", "csv").returncode == 0
+    shutil.copytree(as_csv, tmp_path / "data")
     file = tmp_path / "data" / f"{table}.{'yaml' if table == 'dataset' else 'csv'}"
     whole = file.read_text()
     file.write_text(damage(whole))
@@ -173,27 +191,34 @@ def test_a_full_disk_behind_standard_output_is_one_line() -> None:
     assert (run.returncode, run.stderr) == (2, "error: output: No space left on device\n")
 
 
-@pytest.mark.parametrize("name", ["simulate", "calibrate", "plugin"])
-def test_a_full_disk_is_one_line_and_leaves_no_half_file(name: str, prepared: Prepared, tmp_path: Path) -> None:
-    arguments: dict[str, tuple[object, ...]] = {
-        "simulate": ("simulate", prepared.config, "-o", tmp_path / "new"),
-        "calibrate": ("calibrate", prepared.data, "-o", tmp_path / "new" / "c.yaml"),
-        "plugin": ("plugin", "new", "mine", "--folder", tmp_path / "new"),
-    }
-    run = omnibench(*arguments[name], preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100)))
-    assert_refused(run, str(tmp_path / "new"), "cannot be written: File too large; free space or choose another place")
+FULL = "cannot be written: File too large; free space or choose another place"
+
+
+def test_a_full_disk_is_one_line_and_leaves_no_half_file(prepared: Prepared, tmp_path: Path) -> None:
+    limited = functools.partial(resource.setrlimit, resource.RLIMIT_FSIZE, (100, 100))
+    run = omnibench("simulate", prepared.config, "-o", tmp_path / "new", preexec_fn=limited)
+    assert_refused(run, str(tmp_path / "new"), FULL)
     assert [file for file in (tmp_path / "new").rglob("*") if file.is_file()] == []
 
 
-def test_a_data_set_that_does_not_fit_leaves_the_one_that_was_there(prepared: Prepared, tmp_path: Path) -> None:
-    assert omnibench("simulate", prepared.config, "-o", tmp_path / "data", "--format", "csv").returncode == 0
-    before = load_dataset(tmp_path / "data").hash
-    run = omnibench(
-        *("simulate", prepared.config, "-o", tmp_path / "data"),
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100)),
-    )
-    assert run.returncode == 2
-    assert load_dataset(tmp_path / "data").hash == before
+@pytest.mark.parametrize("arguments", [["calibrate", "DATA", "-o", "new/c.yaml"], ["plugin", "new", "mine"]])
+def test_a_file_that_the_disk_does_not_take_is_not_there(
+    arguments: list[str], command: Command, prepared: Prepared
+) -> None:
+    with disk_that_takes(600):  # the line on standard error
+        run = command(*(str(prepared.data) if argument == "DATA" else argument for argument in arguments))
+    assert_refused(run, FULL)
+    assert [file for file in Path().rglob("*") if file.is_file()] == []
+
+
+def test_a_data_set_that_does_not_fit_leaves_the_one_that_was_there(
+    command: Command, prepared: Prepared, tmp_path: Path
+) -> None:
+    data = shutil.copytree(prepared.data, tmp_path / "data")
+    with disk_that_takes(600):
+        run = command("simulate", prepared.config, "-o", data, "--format", "csv")
+    assert_refused(run, FULL)
+    assert load_dataset(data).hash == load_dataset(prepared.data).hash
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")

@@ -9,13 +9,13 @@ import subprocess
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
 import pytest
 import yaml
-from commands import COMMAND, ENVIRONMENT, Command, assert_refused
+from commands import COMMAND, ENVIRONMENT, Command, Printed, assert_refused, run_here
 
 from omnibench.data.dataset import make_dataset
 from omnibench.data.scans import ScansInMemory
@@ -67,18 +67,40 @@ def _in_room(start: Array, path: Array) -> Array:
     return np.column_stack([start[0] + place.real, start[1] + place.imag, start[2] + path[:, 2]])
 
 
-def test_the_poses_are_those_of_the_truth_and_the_rest_is_as_it_was(command: Command, driven: Driven) -> None:
-    run = command("slam", driven.data, "-o", "found")
-    assert run.returncode == 0, run.stderr
-    before, found = load_dataset(driven.data), load_dataset("found")
+class Found(NamedTuple):
+    """What the command printed, and the data set that it wrote."""
+
+    run: Printed
+    data: Path
+
+
+@pytest.fixture(scope="module")
+def found(driven: Driven, tmp_path_factory: pytest.TempPathFactory) -> Found:
+    folder = tmp_path_factory.mktemp("found")
+    return Found(run_here("slam", driven.data, "-o", "found", cwd=folder), folder / "found")
+
+
+@pytest.fixture(scope="module")
+def document(driven: Driven, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What the command prints as JSON of poses that it does not write."""
+    folder = tmp_path_factory.mktemp("json")
+    run = run_here("slam", driven.data, "--json", "--truth", driven.truth, cwd=folder)
+    assert not list(folder.iterdir())
+    content: dict[str, Any] = json.loads(run.stdout)
+    return content
+
+
+def test_the_poses_are_those_of_the_truth_and_the_rest_is_as_it_was(found: Found, driven: Driven) -> None:
+    assert found.run.returncode == 0, found.run.stderr
+    before, after = load_dataset(driven.data), load_dataset(found.data)
     assert before.scans is not None
-    assert found.scans is not None
-    assert (found.name, found.simulated, found.scans.scanner) == ("driven", True, before.scans.scanner)
+    assert after.scans is not None
+    assert (after.name, after.simulated, after.scans.scanner) == ("driven", True, before.scans.scanner)
     true = pl.read_parquet(driven.truth / "poses.parquet")
-    for old, new in zip(before.trajectories, found.trajectories, strict=True):
+    for old, new in zip(before.trajectories, after.trajectories, strict=True):
         assert (old.id, old.split) == (new.id, new.split)
         np.testing.assert_array_equal(old.rates, new.rates)
-        np.testing.assert_array_equal(found.scans.of(new.id).ranges, before.scans.of(old.id).ranges)
+        np.testing.assert_array_equal(after.scans.of(new.id).ranges, before.scans.of(old.id).ranges)
         np.testing.assert_array_equal(new.pose_times, before.scans.times(old.id))
         path = true.filter(pl.col("trajectory") == new.id)
         ends = [np.interp(new.pose_times[-1], path["t"], path[name]) for name in ("x", "y", "theta")]
@@ -87,21 +109,21 @@ def test_the_poses_are_those_of_the_truth_and_the_rest_is_as_it_was(command: Com
 
 
 def test_the_table_says_how_sure_the_poses_are_and_how_far_from_the_recorded_reference(
-    command: Command, driven: Driven
+    found: Found, driven: Driven
 ) -> None:
-    run = command("slam", driven.data, "-o", "found")
-    scans = sum(len(load_dataset(driven.data).scans.times(name)) for name in ("01", "02", "03"))  # type: ignore[union-attr]
-    assert f"driven: simulated data; 3 runs, {scans} scans, " in run.stdout
-    assert "deviation stated at the end of a run" in run.stdout
-    assert "from the recorded reference (12 poses)" in run.stdout
-    assert "3 trajectories: found" in run.stdout
-    assert "truth" not in run.stdout
-    assert run.stderr == "SLAM: 3 runs\n"
+    scans = load_dataset(driven.data).scans
+    assert scans is not None
+    count = sum(len(scans.times(name)) for name in ("01", "02", "03"))
+    printed = found.run.stdout
+    assert f"driven: simulated data; 3 runs, {count} scans, " in printed
+    assert "deviation stated at the end of a run" in printed
+    assert "from the recorded reference (12 poses)" in printed
+    assert "3 trajectories: found" in printed
+    assert "truth" not in printed
+    assert found.run.stderr == "SLAM: 3 runs\n"
 
 
-def test_json_holds_the_same_figures(command: Command, driven: Driven) -> None:
-    run = command("slam", driven.data, "--json", "--truth", driven.truth)
-    document = json.loads(run.stdout)
+def test_json_holds_the_same_figures(document: dict[str, Any]) -> None:
     assert (document["dataset"], document["simulated"], document["runs"]) == ("driven", True, 3)
     assert 0.2 < document["matched_min"] <= document["matched_mean"] <= 1
     assert 1e-4 < document["position_deviation_mean_m"] <= document["position_deviation_max_m"] < 0.01
@@ -110,21 +132,13 @@ def test_json_holds_the_same_figures(command: Command, driven: Driven) -> None:
     assert recorded["heading_mean_rad"] == pytest.approx(math.radians(1.0), abs=0.005)
     assert accuracy["final"]["position_mean_m"] < 0.01
     assert accuracy["final"]["heading_mean_rad"] < math.radians(0.3)
-    assert not list(Path().iterdir())
 
 
-def test_the_truth_gives_errors_bias_and_drift(command: Command, driven: Driven) -> None:
-    run = command("slam", driven.data, "-o", "found", "--truth", driven.truth)
-    assert "errors of the reference poses against the simulated truth" in run.stdout
-    assert "at the end of a run (3 poses)" in run.stdout
-    assert "mm forward" in run.stdout
-    assert "deg a metre, over 3 m in 3 runs" in run.stdout
-
-
-def test_the_search_can_start_from_the_last_pose_and_leave_scans_distorted(command: Command, driven: Driven) -> None:
-    figures = {}
+def test_the_search_can_start_from_the_last_pose_and_leave_scans_distorted(
+    command: Command, driven: Driven, document: dict[str, Any]
+) -> None:
+    figures = {"odometry": document["accuracy"]["every"]["position_mean_m"]}
     for name, arguments in {
-        "odometry": [],
         "last": ["--start", "last_pose"],
         "skewed": ["--no-deskew"],
         "set": ["--set", "deskew=false"],
@@ -136,12 +150,11 @@ def test_the_search_can_start_from_the_last_pose_and_leave_scans_distorted(comma
     assert figures["skewed"] == figures["set"] != figures["odometry"]
 
 
-def test_a_calibration_can_give_the_odometry(command: Command, driven: Driven) -> None:
-    assert command("slam", driven.data, "-o", "first").returncode == 0
-    assert command("calibrate", "first", "-o", "calibration.yaml").returncode == 0
+def test_a_calibration_can_give_the_odometry(command: Command, driven: Driven, found: Found) -> None:
+    assert command("calibrate", found.data, "-o", "calibration.yaml").returncode == 0
     run = command("slam", driven.data, "-o", "second", "--model", "calibration.yaml")
     assert run.returncode == 0, run.stderr
-    apart = distances(load_dataset("first"), load_dataset("second"))
+    apart = distances(load_dataset(found.data), load_dataset("second"))
     assert apart is not None
     assert apart.position_p95_m < 0.001
 
@@ -168,20 +181,19 @@ def _parameters(name: str) -> dict[str, float]:
     return {parameter.name: 0.0 for parameter in effect().parameters(ROBOT)}
 
 
-def test_csv_can_be_written(command: Command, driven: Driven) -> None:
-    assert command("slam", driven.data, "-o", "found", "--format", "csv").returncode == 0
-    assert {file.suffix for file in Path("found").iterdir()} == {".yaml", ".csv"}
-    assert load_dataset("found").hash == _hash_of_parquet(command, driven)
+def test_csv_can_be_written(command: Command, driven: Driven, found: Found) -> None:
+    assert command("slam", driven.data, "-o", "csv", "--format", "csv").returncode == 0
+    assert {file.suffix for file in Path("csv").iterdir()} == {".yaml", ".csv"}
+    assert load_dataset("csv").hash == load_dataset(found.data).hash
 
 
-def _hash_of_parquet(command: Command, driven: Driven) -> str:
-    assert command("slam", driven.data, "-o", "other").returncode == 0
-    return load_dataset("other").hash
-
-
-def test_the_report_is_written(command: Command, driven: Driven) -> None:
+def test_the_truth_gives_errors_bias_and_drift_and_the_report_is_written(command: Command, driven: Driven) -> None:
     run = command("slam", driven.data, "--report", "slam.html", "--truth", driven.truth)
     assert run.returncode == 0, run.stderr
+    assert "errors of the reference poses against the simulated truth" in run.stdout
+    assert "at the end of a run (3 poses)" in run.stdout
+    assert "mm forward" in run.stdout
+    assert "deg a metre, over 3 m in 3 runs" in run.stdout
     assert "report: slam.html" in run.stdout
     assert "SIMULATED DATA" in Path("slam.html").read_text(encoding="utf-8")
     assert [file.name for file in Path().iterdir()] == ["slam.html"]
