@@ -154,7 +154,7 @@ def test_a_search_that_stops_far_from_the_minimum_has_no_covariance_and_says_why
 @pytest.mark.parametrize("calibrator", ["closed_form", "crs"])
 def test_what_the_data_do_not_identify_is_kept_and_told(calibrator: str) -> None:
     runs = driven(RING, slip=0.02)
-    run = calibrate(make_dataset("straight", ROBOT, 0.1, runs), calibrator)
+    run = calibrate(make_dataset("straight", ROBOT, 0.1, runs), calibrator, budget=Budget(evaluations=500))
     change = run.calibration.matrix_array - ROBOT.inverse_kinematic_matrix
     np.testing.assert_allclose(change.sum(axis=1), 0, atol=1e-15)
     assert run.warnings[0].endswith("kept at the design values")
@@ -168,7 +168,8 @@ def test_told_to_fit_it_calibration_fits_it_and_says_what_that_rests_on() -> Non
 
 
 def test_a_searched_geometry_cannot_keep_it_and_says_so() -> None:
-    run = calibrate(make_dataset("straight", ROBOT, 0.1, driven(RING, slip=0.02)), "parametric")
+    straight = make_dataset("straight", ROBOT, 0.1, driven(RING, slip=0.02))
+    run = calibrate(straight, "parametric", budget=Budget(evaluations=500))
     assert "the geometry cannot keep design values there" in run.warnings[0]
 
 

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from omnibench.errors import ConfigError, DataError, OmnibenchError, PluginError
-from omnibench.testing import CaseOutcome
+from omnibench.registry import registered_from
+from omnibench.testing import CaseOutcome, load_plugin
 from omnibench.testing.plugin_files import PLUGIN_KINDS, CheckReport, check_plugin, new_plugin
 
 pytestmark = pytest.mark.usefixtures("registries_as_before")
@@ -74,7 +75,10 @@ def test_the_cases_run_where_pytest_is_not_installed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", PLUGIN_KINDS)
 def test_a_new_plugin_whose_class_would_hide_an_import_is_called_otherwise(kind: str, tmp_path: Path) -> None:
     name = {"calibrator": "solution", "importer": "trajectory_", "cost": "cost_", "effect": "signals"}[kind]
-    assert check_plugin(new_plugin(name, kind, tmp_path)[0]).passed
+    file, _ = new_plugin(name, kind, tmp_path)
+    load_plugin(file)
+    ((_, entry),) = registered_from(file)
+    assert entry.cls.__name__ == f"{name.strip('_').capitalize()}{kind.capitalize()}"
 
 
 def test_a_file_that_is_there_is_not_written_over(tmp_path: Path) -> None:

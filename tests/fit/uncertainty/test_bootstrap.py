@@ -59,9 +59,9 @@ def test_a_resampled_optimum_differs_from_a_full_refit_by_far_less_than_the_inte
 
 
 def test_about_95_percent_of_the_intervals_hold_the_hidden_matrix():
-    hits = np.array([study().covered(seed, resamples=150) for seed in range(6)])
-    # Binomial, 54 intervals: 95 % of them leaves fewer than 45 inside with a probability of about 2e-4.
-    assert hits.sum() >= 45
+    hits = np.array([study().covered(seed, resamples=100) for seed in range(2)])
+    # Binomial, 18 intervals: 95 % of them leaves fewer than 13 inside with a probability of about 2e-5.
+    assert hits.sum() >= 13
 
 
 def test_intervals_shrink_with_more_repetitions():
@@ -69,7 +69,7 @@ def test_intervals_shrink_with_more_repetitions():
     for repetitions in (1, 4):
         problem = flower_problem(repetitions=repetitions)
         optimum = run_calibrator(calibrators.create("closed_form"), problem).vector
-        intervals = bootstrap_intervals(problem, optimum, resamples=150, rng=np.random.default_rng(0))
+        intervals = bootstrap_intervals(problem, optimum, resamples=100, rng=np.random.default_rng(0))
         widths.append(np.median(intervals.high - intervals.low))
     assert widths[1] == pytest.approx(widths[0] / 2, rel=0.35)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,19 +12,13 @@ from motions import FLOWER, RING, SPEED, TURNS, Twist, driven
 
 from omnibench.data.dataset import Dataset
 from omnibench.errors import DataError
-from omnibench.fit.calibrate import calibrate
 from omnibench.fit.calibrators.closed_form import linear_start
 from omnibench.fit.inspect import inspect_dataset
 from omnibench.fit.span import aligned, driven_span, unidentified_directions
 from omnibench.fit.uncertainty.identifiability import Identifiability, identifiability
 from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
-from omnibench.registry import load_plugin_file
-from omnibench.slam.import_dataset import import_dataset
 from omnibench.testing.synthetic import synthetic_robot
 
-ROOT = Path(__file__).resolve().parents[3]
-OMNI3 = ROOT.parent / "shared" / "data" / "optiodom" / "omni3"
-TABLE = ROOT.parent / "shared" / "data" / "robotino"
 ROBOT = synthetic_robot()
 DISTANCES = ("distance_a", "distance_b", "distance_c")
 
@@ -40,15 +33,6 @@ def states(found: Identifiability) -> dict[str, str]:
 
 def untold(found: Identifiability) -> tuple[str, ...]:
     return tuple(each.name for each in found.parameters if not each.told)
-
-
-@pytest.fixture(scope="module")
-def robotino() -> Dataset:
-    """The table recordings: translation only."""
-    if not TABLE.is_dir():
-        pytest.skip(f"the recordings are not at {TABLE}")
-    assert load_plugin_file(ROOT / "plugins" / "robotino.py") is None
-    return import_dataset("robotino", TABLE)
 
 
 class TestPrecision:
@@ -222,21 +206,5 @@ class TestRecordings:
         assert states(found.identifiability)["turning on the spot"] == "weak"
         assert untold(found.identifiability) == ("distance_1", "distance_2", "distance_3")
 
-    def test_calibration_on_them_keeps_the_turn_of_the_design_and_says_so(self, robotino: Dataset) -> None:
-        design = robotino.robot.inverse_kinematic_matrix
-        run = calibrate(robotino)
-        np.testing.assert_allclose((run.calibration.matrix_array - design).sum(axis=1), 0, atol=1e-15)
-        assert run.warnings[0].startswith("these data do not identify what wheel rates along 1 + 2 + 3")
-        assert run.warnings[0].endswith("kept at the design values")
-
-    def test_told_to_fit_it_the_calibration_does_and_says_what_it_rests_on(self, robotino: Dataset) -> None:
-        design = robotino.robot.inverse_kinematic_matrix
-        run = calibrate(robotino, unidentified="fit")
-        assert np.abs((run.calibration.matrix_array - design).sum(axis=1)).max() > 1e-3
-        assert run.warnings[0].endswith("what was fitted there rests on slip and noise")
-
-    def test_omni3_leaves_nothing_open(self) -> None:
-        if not OMNI3.is_dir():
-            pytest.skip(f"the recordings are not at {OMNI3}")
-        dataset = import_dataset("optiodom", OMNI3)
-        assert warnings_of_calibration(dataset.robot, dataset.split("train"), "matrix", "keep") == ()
+    def test_omni3_leaves_nothing_open(self, omni3: Dataset) -> None:
+        assert warnings_of_calibration(omni3.robot, omni3.split("train"), "matrix", "keep") == ()

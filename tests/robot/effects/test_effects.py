@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import suppress
 from typing import get_args
-from unittest import SkipTest
 
 import numpy as np
 import pytest
@@ -19,7 +17,6 @@ from omnibench.robot.effects.effect import ActuatorEffect, Effect, MotionEffect,
 from omnibench.robot.effects.term import Term, make_term
 from omnibench.robot.kinematics import Array
 from omnibench.robot.signals import Signals, signals_of
-from omnibench.testing import EffectConformance
 
 CATALOGUE = {
     "wheel": (
@@ -139,15 +136,6 @@ def test_an_effect_says_what_it_is(name: str) -> None:
     assert bool(effect.measurement) == (name in ABSORBED)
     assert effect.run_nuisance == (name == "reference_clock_drift")
     assert effects.entry(name).summary.endswith(".")
-
-
-@pytest.mark.parametrize("name", built_in(Effect))
-def test_an_effect_that_is_built_in_conforms(name: str) -> None:
-    suite = type("Suite", (EffectConformance,), {"name": name})()
-    for case in dir(suite):
-        if case.startswith("test_"):
-            with suppress(SkipTest):  # a case for effects of another kind
-                getattr(suite, case)()
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from unittest import SkipTest
 
 import numpy as np
 import pytest
@@ -21,7 +19,6 @@ from omnibench.robot.effects.term import make_term
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, advance
 from omnibench.robot.signals import Signals, signals_of
-from omnibench.testing import EffectConformance
 
 MOTION = (
     *("smooth_elapsed_time", "smooth_heading", "smooth_course", "smooth_place", "smooth_patch", "smooth_command"),
@@ -51,15 +48,6 @@ def driving(vx: float, vy: float, omega: float) -> Array:
 
 def at(x: float, y: float, heading: float = 0.0) -> Array:
     return np.array([[x, y, heading]])
-
-
-@pytest.mark.parametrize("name", [*MOTION, *REFERENCE])
-def test_a_smooth_term_conforms(name: str) -> None:
-    suite = type("Suite", (EffectConformance,), {"name": name})()
-    for case in dir(suite):
-        if case.startswith("test_"):
-            with suppress(SkipTest):  # a case for effects of another kind
-                getattr(suite, case)()
 
 
 @pytest.mark.parametrize("name", [*MOTION, *REFERENCE])
