@@ -32,15 +32,13 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A fresh virtual environment with the wheel; only the dependencies are those of this environment."""
     folder = tmp_path_factory.mktemp("wheel")
     packages = sysconfig.get_path("purelib")
-    environment, isolation = dict(os.environ), []
-    if find_spec("hatchling") is not None:  # without it pip fetches what the build needs
-        environment["PYTHONPATH"], isolation = packages, ["--no-build-isolation"]
-    subprocess.run([sys.executable, "-m", "venv", folder / "venv"], check=True, timeout=120)
-    pip = [folder / "venv" / "bin" / "python", "-m", "pip", "--disable-pip-version-check", "-q"]
-    build = [*pip, "wheel", "--no-deps", *isolation, "-w", folder, ROOT]
-    subprocess.run(build, env=environment, check=True, timeout=300)
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-q"]
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder / "venv"], check=True, timeout=120)
+    isolation = ["--no-build-isolation"] if find_spec("hatchling") else []  # else pip fetches what the build needs
+    subprocess.run([*pip, "wheel", "--no-deps", *isolation, "-w", folder, ROOT], check=True, timeout=300)
     wheel = next(folder.glob("omnibench-*.whl"))
-    subprocess.run([*pip, "install", "--no-deps", "--no-index", wheel], check=True, timeout=120)
+    into = ["--python", folder / "venv" / "bin" / "python"]
+    subprocess.run([*pip, *into, "install", "--no-deps", "--no-index", wheel], check=True, timeout=120)
     library = next((folder / "venv" / "lib").glob("python*")) / "site-packages"
     (library / "dependencies.pth").write_text(f"{packages}\n", encoding="utf-8")
     return folder / "venv"
