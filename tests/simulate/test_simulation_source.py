@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import yaml
-from commands import CONFIGS, Command, Prepared, assert_refused, flower, omnibench, small
+from commands import CONFIGS, Command, Prepared, assert_refused, flower, small
 
 from omnibench.data.storage import load_dataset
 from omnibench.errors import ConfigError, OmnibenchError
@@ -186,9 +186,9 @@ class TestTheCommand:
         assert load_dataset(prepared.data).hash == before
 
 
-def test_the_hidden_effect_of_the_readme_is_in_its_truth(tmp_path: Path) -> None:
+def test_the_hidden_effect_of_the_readme_is_in_its_truth(command: Command, tmp_path: Path) -> None:
     config = CONFIGS / "hidden_effect.yaml"
-    made = omnibench("simulate", config, "-o", tmp_path / "data", "--truth", tmp_path / "truth")
+    made = command("simulate", config, "-o", tmp_path / "data", "--truth", tmp_path / "truth")
     assert made.stdout.endswith(f"360 simulated trajectories: {tmp_path / 'data'}\n"), made.stderr
     truth = yaml.safe_load((tmp_path / "truth" / "truth.yaml").read_text())
     assert len(truth["effects"]) == 1

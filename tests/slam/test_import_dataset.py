@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,27 +16,41 @@ from bag_samples import (
     read,
     text,
     write_mcap,
-    write_mcap_ros2,
     write_rosbag1,
-    write_rosbag2,
 )
 from scan_samples import MOUNTED, SECONDS, without_poses
 
+from omnibench.data.dataset import Dataset
 from omnibench.errors import ConfigError
 from omnibench.slam.import_dataset import import_dataset
 
 
-@pytest.mark.parametrize("write", [write_mcap, write_mcap_ros2, write_rosbag1, write_rosbag2])
-def test_without_poses_they_are_made_from_the_scans(
-    tmp_path: Path, write: Callable[[Path, Sequence[Sent]], Path]
-) -> None:
-    data = read(write(tmp_path / "drive", without_poses()))
+@pytest.fixture(scope="module")
+def blind(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of scans and wheels, without poses."""
+    return write_mcap(tmp_path_factory.mktemp("blind") / "drive", without_poses())
+
+
+@pytest.fixture(scope="module")
+def found(blind: Path) -> Dataset:
+    return read(blind)
+
+
+def test_without_poses_they_are_made_from_the_scans(found: Dataset) -> None:
+    data = found
     assert "reference poses were made from the scans by SLAM, because the recording holds none" in data.warnings[0]
     assert len(data.trajectories) == 2
     for run in data.trajectories:
         np.testing.assert_array_equal(run.poses[0], 0.0)
         assert run.pose_covariances is not None
     assert odometry_error(data) < 0.005  # m and rad; the true odometry agrees with SLAM
+
+
+def test_the_poses_are_the_same_whatever_the_format_of_the_recording(found: Dataset, tmp_path: Path) -> None:
+    for own, other in zip(
+        found.trajectories, read(write_rosbag1(tmp_path / "drive", without_poses())).trajectories, strict=True
+    ):
+        np.testing.assert_allclose(other.poses, own.poses, atol=1e-6)
 
 
 def test_odometry_is_no_reference_where_scans_can_make_one(tmp_path: Path) -> None:
@@ -65,10 +78,9 @@ def test_runs_are_cut_by_a_topic_without_poses_too(tmp_path: Path) -> None:
     assert odometry_error(data) < 0.005
 
 
-def test_the_options_under_slam_are_those_of_slam(tmp_path: Path) -> None:
-    source = write_mcap(tmp_path / "drive", without_poses())
-    one, other = (read(source, slam=options).trajectories[0] for options in ({}, {"spacing": 0.3}))
-    assert not np.array_equal(one.poses, other.poses)
+def test_the_options_under_slam_are_those_of_slam(blind: Path, found: Dataset) -> None:
+    other = read(blind, slam={"spacing": 0.3})
+    assert not np.array_equal(other.trajectories[0].poses, found.trajectories[0].poses)
 
 
 def test_a_wrong_option_of_slam_is_refused_before_the_recording_is_read(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from commands import CONFIGS, Command, assert_refused, flower, omnibench
+from commands import CONFIGS, Command, assert_refused, flower
 
 from omnibench.config import validate
 from omnibench.data.storage import load_dataset, save_dataset
@@ -159,7 +159,7 @@ class TestTheTruth:
         ],
     )
     def test_an_effect_of_any_stage_acts_on_the_true_robot(self, effect: str, parameters: dict[str, float]) -> None:
-        few = {"commands": {"directions_deg": [45], "turn_rates": [0.35]}, "lidar": {"rays": 540}, "repetitions": 3}
+        few = {"commands": {"directions_deg": [45], "turn_rates": [0.35]}, "lidar": {"rays": 540}, "repetitions": 2}
         hidden = [{"name": effect, "parameters": parameters}]
         train = {"seed": 1, "distance": 0.8}
         simulated = made(**few, train=train, truth={"tolerances": {}, "effects": hidden})
@@ -277,5 +277,5 @@ def test_the_papers_experiment_is_36_commands_5_times_in_two_sessions() -> None:
     assert config.validation is not None
 
 
-def test_the_schema_for_editors_knows_a_robot() -> None:
-    assert "RobotConfig" in omnibench("schema", "simulate").stdout
+def test_the_schema_for_editors_knows_a_robot(command: Command) -> None:
+    assert "RobotConfig" in command("schema", "simulate").stdout
