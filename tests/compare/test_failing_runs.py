@@ -138,16 +138,17 @@ def test_the_row_has_outcome_and_reason(comparison: Compared, label: str, outcom
     assert "\n" not in row["reason"]
 
 
-def test_a_run_over_its_time_is_ended_by_force_and_not_repeated(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("registries_as_before")
+def test_a_run_over_its_time_is_ended_by_force_and_not_repeated(command: Command, tmp_path: Path) -> None:
     plugins = write_plugin(tmp_path / "plugins", "hangs", CALIBRATOR.format(name="hangs", body=HANGS))
     budget = {"evaluations": 500, "seconds": 0.5}
     config = write_config(tmp_path, plugins=[str(plugins)], calibrators=["hangs"], budget=budget)
-    run = omnibench("compare", config, "--output", tmp_path / "out")
+    run = command("compare", config, "--output", tmp_path / "out")
     row = rows(tmp_path / "out")["hangs"]
     assert (row["outcome"], row["reason"]) == ("time", "ended by force: 0.5 s spent without an answer")
     assert (row["train_cost"], row["matrix"]) == (None, None)
     assert "flower hangs seed 1: time, no answer" in run.stderr
-    again = omnibench("compare", config, "--output", tmp_path / "out")
+    again = command("compare", config, "--output", tmp_path / "out")
     assert "kept from an earlier run" in again.stderr
 
 
