@@ -50,9 +50,9 @@ def recorded(room: str = "furnished_room", runs: int = 3) -> tuple[Dataset, dict
 
 
 @cache
-def found_alone(room: str = "furnished_room") -> Dataset:
+def found_alone() -> Dataset:
     """What SLAM in this process makes of them."""
-    return slam_dataset(recorded(room)[0], SlamOptions(), workers=1)
+    return slam_dataset(recorded()[0], SlamOptions(), workers=1)
 
 
 def with_scans(dataset: Dataset, **changed: TrajectoryScans | None) -> Dataset:

@@ -154,7 +154,7 @@ class TestSlowScanner:
 def test_coarse_encoders_do_not_make_covariances_dishonest(turn_time: float) -> None:
     tick, lidar = 2 * np.pi / 400, Lidar(turn_time=turn_time)
     found = []
-    for number in range(4):
+    for number in range(6):
         run = driven("furnished_room", number, lidar)
         phases = np.random.default_rng(number).uniform(size=3)  # a wheel stands anywhere between two ticks
         counts = np.floor(np.cumsum(run.log.rates * 0.01, axis=0) / tick + phases)
