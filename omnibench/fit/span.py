@@ -118,6 +118,45 @@ def aligned(space: Array, robot: Robot) -> Array:
     return _signed(chosen)
 
 
+@dataclass(frozen=True, eq=False)
+class WheelDirection:
+    """One of the directions of wheel rates in words, and how much the recordings drive it.
+
+    rates (N,): of length one. words: like ``a - b``. motion: the design robot's motion under these rates, like ``turning
+    on the spot``; empty if the wheels only slip. share and state: see DrivenSpan. identified: False where the
+    recordings do not identify the matrix, so that a calibration keeps the design values.
+    """
+
+    rates: Array
+    words: str
+    motion: str
+    share: float
+    state: State
+    identified: bool
+
+    @property
+    def share_in_words(self) -> str:
+        """The share, like ``5.3 % of the strongest motion``."""
+        return f"{100 * self.share:.1f} % of the strongest motion"
+
+
+def wheel_directions(robot: Robot, span: DrivenSpan) -> tuple[WheelDirection, ...]:
+    """All N directions, those that are identified first."""
+    spaces = (True, aligned(span.strong, robot)), (False, unidentified_directions(robot, span))
+    return tuple(
+        WheelDirection(
+            rates,
+            direction_in_words(rates, robot.wheel_names),
+            motion_in_words(rates, robot),
+            span.share(rates),
+            span.state(rates),
+            identified,
+        )
+        for identified, space in spaces
+        for rates in space
+    )
+
+
 def direction_in_words(direction: Array, wheels: Sequence[str]) -> str:
     """A direction of wheel rates (N,) as text like ``a - b + 0.5 c``, its largest element 1 and its sign arbitrary."""
     large = np.abs(direction) > 0.5 * np.abs(direction).max()

@@ -11,15 +11,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.least_squares.noise import NoiseEstimate, estimate_noise
 from omnibench.fit.parameterisation import WheelGeometry
-from omnibench.fit.span import (
-    DrivenSpan,
-    State,
-    aligned,
-    direction_in_words,
-    driven_span,
-    motion_in_words,
-    unidentified_directions,
-)
+from omnibench.fit.span import DrivenSpan, State, driven_span, unidentified_directions, wheel_directions
 from omnibench.fit.uncertainty.information import information_of_runs
 from omnibench.fit.uncertainty.physical import (
     identified_parameters,
@@ -90,10 +82,19 @@ def identifiability(
     estimate, matrix = _quick_noise(robot, trajectories, span, integration)
     information = information_of_runs(trajectories, matrix, integration, estimate.noise).sum(axis=0)
     rows = np.abs(robot.inverse_kinematic_matrix).max(axis=1)
-    every = np.concatenate([aligned(span.strong, robot), unidentified_directions(robot, span)])
-    driven = every[[span.state(direction) != "undriven" for direction in every]]
-    deviations = iter(_deviations(information, driven) / rows)
-    directions = tuple(_direction(robot, span, direction, deviations) for direction in every)
+    every = wheel_directions(robot, span)
+    driven = np.array([each.rates for each in every if each.state != "undriven"])
+    deviations = iter((_deviations(information, driven) / rows).tolist())
+    directions = tuple(
+        DirectionIdentifiability(
+            direction=each.words,
+            motion=each.motion,
+            share=each.share,
+            state=each.state,
+            deviations=None if each.state == "undriven" else tuple(next(deviations)),
+        )
+        for each in every
+    )
     parameters = _parameters(robot, span, information)
     return Identifiability(
         directions=directions,
@@ -101,7 +102,7 @@ def identifiability(
         noise=estimate.noise,
         noise_source=estimate.description,
         sentences=(
-            *open_directions(robot, span),
+            *open_directions(every),
             *_rough_rows(directions),
             *_open_parameters(robot, parameters),
         ),
@@ -182,24 +183,6 @@ def _inverse(information: Array) -> Array:
     values = np.maximum(values, 1e-14 * max(float(values.max(initial=0.0)), 1e-300))
     inverse: Array = (vectors / values) @ vectors.T
     return inverse
-
-
-def _direction(
-    robot: Robot, span: DrivenSpan, direction: Array, deviations: Iterator[Array]
-) -> DirectionIdentifiability:
-    """The identifiability along one direction; takes the next of ``deviations`` (3,) unless it is undriven."""
-    state = span.state(direction)
-    of_rows: tuple[float, float, float] | None = None
-    if state != "undriven":
-        x, y, heading = map(float, next(deviations))
-        of_rows = x, y, heading
-    return DirectionIdentifiability(
-        direction=direction_in_words(direction, robot.wheel_names),
-        motion=motion_in_words(direction, robot),
-        share=span.share(direction),
-        state=state,
-        deviations=of_rows,
-    )
 
 
 def _parameters(robot: Robot, span: DrivenSpan, information: Array) -> tuple[ParameterIdentifiability, ...]:

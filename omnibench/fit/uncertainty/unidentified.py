@@ -6,34 +6,26 @@ from collections.abc import Iterator, Sequence
 
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.parameterisation import ParameterisationName
-from omnibench.fit.span import (
-    DrivenSpan,
-    Unidentified,
-    aligned,
-    direction_in_words,
-    driven_span,
-    motion_in_words,
-    unidentified_directions,
-)
+from omnibench.fit.span import Unidentified, WheelDirection, driven_span, wheel_directions
 from omnibench.robot.kinematics import Robot
 
 _LITTLE_SHARE = 0.2  # share of the strongest direction: one that is driven less is mentioned; chosen
 
 
-def open_directions(robot: Robot, span: DrivenSpan) -> Iterator[str]:
+def open_directions(directions: Sequence[WheelDirection]) -> Iterator[str]:
     """A sentence for every direction that the runs drive little or not at all."""
     kept = "calibration keeps the design values there"
-    for direction in unidentified_directions(robot, span):
-        state = span.state(direction)
-        words, motion = direction_in_words(direction, robot.wheel_names), motion_in_words(direction, robot)
-        share = f"{100 * span.share(direction):.1f} % of the strongest motion"
-        if state == "undriven" and motion:
+    for each in directions:
+        words, motion, share = each.words, each.motion, each.share_in_words
+        if each.identified:
+            continue
+        if each.state == "undriven" and motion:
             yield (
                 f"no run drives the wheels along {words} ({motion}): the matrix is not determined along it, "
                 f"and {kept}; {_advice(motion)}"
             )
-        elif state == "undriven":
-            alone = len(robot.wheels) == 4 and len(span.null) == 1
+        elif each.state == "undriven":
+            alone = len(directions) == 4 and sum(other.state == "undriven" for other in directions) == 1
             expected = ", as for any robot on four wheels that does not slip" if alone else ""
             yield f"no run drives the wheels along {words}{expected}: the matrix is not determined along it, and {kept}"
         elif motion:
@@ -44,13 +36,11 @@ def open_directions(robot: Robot, span: DrivenSpan) -> Iterator[str]:
             )
         else:
             yield f"the wheels go along {words}, which only slips, with {share}: slip cannot be identified, and {kept}"
-    for direction in aligned(span.strong, robot):
-        if span.share(direction) < _LITTLE_SHARE:
-            words, motion = direction_in_words(direction, robot.wheel_names), motion_in_words(direction, robot)
+    for each in directions:
+        if each.identified and each.share < _LITTLE_SHARE:
             yield (
-                f"the runs drive the wheels along {words}{f' ({motion})' if motion else ''} with only "
-                f"{100 * span.share(direction):.1f} % of the strongest motion: slip counts "
-                f"{1 / span.share(direction):.0f} times as much there"
+                f"the runs drive the wheels along {each.words}{f' ({each.motion})' if each.motion else ''} with only "
+                f"{each.share_in_words}: slip counts {1 / each.share:.0f} times as much there"
             )
 
 
@@ -75,19 +65,16 @@ def warnings_of_calibration(
     unidentified: Unidentified,
 ) -> tuple[str, ...]:
     """Warnings of a calibration on these runs: a sentence for every unidentified direction, and how it was treated."""
-    span = driven_span(trajectories)
     sentences = []
-    for direction in unidentified_directions(robot, span):
-        state = span.state(direction)
-        motion = motion_in_words(direction, robot)
-        if not motion:  # the wheels would only slip: no motion of the robot depends on it
+    for each in wheel_directions(robot, driven_span(trajectories)):
+        if each.identified or not each.motion:  # where the wheels only slip, no motion of the robot depends on it
             continue
-        subject = f"{direction_in_words(direction, robot.wheel_names)} ({motion}) do"
-        if state == "weak":
-            subject += f": {100 * span.share(direction):.1f} % of the strongest motion, which slip alone can make"
+        subject = f"{each.words} ({each.motion}) do"
+        if each.state == "weak":
+            subject += f": {each.share_in_words}, which slip alone can make"
         if parameterisation == "geometry":
             end = "the geometry cannot keep design values there, so what was fitted to it rests on slip and noise"
-        elif state == "weak" and unidentified == "fit":
+        elif each.state == "weak" and unidentified == "fit":
             end = "what was fitted there rests on slip and noise"
         else:
             end = "kept at the design values"
