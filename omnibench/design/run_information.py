@@ -15,7 +15,7 @@ from omnibench.errors import ConfigError
 from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.fit.span import direction_in_words, driven_span
 from omnibench.fit.uncertainty.information import information_of_runs
-from omnibench.fit.uncertainty.physical import is_invertible, matrix_slopes
+from omnibench.fit.uncertainty.physical import is_invertible
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.planar import relative
@@ -159,7 +159,8 @@ def _cost(candidate: Candidate, per: Per) -> float:
 
 def _element_slopes(robot: Robot) -> Array:
     """Derivatives (9, 9) of the physical parameters of three omni wheels with respect to the matrix elements."""
-    return np.linalg.inv(matrix_slopes(robot, WheelGeometry(robot).start))
+    geometry = WheelGeometry(robot)
+    return np.linalg.inv(geometry.slopes(geometry.start))
 
 
 def _physical_spread(slopes: Array, covariance: Array, robot: Robot) -> PhysicalSpread:

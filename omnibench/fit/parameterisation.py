@@ -15,6 +15,8 @@ from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrices
 
 ParameterisationName = Literal["matrix", "geometry"]
 
+_STEP = 1e-6  # share of each parameter's scale: step of central differences, near the cube root of the rounding
+
 
 class ExplicitBox(Model):
     """Bounds of each matrix element, 3 rows of N."""
@@ -69,6 +71,9 @@ class Parameterisation(Protocol):
     def matrices(self, vectors: Array) -> Array:
         """Inverse kinematic matrices (P, 3, N) of vectors (P, n)."""
 
+    def slopes(self, vector: Array) -> Array:
+        """Derivatives (3N, n) of the matrix elements, row by row, by the vector (n,)."""
+
 
 @dataclass(frozen=True, eq=False)
 class MatrixElements:
@@ -103,6 +108,11 @@ class MatrixElements:
         across = (matrices - self.robot.inverse_kinematic_matrix) @ self.null.T
         return matrices - across @ self.null
 
+    def slopes(self, vector: Array) -> Array:  # noqa: ARG002 (the matrix is linear in the vector)
+        """Derivatives (3N, 3N): the identity, less its part along ``null``."""
+        slopes: Array = np.kron(np.eye(3), np.eye(len(self.robot.wheels)) - self.null.T @ self.null)
+        return slopes
+
 
 @dataclass(frozen=True, eq=False)
 class WheelGeometry:
@@ -123,14 +133,18 @@ class WheelGeometry:
         return np.array([[w.radius for w in wheels], [w.distance for w in wheels], [w.angle for w in wheels]]).ravel()
 
     @property
+    def scale(self) -> Array:
+        """Scale (3N,) of each parameter: radii and distances their design values in m, angles 1 rad."""
+        wheels = self.robot.wheels
+        return np.array([[w.radius for w in wheels], [abs(w.distance) for w in wheels], [1.0] * len(wheels)]).ravel()
+
+    @property
     def bounds(self) -> Bounds:
         count = len(self.robot.wheels)
         limits = self.limits or GeometryLimits()
         low, high = np.array([_range(limits.radius), _range(limits.distance), np.radians(_range(limits.angle_deg))]).T
-        scale = self.start.copy()
-        scale[2 * count :] = 1.0
-        lower = self.start + np.repeat(low, count) * scale
-        upper = self.start + np.repeat(high, count) * scale
+        lower = self.start + np.repeat(low, count) * self.scale
+        upper = self.start + np.repeat(high, count) * self.scale
         return _checked(Bounds("limits", lower, upper), self.start, self.names)
 
     def matrices(self, vectors: Array) -> Array:
@@ -138,6 +152,13 @@ class WheelGeometry:
         radius, distance, angle = np.moveaxis(np.asarray(vectors, dtype=float).reshape(len(vectors), 3, -1), 1, 0)
         rollers = np.array([wheel.roller_angle for wheel in self.robot.wheels])
         return inverse_kinematic_matrices(radius, distance, angle, rollers)
+
+    def slopes(self, vector: Array) -> Array:
+        """Derivatives (3N, 3N) by central differences."""
+        steps = _STEP * np.diag(self.scale)
+        difference = self.matrices(vector + steps) - self.matrices(vector - steps)
+        slopes: Array = (difference.reshape(len(steps), -1) / (2 * _STEP * self.scale)[:, None]).T
+        return slopes
 
 
 @dataclass(frozen=True)

@@ -106,15 +106,12 @@ def cone_program(problem: CalibrationProblem, objective: SumOfNorms, vector: Arr
     """A program for the best step from ``vector``: the cost with the poses linearised there."""
     from omnibench.fit.sum_of_norms import SumOfNormsProgram
 
-    assert isinstance(problem.parameterisation, MatrixElements)  # calibrate has refused others
     matrix = problem.matrix(vector)
     used = np.flatnonzero(objective.weights)
     scale = np.array(objective.weights)[used]
     residuals = (problem.odometry.poses(matrix[None])[0] - problem.reference)[:, used] * scale
-    jacobian = problem.odometry.jacobian(matrix)[:, used] * scale[:, None, None]
-    # The matrix ignores steps along the directions that the data do not identify.
-    null = problem.parameterisation.null
-    jacobian = (jacobian - jacobian @ null.T @ null).reshape(len(residuals), len(used), -1)
+    jacobian = (problem.odometry.jacobian(matrix)[:, used] * scale[:, None, None]).reshape(*residuals.shape, -1)
+    jacobian = jacobian @ problem.parameterisation.slopes(vector)
     return SumOfNormsProgram(residuals, jacobian, problem.lower - vector, problem.upper - vector)
 
 

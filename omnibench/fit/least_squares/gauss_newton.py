@@ -47,12 +47,9 @@ class BoxedFit:
 
     @property
     def columns(self) -> list[Array]:
-        """Derivatives (K, 3, n) of every run's poses by the vector; the matrix is differentiated centrally."""
-        searched, size = self.problem.parameterisation, len(self.vector)
-        steps = 1e-5 * np.maximum(np.abs(searched.start), 1e-3)
-        matrices = searched.matrices(np.concatenate([self.vector + np.diag(steps), self.vector - np.diag(steps)]))
-        slopes = (matrices[:size] - matrices[size:]) / (2 * steps[:, None, None])
-        return [of_run @ slopes.reshape(size, -1).T for of_run in self.trajectories.matrix_jacobian()]
+        """Derivatives (K, 3, n) of every run's poses by the vector."""
+        slopes = self.problem.parameterisation.slopes(self.vector)
+        return [of_run @ slopes for of_run in self.trajectories.matrix_jacobian()]
 
     def linearised(self, weightings: Sequence[Weighting]) -> Whitened:
         """The fit's columns and residuals, weighted, the nuisances eliminated."""

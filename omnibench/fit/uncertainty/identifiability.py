@@ -15,8 +15,7 @@ from omnibench.fit.span import DrivenSpan, State, driven_span, unidentified_dire
 from omnibench.fit.uncertainty.information import information_of_runs
 from omnibench.fit.uncertainty.physical import (
     identified_parameters,
-    matrix_slopes,
-    parameter_scale,
+    known_slopes,
     unit_of,
 )
 from omnibench.fit.uncertainty.unidentified import open_directions
@@ -188,13 +187,9 @@ def _inverse(information: Array) -> Array:
 def _parameters(robot: Robot, span: DrivenSpan, information: Array) -> tuple[ParameterIdentifiability, ...]:
     """Identifiability of the physical parameters if the matrix is unknown along unidentified directions."""
     kept = unidentified_directions(robot, span)
-    identified = identified_parameters(robot, kept)
-    design = WheelGeometry(robot).start
-    known = np.kron(np.eye(3), np.eye(kept.shape[1]) - kept.T @ kept)
-    unit = parameter_scale(design)
-    slopes = known @ matrix_slopes(robot, design) * unit
+    identified, slopes, geometry = identified_parameters(robot, kept), known_slopes(robot, kept), WheelGeometry(robot)
     covariance = np.linalg.pinv(slopes.T @ information @ slopes, rcond=1e-12, hermitian=True)
-    deviations = unit * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    deviations = geometry.scale * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return tuple(
         ParameterIdentifiability(
             name=name,
@@ -203,5 +198,5 @@ def _parameters(robot: Robot, span: DrivenSpan, information: Array) -> tuple[Par
             told=told,
             deviation=float(deviation) if told else None,
         )
-        for name, value, told, deviation in zip(WheelGeometry(robot).names, design, identified, deviations, strict=True)
+        for name, value, told, deviation in zip(geometry.names, geometry.start, identified, deviations, strict=True)
     )

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.errors import DataError
-from omnibench.fit.parameterisation import WheelGeometry
-from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrices
+from omnibench.fit.parameterisation import MatrixElements, WheelGeometry
+from omnibench.robot.kinematics import Array, Robot
 
-_STEP = 1e-6  # share of each parameter's scale: step of central differences; chosen
 _UNIDENTIFIED = 1e-3  # share of a parameter's axis in the unidentified space from which on it is not identified; chosen
 
 
@@ -58,16 +57,14 @@ def geometry_of(matrix: Array, robot: Robot) -> Array:
     return np.concatenate([radius, turn * radius, angle])
 
 
-def matrix_slopes(robot: Robot, geometry: Array) -> Array:
-    """Derivatives (3N, 3N) of the elements, row by row, with respect to the geometry (3N,): central differences."""
-    scale = parameter_scale(geometry)
-    steps = _STEP * np.diag(scale)
-    rollers = np.array([wheel.roller_angle for wheel in robot.wheels])
-    sides = []
-    for sign in (1, -1):
-        radius, distance, angle = np.moveaxis((geometry + sign * steps).reshape(len(steps), 3, -1), 1, 0)
-        sides.append(inverse_kinematic_matrices(radius, distance, angle, rollers))
-    slopes: Array = ((sides[0] - sides[1]).reshape(len(steps), -1) / (2 * _STEP * scale)[:, None]).T
+def known_slopes(robot: Robot, kept: Array) -> Array:
+    """Derivatives (3N, 3N) of the matrix elements by the parameters in units of their scale, at the design.
+
+    kept (q, N): directions of wheel rates along which the matrix is unknown; the derivatives are 0 there.
+    """
+    geometry = WheelGeometry(robot)
+    known = MatrixElements(robot, "row", kept).slopes(geometry.start)
+    slopes: Array = known @ geometry.slopes(geometry.start) * geometry.scale
     return slopes
 
 
@@ -77,17 +74,7 @@ def identified_parameters(robot: Robot, kept: Array) -> tuple[bool, ...]:
     Linearised about the design: a parameter is identified if every change of the geometry that moves it changes the
     known part of the matrix.
     """
-    geometry = WheelGeometry(robot).start
-    known = np.kron(np.eye(3), np.eye(kept.shape[1]) - kept.T @ kept)
-    rows = np.repeat(np.abs(robot.inverse_kinematic_matrix).max(axis=1), kept.shape[1])
-    slopes = known @ matrix_slopes(robot, geometry) * parameter_scale(geometry) / rows[:, None]
-    _, strengths, directions = np.linalg.svd(slopes)
+    rows = np.repeat(np.abs(robot.inverse_kinematic_matrix).max(axis=1), len(robot.wheels))
+    _, strengths, directions = np.linalg.svd(known_slopes(robot, kept) / rows[:, None])
     unidentified = directions[strengths <= 1e-6 * strengths[0]]
     return tuple(bool(share < _UNIDENTIFIED) for share in np.square(unidentified).sum(axis=0))
-
-
-def parameter_scale(geometry: Array) -> Array:
-    """Scale (3N,) of each parameter: radii and distances their own size in m, angles 1 rad."""
-    scale: Array = np.abs(geometry)
-    scale[2 * len(geometry) // 3 :] = 1.0
-    return scale

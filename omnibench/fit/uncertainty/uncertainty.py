@@ -13,7 +13,7 @@ from omnibench.errors import DataError
 from omnibench.fit.calibrator import RunResult
 from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.least_squares.noise import NoiseEstimate, estimate_noise
-from omnibench.fit.parameterisation import MatrixElements, WheelGeometry
+from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.span import driven_span, unidentified_directions
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals
@@ -23,7 +23,6 @@ from omnibench.fit.uncertainty.physical import (
     geometry_of,
     identified_parameters,
     is_invertible,
-    matrix_slopes,
     unit_of,
 )
 from omnibench.fit.uncertainty.sandwich import Scores, sandwich, scores_of_runs
@@ -78,7 +77,7 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     """
     if result.matrix is None or result.vector is None:
         raise NoCovarianceError(f"no covariance without an answer: {result.reason}")
-    slopes = element_slopes(problem, result.vector)
+    slopes = problem.parameterisation.slopes(result.vector)
     freedom: int | None
     if result.covariance is not None:
         of_vector, freedom = result.covariance, None
@@ -110,16 +109,6 @@ def noise_of(problem: CalibrationProblem, matrix: Array) -> NoiseEstimate:
     return estimate_noise(problem.trajectories, residuals)
 
 
-def element_slopes(problem: CalibrationProblem, vector: Array) -> Array:
-    """Derivatives (3N, n) of the matrix elements, row by row, with respect to the searched numbers."""
-    searched = problem.parameterisation
-    if isinstance(searched, MatrixElements):
-        known = np.eye(searched.null.shape[1]) - searched.null.T @ searched.null
-        slopes: Array = np.kron(np.eye(3), known)
-        return slopes
-    return matrix_slopes(problem.robot, vector)
-
-
 def _by_scatter(problem: CalibrationProblem, result: RunResult) -> tuple[Array, int, str]:
     """Sandwich covariance (n, n) of the vector, its degrees of freedom, and the data behind it, in words."""
     objective = problem.objective
@@ -127,7 +116,7 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult) -> tuple[Array, 
     if not isinstance(objective, SumOfNorms):
         raise NoCovarianceError(f"no covariance: the cost {objective.name} is no sum of norms")
     free = problem.free & ~np.isin(problem.names, result.at_bounds)
-    if not element_slopes(problem, result.vector)[:, free].any():
+    if not problem.parameterisation.slopes(result.vector)[:, free].any():
         raise NoCovarianceError(
             "no covariance: no number was free to be fitted; each is kept at its design value or lies on a bound"
         )
@@ -152,7 +141,7 @@ def _scores(problem: CalibrationProblem, objective: SumOfNorms, vector: Array, f
     """Score vectors of the runs in the free numbers, at a vector (n,)."""
     matrix = problem.matrix(vector)
     errors = problem.odometry.poses(matrix[None])[0] - problem.reference
-    slopes = element_slopes(problem, vector)[:, free]
+    slopes = problem.parameterisation.slopes(vector)[:, free]
     jacobian = problem.odometry.jacobian(matrix).reshape(len(errors), 3, -1) @ slopes
     return scores_of_runs(objective, problem.odometry, errors, jacobian, problem.trajectories)
 
@@ -195,7 +184,7 @@ def _parameters(
     elif is_invertible(robot):
         try:
             values = geometry_of(result.matrix, robot)
-            turned = np.linalg.inv(matrix_slopes(robot, values))
+            turned = np.linalg.inv(WheelGeometry(robot).slopes(values))
         except (DataError, np.linalg.LinAlgError):
             return None
         covariance = turned @ of_elements @ turned.T

@@ -22,7 +22,7 @@ from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.fit.uncertainty.bootstrap import bootstrap_intervals
 from omnibench.fit.uncertainty.information import information_of_run, information_of_runs
-from omnibench.fit.uncertainty.physical import geometry_of, identified_parameters, matrix_slopes
+from omnibench.fit.uncertainty.physical import geometry_of, identified_parameters
 from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import Noise
@@ -257,7 +257,9 @@ class TestParameters:
         geometry = geometry_of(TRUTH, ROBOT)
         step = 1e-6 * np.random.default_rng(0).standard_normal((3, 3))
         moved = geometry_of(TRUTH + step, ROBOT) - geometry_of(TRUTH - step, ROBOT)
-        np.testing.assert_allclose(matrix_slopes(ROBOT, geometry) @ moved / 2, step.ravel(), rtol=1e-5, atol=1e-12)
+        np.testing.assert_allclose(
+            WheelGeometry(ROBOT).slopes(geometry) @ moved / 2, step.ravel(), rtol=1e-5, atol=1e-12
+        )
 
     @pytest.mark.parametrize("matrix", [np.zeros((3, 3)), np.ones((3, 3))])
     def test_a_matrix_that_no_wheels_have_is_refused(self, matrix: Array) -> None:
