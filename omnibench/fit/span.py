@@ -122,9 +122,9 @@ def aligned(space: Array, robot: Robot) -> Array:
 class WheelDirection:
     """One of the directions of wheel rates in words, and how much the recordings drive it.
 
-    rates (N,): of length one. words: like ``a - b``. motion: the design robot's motion under these rates, like ``turning
-    on the spot``; empty if the wheels only slip. share and state: see DrivenSpan. identified: False where the
-    recordings do not identify the matrix, so that a calibration keeps the design values.
+    rates (N,): of length one. words: like ``a - b``. motion: the design robot's motion under these rates, like
+    ``turning on the spot``; empty if the wheels only slip. share and state: see DrivenSpan. identified: False where
+    the recordings do not identify the matrix, so that a calibration keeps the design values.
     """
 
     rates: Array

@@ -60,6 +60,7 @@ from omnibench.errors import ConfigError
 from omnibench.fit.bounds.dual_directions import into_unit_ball, least_sum_of_norms
 from omnibench.fit.bounds.stamp_sums import StampSums
 from omnibench.fit.cost import SumOfNorms
+from omnibench.fit.evaluator.element_box import ElementBox
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.robot.kinematics import Array
@@ -73,26 +74,8 @@ _LOOSE = 0.9  # share of the expected cost below which a bound is tried again wi
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
-    """A part of the box, between the deviations ``lower`` and ``upper`` (3, r)."""
-
-    lower: Array
-    upper: Array
-
-    @property
-    def middle(self) -> Array:
-        """The middle (r,) in row 3."""
-        return (self.lower[2] + self.upper[2]) / 2
-
-    @property
-    def reach(self) -> Array:
-        """The half-widths rho (r,) in row 3."""
-        return (self.upper[2] - self.lower[2]) / 2
-
-
-@dataclass(frozen=True, eq=False)
-class Node(Part):
-    """A part of the box with its proven bound.
+class Node(ElementBox):
+    """A part of the box, given by its deviations (3, r), with its proven bound.
 
     bound: no matrix in it costs less. good (3, r): deviations of a matrix in it with a low cost. looseness (3, r): by
     how much the width in each deviation may lower the bound, Eq. (B8).
@@ -105,8 +88,6 @@ class Node(Part):
 
 class LowerBounds:
     """Lower bounds of a problem's cost over parts of its box.
-
-    largest (3, N): magnitudes that the elements of no matrix in the box exceed.
 
     ConfigError for another parameterisation than the matrix, or a cost that is no sum of norms.
     """
@@ -125,9 +106,8 @@ class LowerBounds:
         owner = problem.odometry.trajectory
         self._shares = objective.shares(owner)
         self._weights = np.array(objective.weights)
-        widest = np.maximum(np.abs(self._box.lower), np.abs(self._box.upper))
-        self.largest: Array = np.abs(self._design) + widest @ np.abs(self._fitted)
-        self._stamps = StampSums(problem, self._fitted, self.largest)
+        elements = ElementBox.of(parameterisation, problem.lower, problem.upper)
+        self._stamps = StampSums(problem, self._fitted, elements)
         start = np.array([run.start for run in problem.trajectories])[owner]
         self._offset = start[:, 0] - problem.reference[:, 0] + 1j * (start[:, 1] - problem.reference[:, 1])
         self._turned = problem.odometry.driven @ self._fitted.T
@@ -154,7 +134,7 @@ class LowerBounds:
             border = (good + (high if high - good > good - low else low)) / 2
         below, above = node.upper.copy(), node.lower.copy()
         below[row, column] = above[row, column] = border
-        parts = Part(node.lower, below), Part(above, node.upper)
+        parts = ElementBox(node.lower, below), ElementBox(above, node.upper)
         return self._node(parts[0], node.good, node.bound), self._node(parts[1], node.good, node.bound)
 
     def vector(self, deviations: Array) -> Array:
@@ -162,34 +142,32 @@ class LowerBounds:
         matrix: Array = self._design + deviations @ self._fitted
         return matrix.ravel()
 
-    def _deviations_of_box(self, problem: CalibrationProblem) -> Part:
+    def _deviations_of_box(self, problem: CalibrationProblem) -> ElementBox:
         """The least part (3, r) whose deviations contain those of all vectors in the problem's box."""
         low = problem.lower.reshape(3, -1) - self._design
         high = problem.upper.reshape(3, -1) - self._design
         positive, negative = np.maximum(self._fitted, 0).T, np.minimum(self._fitted, 0).T
-        return Part(low @ positive + high @ negative, high @ positive + low @ negative)
+        return ElementBox(low @ positive + high @ negative, high @ positive + low @ negative)
 
-    def _node(self, part: Part, near: Array, proven: float = 0.0) -> Node:
+    def _node(self, part: ElementBox, near: Array, proven: float = 0.0) -> Node:
         """A part of the box with its bound; near (3, r): first guess of a good matrix; proven: bound of the whole."""
         begin = np.clip(near, part.lower, part.upper)
-        sums, slopes = self._stamps.at(part.middle)
+        sums, slopes = self._stamps.at(part.centre[2])
         residuals, jacobian = self._linearised(part, sums, slopes, begin[:2])
-        centre = np.concatenate([np.zeros(2 * len(part.middle)), part.middle])
-        box = part.lower.ravel() - centre, part.upper.ravel() - centre
-        point, directions = least_sum_of_norms(residuals, jacobian, self._shares, *box, begin.ravel() - centre)
+        middle = part.centre * [[0.0], [0.0], [1.0]]
+        box = (part.lower - middle).ravel(), (part.upper - middle).ravel(), (begin - middle).ravel()
+        point, directions = least_sum_of_norms(residuals, jacobian, self._shares, *box)
         bounds = [self._dual_bound(part, sums, slopes, scaled) for scaled in into_unit_ball(directions)]
         bound, looseness = max(bounds, key=itemgetter(0))
         expected = float(self._shares @ np.linalg.norm(residuals + jacobian @ point, axis=1))
         if self._weights[2] and bound < _LOOSE * expected:
-            turns = least_sum_of_norms(
-                residuals[:, 2:], jacobian[:, 2:], self._shares, *box, begin.ravel() - centre
-            ).directions
+            turns = least_sum_of_norms(residuals[:, 2:], jacobian[:, 2:], self._shares, *box).directions
             headings = np.column_stack([np.zeros((len(turns), 2)), turns])
             again = [self._dual_bound(part, sums, slopes, scaled)[0] for scaled in into_unit_ball(headings)]
             bound = max(bound, *again)
-        return Node(part.lower, part.upper, max(proven, bound), (point + centre).reshape(3, -1), looseness)
+        return Node(part.lower, part.upper, max(proven, bound), point.reshape(3, -1) + middle, looseness)
 
-    def _linearised(self, part: Part, sums: Complex, slopes: Complex, rows_12: Array) -> tuple[Array, Array]:
+    def _linearised(self, part: ElementBox, sums: Complex, slopes: Complex, rows_12: Array) -> tuple[Array, Array]:
         """Weighted errors (S, 3) of the part's middle in row 3 and no deviation in rows 1 and 2, and their slopes.
 
         The slopes (S, 3, 3r) are those at rows 1 and 2 of ``rows_12`` (2, r), Eq. (B3) and (B5).
@@ -198,7 +176,7 @@ class LowerBounds:
         moved = self._offset + sums[:, 0]
         turning = slopes[:, 0] + np.einsum("sjl,j->sl", slopes[:, 1:], zeta)
         driving = sums[:, 1:]
-        residuals = np.stack([moved.real, moved.imag, self._heading + self._turned @ part.middle], axis=1)
+        residuals = np.stack([moved.real, moved.imag, self._heading + self._turned @ part.centre[2]], axis=1)
         still = np.zeros_like(driving.real)
         jacobian = np.stack(
             [
@@ -210,9 +188,9 @@ class LowerBounds:
         )
         return residuals * self._weights, jacobian * self._weights[:, None]
 
-    def _dual_bound(self, part: Part, sums: Complex, slopes: Complex, directions: Array) -> tuple[float, Array]:
+    def _dual_bound(self, part: ElementBox, sums: Complex, slopes: Complex, directions: Array) -> tuple[float, Array]:
         """Bound (B7) of a part for u_s = ``directions`` (S, 3), and its looseness (3, r), Eq. (B8)."""
-        lower, upper, reach = part.lower[:2], part.upper[:2], part.reach
+        lower, upper, reach = part.lower[:2], part.upper[:2], part.reach[2]
         weighted = directions * self._weights * self._shares[:, None]
         along = weighted[:, 0] - 1j * weighted[:, 1]  # v_s of Eq. (B4)
         value = along @ sums
@@ -220,13 +198,14 @@ class LowerBounds:
         curvature = np.tensordot(np.abs(along), self._stamps.curvature, (0, 0))  # B of Eq. (B5): (1 + r, r, r)
         corners = np.array(list(product(*((-side, side) for side in reach)))).T  # (r, 2^r)
         turned = weighted[:, 2] @ self._turned
-        constant = (along @ self._offset).real + value[0].real + weighted[:, 2] @ self._heading + turned @ part.middle
+        constant = (
+            (along @ self._offset).real + value[0].real + weighted[:, 2] @ self._heading + turned @ part.centre[2]
+        )
         total = constant + (turned + slope[0].real) @ corners  # Eq. (B6), first line
         at_corners = value[1:, None] + slope[1:] @ corners
         for row, factor in enumerate((at_corners.real, -at_corners.imag)):  # Eq. (B6), second line
             total += np.minimum(factor * lower[row][:, None], factor * upper[row][:, None]).sum(axis=0)
-        largest = np.maximum(np.abs(lower), np.abs(upper))
-        bending = np.tensordot(np.append(1.0, np.hypot(*largest)), curvature, (0, 0))  # (r, r)
+        bending = np.tensordot(np.append(1.0, part.speed), curvature, (0, 0))  # (r, r)
         remainder = reach @ bending @ reach / 2
         widths = upper - lower
         bilinear = widths[..., None] * np.abs([slope[1:].real, slope[1:].imag]) * reach  # (2, r, r)

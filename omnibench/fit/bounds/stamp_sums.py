@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.errors import ConfigError
+from omnibench.fit.evaluator.element_box import ElementBox
 from omnibench.fit.evaluator.impulses import cut, impulses, make_path, quadrature
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.robot.kinematics import Array
@@ -38,24 +39,24 @@ _QUADRATURE = 1e-9
 class StampSums:
     """The sums of Eq. (S1). curvature (S, 1 + r, r, r): bounds of their second derivatives, Eq. (S2).
 
-    fitted (r, N): orthonormal directions of wheel rates. largest (3, N): magnitudes that no matrix of the box exceeds.
+    fitted (r, N): orthonormal directions of wheel rates. elements: a box that holds all matrices of the problem's box.
     ConfigError where arcs are too long for the quadrature.
     """
 
-    def __init__(self, problem: CalibrationProblem, fitted: Array, largest: Array) -> None:
+    def __init__(self, problem: CalibrationProblem, fitted: Array, elements: ElementBox) -> None:
         design = problem.start.reshape(3, -1)
         logs = problem.objective.logs(problem.trajectories)
         integration = problem.integration
         paths = [make_path(log, integration) for log in logs]
-        speed = np.hypot(largest[0], largest[1])
-        nodes = quadrature(paths, largest[2], speed, _QUADRATURE, integration)
+        row, speed = elements.largest[2], elements.speed
+        nodes = quadrature(paths, row, speed, _QUADRATURE, integration)
         if nodes is None:
             raise ConfigError("samples turn too far for a lower bound with arcs; use integration euler")
         self._quadrature = _QUADRATURE if integration == "arc" else 0.0
         self._runs: list[tuple[Array, Array, Array, NDArray[np.intp]]] = []
         curvature = []
         for path, log in zip(paths, logs, strict=True):
-            (whole,) = cut(path, largest[2], np.inf)
+            (whole,) = cut(path, row, np.inf)
             angles, before = (
                 np.reshape(part, (-1, design.shape[1])) for part in impulses(path, whole, integration, nodes)
             )
@@ -71,7 +72,7 @@ class StampSums:
             curvature.append(np.cumsum(np.roll(pairs, 1, axis=0), axis=0)[ends])  # the row of zeros comes first
         self.curvature = np.concatenate(curvature)
         longest = max(float((np.abs(path.angles) @ speed).sum()) for path in paths)
-        angle = max(float((np.abs(path.before) @ largest[2]).max(initial=0.0)) for path in paths)
+        angle = max(float((np.abs(path.before) @ row).max(initial=0.0)) for path in paths)
         self._farthest = np.max([np.abs(turns).max(axis=0) for _, _, turns, _ in self._runs], axis=0)  # |c|: (r,)
         additions = nodes * max(len(path.angles) for path in paths) + len(self.curvature) + 1000
         self._rounding = 4 * np.finfo(float).eps * additions * (1 + longest) * (2 + angle)  # eps = 2 u

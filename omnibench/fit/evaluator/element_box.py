@@ -1,4 +1,4 @@
-"""The box of matrices in which the fast evaluator answers."""
+"""A box of matrices, in which the fast evaluator answers and lower bounds hold."""
 
 from __future__ import annotations
 
@@ -43,8 +43,12 @@ class ElementBox:
         return (self.upper - self.lower) / 2
 
     @property
+    def largest(self) -> Array:
+        """The largest magnitudes (3, N) of the elements."""
+        return np.maximum(np.abs(self.lower), np.abs(self.upper))
+
+    @property
     def speed(self) -> Array:
         """The largest |m1j + i m2j| (N,) in the box, m per rad."""
-        largest = np.maximum(np.abs(self.lower[:2]), np.abs(self.upper[:2]))
-        speed: Array = np.hypot(largest[0], largest[1])
+        speed: Array = np.hypot(*self.largest[:2])
         return speed

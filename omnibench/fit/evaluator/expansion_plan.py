@@ -63,7 +63,7 @@ def make_plan(logs: Sequence[WheelLog], integration: Integration, box: ElementBo
     if any(len(log.stamps) == 0 or log.stamps[0] <= 0 for log in logs) or not np.isfinite(box.reach).all():
         return None
     paths = [make_path(log, integration) for log in logs]
-    row, speed = np.abs(box.centre[2]) + box.reach[2], box.speed
+    row, speed = box.largest[2], box.speed
     lengths = [float((np.abs(path.angles) @ speed).sum()) for path in paths]
     length = max(1.0, *lengths)
     nodes = quadrature(paths, row, speed, _QUADRATURE * length, integration)

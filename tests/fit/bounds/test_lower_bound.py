@@ -12,10 +12,10 @@ from fit_samples import box_between, make_problem, noisy_trajectories
 
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.bounds.dual_directions import into_unit_ball, least_sum_of_norms
-from omnibench.fit.bounds.lower_bound import LowerBounds
 from omnibench.fit.bounds.stamp_sums import StampSums
 from omnibench.fit.certify import prove
 from omnibench.fit.cost import SumOfNorms
+from omnibench.fit.evaluator.element_box import ElementBox
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options
@@ -92,7 +92,8 @@ def test_scaled_directions_lie_in_the_unit_ball_to_the_last_digit() -> None:
 @pytest.mark.parametrize("integration", ["euler", "arc"])
 def test_sums_differ_from_their_first_order_expansion_by_no_more_than_their_curvature(integration: str) -> None:
     problem = make_problem(noisy_trajectories(noise=0.03), cost="trajectory", integration=integration)
-    sums = StampSums(problem, np.eye(3), np.abs(problem.upper).reshape(3, 3) * 2)
+    wide = 2 * np.abs(problem.upper).reshape(3, 3)
+    sums = StampSums(problem, np.eye(3), ElementBox(-wide, wide))
     rng = np.random.default_rng(0)
     value, slope = sums.at(np.zeros(3))
     for reach in (0.001, 0.01, 0.1):
@@ -127,7 +128,7 @@ def test_no_matrix_of_the_box_has_larger_elements_than_the_sums_allow_for() -> N
     vectors = np.random.default_rng(0).uniform(problem.lower, problem.upper, (2000, problem.size))
     moved = np.abs(problem.parameterisation.matrices(vectors)).max(axis=0)
     assert (moved[:, 0] > np.abs(matrix[:, 0]) + 1e-3).any()
-    assert (moved <= LowerBounds(problem).largest).all()
+    assert (moved <= ElementBox.of(problem.parameterisation, problem.lower, problem.upper).largest).all()
 
 
 def with_later_poses(run: Trajectory, *stamps: float) -> Trajectory:
