@@ -21,15 +21,6 @@ class SolverError(OmnibenchError):
     """The solver did not reach an optimum."""
 
 
-def least_squares(design: Array, target: Array, lower: Array, upper: Array) -> Array:
-    """The x (n,) in the box that minimises the squares of design (m, n) @ x - target (m,)."""
-    x = cp.Variable(design.shape[1])
-    scale = max(float(np.abs(target).max(initial=0.0)), 1e-12)
-    objective = cp.Minimize(cp.sum_squares((design @ x - target) / scale))
-    _solve(cp.Problem(objective, [x >= lower, x <= upper]))
-    return np.clip(x.value, lower, upper)
-
-
 class SumOfNormsProgram:
     """Minimises sum_s shares_s * norm(residuals_s + jacobian_s @ d) over steps d in a box, for any shares.
 

@@ -16,6 +16,7 @@ from pydantic import Field
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.cost import SumOfNorms
+from omnibench.fit.linear_fit import linear_fit
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
@@ -82,24 +83,10 @@ class ClosedForm(Calibrator):
 
 
 def linear_start(problem: CalibrationProblem) -> Array:
-    """Vector (n,) by least squares: headings give row 3, then positions, with reference headings, rows 1 and 2."""
-    from omnibench.fit.sum_of_norms import least_squares
-
-    lower, upper = (bound.reshape(3, -1) for bound in (problem.lower, problem.upper))
-    starts = np.array([trajectory.start for trajectory in problem.trajectories])[problem.odometry.trajectory]
-    moved = problem.reference - starts
-    row_3 = least_squares(problem.odometry.driven, moved[:, 2], lower[2], upper[2])
-    headings = [
-        np.interp(np.concatenate([[0.0], t.times[:-1]]), t.pose_times, t.poses[:, 2]) for t in problem.trajectories
-    ]
-    design = problem.odometry.position_design(headings)
-    rows_12 = least_squares(
-        np.block([[design.real, -design.imag], [design.imag, design.real]]),
-        np.concatenate([moved[:, 0], moved[:, 1]]),
-        np.concatenate([lower[0], lower[1]]),
-        np.concatenate([upper[0], upper[1]]),
-    )
-    return _settled(problem, np.concatenate([rows_12, row_3]))
+    """Vector (n,) in the box by linear least squares."""
+    design, identity = problem.matrix(problem.start), np.eye(len(problem.robot.wheels))
+    matrix = linear_fit(problem.odometry, problem.trajectories, problem.reference, design, identity)
+    return _settled(problem, matrix.ravel())
 
 
 def cone_program(problem: CalibrationProblem, objective: SumOfNorms, vector: Array) -> SumOfNormsProgram:

@@ -9,10 +9,11 @@ import numpy as np
 from omnibench.config import Model
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
-from omnibench.fit.least_squares.noise import NoiseEstimate, estimate_noise
+from omnibench.fit.least_squares.noise import NoiseEstimate
+from omnibench.fit.linear_fit import linear_fit
 from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.fit.span import DrivenSpan, State, driven_span, unidentified_directions, wheel_directions
-from omnibench.fit.uncertainty.information import information_of_runs
+from omnibench.fit.uncertainty.information import information_of_runs, noise_of_matrix
 from omnibench.fit.uncertainty.physical import (
     identified_parameters,
     known_slopes,
@@ -140,32 +141,14 @@ def _open_parameters(robot: Robot, parameters: Sequence[ParameterIdentifiability
 def _quick_noise(
     robot: Robot, trajectories: Sequence[Trajectory], span: DrivenSpan, integration: Integration
 ) -> tuple[NoiseEstimate, Array]:
-    """Noise of the poses by a linear fit, and the fit's matrix (3, N).
-
-    Headings are linear in row 3; positions, with the headings of the reference, are linear in rows 1 and 2. Undriven
-    directions keep the design values.
-    """
+    """Noise of the poses by a linear fit, and the fit's matrix (3, N). Undriven directions keep the design values."""
     usable = [run for run in trajectories if len(run.pose_times) > 1]
     if not usable:
         raise DataError("no trajectory has a reference pose after its start; nothing can be identified")
-    design = robot.inverse_kinematic_matrix
-    batch = OdometryBatch([run.reference_log for run in usable], integration)
-    moved = np.concatenate([run.poses[1:] - run.poses[0] for run in usable])
-    basis = span.driven.T
-    headings = [np.interp(np.append(0.0, run.times[:-1]), run.pose_times, run.poses[:, 2]) for run in usable]
-    matrix = design.copy()
-    matrix[2] += basis @ np.linalg.lstsq(batch.driven @ basis, moved[:, 2] - batch.driven @ design[2], rcond=None)[0]
-    columns = batch.position_design(headings)
-    missing = moved[:, 0] + 1j * moved[:, 1] - columns @ (design[0] + 1j * design[1])
-    change = basis @ np.linalg.lstsq(columns @ basis, missing, rcond=None)[0]
-    matrix[0] += change.real
-    matrix[1] += change.imag
-    poses = batch.poses(matrix[None])[0]
-    residuals = np.split(
-        poses - np.concatenate([run.poses[1:] for run in usable]),
-        np.cumsum([len(run.poses) - 1 for run in usable])[:-1],
-    )
-    return estimate_noise(usable, residuals), matrix
+    odometry = OdometryBatch([run.reference_log for run in usable], integration)
+    reference = np.concatenate([run.poses[1:] for run in usable])
+    matrix = linear_fit(odometry, usable, reference, robot.inverse_kinematic_matrix, span.driven)
+    return noise_of_matrix(usable, matrix, integration), matrix
 
 
 def _deviations(information: Array, driven: Array) -> Array:

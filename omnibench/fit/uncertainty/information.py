@@ -1,4 +1,4 @@
-"""Fisher information of the matrix elements, given the noise of the reference poses."""
+"""Noise of the reference poses about a matrix, and the Fisher information of its elements under a noise."""
 
 from __future__ import annotations
 
@@ -8,12 +8,24 @@ from typing import Literal
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.least_squares.noise import Whitener
+from omnibench.fit.least_squares.noise import NoiseEstimate, Whitener, estimate_noise
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
 
 Stamps = Literal["reference", "final"]
+
+
+def noise_of_matrix(runs: Sequence[Trajectory], matrix: Array, integration: Integration) -> NoiseEstimate:
+    """Noise of the reference poses, estimated from the residuals that ``matrix`` (3, N) leaves in some runs."""
+    logs = [run.reference_log for run in runs]
+    return estimate_noise(
+        runs,
+        [
+            OdometryBatch([log], integration).poses(matrix[None])[0] - run.poses[1:]
+            for log, run in zip(logs, runs, strict=True)
+        ],
+    )
 
 
 def information_of_run(

@@ -12,12 +12,11 @@ from scipy.special import stdtrit
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import RunResult
 from omnibench.fit.cost import SumOfNorms
-from omnibench.fit.least_squares.noise import NoiseEstimate, estimate_noise
 from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.span import driven_span, unidentified_directions
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals
-from omnibench.fit.uncertainty.information import information_of_run, information_of_runs
+from omnibench.fit.uncertainty.information import noise_of_matrix
 from omnibench.fit.uncertainty.physical import (
     ParameterEstimate,
     geometry_of,
@@ -28,9 +27,6 @@ from omnibench.fit.uncertainty.physical import (
 from omnibench.fit.uncertainty.sandwich import Scores, sandwich, scores_of_runs
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
-from omnibench.robot.odometry import OdometryBatch
-
-__all__ = ["NoCovarianceError", "Uncertainty", "information_of_run", "information_of_runs", "uncertainty_of"]
 
 _INTERVAL = 0.95  # probability of the intervals
 _MANY = 10**9  # degrees of freedom that stand for infinity, where Student's t is the normal distribution
@@ -87,7 +83,7 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     covariance = slopes @ of_vector @ slopes.T
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(result.matrix.shape)
     reach = _quantile(freedom) * deviations
-    noise = result.noise or noise_of(problem, result.matrix).noise
+    noise = result.noise or noise_of_matrix(problem.trajectories, result.matrix, problem.integration).noise
     return Uncertainty(
         covariance=covariance,
         standard_deviations=deviations,
@@ -98,15 +94,6 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
         degrees_of_freedom=freedom,
         source=source,
     )
-
-
-def noise_of(problem: CalibrationProblem, matrix: Array) -> NoiseEstimate:
-    """Noise of the reference poses, estimated from the residuals that ``matrix`` (3, N) leaves in a problem's runs."""
-    residuals = []
-    for run in problem.trajectories:
-        odometry = OdometryBatch([run.reference_log], problem.integration)
-        residuals.append(odometry.poses(matrix[None])[0] - run.poses[1:])
-    return estimate_noise(problem.trajectories, residuals)
 
 
 def _by_scatter(problem: CalibrationProblem, result: RunResult) -> tuple[Array, int, str]:
