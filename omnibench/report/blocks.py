@@ -1,12 +1,13 @@
-"""The blocks that a report is built from. Their texts are plain text: the template escapes them."""
+"""The blocks that a report is built from; the terminal shows the tables, too. Their texts are plain text."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-import plotly.graph_objects as go
+if TYPE_CHECKING:  # a terminal shows tables and needs no plots
+    import plotly.graph_objects as go
 
 Tone = Literal["plain", "good", "warning"]
 Dash = Literal["solid", "dash", "dot", "dashdot"]
@@ -64,11 +65,15 @@ class Facts:
 
 @dataclass(frozen=True)
 class Column:
-    """The head of a table column; numeric columns are aligned right."""
+    """The head of a table column; numeric columns are aligned right, and their cells never wrap.
+
+    priority: where a terminal is too narrow for the table, columns of the highest number are left out first.
+    """
 
     title: str
     unit: str = ""
     numeric: bool = True
+    priority: int = 0
 
 
 @dataclass(frozen=True)
@@ -80,12 +85,20 @@ class Cell:
     colour: str = ""
 
 
+RowRole = Literal["plain", "best", "failed", "muted", "group"]
+
+
 @dataclass(frozen=True)
 class Row:
     """A table row. A ``group`` row has one cell that spans the table."""
 
     cells: tuple[Cell, ...]
-    role: Literal["plain", "best", "failed", "muted", "group"] = "plain"
+    role: RowRole = "plain"
+
+    @classmethod
+    def of(cls, *cells: Cell | str, role: RowRole = "plain") -> Row:
+        """A row of cells, of which those given as text have no note."""
+        return cls(tuple(cell if isinstance(cell, Cell) else Cell(cell) for cell in cells), role)
 
 
 @dataclass(frozen=True)

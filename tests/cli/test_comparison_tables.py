@@ -37,60 +37,60 @@ def printed(result: ComparisonResult, width: int = 160) -> str:
 
 
 def table(text: str, title: str) -> dict[str, list[str]]:
-    """Cells of a printed table by its first column."""
-    lines = text.split(title, 1)[1].split("\n\n", 1)[0].splitlines()
-    cells = [re.split(r"\s{2,}", line.strip()) for line in lines[3:]]
-    return {row[0]: row[1:] for row in cells if len(row) > 1}
+    """Cells of a printed table by its first column, whose notes in brackets are left out."""
+    lines = text.split(title, 1)[1].split("───\n", 1)[1].split("\n\n", 1)[0].splitlines()
+    cells = [re.split(r"\s{2,}", line.strip()) for line in lines]
+    return {re.sub(r" \((design|matrix).*\)$", "", row[0]): row[1:] for row in cells if len(row) > 1}
 
 
 @pytest.mark.parametrize("split", ["train", "validation"])
 def test_the_tables_of_costs_agree_with_the_summary(result: ComparisonResult, split: str) -> None:
-    title = {"train": "Training: ", "validation": "Validation: "}[split]
-    found = table(printed(result), f"{title}flower (simulated data), 6 trajectories, cost final_pose")
+    text = printed(result)
+    assert text.startswith("flower (simulated data), cost final_pose\n")
+    found = table(text, f"Cost of 6 trajectories, {'training' if split == 'train' else split}")
     for run in summary(result.output)["runs"]:
-        if run["matrix"] is not None:
-            theoretical, cost, interval, improvement, _ = found[run["label"]]
+        if run["matrix"] is not None and run["label"] != "theoretical":
+            theoretical, cost, improvement = found[run["label"]]
             assert float(theoretical) == pytest.approx(run[f"theoretical_{split}_cost"], abs=1e-4)
-            assert float(cost) == pytest.approx(run[f"{split}_cost"], abs=1e-4)
-            assert float(improvement.rstrip("%")) == pytest.approx(100 * run[f"{split}_improvement"], abs=1e-2)
-            low, high = map(float, interval.split(" .. "))
-            assert low <= float(cost) <= high
+            value, low, high = map(float, re.findall(r"[\d.]+", cost))
+            assert value == pytest.approx(run[f"{split}_cost"], abs=1e-4)
+            assert low <= value <= high
+            assert float(improvement.split(" %")[0]) == pytest.approx(100 * run[f"{split}_improvement"], abs=1e-2)
 
 
 def test_the_final_errors_are_in_millimetres_and_degrees(result: ComparisonResult) -> None:
-    found = table(printed(result), "Final errors: flower (simulated data)")
     (run,) = (run for run in summary(result.output)["runs"] if run["label"] == "closed_form")
-    expected = [
-        text
-        for split in ("train", "validation")
-        for text in (
-            f"{1000 * run[f'{split}_position_m']:.1f} mm",
-            f"{math.degrees(run[f'{split}_heading_rad']):.2f} deg",
-        )
-    ]
-    assert found["closed_form"] == [*expected, "best"]
+    for split, name in (("train", "training"), ("validation", "validation")):
+        mean, _, heading, _ = table(printed(result), f"Error of the final pose, {name}")["closed_form"]
+        assert mean == f"{1000 * run[f'{split}_position_m']:.1f}"
+        assert heading == f"{math.degrees(run[f'{split}_heading_rad']):.2f}"
+    assert "mean (mm)" in printed(result)
+    assert "mean (°)" in printed(result)
 
 
 def test_a_practically_equal_entry_is_marked(result: ComparisonResult) -> None:
-    found = table(printed(result), "Final errors: flower")
-    assert found["again"][4] == "= +0.00000"
-    assert found["theoretical"][4].startswith("+")
+    found = table(printed(result, 240), "Entries over their seeds")
+    assert found["again"][-1] == "practically equal"
+    assert found["theoretical"][-2].startswith("+")
+    assert found["theoretical"][-1] == "worse"
+    assert found["closed_form"][-1].startswith("best")
 
 
 def test_a_run_without_an_answer_is_in_every_table_and_told_with_its_reason(result: ComparisonResult) -> None:
     text = printed(result)
-    for title in ("Training: ", "Validation: ", "Final errors: "):
-        assert table(text, title)["refused"] == ["no answer"]
-    assert table(text, "How each was found")["refused"][:3] == ["limits", "failed", "0/1"]
+    for title in ("Cost of 6 trajectories, training", "Cost of 6 trajectories, validation"):
+        assert table(text, title)["refused (geometry within limits)"][1:] == ["no answer (failed)", "–"]
+    assert table(printed(result, 240), "Entries over their seeds")["refused (geometry within limits)"][0] == "0 of 1"
+    assert table(text, "The run of each entry")["refused"][:2] == ["1", "failed"]
     assert "no answer: flower refused seed 1: failed: closed_form works on the matrix parameterisation" in text
 
 
 def test_texts_are_shown_as_they_are(result: ComparisonResult) -> None:
-    assert printed(result).count(ODD) == 4
+    assert printed(result).count(ODD) == 6
 
 
 @pytest.mark.parametrize("width", [60, 80, 100])
-def test_a_narrow_terminal_folds_cells_and_leaves_nothing_out(result: ComparisonResult, width: int) -> None:
+def test_a_narrow_terminal_wraps_words_and_cuts_no_number(result: ComparisonResult, width: int) -> None:
     tables = printed(result, width).split("no answer: ")[0]
     assert "…" not in tables
     assert max(map(len, tables.splitlines())) <= width
@@ -101,10 +101,10 @@ def test_a_narrow_terminal_folds_cells_and_leaves_nothing_out(result: Comparison
 def test_data_sets_are_told_apart_where_there_are_several(tmp_path: Path) -> None:
     sets = {name: {"simulate": flower()} for name in ("one", "two")}
     text = printed(compared_here(tmp_path / "out", datasets=sets, calibrators=["theoretical"]))
-    assert {"Training: one", "Training: two", "Final errors: one"} <= {
-        line.split(" (")[0] for line in text.splitlines()
-    }
-    assert {"one", "two"} <= set(table(text, "How each was found"))
+    assert [line for line in text.splitlines() if "(simulated data)" in line] == [
+        f"{name} (simulated data), cost final_pose" for name in sets
+    ]
+    assert text.count("Cost of 6 trajectories, training\n") == 2
 
 
 def test_a_pipe_gets_one_plain_line_for_each_run_and_the_tables(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_a_pipe_gets_one_plain_line_for_each_run_and_the_tables(tmp_path: Path) 
     ]
     assert "\x1b" not in run.stdout + run.stderr
     assert run.stdout.splitlines()[-1] == f"report: {tmp_path / 'out' / 'report.html'}"
-    assert table(run.stdout, "Training: ")["closed_form"][0] == "0.1387"
+    assert table(run.stdout, "Cost of 6 trajectories, training")["closed_form"][0] == "0.13873"
 
 
 def on_a_terminal(*arguments: object, **others: Any) -> tuple[int, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import signal
 import subprocess
 import time
@@ -117,7 +118,7 @@ def test_the_table_says_how_sure_the_poses_are_and_how_far_from_the_recorded_ref
     printed = found.run.stdout
     assert f"driven: simulated data; 3 runs, {count} scans, " in printed
     assert "deviation stated at the end of a run" in printed
-    assert "from the recorded reference (12 poses)" in printed
+    assert "distance from the recorded reference (12 poses)" in " ".join(printed.split())
     assert "3 trajectories: found" in printed
     assert "truth" not in printed
     assert found.run.stderr == "SLAM: 3 runs\n"
@@ -190,10 +191,11 @@ def test_csv_can_be_written(command: Command, driven: Driven, found: Found) -> N
 def test_the_truth_gives_errors_bias_and_drift_and_the_report_is_written(command: Command, driven: Driven) -> None:
     run = command("slam", driven.data, "--report", "slam.html", "--truth", driven.truth)
     assert run.returncode == 0, run.stderr
-    assert "errors of the reference poses against the simulated truth" in run.stdout
-    assert "at the end of a run (3 poses)" in run.stdout
-    assert "mm forward" in run.stdout
-    assert "deg a metre, over 3 m in 3 runs" in run.stdout
+    assert "Errors of the reference poses against the truth" in run.stdout
+    assert "last of each run (3 poses)" in run.stdout
+    assert re.search(r"Mean error along the robot's axes\n[^─]*forward[^─]*left[^─]*heading", run.stdout)
+    assert "deg a metre" in run.stdout
+    assert "3 runs, 3." in run.stdout
     assert "report: slam.html" in run.stdout
     assert "SIMULATED DATA" in Path("slam.html").read_text(encoding="utf-8")
     assert [file.name for file in Path().iterdir()] == ["slam.html"]

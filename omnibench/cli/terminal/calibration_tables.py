@@ -6,14 +6,15 @@ import math
 from collections.abc import Iterator, Sequence
 
 from rich.console import Console
-from rich.table import Table
 
+from omnibench.cli.terminal.tables import print_table
 from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.certify import CertifiedCalibration
 from omnibench.fit.evaluate import Evaluation
 from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals
 from omnibench.fit.uncertainty.physical import ParameterEstimate
+from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.words import plural
@@ -44,23 +45,9 @@ def print_certificate(console: Console, certified: CertifiedCalibration) -> None
 def print_calibration(console: Console, run: CalibrationRun) -> None:
     """Print the matrix beside its deviation from the design, its intervals, if any, and how the search ended."""
     calibration, result = run.calibration, run.result
-    design = calibration.robot.inverse_kinematic_matrix
-    simulated = calibration.provenance is not None and calibration.provenance.simulated
-    table = Table(title=f"{calibration.name}{' (simulated data)' if simulated else ''}", title_justify="left")
-    table.add_column("")
-    for wheel in calibration.robot.wheel_names:
-        table.add_column(f"wheel {wheel}", justify="right")
-    labels = zip("xyw", ("m/rad", "m/rad", "rad/rad"), strict=True)
-    rows = zip(labels, calibration.matrix, design, strict=True)
-    for row_number, ((label, unit), row, start) in enumerate(rows):
-        cells = [f"{value:+.7f} ({_deviation(value, first)})" for value, first in zip(row, start, strict=True)]
-        table.add_row(f"{label} ({unit})", *cells)
-        for label, intervals in _intervals(run):
-            bounds = zip(intervals.low[row_number], intervals.high[row_number], strict=True)
-            table.add_row(f"  {label}", *(f"{low:+.7f} .. {high:+.7f}" for low, high in bounds), style="dim")
-    console.print(table)
+    print_table(console, _matrix_table(run))
     if run.uncertainty is not None and run.uncertainty.parameters is not None:
-        _print_parameters(console, calibration.robot, run.uncertainty.parameters)
+        print_table(console, _parameter_table(calibration.robot, run.uncertainty.parameters))
     if run.uncertainty is not None:
         console.print(f"95 % intervals: {run.uncertainty.source}", soft_wrap=True)
         console.print(f"noise of the reference: {_noise_in_words(run.uncertainty.noise)}", soft_wrap=True)
@@ -68,6 +55,24 @@ def print_calibration(console: Console, run: CalibrationRun) -> None:
         f"{result.outcome}: {result.reason}; {plural(result.evaluations, 'evaluation')}, {result.seconds:.2f} s",
         soft_wrap=True,
     )
+
+
+def _matrix_table(run: CalibrationRun) -> Table:
+    """The matrix with its deviation from the design values, each row followed by its intervals."""
+    calibration = run.calibration
+    simulated = calibration.provenance is not None and calibration.provenance.simulated
+    labels = ("x (m/rad)", "y (m/rad)", "w (rad/rad)")
+    rows = []
+    for number, (label, values) in enumerate(zip(labels, calibration.matrix, strict=True)):
+        design = calibration.robot.inverse_kinematic_matrix[number]
+        cells = (Cell(f"{value:+.7f}", _deviation(value, first)) for value, first in zip(values, design, strict=True))
+        rows.append(Row.of(label, *cells))
+        for name, intervals in _intervals(run):
+            bounds = zip(intervals.low[number], intervals.high[number], strict=True)
+            rows.append(Row.of(f"  {name}", *(Cell("", f"{low:+.7f} to {high:+.7f}") for low, high in bounds)))
+    wheels = (Column(f"wheel {wheel}") for wheel in calibration.robot.wheel_names)
+    caption = f"{calibration.name}{' (simulated data)' if simulated else ''}"
+    return Table(caption, (Column("", numeric=False), *wheels), tuple(rows))
 
 
 def _intervals(run: CalibrationRun) -> Iterator[tuple[str, ElementIntervals]]:
@@ -89,43 +94,42 @@ def _noise_in_words(noise: Noise) -> str:
     return "; ".join(parts)
 
 
-def _print_parameters(console: Console, robot: Robot, parameters: Sequence[ParameterEstimate]) -> None:
-    table = Table(title="physical parameters", title_justify="left")
-    for heading in ("parameter", "design", "fitted", "deviation", "95 %"):
-        table.add_column(heading, justify="left" if heading == "parameter" else "right")
-    design = WheelGeometry(robot).start
-    for parameter, start in zip(parameters, design, strict=True):
-        factor, form = (math.degrees(1.0), "{:.3f} deg") if parameter.unit == "rad" else (1.0, "{:.5f} m")
-        shown = [form.format(factor * value) for value in (start, parameter.value)]
-        deviation = "design 0" if not start else f"{100 * (parameter.value / start - 1):+.2f} %"
-        interval = "not identified by these data"
+def _parameter_table(robot: Robot, parameters: Sequence[ParameterEstimate]) -> Table:
+    rows = []
+    for parameter, start in zip(parameters, WheelGeometry(robot).start, strict=True):
+        factor, decimals, unit = (math.degrees(1.0), 3, "deg") if parameter.unit == "rad" else (1.0, 5, "m")
+        interval = Cell("", "not identified by these data")
         if parameter.low is not None and parameter.high is not None:
-            interval = f"{form.format(factor * parameter.low)} .. {form.format(factor * parameter.high)}"
-        table.add_row(parameter.name, *shown, deviation, interval)
-    console.print(table)
+            low, high = (f"{factor * bound:.{decimals}f}" for bound in (parameter.low, parameter.high))
+            interval = Cell("", f"{low} to {high} {unit}")
+        values = (f"{factor * value:.{decimals}f} {unit}" for value in (start, parameter.value))
+        rows.append(Row.of(parameter.name, *values, _deviation(parameter.value, start), interval))
+    columns = (Column("parameter", numeric=False), *map(Column, ("design", "fitted", "deviation", "95 %")))
+    return Table("physical parameters", columns, tuple(rows))
 
 
 def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     """Print cost and final errors on every split, beside those of the design values."""
-    kind = " (simulated data)" if evaluation.simulated else ""
-    table = Table(title=f"{evaluation.dataset}{kind}", title_justify="left")
-    table.add_column("split")
-    table.add_column("model")
-    for heading in ("runs", "cost (Eq. 6)", "position mean", "max", "heading mean", "max"):
-        table.add_column(heading, justify="right")
+    rows = []
     for split in evaluation.splits:
+        rows.append(Row.of(f"{split}: {plural(evaluation.splits[split].trajectories, 'run')}", role="group"))
         for label, errors in (("calibration", evaluation.splits[split]), ("design", evaluation.design[split])):
-            table.add_row(
-                split,
-                label,
-                str(errors.trajectories),
+            figures = (
                 f"{errors.cost:.4f}",
-                f"{errors.position_mean_m:.4f} m",
-                f"{errors.position_max_m:.4f} m",
-                f"{math.degrees(errors.heading_mean_rad):.2f} deg",
-                f"{math.degrees(errors.heading_max_rad):.2f} deg",
+                f"{errors.position_mean_m:.4f}",
+                f"{errors.position_max_m:.4f}",
+                f"{math.degrees(errors.heading_mean_rad):.2f}",
+                f"{math.degrees(errors.heading_max_rad):.2f}",
             )
-    console.print(table)
+            rows.append(Row.of(label, *figures))
+    columns = (
+        Column("model", numeric=False),
+        Column("cost, Eq. (6)"),
+        *(Column(f"position, {which}", "m") for which in ("mean", "max")),
+        *(Column(f"heading, {which}", "deg") for which in ("mean", "max")),
+    )
+    kind = " (simulated data)" if evaluation.simulated else ""
+    print_table(console, Table(f"{evaluation.dataset}{kind}", columns, tuple(rows)))
 
 
 def _deviation(value: float, design: float) -> str:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 from rich.console import Console
-from rich.table import Table
 
+from omnibench.cli.terminal.tables import print_table
 from omnibench.fit.inspect import Inspection, ScansContent
 from omnibench.fit.uncertainty.identifiability import ROWS, Identifiability
+from omnibench.report.blocks import Column, Row, Table
 from omnibench.words import plural
 
 
@@ -30,29 +31,13 @@ def print_inspection(console: Console, inspection: Inspection) -> None:
     )
     if inspection.scans is not None:
         _print_scans(console, inspection.scans)
-    table = Table()
-    for heading in ("split", "runs", "commands", "repetitions", "sessions", "duration", "distance", "turned"):
-        table.add_column(heading, justify="left" if heading == "split" else "right")
-    for name, split in inspection.splits.items():
-        repetitions = f"{split.repetitions_min}"
-        if split.repetitions_max != split.repetitions_min:
-            repetitions += f" to {split.repetitions_max}"
-        table.add_row(
-            name,
-            str(split.trajectories),
-            str(split.commands),
-            repetitions,
-            str(split.sessions),
-            f"{split.duration_s:.0f} s",
-            f"{split.distance_m:.1f} m",
-            f"{math.degrees(split.turned_rad):.0f} deg",
-        )
-    console.print(table)
+    print_table(console, _split_table(inspection))
     shares = ", ".join(f"{share:.2g}" for share in inspection.driven_shares)
     console.print(
         f"directions of wheel rates driven: {inspection.driven_directions} of {len(inspection.wheels)} ({shares})"
     )
-    _print_identifiability(console, inspection.identifiability)
+    print_table(console, _identifiability_table(inspection.identifiability))
+    console.print(f"noise: {inspection.identifiability.noise_source}", soft_wrap=True)
     for finding in inspection.findings:
         console.print(f"- {finding}", soft_wrap=True)
 
@@ -67,18 +52,39 @@ def _print_scans(console: Console, scans: ScansContent) -> None:
     )
 
 
-def _print_identifiability(console: Console, identifiability: Identifiability) -> None:
-    table = Table(
-        title="precision of a calibration from these data, +- % of the row's largest element", title_justify="left"
+def _split_table(inspection: Inspection) -> Table:
+    rows = []
+    for name, split in inspection.splits.items():
+        repetitions = f"{split.repetitions_min}"
+        if split.repetitions_max != split.repetitions_min:
+            repetitions += f" to {split.repetitions_max}"
+        counts = (str(split.trajectories), str(split.commands), repetitions, str(split.sessions))
+        amounts = (f"{split.duration_s:.0f}", f"{split.distance_m:.1f}", f"{math.degrees(split.turned_rad):.0f}")
+        rows.append(Row.of(name, *counts, *amounts))
+    columns = (
+        Column("split", numeric=False),
+        Column("runs"),
+        Column("commands"),
+        Column("repetitions", priority=1),
+        Column("sessions"),
+        *(Column(*quantity) for quantity in (("duration", "s"), ("distance", "m"), ("turned", "deg"))),
     )
-    for heading in ("wheel rates along", "motion", "driven", *(f"row {row}" for row in ROWS)):
-        table.add_column(heading, justify="left" if heading in ("wheel rates along", "motion") else "right")
+    return Table("", columns, tuple(rows))
+
+
+def _identifiability_table(identifiability: Identifiability) -> Table:
+    rows = []
     for direction in identifiability.directions:
         deviations = ["open"] * len(ROWS)
         if direction.state == "driven" and direction.deviations is not None:
             deviations = [f"{100 * value:.2g} %" for value in direction.deviations]
-        table.add_row(
-            direction.direction, direction.motion or "slip of the wheels", f"{100 * direction.share:.3g} %", *deviations
-        )
-    console.print(table)
-    console.print(f"noise: {identifiability.noise_source}", soft_wrap=True)
+        motion = direction.motion or "slip of the wheels"
+        rows.append(Row.of(direction.direction, motion, f"{100 * direction.share:.3g} %", *deviations))
+    columns = (
+        Column("wheel rates along", numeric=False),
+        Column("motion", numeric=False),
+        Column("driven"),
+        *(Column(f"row {row}") for row in ROWS),
+    )
+    caption = "precision of a calibration from these data, +- % of the row's largest element"
+    return Table(caption, columns, tuple(rows))

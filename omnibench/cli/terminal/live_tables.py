@@ -9,12 +9,13 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.table import Table
 
+from omnibench.cli.terminal.tables import print_table
+from omnibench.report.blocks import Column, Row, Table
 from omnibench.words import plural
 
 if TYPE_CHECKING:
-    from omnibench.live.replay.demonstration import Demonstration, Deviation
+    from omnibench.live.replay.demonstration import Demonstration
     from omnibench.live.replay.replay_player import PlayReport
 
 
@@ -62,23 +63,7 @@ def print_played(console: Console, report: PlayReport, simulated: bool) -> None:
 def print_demonstration(console: Console, shown: Demonstration) -> None:
     """Print what was played to a node, its errors against the reference, and its agreement with the batch odometry."""
     print_played(console, shown.report, shown.simulated)
-    table = Table(title=f"{shown.robot} against {shown.against}", title_justify="left")
-    for heading in ("estimate", "position RMS", "heading RMS", "position at the end"):
-        table.add_column(heading, justify="left" if heading == "estimate" else "right")
-    rows: list[tuple[str, Deviation | None]] = [
-        ("odometry of the design matrix", shown.theoretical),
-        (f"odom: {shown.calibration}", shown.calibrated),
-        ("odometry/filtered: fused with SLAM", shown.fused),
-    ]
-    for label, deviation in rows:
-        if deviation is not None:
-            table.add_row(
-                label,
-                f"{deviation.position:.4f} m",
-                f"{math.degrees(deviation.heading):.2f} deg",
-                f"{deviation.final_position:.4f} m",
-            )
-    console.print(table)
+    print_table(console, _deviation_table(shown))
     console.print(
         f"odom against the batch odometry: {shown.batch_difference:.1e} (m, rad) at most; "
         f"{plural(shown.lost, 'message')} of odom lost",
@@ -86,3 +71,23 @@ def print_demonstration(console: Console, shown: Demonstration) -> None:
     )
     counts = {name: value for name, value in shown.health.counts.items() if value}
     console.print("counted: " + ", ".join(f"{value} {name}" for name, value in counts.items()), soft_wrap=True)
+
+
+def _deviation_table(shown: Demonstration) -> Table:
+    estimates = (
+        ("odometry of the design matrix", shown.theoretical),
+        (f"odom: {shown.calibration}", shown.calibrated),
+        ("odometry/filtered: fused with SLAM", shown.fused),
+    )
+    rows = (
+        Row.of(label, f"{of.position:.4f}", f"{math.degrees(of.heading):.2f}", f"{of.final_position:.4f}")
+        for label, of in estimates
+        if of is not None
+    )
+    columns = (
+        Column("estimate", numeric=False),
+        Column("position, RMS", "m"),
+        Column("heading, RMS", "deg"),
+        Column("position at the end", "m"),
+    )
+    return Table(f"{shown.robot} against {shown.against}", columns, tuple(rows))

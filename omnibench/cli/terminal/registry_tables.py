@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from rich.console import Console
-from rich.table import Table
 
+from omnibench.cli.terminal.tables import print_table
 from omnibench.registry import REGISTRIES, Entry, PluginFailure
+from omnibench.report.blocks import Column, Row, Table
 
 
 def print_registries(console: Console) -> None:
     """Print a table for each kind: calibrators, costs, effects, importers."""
     for registry in REGISTRIES:
         entries = registry.entries()
-        table = Table(title=f"{registry.kind}s", title_justify="left", title_style="bold", expand=False)
-        for heading in ("name", "what", "from"):
-            table.add_column(heading, overflow="fold")
-        for entry in entries:
-            table.add_row(entry.name, entry.summary, entry.origin)
-        console.print(table if entries else f"{registry.kind}s: none yet")
+        rows = tuple(Row.of(entry.name, entry.summary, entry.origin) for entry in entries)
+        columns = tuple(Column(heading, numeric=False) for heading in ("name", "what", "from"))
+        if entries:
+            print_table(console, Table(f"{registry.kind}s", columns, rows))
+        else:
+            console.print(f"{registry.kind}s: none yet")
 
 
 def registry_document(failures: list[PluginFailure]) -> dict[str, object]:

@@ -10,23 +10,37 @@ from threading import Event
 from typing import Final
 
 import zenoh
-from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
+from omnibench.cli.terminal.tables import render_table
 from omnibench.live.robot_monitor import RobotMonitor
 from omnibench.live.robot_status import OdometryStatus, RobotStatus, json_document
 from omnibench.live.stopping import ticks
 from omnibench.live.wire.topics import KeySpace
+from omnibench.report.blocks import Column, Row, RowRole, Table
 
 _REFRESH: Final = 0.2  # s between two drawings of the table; chosen
 _LINE_PERIOD: Final = 1.0  # s between two lines of a robot
 _SILENCE: Final = 1.0  # s without a message from which on the silence is shown
 _HEALTH_WIDTH: Final = 48  # columns that the health and wider gaps between the figures need beside the figures
-_NAME_WIDTH: Final = 10  # columns of a robot's name in the narrow table
 _NO_ROBOT: Final = "no robot seen yet"
+_COLUMNS: Final = (
+    Column("robot", numeric=False),
+    Column("frame", numeric=False),
+    Column("x", "m"),
+    Column("y", "m"),
+    Column("deg"),
+    Column("±m", priority=2),
+    Column("±deg", priority=2),
+    Column("vx", "m/s", priority=1),
+    Column("vy", "m/s", priority=1),
+    Column("deg/s", priority=1),
+    Column("Hz"),
+    Column("age", "ms"),
+    Column("health", numeric=False),
+)
 
 
 def listen(
@@ -62,9 +76,9 @@ def view(statuses: Sequence[RobotStatus], console: Console) -> RenderableType:
     """The robots as a table that fits the console: health beside the figures if there is room, else below them."""
     if not statuses:
         return Text(_NO_ROBOT)
-    figures = _table(statuses, health=False)
+    figures = render_table(_table(statuses, health=False), console.width)
     if console.measure(figures).maximum + _HEALTH_WIDTH <= console.width:
-        return _table(statuses, health=True)
+        return render_table(_table(statuses, health=True), console.width)
     return Group(figures, *(Text(f"{status.robot}: {describe(status)}", style=_style(status)) for status in statuses))
 
 
@@ -105,19 +119,14 @@ def _json_lines(statuses: Sequence[RobotStatus]) -> list[str]:
 
 
 def _table(statuses: Sequence[RobotStatus], health: bool) -> Table:
-    table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, int(health), 0, 0), pad_edge=False)
-    table.add_column("robot", no_wrap=True, overflow="ellipsis", max_width=None if health else _NAME_WIDTH)
-    table.add_column("frame")
-    for heading in ("x\nm", "y\nm", "deg", "±m", "±deg", "vx\nm/s", "vy\nm/s", "deg/s", "Hz", "age\nms"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    if health:
-        table.add_column("health")
+    rows = []
     for status in statuses:
-        for row, stream in enumerate(_streams(status) or (None,)):
-            words = [describe(status) if row == 0 else ""] if health else []
-            name = status.robot if row == 0 else ""
-            table.add_row(name, *_cells(status.robot, stream, by_stamp=health), *words, style=_style(status))
-    return table
+        for number, stream in enumerate(_streams(status) or (None,)):
+            words = [describe(status) if number == 0 else ""] if health else []
+            name = status.robot if number == 0 else ""
+            role: RowRole = "muted" if status.presence == "left" else "plain"
+            rows.append(Row.of(name, *_cells(status.robot, stream, by_stamp=health), *words, role=role))
+    return Table("", _COLUMNS if health else _COLUMNS[:-1], tuple(rows))
 
 
 def _style(status: RobotStatus) -> str:

@@ -54,10 +54,10 @@ def entry_table(view: DatasetView) -> Table:
         caption="Entries over their seeds",
         columns=(
             Column("Entry", numeric=False),
-            Column("Answers of runs"),
+            Column("Answers of runs", priority=1),
             Column("CF training, median"),
-            Column("Gap above exact optimum", "relative"),
-            Column("Evaluations and time, median"),
+            Column("Gap above exact optimum", "relative", priority=2),
+            Column("Evaluations and time, median", priority=3),
             Column(f"Difference from the best in CF {SPLIT_NAMES[view.scored]}"),
             Column("Verdict", numeric=False),
         ),
@@ -71,21 +71,22 @@ def entry_table(view: DatasetView) -> Table:
     )
 
 
-def run_table(view: DatasetView) -> Table:
-    """A table of every run, including those without an answer."""
+def run_table(view: DatasetView, typical: bool = False) -> Table:
+    """A table of every run, or of each entry's ``typical`` one, including those without an answer."""
+    runs = view.typical_runs if typical else view.runs
     return Table(
-        caption="Every run",
+        caption="The run of each entry with the median training cost" if typical else "Every run",
         columns=(
             Column("Entry", numeric=False),
             Column("Seed"),
             Column("Outcome", numeric=False),
-            Column("CF training"),
-            Column("CF validation"),
+            Column("CF training", priority=1),
+            Column("CF validation", priority=2),
             Column("Gap"),
             Column("Evaluations and time"),
             Column("On a bound", numeric=False),
         ),
-        rows=tuple(_run_row(view, run.record) for run in view.runs),
+        rows=tuple(_run_row(view, run.record) for run in runs),
     )
 
 

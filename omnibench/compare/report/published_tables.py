@@ -1,9 +1,9 @@
-"""Published results compared with ours in sentences: which figures agree, which do not, and why."""
+"""Published results as rows beside ours: which figures agree, and the circumstances in which they may differ."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,124 +12,90 @@ from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_NAME, Dataset
 from omnibench.compare.report.wording import cost_decimals
 from omnibench.compare.result import EntryStatistics, Interval
 from omnibench.data.dataset import SPLITS, Split, Trajectory
-from omnibench.report.blocks import Block, Callout
-from omnibench.report.numbers import fixed, listing, percent, span
+from omnibench.report.blocks import Block, Callout, Cell, Column, Row, Table
+from omnibench.report.numbers import NOTHING, fixed, listing, percent, span
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
 _PUBLISHED_COST = "final_pose"  # published costs are those of Eq. (6)
-_SCATTER = 0.75  # share of the calibrated cost: above it the cost is called "mostly" scatter (chosen)
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One of our figures compared with the published ones, in a sentence. alike: True where they agree."""
-
-    alike: bool
-    words: str
+_UNKNOWN = "not known"
 
 
 def published_blocks(view: DatasetView) -> tuple[Block, ...]:
-    """Our figures compared with the published ones, and reasons why they differ; nothing where none are published."""
-    results = view.config.published_results
-    if not results:
+    """Our figures beside the published ones, and the circumstances of both; nothing where none are published."""
+    if not view.config.published_results:
         return ()
     if view.config.cost.name != _PUBLISHED_COST:
         remark = f"They are of the cost {_PUBLISHED_COST}, Eq. (6); this comparison's is {view.config.cost.name}."
         return (Callout("The published costs cannot be set beside these", (remark,), "warning"),)
-    compared = findings(view)
-    sources = listing(list(dict.fromkeys(result.source for result in results)))
-    return (
-        Callout(f"As published ({sources})", tuple(finding.words for finding in compared if finding.alike), "good"),
-        Callout(f"Not as published ({sources})", tuple(finding.words for finding in compared if not finding.alike)),
-        Callout("Why they are alike, or are not", tuple(_reasons(view))),
-    )
+    return (_figure_table(view), _circumstance_table(view))
 
 
-def findings(view: DatasetView) -> list[Finding]:
+@dataclass(frozen=True)
+class ComparedFigure:
+    """One of our figures with its 95 % interval, and the published ones: costs, or shares where ``is_share``."""
+
+    name: str
+    ours: Interval
+    published: tuple[float, ...]
+    is_share: bool
+
+    @property
+    def alike(self) -> bool:
+        """True if our interval contains a published figure."""
+        return any(self.ours.low <= value <= self.ours.high for value in self.published)
+
+    @property
+    def difference(self) -> str:
+        """Our figure relative to the nearest published one, or for shares the percentage points between them."""
+        nearest = min(self.published, key=lambda value: abs(value - self.ours.value))
+        if self.is_share:
+            return f"{fixed(100 * (self.ours.value - nearest), 1, signed=True)} points"
+        return percent(self.ours.value / nearest - 1, signed=True)
+
+
+def compared_figures(view: DatasetView) -> list[ComparedFigure]:
     """Theoretical cost, calibrated cost and improvement on each split; then the change from training to validation."""
     best = view.best
     calibrated = None if best is None or best.calibrator == THEORETICAL_NAME else best
-    compared = [finding for split in view.splits for finding in _of_split(view, split, calibrated)]
-    return compared + _over_time(view, calibrated)
+    figures = [figure for split in view.splits for figure in _of_split(view, split, calibrated)]
+    return [*figures, *_over_time(view, calibrated)]
 
 
-def _of_split(view: DatasetView, split: Split, best: EntryStatistics | None) -> list[Finding]:
-    """Costs before and after calibration, and the improvement, compared with those published for the split."""
-    decimals, name = cost_decimals(view), SPLIT_NAMES[split]
+def _of_split(view: DatasetView, split: Split, best: EntryStatistics | None) -> Iterator[ComparedFigure]:
     published = _published(view, split)
     if not published:
-        return []
+        return
     before, after = zip(*published, strict=True)
-    compared = []
+    name = SPLIT_NAMES[split]
     if split in view.design_costs:
-        compared.append(_compared_cost(f"Theoretical cost, {name}", view.design_costs[split], before, decimals))
+        yield ComparedFigure(f"Theoretical cost, {name}", view.design_costs[split], before, False)
     if best is None:
-        return compared
-    reached, fell = best.cost(split), best.improvement(split)
-    if reached is not None:
-        compared.append(_compared_cost(f"Calibrated cost, {name} ({best.label})", reached, after, decimals))
-    if fell is not None:
-        improvements = [1 - low / high for high, low in published]
-        compared.append(_compared_improvement(f"Improvement, {name} ({best.label})", fell, improvements))
-    return compared
+        return
+    if (reached := best.cost(split)) is not None:
+        yield ComparedFigure(f"Calibrated cost, {name} ({best.label})", reached, after, False)
+    if (fell := best.improvement(split)) is not None:
+        shares = tuple(1 - low / high for high, low in published)
+        yield ComparedFigure(f"Improvement, {name} ({best.label})", fell, shares, True)
 
 
-def _compared_cost(what: str, ours: Interval, published: Sequence[float], decimals: int) -> Finding:
-    """A cost compared with the published ones: alike where its interval contains one of them."""
-    inside = any(ours.low <= value <= ours.high for value in published)
-    nearest = min(published, key=lambda value: abs(value - ours.value))
-    ratio = ours.value / nearest - 1
-    theirs = listing([fixed(value, 4) for value in dict.fromkeys(published)])
-    place = "inside the interval" if inside else f"ours is {percent(abs(ratio))} {'above' if ratio > 0 else 'below'}"
-    return Finding(
-        inside,
-        f"{what}: {fixed(ours.value, decimals)} (95 % interval {span(ours.low, ours.high, decimals)}), published "
-        f"{theirs}: {place}.",
-    )
-
-
-def _compared_improvement(what: str, ours: Interval, published: Sequence[float]) -> Finding:
-    """An improvement compared with the published ones: alike where its interval contains one of them."""
-    inside = any(ours.low <= value <= ours.high for value in published)
-    nearest = min(published, key=lambda value: abs(value - ours.value))
-    points = 100 * (ours.value - nearest)
-    theirs = listing([percent(value) for value in dict.fromkeys(published)])
-    more = f"ours is {fixed(abs(points), 1)} percentage points {'more' if points > 0 else 'less'}"
-    return Finding(
-        inside,
-        f"{what}: {percent(ours.value)} (95 % interval {span(100 * ours.low, 100 * ours.high, 1)} %), published "
-        f"{theirs}: {'inside the interval' if inside else more}.",
-    )
-
-
-def _over_time(view: DatasetView, best: EntryStatistics | None) -> list[Finding]:
-    """Findings about the change of the cost from training to validation, before and after calibration."""
+def _over_time(view: DatasetView, best: EntryStatistics | None) -> Iterator[ComparedFigure]:
+    """The change of the cost from training to validation, before and after calibration."""
     pairs = [[result.costs(split) for split in SPLITS] for result in view.config.published_results]
     published = [(train, validation) for train, validation in pairs if train is not None and validation is not None]
     kinds = (
         ("theoretical", [view.design_costs.get(split) for split in SPLITS], 0),
         ("calibrated", [None if best is None else best.cost(split) for split in SPLITS], 1),
     )
-    compared = []
     for name, (train, validation), kind in kinds:
         if train is None or validation is None or not published:
             continue
         change = validation.value / train.value - 1
-        changes = [later[kind] / earlier[kind] - 1 for earlier, later in published]
         # Both splits are samples, so that the interval of the change is about that of the two together.
         spread = math.hypot(*((cost.high - cost.low) / 2 / cost.value for cost in (train, validation)))
-        inside = any(abs(change - value) <= spread for value in changes)
-        theirs = listing([percent(value, signed=True) for value in dict.fromkeys(changes)])
-        compared.append(
-            Finding(
-                inside,
-                f"From training to validation the {name} cost changes by {percent(change, signed=True)} (± "
-                f"{percent(spread)} by chance), published {theirs}: "
-                f"{'within chance' if inside else 'more apart than chance explains'}.",
-            )
-        )
-    return compared
+        changes = tuple(later[kind] / earlier[kind] - 1 for earlier, later in published)
+        ours = Interval(value=change, low=change - spread, high=change + spread)
+        yield ComparedFigure(f"Change of the {name} cost to validation", ours, changes, True)
 
 
 def _published(view: DatasetView, split: Split) -> list[tuple[float, float]]:
@@ -138,52 +104,75 @@ def _published(view: DatasetView, split: Split) -> list[tuple[float, float]]:
     return [pair for pair in costs if pair is not None]
 
 
-def _reasons(view: DatasetView) -> list[str]:
-    """Reasons, from the data and the config, why our figures differ from the published ones."""
+def _figure_table(view: DatasetView) -> Table:
+    rows = []
+    for figure in compared_figures(view):
+        ours, decimals = figure.ours, 1 if figure.is_share else cost_decimals(view)
+        factor, unit = (100.0, " %") if figure.is_share else (1.0, "")
+        interval = f"{span(factor * ours.low, factor * ours.high, decimals)}{unit}"
+        theirs = (f"{fixed(factor * value, 1 if figure.is_share else 4)}{unit}" for value in figure.published)
+        rows.append(
+            Row.of(
+                figure.name,
+                Cell(f"{fixed(factor * ours.value, decimals)}{unit}", interval),
+                listing(list(dict.fromkeys(theirs))),
+                figure.difference,
+                "as published" if figure.alike else "not as published",
+            )
+        )
+    sources = listing(list(dict.fromkeys(result.source for result in view.config.published_results)))
+    return Table(
+        f"Beside the published figures ({sources})",
+        (
+            Column("Figure", numeric=False),
+            Column("Here"),
+            Column("Published"),
+            Column("From the nearest"),
+            Column("Verdict", numeric=False),
+        ),
+        tuple(rows),
+        "As published: the 95 % interval (small print) contains a published figure.",
+    )
+
+
+def _circumstance_table(view: DatasetView) -> Table:
     config, dataset, split = view.config, view.dataset, view.scored
     runs = dataset.split(split)
     origin = "simulated" if dataset.simulated else "recorded by another robot, or at another time"
-    reasons = [f"The data are others: these are {origin}, {plural(len(runs), 'run')} for {SPLIT_NAMES[split]}."]
-    distance = float(np.mean([_length(run) for run in runs]))
     systematic, _ = _parts(view.design_errors[split], runs)
-    theoretical = (
+    boxes = {entry.box for entry, _ in view.calibrated if entry.parameterisation == "matrix"}
+    rows = [
+        Row.of("Data", Cell(origin, f"{plural(len(runs), 'run')} for {SPLIT_NAMES[split]}"), NOTHING),
+        Row.of("Distance of a run, mean", f"{fixed(float(np.mean([_length(run) for run in runs])), 2)} m", _UNKNOWN),
+        Row.of("Miss of a command's mean end by the design values", fixed(systematic, 4), _UNKNOWN),
+        *_scatter_rows(view, runs),
+        Row.of("Odometry", "exact arcs" if config.integration == "arc" else "Euler steps", "Euler steps, Eq. (1)"),
+        Row.of("Box of the matrix", listing(sorted(boxes)) or NOTHING, "±10 % of each element"),
+    ]
+    return Table(
+        "In which circumstances",
+        (Column("Circumstance", numeric=False), Column("Here", numeric=False), Column("Published", numeric=False)),
+        tuple(rows),
         "The theoretical cost comes from deviations of the wheels from their design values, and grows with the "
-        f"distance driven: {fixed(distance, 2)} m a run here; the published lengths are not known."
+        "distance driven. Scatter of repetitions can come from the reference, from slip and from the encoders; no "
+        f"matrix can remove it.{' See also the notes of the config above.' if config.notes else ''}",
     )
-    if systematic is not None:
-        theoretical += f" The design values miss the mean end of a command's runs by {fixed(systematic, 4)} on average."
-    reasons.append(theoretical)
-    reasons += _floor(view, runs)
-    if config.integration == "arc":
-        reasons.append("Odometry is by exact arcs here; the published costs are of the Euler steps of Eq. (1).")
-    boxes = {entry.box for entry, _ in view.calibrated if entry.parameterisation == "matrix"} - {"paper"}
-    if boxes:
-        reasons.append("Some entries search a wider box than the published ±10 % of each element; tables name the box.")
-    if config.notes:
-        reasons.append("What the config's author says of it stands at the top of the report.")
-    return reasons
 
 
-def _floor(view: DatasetView, runs: Sequence[Trajectory]) -> list[str]:
+def _scatter_rows(view: DatasetView, runs: Sequence[Trajectory]) -> Iterator[Row]:
     """The share of the calibrated cost that no matrix could remove: the scatter of repetitions of one command."""
     best = view.best
     if best is None or best.typical is None or best.calibrator == THEORETICAL_NAME:
-        return []
+        return
     errors, reached = view.errors(best.typical, view.scored), best.cost(view.scored)
     if errors is None or reached is None:
-        return []
+        return
     _, scatter = _parts(errors, runs)
-    if scatter is None:
-        return ["No command was repeated, so how much of the calibrated cost is noise cannot be told from the data."]
-    share = scatter / reached.value
-    published = [after for _, after in _published(view, view.scored)]
-    floor = f"floor of {fixed(min(published), 4)}" if published else "floor"
-    return [
-        f"The calibrated cost is {'mostly ' if share > _SCATTER else 'in part '}scatter: after calibration, "
-        f"repetitions of one command end {fixed(scatter, 4)} from their mean ({percent(share, 0)} of the cost), which "
-        "no matrix can remove. It can come from the reference, from slip and from the encoders; how large it was where "
-        f"the published {floor} comes from is not known."
-    ]
+    here = Cell("no command was repeated")
+    if scatter is not None:
+        here = Cell(fixed(scatter, 4), f"{percent(scatter / reached.value, 0)} of the cost")
+    floor = min((after for _, after in _published(view, view.scored)), default=None)
+    yield Row.of("Scatter of a command's repetitions", here, Cell(_UNKNOWN, "" if floor is None else f"of {floor:.4f}"))
 
 
 def _parts(errors: Array, runs: Sequence[Trajectory]) -> tuple[float | None, float | None]:

@@ -83,6 +83,12 @@ class DatasetView:
         ]
 
     @property
+    def typical_runs(self) -> list[ScoredRun]:
+        """The run of each entry with the median training cost; its first where none gave an answer."""
+        first = {run.record.label: run for run in reversed(self.runs)}
+        return [entry.typical or first[entry.label] for entry in self.statistics]
+
+    @property
     def reference_entry(self) -> tuple[EntryStatistics, ScoredRun] | None:
         """The entry that matrices are compared with: the exact optimum, else the best calibration."""
         exact = [pair for pair in self.calibrated if calibrators.entry(pair[0].calibrator).cls.exact]

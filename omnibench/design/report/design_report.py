@@ -6,36 +6,29 @@ from pathlib import Path
 
 from omnibench.design.report.design_figures import efficiency_figure, path_figures, precision_figures
 from omnibench.design.report.design_wording import (
-    UNIT_OF_COST,
     USE_IN_WORDS,
     baseline_runs,
     choice_in_words,
-    command_in_words,
     duration_in_words,
-    effort_in_words,
     equal_in_words,
     headline,
-    least_in_words,
     origin_in_words,
 )
-from omnibench.design.result import Candidate, Design, SetDesign
+from omnibench.design.report.tables import candidate_table, chosen_table, equal_table, promise_table
+from omnibench.design.result import Design
 from omnibench.report.blocks import (
     Badge,
     Block,
     Callout,
-    Cell,
-    Column,
     Details,
     Document,
     Fact,
     Facts,
     Paragraph,
-    Row,
     Section,
-    Table,
     simulated_badge,
 )
-from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, significant
+from omnibench.report.numbers import listing, percent, significant
 from omnibench.report.render import write_document
 from omnibench.words import plural
 
@@ -53,7 +46,7 @@ def design_document(design: Design) -> Document:
         sections=(
             Section("result", "Result", _result(design)),
             Section("commands", "Chosen commands", _commands(design)),
-            Section("precision", "Precision against runs", _precision(design)),
+            Section("precision", "Precision against runs", (precision_figures(design), promise_table(design))),
             Section("efficiency", "Efficiency against the bound", (efficiency_figure(design),)),
             Section("basis", "What this rests on", _basis(design)),
         ),
@@ -87,45 +80,8 @@ def _result(design: Design) -> tuple[Block, ...]:
     return (
         Paragraph(headline(design), "lead"),
         Facts(tuple(tiles), "tiles"),
-        _equal_table(design),
+        equal_table(design),
         Callout("Before you read on", design.notes),
-    )
-
-
-def _equal_table(design: Design) -> Table:
-    rows = []
-    for of_set in design.sets:
-        for equal in of_set.equivalents:
-            effort = equal.effort
-            reason = (
-                "they leave part of the matrix undetermined"
-                if equal.least is None
-                else "not within the repetitions allowed"
-            )
-            cells = [Cell(NOTHING, reason), Cell(NOTHING), Cell(NOTHING)]
-            if effort is not None:
-                cells = [
-                    Cell(count(effort.runs)),
-                    Cell(duration_in_words(effort.seconds)),
-                    Cell(f"{significant(effort.metres, 3)} m"),
-                ]
-            least = NOTHING if equal.least is None else least_in_words(equal.least)
-            rows.append(Row((Cell(of_set.name), Cell(USE_IN_WORDS[equal.use]), *cells, Cell(least))))
-    effort = design.baseline.precision.effort
-    return Table(
-        f"As good as the baseline: {design.baseline.name} ({effort_in_words(effort)})",
-        (
-            Column("Candidates", numeric=False),
-            Column("Calibrated from", numeric=False),
-            Column("Runs"),
-            Column("Time"),
-            Column("Distance"),
-            Column("Bound", UNIT_OF_COST[design.per]),
-        ),
-        tuple(rows),
-        "The smallest design found whose det(information)^(1/p) is at least the baseline's; no design at all can do "
-        "it with less than the bound in the last column. Final poses are taken as Eq. (6) does, with equal noise in m "
-        "and rad; whole trajectories by every reference pose under the noise model.",
     )
 
 
@@ -134,85 +90,11 @@ def _commands(design: Design) -> tuple[Block, ...]:
     for of_set in design.sets:
         blocks += [
             Paragraph(f"{of_set.name}: {choice_in_words(design, of_set)}"),
-            _chosen_table(design, of_set),
+            chosen_table(design, of_set),
         ]
         equal = f"{of_set.name} equals the baseline with {equal_in_words(design, of_set, design.use)}"
         blocks.append(Paragraph(f"{equal}, calibrated from {USE_IN_WORDS[design.use]}.", "note"))
     return tuple(blocks)
-
-
-def _chosen_table(design: Design, of_set: SetDesign) -> Table:
-    rows = tuple(
-        Row(
-            (
-                *_command_cells(design.candidate(chosen.command)),
-                Cell(count(chosen.runs)),
-                Cell(percent(of_set.optimum.shares.get(chosen.command, 0.0))),
-            )
-        )
-        for chosen in of_set.chosen
-    )
-    unit = {"run": "runs", "second": "time", "metre": "wheels' distance"}[design.per]
-    return Table(
-        f"What to drive of {of_set.name}: {effort_in_words(of_set.step.effort)}",
-        (*_COMMAND_COLUMNS, Column("Runs"), Column("Continuous optimum", f"share of the {unit}")),
-        rows,
-        "Other choices may be as good: turning all directions of a design by the same angle often changes nothing.",
-    )
-
-
-_COMMAND_COLUMNS = (
-    Column("Command", numeric=False),
-    Column("Duration", "s"),
-    Column("Distance", "m"),
-    Column("Wheels roll", "m"),
-)
-
-
-def _command_cells(candidate: Candidate) -> tuple[Cell, ...]:
-    return (
-        Cell(command_in_words(candidate), candidate.name),
-        Cell(fixed(candidate.duration_s, 2)),
-        Cell(fixed(candidate.distance_m, 2)),
-        Cell(fixed(candidate.rolled_m, 2)),
-    )
-
-
-def _precision(design: Design) -> tuple[Block, ...]:
-    physical = design.baseline.precision.physical is not None
-    columns = [
-        Column("Runs"),
-        Column("Time"),
-        Column("Against the baseline"),
-        *(Column(f"Row {number}", "% of largest") for number in (1, 2, 3)),
-    ]
-    if physical:
-        columns += [Column("Radius", "%"), Column("Distance", "%"), Column("Angle", "deg")]
-    rows = []
-    for title, precision in (
-        *((of_set.name, of_set.step) for of_set in design.sets),
-        (f"baseline: {design.baseline.name}", design.baseline.precision),
-    ):
-        cells = [
-            Cell(title),
-            Cell(count(precision.effort.runs)),
-            Cell(duration_in_words(precision.effort.seconds)),
-            Cell(f"× {significant(precision.relative, 3)}"),
-            *(Cell(significant(value, 3)) for value in precision.row_percent),
-        ]
-        if precision.physical is not None:
-            spread = precision.physical
-            values = (spread.radius_percent, spread.distance_percent, spread.angle_deg)
-            cells += [Cell(significant(value, 3)) for value in values]
-        rows.append(Row(tuple(cells)))
-    table = Table(
-        "Standard deviations that the chosen runs promise",
-        (Column("Design", numeric=False), *columns),
-        tuple(rows),
-        "Of each row, and of each kind of physical parameter, the largest. They fall with the root of the number of "
-        "runs when a design is repeated.",
-    )
-    return (precision_figures(design), table)
 
 
 def _basis(design: Design) -> tuple[Block, ...]:
@@ -241,9 +123,7 @@ def _basis(design: Design) -> tuple[Block, ...]:
             listing([f"{of_set.name}: within {100 * of_set.optimum.gap:.1g} % of its bound" for of_set in design.sets]),
         ),
     )
-    rows = tuple(Row(_command_cells(candidate)) for candidate in design.candidates)
-    table = Table(f"All {len(rows)} candidates", _COMMAND_COLUMNS, rows)
-    return (Facts(facts), Details(f"All candidates ({len(rows)})", (table,)))
+    return (Facts(facts), Details(f"All candidates ({len(design.candidates)})", (candidate_table(design),)))
 
 
 def _small(value: float) -> str:

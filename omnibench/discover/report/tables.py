@@ -48,8 +48,8 @@ def dependence_table(dependences: Sequence[CovariateDependence], caption: str) -
             Column("Residual over", numeric=False),
             Column("In words", numeric=False),
             Column("Chance"),
-            Column("Excess", "χ²"),
-            Column("Degrees of freedom"),
+            Column("Excess", "χ²", priority=1),
+            Column("Degrees of freedom", priority=2),
         ),
         rows,
         "Chance: how often noise alone would give as much in any of the covariates that were tried. Excess: whitened "
@@ -111,7 +111,7 @@ _GAP_COLUMNS = (
     Column("After"),
     Column("Floor"),
     Column("Closed"),
-    Column("Std. error of the gap"),
+    Column("Std. error of the gap", priority=1),
 )
 
 
@@ -187,10 +187,10 @@ def hidden_table(hidden: Sequence[Hidden]) -> Table:
             Column("Effect", numeric=False),
             Column("Parameter", numeric=False),
             Column("At most (95 %)"),
-            Column("Found nearly always above"),
+            Column("Found nearly always above", priority=2),
             Column("Plausible"),
             Column("Unit", numeric=False),
-            Column("Of the plausible"),
+            Column("Of the plausible", priority=1),
         ),
         tuple(rows),
         "At most: its parameter lies within ± this with 95 %, given what was added.",

@@ -1,18 +1,20 @@
-"""Tables of the errors of reference poses against the truth: final and overall errors, drift, bias, NEES."""
+"""Tables of reference poses by SLAM: stated deviations, and errors against the truth with drift, bias and NEES."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from omnibench.report.blocks import Block, Cell, Column, Fact, Facts, Row, Table
 from omnibench.report.numbers import NOTHING, significant
 from omnibench.slam.accuracy import ErrorSummary, SlamAccuracy
+from omnibench.slam.summary import SlamSummary
 from omnibench.words import plural
 
 
 def accuracy_blocks(accuracy: SlamAccuracy) -> tuple[Block, ...]:
     """The errors of reference poses against the truth, as tiles and as tables."""
-    return (_tiles(accuracy), _errors(accuracy), _biases(accuracy))
+    return (_tiles(accuracy), error_table(accuracy), bias_table(accuracy))
 
 
 def _tiles(accuracy: SlamAccuracy) -> Facts:
@@ -30,35 +32,28 @@ def _tiles(accuracy: SlamAccuracy) -> Facts:
     )
 
 
-def _errors(accuracy: SlamAccuracy) -> Table:
+def error_table(accuracy: SlamAccuracy) -> Table:
+    """The errors of the last pose of each run, and of all poses."""
     rows = []
     for name, summary in _summaries(accuracy):
-        values = [
-            *(_mm(v) for v in (summary.position_mean_m, summary.position_p95_m, summary.position_max_m)),
-            *(_degrees(v) for v in (summary.heading_mean_rad, summary.heading_p95_rad, summary.heading_max_rad)),
-            _nees(summary),
-        ]
-        rows.append(Row((Cell(name, f"{plural(summary.poses, 'pose')}"), *(Cell(value) for value in values))))
+        positions = (summary.position_mean_m, summary.position_p95_m, summary.position_max_m)
+        headings = (summary.heading_mean_rad, summary.heading_p95_rad, summary.heading_max_rad)
+        rows.append(Row.of(Cell(name, plural(summary.poses, "pose")), *_figures(positions, headings), _nees(summary)))
     return Table(
         caption="Errors of the reference poses against the truth",
-        columns=(
-            Column("Poses", numeric=False),
-            *(Column(f"position, {which}", "mm") for which in ("mean", "95 %", "worst")),
-            *(Column(f"heading, {which}", "°") for which in ("mean", "95 %", "worst")),
-            Column("NEES, mean"),
-        ),
+        columns=(*_FIGURES, Column("NEES, mean")),
         rows=tuple(rows),
         note=f"{plural(accuracy.runs, 'run')}, {significant(accuracy.distance_m, 4)} m in all. Drift: the "
         "growth k of the error over the distance s, from error² = noise² + (k s)²; 0 where it does not grow.",
     )
 
 
-def _biases(accuracy: SlamAccuracy) -> Table:
+def bias_table(accuracy: SlamAccuracy) -> Table:
+    """The mean errors along the robot's axes."""
     rows = []
     for name, summary in _summaries(accuracy):
         lengths = (_mm(v, signed=True) for v in (summary.bias_forward_m, summary.bias_left_m))
-        cells = (Cell(name), *map(Cell, lengths), Cell(_degrees(summary.bias_heading_rad, signed=True)))
-        rows.append(Row(cells))
+        rows.append(Row.of(name, *lengths, _degrees(summary.bias_heading_rad, signed=True)))
     return Table(
         caption="Mean error along the robot's axes",
         columns=(
@@ -70,6 +65,37 @@ def _biases(accuracy: SlamAccuracy) -> Table:
         rows=tuple(rows),
         note="The signed mean of the errors: 0 for a reference without bias.",
     )
+
+
+def summary_table(summary: SlamSummary) -> Table:
+    """The deviations that SLAM states, and the distances from the reference poses that were recorded."""
+    deviations = _figures(
+        (summary.position_deviation_mean_m, None, summary.position_deviation_max_m),
+        (summary.heading_deviation_mean_rad, None, summary.heading_deviation_max_rad),
+    )
+    rows = [Row.of("deviation stated at the end of a run", *deviations)]
+    if summary.recorded is not None:
+        recorded = summary.recorded
+        name = Cell("distance from the recorded reference", plural(recorded.poses, "pose"))
+        distances = _figures(
+            (recorded.position_mean_m, recorded.position_p95_m, None),
+            (recorded.heading_mean_rad, recorded.heading_p95_rad, None),
+        )
+        rows.append(Row.of(name, *distances))
+    return Table("Reference poses from the scans", _FIGURES, tuple(rows))
+
+
+_FIGURES = (
+    Column("Poses", numeric=False),
+    *(Column(f"position, {which}", "mm") for which in ("mean", "95 %", "worst")),
+    *(Column(f"heading, {which}", "°") for which in ("mean", "95 %", "worst")),
+)
+
+
+def _figures(metres: Sequence[float | None], radians: Sequence[float | None]) -> list[str]:
+    """Mean, 95th percentile and maximum of positions in mm, then of headings in degrees."""
+    lengths = [NOTHING if value is None else _mm(value) for value in metres]
+    return lengths + [NOTHING if value is None else _degrees(value) for value in radians]
 
 
 def _summaries(accuracy: SlamAccuracy) -> tuple[tuple[str, ErrorSummary], ...]:

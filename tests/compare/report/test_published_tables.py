@@ -1,4 +1,4 @@
-"""Our figures beside those that were published: what the report says is alike, what is not, and why."""
+"""Our figures beside those that were published: which are alike, by how much others differ, in which circumstances."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from report_samples import config, flower, run, statistics
 
-from omnibench.compare.report.published_tables import findings, published_blocks
+from omnibench.compare.report.published_tables import ComparedFigure, compared_figures, published_blocks
 from omnibench.compare.report.view import DatasetView, views
 from omnibench.compare.result import ComparisonResult
-from omnibench.report.blocks import Callout
+from omnibench.report.blocks import Callout, Row, Table
 
 
 @pytest.fixture(scope="module")
@@ -40,61 +40,73 @@ def scaled(result: ComparisonResult, before: float, after: float) -> dict[str, f
     }
 
 
-def words(view: DatasetView, alike: bool) -> str:
-    """The findings of one kind."""
-    return "\n".join(found.words for found in findings(view) if found.alike is alike)
+def figures(view: DatasetView, alike: bool) -> dict[str, ComparedFigure]:
+    """The figures that are like published ones, or those that are not, by name."""
+    return {figure.name: figure for figure in compared_figures(view) if figure.alike is alike}
 
 
-def reasons(view: DatasetView) -> str:
-    """What is said of why."""
-    return "\n".join(next(block.items for block in published_blocks(view) if "Why" in block.title))
+def circumstances(view: DatasetView) -> dict[str, Row]:
+    """The rows on circumstances, by the circumstance."""
+    _, table = published_blocks(view)
+    assert isinstance(table, Table)
+    return {row.cells[0].text: row for row in table.rows}
+
+
+def here(view: DatasetView, circumstance: str) -> str:
+    """Our side of a circumstance."""
+    return circumstances(view)[circumstance].cells[1].text
+
+
+SCATTER = "Scatter of a command's repetitions"
 
 
 def test_figures_equal_to_ours_are_alike(result: ComparisonResult) -> None:
     view = with_published(result, scaled(result, 1.0, 1.0))
-    assert words(view, alike=False) == ""
-    assert len(findings(view)) == 8
-    assert words(view, alike=True).count("inside the interval") == 6
+    assert not figures(view, alike=False)
+    assert len(compared_figures(view)) == 8
+    table, _ = published_blocks(view)
+    assert isinstance(table, Table)
+    assert [row.cells[-1].text for row in table.rows] == ["as published"] * 8
+    assert table.rows[0].cells[3].text == "0.0 %"
 
 
 def test_a_published_floor_twice_as_high_is_not_as_ours(result: ComparisonResult) -> None:
     view = with_published(result, scaled(result, 1.0, 2.0))
-    told = words(view, alike=False).splitlines()
-    assert [line.split(":")[0] for line in told] == [
+    differ = figures(view, alike=False)
+    assert list(differ) == [
         "Calibrated cost, training (closed_form)",
         "Improvement, training (closed_form)",
         "Calibrated cost, validation (closed_form)",
         "Improvement, validation (closed_form)",
     ]
-    assert told[0].endswith("ours is 50.0 % below.")
-    assert "percentage points more" in told[1]
-    assert words(view, alike=True).count("Theoretical cost") == 2
+    assert differ["Calibrated cost, training (closed_form)"].difference == "−50.0 %"
+    improvement = differ["Improvement, training (closed_form)"].difference
+    assert improvement.startswith("+")
+    assert improvement.endswith(" points")
+    assert {"Theoretical cost, training", "Theoretical cost, validation"} <= set(figures(view, alike=True))
 
 
 def test_a_published_theoretical_cost_half_of_ours_is_not_as_ours(result: ComparisonResult) -> None:
-    told = words(with_published(result, scaled(result, 0.5, 1.0)), alike=False)
-    assert "Theoretical cost, training" in told
-    assert "ours is 100.0 % above." in told
+    differ = figures(with_published(result, scaled(result, 0.5, 1.0)), alike=False)
+    assert differ["Theoretical cost, training"].difference == "+100.0 %"
 
 
 def test_a_cost_that_rises_over_time_as_ours_does_not_is_told(result: ComparisonResult) -> None:
-    figures = scaled(result, 1.0, 1.0)
-    figures["validation_cost"] *= 3
-    told = words(with_published(result, figures), alike=False)
-    assert "From training to validation the calibrated cost changes" in told
-    assert "more apart than chance explains" in told
+    published = scaled(result, 1.0, 1.0)
+    published["validation_cost"] *= 3
+    assert "Change of the calibrated cost to validation" in figures(with_published(result, published), alike=False)
 
 
 def test_the_nearest_of_several_published_figures_counts(result: ComparisonResult) -> None:
     view = with_published(result, scaled(result, 1.0, 2.0), scaled(result, 1.0, 1.0))
-    assert words(view, alike=False) == ""
+    assert not figures(view, alike=False)
 
 
 def test_published_figures_without_validation_are_compared_on_training_only(result: ComparisonResult) -> None:
-    figures = {name: value for name, value in scaled(result, 1, 1).items() if "validation" not in name}
-    told = findings(with_published(result, figures))
-    assert len(told) == 3
-    assert not any("validation" in found.words for found in told)
+    published = {name: value for name, value in scaled(result, 1, 1).items() if "validation" not in name}
+    compared = compared_figures(with_published(result, published))
+    assert len(compared) == 3
+    assert not any("validation" in figure.name for figure in compared)
 
 
 def test_costs_of_another_kind_are_not_set_beside_the_published_ones(result: ComparisonResult) -> None:
@@ -112,25 +124,23 @@ def test_the_scatter_of_repetitions_is_what_noise_alone_makes() -> None:
     truth = {"published": "palacin2023_eq8"}
     many = flower(noise=noise, truth=truth, repetitions=40)
     result = run(config(datasets={"f": {"simulate": many}}, calibrators=["closed_form"], seeds=[1]))
-    told = reasons(with_published(result, scaled(result, 1, 1)))
-    scatter = float(told.split("repetitions of one command end ")[1].split(" from")[0])
+    cell = circumstances(with_published(result, scaled(result, 1, 1)))[SCATTER].cells[1]
     # The mean norm of three normal errors of 5 mm or mrad each.
-    assert scatter == pytest.approx(0.005 * math.sqrt(8 / math.pi), rel=0.05)
-    assert "mostly scatter" in told
+    assert float(cell.text) == pytest.approx(0.005 * math.sqrt(8 / math.pi), rel=0.05)
+    assert float(cell.note.split(" %")[0]) > 75
 
 
 def test_data_without_repetitions_say_that_their_noise_cannot_be_told() -> None:
     once = {"f": {"simulate": flower(repetitions=1)}}
     result = run(config(datasets=once, calibrators=["closed_form"], seeds=[1]))
-    assert "cannot be told from the data" in reasons(with_published(result, scaled(result, 1, 1)))
+    assert here(with_published(result, scaled(result, 1, 1)), SCATTER) == "no command was repeated"
 
 
-def test_the_way_driven_and_the_odometry_are_among_the_reasons(result: ComparisonResult) -> None:
-    told = reasons(with_published(result, scaled(result, 1, 1)))
-    assert "1.20 m a run here" in told
-    assert "exact arcs here" in told
-    euler = reasons(with_published(result, scaled(result, 1, 1), integration="euler"))
-    assert "exact arcs" not in euler
+def test_the_way_driven_and_the_odometry_are_among_the_circumstances(result: ComparisonResult) -> None:
+    view = with_published(result, scaled(result, 1, 1))
+    assert here(view, "Distance of a run, mean") == "1.20 m"
+    assert here(view, "Odometry") == "exact arcs"
+    assert here(with_published(result, scaled(result, 1, 1), integration="euler"), "Odometry") == "Euler steps"
 
 
 def test_systematic_error_is_that_of_the_commands_means(result: ComparisonResult) -> None:
@@ -138,4 +148,4 @@ def test_systematic_error_is_that_of_the_commands_means(result: ComparisonResult
     errors = view.design_errors["validation"]
     commands = [trajectory.command for trajectory in view.dataset.split("validation")]
     means = [np.linalg.norm(errors[[c == name for c in commands]].mean(axis=0)) for name in dict.fromkeys(commands)]
-    assert f"runs by {np.mean(means):.4f} on average" in reasons(view)
+    assert here(view, "Miss of a command's mean end by the design values") == f"{np.mean(means):.4f}"
