@@ -6,10 +6,12 @@ import re
 from io import StringIO
 
 import pytest
+from report_page import Page
 from rich.console import Console
 
 from omnibench.cli.terminal.tables import in_brief, print_table
-from omnibench.report.blocks import Cell, Column, Row, Table
+from omnibench.report.blocks import Cell, Column, Document, Row, Section, Table
+from omnibench.report.render import render
 
 NUMBERS = ("0.1387", "0.1301", "0.1465", "0.0387", "0.0301", "0.0465", "72.11 %", "9.3 × 10⁻⁹", "5.58 s")
 TABLE = Table(
@@ -83,3 +85,13 @@ def test_in_brief_a_table_has_neither_notes_nor_lesser_columns() -> None:
     for left_out in ("Improvement", "Gap", "0.0465", "As Table 2", "left out"):
         assert left_out not in text
     assert "Published elsewhere" in text
+
+
+def test_one_description_gives_the_cells_of_the_report_and_of_the_terminal() -> None:
+    page = Page(render(Document("Report", "", (Section("costs", "Costs", (TABLE,)),))))
+    shown = [[" ".join(cell.split()) for cell in row] for row in page.tables[TABLE.caption]]
+    below_heading = printed(TABLE, 240).split("─\n")[1].splitlines()[:-1]
+    assert shown[0] == [column.title + f" ({column.unit})" * bool(column.unit) for column in TABLE.columns]
+    assert [re.sub(r" \| (.+)", r" (\1)", cell) for row in shown[1:] for cell in row] == [
+        cell for line in below_heading for cell in re.split(r" {2,}", line.strip())
+    ]
