@@ -133,10 +133,10 @@ def _pictures(
     runs = representative_runs(dataset)
     odometry = OdometryModel.of_design(dataset.robot, "arc")
     from_start = {run.id: _outlines(plan, starts.get(run.id)) for run in runs.values()}
-    placed = {run.id: [placed(run.start, outline) for outline in from_start[run.id]] for run in runs.values()}
+    walls = {run.id: [placed(run.start, outline) for outline in from_start[run.id]] for run in runs.values()}
     first = next(iter(runs.values()))
     rooms: dict[str, tuple[Block, ...]] = {
-        name: (one_run(dataset, run, odometry, truth.get(run.id), placed[run.id]),) for name, run in runs.items()
+        name: (one_run(dataset, run, odometry, truth.get(run.id), walls[run.id]),) for name, run in runs.items()
     }
     wheels: dict[str, tuple[Block, ...]] = {name: (wheel_rates(run, dataset.robot),) for name, run in runs.items()}
     exactness: tuple[str, ...] = ()
@@ -152,7 +152,7 @@ def _pictures(
             (Callout("Floor plan", exactness), all_runs(dataset, first, from_start[first.id]), Choice("Run", rooms)),
         ),
         Section(f"{prefix}wheels", "Wheels", (Choice("Run", wheels),)),
-        Section(f"{prefix}player", "Step by step", (player(dataset, runs, odometry, truth, placed),)),
+        Section(f"{prefix}player", "Step by step", (player(dataset, runs, odometry, truth, walls),)),
     ]
 
 
