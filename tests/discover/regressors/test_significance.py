@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import binomtest
+import pytest
+from scipy.stats import binomtest, chi2
+from screening_samples import FIRST, SECOND, THIRD, screening
 
 from omnibench.discover.regressors.column_group import Group
-from omnibench.discover.regressors.significance import significance_of
+from omnibench.discover.regressors.significance import Significance, significance_of
 from omnibench.fit.least_squares.whitened import Whitened
 
 GROUPS = tuple(Group("covariate", f"group {start}", tuple(range(start, start + 2))) for start in range(2, 22, 2))
@@ -62,3 +64,51 @@ def test_what_depends_on_few_runs_is_found_where_these_agree() -> None:
     found = significance_of(data_of(residuals, columns), [0, 1], GROUPS, rng)
     assert found.groups[found.best].name == "group 6"
     assert found.p_value(found.best) < 1e-3
+
+
+def by_chance(evidence: float, chance: np.ndarray) -> Significance:
+    """One group of so much evidence, where random flips made ``chance``."""
+    one = np.ones(1)
+    return Significance(GROUPS[:1], one, one, one, np.array([evidence]), np.sort(chance), 0.0, 0)
+
+
+def test_a_chance_that_many_flips_reach_is_their_share_with_the_data_as_one_more() -> None:
+    chance = np.arange(499) / 100
+    assert by_chance(4.0, chance).p_value(0) == pytest.approx((99 + 1) / 500)
+
+
+def test_a_chance_that_hardly_any_flip_reaches_is_that_of_an_exponential_tail() -> None:
+    tail = np.concatenate([[1.0], 1.0 + np.linspace(0.0, 49 / 48, 48)])  # 49 of them, by 0.5 beyond 1 in the mean
+    chance = np.concatenate([np.zeros(450), tail])
+    assert by_chance(3.0, chance).p_value(0) == pytest.approx(49 / 499 * np.exp(-(3 - 1) / 0.5))
+
+
+def test_the_tail_of_the_surest_of_many_uniform_chances_goes_on_at_ten_to_the_minus_z() -> None:
+    chance = -np.log10((np.arange(499) + 0.5) / 499)
+    assert by_chance(6.0, chance).p_value(0) == pytest.approx(1e-6, rel=0.5)
+
+
+def test_evidence_is_of_the_difference_without_the_run_that_adds_most_and_corrected_for_its_tries() -> None:
+    given = screening({}, {"heading": FIRST, "place": SECOND}, [0, 6, 0, 0, 0])
+    groups = [given.groups.bases[0], Group("covariate", "patch", (1,), tries=5)]
+    found = significance_of(given.data, [0], groups, np.random.default_rng(0))
+    scores = given.data.scores[:, 1]
+    least = min((6.0 - score) ** 2 for score in scores)
+    assert found.chi_square == pytest.approx([36, 36])
+    assert found.evidence == pytest.approx([-chi2.logsf(least, 1) / np.log(10) - each for each in (0, np.log10(5))])
+
+
+def test_what_chance_makes_is_no_excess() -> None:
+    given = screening({}, {"heading": FIRST, "place": SECOND}, [0, 6, 0, 0, 0])
+    found = significance_of(given.data, [0], given.groups.bases, np.random.default_rng(0))
+    assert found.spread == pytest.approx([1, 1])
+    assert found.excess == pytest.approx([35, 0])
+
+
+def test_the_surplus_is_that_of_the_group_that_stands_out_most_beyond_what_usually_does() -> None:
+    given = screening({}, {"heading": FIRST, "place": SECOND, "time": THIRD}, [0, 6, 9, 0, 0])
+    found = significance_of(given.data, [0], given.groups.bases, np.random.default_rng(0))
+    assert found.surplus_of == 1
+    # of three squares of normal numbers the largest is 2.10 in the mean
+    assert found.surplus == pytest.approx((81 - 2.10) / np.sqrt(2), abs=0.15)
+    assert found.surplus_chi_square == pytest.approx((81 - 2.10, np.sqrt(2)), abs=0.25)

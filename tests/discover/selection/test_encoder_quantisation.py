@@ -1,0 +1,39 @@
+"""The bound on what encoder quantisation can make of a column, by numbers that can be worked out by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from extended_samples import FORWARD, MATRIX, extended_of, run_of
+
+from omnibench.discover.selection.encoder_quantisation import EncoderQuantisation
+
+ALONG = np.zeros((2, 3, 1))
+ALONG[:, 0] = 1.0  # both poses of a run, 1 m along x
+TICKS = 0.1 * np.abs(FORWARD)  # rad: what the wheels turn in each sample of 0.1 s
+QUARTER_TICKS = 0.25 * float((TICKS * np.abs(MATRIX[0])).sum())  # m along x, of all wheels in the same direction
+OF_RUN = (2 + 1) * QUARTER_TICKS  # at the start they move both poses, at rest the last one
+
+
+def bound(commands: Sequence[str], columns: Sequence[np.ndarray], beyond: Sequence[int] = ()) -> float:
+    runs = [run_of(FORWARD, command, f"run {number}") for number, command in enumerate(commands)]
+    fit = extended_of(runs, [np.zeros((2, 3)) for _ in runs]).fit
+    return EncoderQuantisation(fit, columns).chi_square([0], beyond)
+
+
+def test_a_column_explains_at_most_the_quarter_ticks_that_all_push_along_it() -> None:
+    assert bound(["a", "b"], [ALONG, ALONG]) == pytest.approx((2 * OF_RUN) ** 2 / 4)  # X'X = 2 poses of 2 runs
+
+
+def test_repetitions_of_a_command_are_off_by_the_same_part_of_a_tick() -> None:
+    assert bound(["a", "a"], [ALONG, -ALONG]) == pytest.approx(0.0, abs=1e-20)
+    assert bound(["a", "b"], [ALONG, -ALONG]) == pytest.approx((2 * OF_RUN) ** 2 / 4)
+
+
+def test_what_other_columns_make_does_not_count() -> None:
+    other = np.zeros((2, 3, 1))
+    other[1, 0] = 1.0  # the last pose alone, so that beyond it a column keeps the first: only starts push that
+    columns = [np.concatenate([ALONG, other], axis=2)] * 2
+    assert bound(["a", "b"], columns, [1]) == pytest.approx((2 * QUARTER_TICKS) ** 2 / 2)
