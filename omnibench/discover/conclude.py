@@ -24,8 +24,9 @@ from omnibench.discover.verdict import headline_of
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
-_FEW_RUNS, _FEW_COMMANDS = 10, 4  # with fewer a note says that these show hardly anything; chosen
-_WORSE = 1.05  # times the plain matrix's error: more than chance makes of it; chosen
+_FEW_RUNS = 10  # with fewer, the signs of runs flip in less than 2^9 ways, and no chance falls below CHANCE, 0.002
+_FEW_COMMANDS = 4  # up to three motions are what some matrix makes of any wheel rates: nothing contradicts it
+_WORSE = 1.05  # times the plain matrix's error; nothing but a warning hangs on it
 
 
 @dataclass(frozen=True, eq=False)

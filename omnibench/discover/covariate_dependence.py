@@ -14,7 +14,7 @@ from omnibench.discover.selection.model_selection import Selection
 from omnibench.discover.selection.motor_effects import MotorEffects
 from omnibench.discover.selection.screening import Screening
 
-_SHOWN = 0.01  # chance up to which a dependence is mentioned; chosen
+_SHOWN = 0.01  # chance up to which a dependence is mentioned; verdicts count those below CHANCE alone
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,16 @@
-"""The model extended by effects: matrix and parameters fitted together, noise and nuisances estimated anew."""
+"""The model extended by effects: matrix and parameters fitted together, noise and nuisances estimated anew.
+
+With s_z the scores of the Z runs at the fit, R the roots of the information I of all columns (R' I R = 1) and n their
+rank, the scatter of the runs, by which model errors that runs do not share count as noise, is
+
+    S = R' (sum over runs of s_z s_z') R Z / (Z - n)                                                                (1)
+
+(Liang and Zeger, "Longitudinal data analysis using generalized linear models", Biometrika 73, 1986), in expectation the
+identity where the noise model is right. With S = U diag(l) U', the covariance of the fitted numbers, never below what
+the noise model says, is
+
+    R U diag(max(l, 1)) U' R'.                                                                                      (2)
+"""
 
 from __future__ import annotations
 
@@ -139,8 +151,8 @@ def _covariance(data: Whitened) -> Array:
     roots = now.roots(list(range(data.information.shape[0])))
     runs = len(data.scores)
     centred = data.scores @ roots
-    scatter = centred.T @ centred * runs / max(runs - roots.shape[1], 1)
+    scatter = centred.T @ centred * runs / max(runs - roots.shape[1], 1)  # Eq. (1)
     sizes, directions = np.linalg.eigh(scatter)
     wider = (directions * np.maximum(sizes, 1.0)) @ directions.T
-    covariance: Array = roots @ wider @ roots.T
+    covariance: Array = roots @ wider @ roots.T  # Eq. (2)
     return covariance

@@ -23,6 +23,7 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
 _UNKNOWN_NOISE = NoiseEstimate(FIRST_NOISE, "within runs", 1, "")
+_FIRST_STEPS = 3  # Gauss-Newton steps from the design values on, before anything is known of the noise
 _ROUNDS = 4  # rounds that fit noise and matrix by turns, at most; fewer where the noise stays within 2 %
 _NEAR = 0.02  # share of the largest component of the noise, see is_near; chosen
 
@@ -74,7 +75,7 @@ def fit_matrix(runs: Sequence[Trajectory], robot: Robot, sample_period: float, s
     """
     model = OdometryModel(robot, start, "arc", (), sample_period)
     fit = Fit(model, tuple(runs), Nuisances(np.zeros((len(runs), 3)), np.zeros(3)), _UNKNOWN_NOISE)
-    for _ in range(3):
+    for _ in range(_FIRST_STEPS):
         fit = _matrix_step(fit)
     for _ in range(_ROUNDS):
         before = fit.noise.noise

@@ -1,4 +1,13 @@
-"""Reference poses that jump: they contradict the other poses of their run."""
+"""Reference poses that jump: they contradict the other poses of their run.
+
+Let r be the residuals of a run along one axis, normal with the inverse covariance P. Given all others, residual i is
+normal with the mean r_i - (P r)_i / P_ii and the variance 1 / P_ii (Rasmussen and Williams, Gaussian processes for
+machine learning, 2006, Eq. 5.12), so that it lies so many standard deviations from what the others predict:
+
+    |(P r)_i| / sqrt(P_ii).                                                                                         (1)
+
+The score of a pose is the largest of those in x, y and heading.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +21,9 @@ from omnibench.fit.least_squares.noise import Whitener
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
-_JUMP = 4.5  # standard deviations between a pose and what the run's other poses predict for it; chosen
-_MOST_JUMPS = 0.1  # share of a run's poses that may be left out; chosen
-_RARE = 0.08  # share of all poses: where more seem to jump, the model is wrong in a way that varies fast; chosen
+_JUMP = 4.5  # score, Eq. (1), from which on a pose jumps: noise alone makes it of one normal pose in 49,000
+_MOST_JUMPS = 0.1  # share of a run's poses that may be left out
+_RARE = 0.08  # share of all poses: where more seem to jump, the model is wrong in a way that varies fast
 _MANY, _MANY_BY_CHANCE = 0.95, 2.39  # a quantile of all scores, and its value for the largest of three normal ones
 
 
@@ -75,5 +84,5 @@ def _scores(residuals: Array, position: Array, heading: Array) -> Array:
     """
     of_position = (position @ residuals[:, :2]) / np.sqrt(np.diag(position))[:, None]
     of_heading = (heading @ residuals[:, 2:]) / np.sqrt(np.diag(heading))[:, None]
-    scores: Array = np.abs(np.concatenate([of_position, of_heading], axis=1)).max(axis=1)
+    scores: Array = np.abs(np.concatenate([of_position, of_heading], axis=1)).max(axis=1)  # Eq. (1)
     return scores

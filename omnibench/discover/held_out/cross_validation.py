@@ -1,4 +1,18 @@
-"""Cross-validation: runs of a fit predicted from the runs of the other folds."""
+"""Cross-validation: runs of a fit predicted from the runs of the other folds.
+
+With I the information X'X and s the scores X'e of whitened columns X against whitened residuals e, summed over all
+runs, and I_f, s_f those over the runs of fold f, least squares of all runs but these give the values
+
+    b_f = (I - I_f)^+ (s - s_f),                                                                                    (1)
+
+which leave a run z of the fold the chi-square
+
+    Q_z = |e_z - X_z b_f|^2.                                                                                        (2)
+
+With g_z the fall of Q_z by further columns, over Z runs, these are confirmed if
+
+    mean of g_z > c sd of g_z / sqrt(Z).                                                                            (3)
+"""
 
 from __future__ import annotations
 
@@ -13,8 +27,9 @@ from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.fit.least_squares.whitened import Given, Whitened
 from omnibench.robot.kinematics import Array
 
-_FOLDS = 5
-STANDARD_ERRORS = 2.0  # by which runs that are held out must gain; chosen
+_FOLDS = 5  # Hastie, Tibshirani and Friedman, Elements of Statistical Learning, 2009, section 7.10.1: five or ten
+# c, Eq. (3), standard errors: a difference that exceeds them where there is none is one of 44, if it is normal.
+STANDARD_ERRORS = 2.0
 
 
 def folds_of_repetitions(runs: Sequence[Trajectory]) -> NDArray[np.intp]:
@@ -59,7 +74,7 @@ def values_of_other_folds(data: Whitened, index: Sequence[int], folds: NDArray[n
         inside = folds == fold
         columns = np.concatenate([data.columns[run][:, index] for run in np.flatnonzero(inside)])
         others = Given(whole - columns.T @ columns, data.scores[~inside][:, index], np.diag(whole))
-        values[inside] = others.estimate(range(len(index)))[0]
+        values[inside] = others.estimate(range(len(index)))[0]  # Eq. (1)
     return values
 
 
@@ -82,7 +97,7 @@ def held_out_squares(data: Whitened, index: Sequence[int], folds: NDArray[np.int
     values = values_of_other_folds(data, index, folds)
     of_runs = zip(data.residuals, data.columns, values, strict=True)
     left = [residuals - columns[:, list(index)] @ value for residuals, columns, value in of_runs]
-    return np.array([float(np.square(of_run).sum()) for of_run in left])
+    return np.array([float(np.square(of_run).sum()) for of_run in left])  # Eq. (2)
 
 
 def held_out_chi_square(data: Whitened, before: Sequence[int], after: Sequence[int], folds: NDArray[np.intp]) -> Array:
@@ -92,5 +107,9 @@ def held_out_chi_square(data: Whitened, before: Sequence[int], after: Sequence[i
 
 def is_confirmed(data: Whitened, before: Sequence[int], new: Sequence[int], folds: NDArray[np.intp]) -> bool:
     """True if the columns ``new`` lower the chi-square of held-out runs beyond ``before``, by two standard errors."""
-    gains = held_out_chi_square(data, before, [*before, *new], folds)
+    return is_gain(held_out_chi_square(data, before, [*before, *new], folds))
+
+
+def is_gain(gains: Array) -> bool:
+    """True if the gains (Z,) of runs are more than chance in the mean, Eq. (3)."""
     return float(gains.mean()) > STANDARD_ERRORS * float(gains.std()) / np.sqrt(len(gains))

@@ -1,4 +1,12 @@
-"""Errors of plain and extended model on held-out runs, and the gap between them and what repetitions allow."""
+"""Errors of plain and extended model on held-out runs, and the gap between them and what repetitions allow.
+
+Let b_z and a_z be the errors of Z runs by the plain and by the extended model, and f_i those that D differences between
+repetitions of a command leave to any model, the floor. The gap, its standard error and the share that is closed are
+
+    G = mean b - mean f,    sigma = sqrt(var b / Z + var f / D),    (mean b - mean a) / G.                          (1)
+
+Where G is within two standard errors of nothing, no share is closed.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +21,13 @@ from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit, at_runs
 from omnibench.discover.fitting.start_frames import in_start_frames
-from omnibench.discover.held_out.cross_validation import held_out_residuals, held_out_squares
+from omnibench.discover.held_out.cross_validation import STANDARD_ERRORS, held_out_residuals, held_out_squares
 from omnibench.discover.held_out.validation_runs import ValidationRuns
 from omnibench.discover.result import Gap, HeldOut
 from omnibench.fit.least_squares.noise import whiteners
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions
 from omnibench.fit.least_squares.whitened import whitened
 from omnibench.robot.kinematics import Array
-
-_CLEARLY = 2.0  # standard errors that a gap must measure for a share of it to be said to be closed; chosen
 
 
 def compare_held_out(
@@ -120,5 +126,5 @@ def gap_between(metric: Literal["eq6", "chi2"], before: Array, after: Array, flo
         return Gap(metric, first, last, min(first, last), None, float(before.std() / np.sqrt(len(before))))
     error = float(np.sqrt(before.var() / len(before) + floor.var() / len(floor)))
     gap = first - float(floor.mean())
-    closed = (first - last) / gap if gap > _CLEARLY * error else None
+    closed = (first - last) / gap if gap > STANDARD_ERRORS * error else None  # Eq. (1)
     return Gap(metric, first, last, float(floor.mean()), closed, error)

@@ -13,7 +13,9 @@ from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.errors import DataError
 from omnibench.robot.model import OdometryModel
 
-_LATER, _LATER_S = 1.1, 60  # times, and s more than, the latest training run: beyond it a session's time is new
+# Times, and s more than, the latest training run, from where on a session's time counts as new. Nothing but a warning
+# hangs on them.
+_LATER, _LATER_S = 1.1, 60
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,6 +48,7 @@ _GRID = 5  # patches along each side of the area; chosen
 _WIDE = 0.7  # radius of a patch, of the distance between two: they cover the area evenly; chosen
 _SEEN = 0.002  # share of the samples that must lie in a patch; chosen
 _NARROW = 0.02  # share of the largest motion: least width of a bump about one motion; chosen
+_TOP = 0.999  # quantile of the wheel rates up to which functions of them reach
 _SMALL = 1e-9  # range below which a covariate does not vary
 
 
@@ -172,7 +173,7 @@ def _order(paths: Paths, twists: _Twists, trajectories: Sequence[Trajectory]) ->
 
 def _wheel_rate(paths: Paths) -> Iterator[Basis]:
     rates = paths.signals.rates
-    top = float(np.quantile(np.abs(rates), 0.999))
+    top = float(np.quantile(np.abs(rates), _TOP))
     if top < _SMALL:
         return
     effect, shapes, changes = SmoothWheelRate(), {"top": top}, hat_functions(rates, top)

@@ -3,9 +3,10 @@
 With z = x + iy and theta along a path, a change (dv, dw) of the twist, dv = dvx + i dvy in the robot's frame, moves the
 pose at time t, to first order, by
 
-    d theta(t) = int dw dt',    d z(t) = int (exp(i theta) dv - i z dw) dt' + i z(t) d theta(t),
+    d theta(t) = int dw dt',    d z(t) = int (exp(i theta) dv - i z dw) dt' + i z(t) d theta(t),                    (1)
 
-One sum over the samples is enough for each change.
+integrals from 0 to t: a turn by dw at t' swings the rest of the path, z(t) - z(t'), about where the robot is then. One
+sum over the samples is enough for each change.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from omnibench.robot.path import Path
 from omnibench.robot.signals import Signals, signals_of
 
 _STEP = 0.1  # share of the plausible range: step of a reference effect's parameter for its slope; chosen
+_LAST = 5  # samples at the end of a run whose mean velocity leads on to stamps after it
 _BLOCK = 8_000_000  # numbers that are summed at once: 64 MB
 
 
@@ -188,7 +190,7 @@ def _along(times: Array, ends: Array, values: Array) -> Array:
     along: Array = np.interp(times, ends, values)
     late = times > ends[-1]
     if late.any():
-        back = max(len(ends) - 6, 0)
+        back = max(len(ends) - 1 - _LAST, 0)
         slope = (values[-1] - values[back]) / (ends[-1] - ends[back])
         along[late] = values[-1] + slope * (times[late] - ends[-1])
     return along

@@ -17,8 +17,8 @@ from omnibench.report.numbers import fixed
 from omnibench.report.style import INK, QUIET, plot, text
 from omnibench.report.traces import area, coordinates, line, marks
 
-_ROWS = 16  # commands listed at most (chosen)
-_ON_MAP = 200
+_ROWS = 16  # commands listed, at most; only the drawing hangs on it
+_ON_MAP = 200  # commands on the map, at most: beyond them circles hide each other; only the drawing hangs on it
 
 
 def command_blocks(residuals: Residuals, styles: Sequence[ModelStyle]) -> tuple[Block, ...]:

@@ -28,7 +28,7 @@ from omnibench.report.style import INK, QUIET, logarithmic, plot, text
 from omnibench.report.traces import coordinates, marks
 
 EvidenceFigure = Callable[[Discovery], FigureGrid | None]
-_CANDIDATES = 8  # shown of each step (chosen)
+_CANDIDATES = 8  # shown of each step, at most; only the drawing hangs on it
 _UNCHOSEN = "#b9c0c8"
 _GAINED, _LOST = "#7fb8d8", "#e3a3a3"
 _FLOOR_LEGEND = LegendItem("floor", "floor", FLOOR, "dash")

@@ -20,10 +20,10 @@ from omnibench.report.traces import arrows, coordinates
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
-_CELLS = 8  # along the longer side (chosen)
-_LEAST = 0.003  # share of the samples; a cell with fewer is left out (chosen)
+_CELLS = 8  # cells along the longer side; only the drawing hangs on it
+_LEAST = 0.003  # share of the samples; a cell with fewer, a fifth of the mean of 64 cells, is left out
 _INSIDE = LegendItem("inside", "within the noise", "#c3c9d0")
-_SCALE = 6.0  # standard errors at the ends of the colour scale (chosen)
+_SCALE = 6.0  # standard errors at the ends of the colour scale; only the drawing hangs on it
 
 # By cell: mean residual (3,) in m, m, rad, standard error of its x and y (m), number of runs.
 _Means = dict[int, tuple[Array, float, int]]

@@ -15,9 +15,9 @@ from omnibench.discover.report.residuals import CIRCLE_95, NORMAL_95, Fitted, Re
 from omnibench.report.blocks import Figure, FigureGrid
 from omnibench.robot.kinematics import Array
 
-_BINS = 12
+_BINS = 12  # bins along an axis; only the drawing hangs on it
 _HEIGHT = 270  # px
-_LEAST = 0.002  # share of the samples; a bin with fewer is left out (chosen)
+_LEAST = 0.002  # share of the samples; a bin with fewer, 2 % of its even part, is left out of the drawing
 _STILL = 1e-3  # rad/s, m/s; slower counts as standing
 # Harmonics per turn, as in the bases of covariate dependence: by halves, then whole ones up to 16.
 _HARMONICS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, *map(float, range(4, 17)))

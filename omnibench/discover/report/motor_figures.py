@@ -16,8 +16,8 @@ from omnibench.report.blocks import FigureGrid
 from omnibench.robot.effects.effect import ActuatorEffect
 from omnibench.robot.kinematics import Array
 
-_BINS = 12
-_START = 2.0  # s from the start of a run in which motors settle (chosen)
+_BINS = 12  # bins along an axis; only the drawing hangs on it
+_START = 2.0  # s from the start of a run that are drawn: ten time constants of a motor of 0.2 s
 _MEASURED = ModelStyle("before", "measured − target", BEFORE)
 _EXPECTED = ModelStyle("after", "measured − expected with the effects", AFTER, index=1)
 

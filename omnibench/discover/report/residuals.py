@@ -24,11 +24,13 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import relative, rotation
 
 # Standard deviations that hold 95 % of a normal distribution, on a line and in the plane.
-NORMAL_95 = 1.96
-CIRCLE_95 = 2.448
-_STAMPS = 15_000  # fitted at most, of all runs (chosen: keeps a report below seconds)
-_DETERMINED = 1e-4  # share of the largest eigenvalue of the information, below which a direction is left open (chosen)
-_COMMANDS = 8  # with so many or more, random signs are drawn for whole commands (chosen)
+NORMAL_95 = 1.96  # standard deviations within which 95 % of a normal number lie
+CIRCLE_95 = 2.448  # sqrt(-2 ln 0.05), standard deviations within which 95 % of a pair of normal numbers lie
+_STAMPS = 15_000  # reference poses drawn of all runs, at most, so that a report takes seconds
+# Share of the largest eigenvalue of the information, below which a direction is left open: its standard error is 100
+# times that of the best known one, wider than any figure.
+_DETERMINED = 1e-4
+_COMMANDS = 8  # with fewer, the signs of whole commands flip in less than 2^7 ways, too few for the band of 95 %
 
 
 @dataclass(frozen=True, eq=False)

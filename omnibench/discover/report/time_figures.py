@@ -19,12 +19,12 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import rotated
 from omnibench.words import plural
 
-_TIMES = 14  # times at which the mean residual is drawn (chosen)
-_BLOCKS = 12  # blocks of runs, at most (chosen)
-_RUNS = 3  # runs in a block, at least (chosen)
-_STAMPS = 30  # bins of the stamps of a run (chosen)
-_MOVING = 0.01  # m/s; slower counts as standing
-_TURNING = math.radians(2.0)  # rad/s; slower counts as straight
+_TIMES = 14  # times at which the mean residual is drawn; only the drawing hangs on it
+_BLOCKS = 12  # blocks of runs, at most; only the drawing hangs on it
+_RUNS = 3  # runs in a block, at least: the fewest that have a scatter with more than one degree of freedom
+_STAMPS = 30  # bins of the stamps of a run; only the drawing hangs on it
+_MOVING = 0.01  # m/s; slower counts as standing, and has no direction to be drawn along
+_TURNING = math.radians(2.0)  # rad/s; slower counts as straight: a turn of 20 deg in 10 s; only the drawing hangs on it
 _QUANTITIES = (("along the way", 1e3, "mm"), ("across, to the left", 1e3, "mm"), ("heading", math.degrees(1.0), "°"))
 
 

@@ -12,12 +12,10 @@ import numpy as np
 
 from omnibench.discover.fitting.extend import Extended, extend
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.held_out.cross_validation import folds_of_commands, held_out_residuals
+from omnibench.discover.held_out.cross_validation import folds_of_commands, held_out_residuals, is_gain
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.selection.model_selection import Selection
 from omnibench.robot.kinematics import Array
-
-_CLEARLY = 2.0  # standard errors of the difference in cost from which on a model predicts better; chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +64,7 @@ def _exchanged(selection: Selection, position: int, stand_in: Group) -> Selectio
 
 
 def _reason(group: Group, difference: Array) -> str:
-    clear = difference.mean() > _CLEARLY * difference.std() / np.sqrt(max(len(difference), 1))
-    how = "better" if clear else "no worse"
+    how = "better" if is_gain(difference) else "no worse"
     return f"{group.name} is used: it predicts commands that were held out {how} in the cost of Eq. (6)"
 
 

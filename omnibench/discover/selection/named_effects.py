@@ -1,4 +1,10 @@
-"""Named effects: those that were selected, with 95 % intervals, probabilities and doubts; and all that were tried."""
+"""Named effects: those that were selected, with 95 % intervals, probabilities and doubts; and all that were tried.
+
+With b the estimate of a parameter, sigma its standard error by the scatter of Z runs, and n numbers that were fitted,
+the interval has Student's quantile, as the scatter is known by no more than the runs:
+
+    b +- t(0.975; Z - n) sigma.                                                                                     (1)
+"""
 
 from __future__ import annotations
 
@@ -41,7 +47,7 @@ def _effects(
 ) -> tuple[NamedEffect, ...]:
     """The chosen effects. first: the row of the covariance at which their parameters begin."""
     deviations = np.sqrt(np.diag(covariance))[first:]
-    quantile = float(stdtrit(max(runs - len(deviations) - first, 1), 0.975))
+    quantile = float(stdtrit(max(runs - len(deviations) - first, 1), 0.975))  # Eq. (1)
     tried = {
         group.name: (chi_square, rank)
         for step in selection.steps[::-1]

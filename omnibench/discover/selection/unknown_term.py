@@ -1,6 +1,16 @@
 """A smooth term where no effect has a name: functions of the covariate that the residuals depend on most surely.
 
-They are kept if held-out runs gain by them.
+They are kept if held-out runs gain by them. With Q the chi-square difference of a basis of d columns beyond those that
+were taken before it, and v what chance makes of Q / d, a further basis is put to them if
+
+    Q > 2 v d                                                                                                       (1)
+
+(Akaike, "A new look at the statistical model identification", IEEE Trans. Automatic Control 19, 1974). Of all functions
+of these bases, one after another is fitted that lowers the chi-square of Z runs by more than
+
+    ln Z                                                                                                            (2)
+
+(Schwarz, "Estimating the dimension of a model", Annals of Statistics 6, 1978).
 """
 
 from __future__ import annotations
@@ -14,7 +24,7 @@ from numpy.typing import NDArray
 
 from omnibench.discover.fitting.extend import Extended, columns_of, extend
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.held_out.cross_validation import STANDARD_ERRORS, held_out_chi_square
+from omnibench.discover.held_out.cross_validation import held_out_chi_square, is_gain
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Significance
@@ -72,7 +82,7 @@ def add_smooth_term(
     what = f"a smooth term over {covariate} ({'; '.join(details)})"
     mean, error = float(best.gains.mean()), float(best.gains.std()) / np.sqrt(len(best.gains))
     gained = f"{mean:.2g} +- {error:.1g} of whitened chi2 a run"
-    if not mean > STANDARD_ERRORS * error:
+    if not is_gain(best.gains):
         return SmoothTerm(models, f"{_capital(what)} was tried and left out: on runs held out it gains {gained}.")
     others = tuple((weight, extend(plain, [*model.groups, *best.terms])) for weight, model in models.weighted[1:])
     note = f"The extended model holds {what}, which is no name: on runs held out it gains {gained}."
@@ -95,7 +105,7 @@ def surest_bases(screening: Screening, selection: Selection) -> list[list[Basis]
     significance = selection.left if selection.chosen else selection.where
     groups = _of_surest_covariate(significance)
     before = screening.index_with(selection.chosen)
-    price = _PRICE * max(float(np.median(significance.spread)), 1.0)
+    price = _PRICE * max(float(np.median(significance.spread)), 1.0)  # Eq. (1)
     stages = dict.fromkeys(group.basis.stage for group in groups if group.basis is not None)
     of_stages = [[group for group in groups if group.basis and group.basis.stage == stage] for stage in stages]
     return [
@@ -178,7 +188,7 @@ def chosen_functions(base: Extended, groups: Sequence[Group]) -> list[Group]:
         allowed = (size > _DETERMINED * left.total[first:]) & (np.abs(score) < limits * size)
         gain = np.where(allowed, np.square(score) / np.maximum(size, 1e-300), 0.0)
         best = int(gain.argmax())
-        if gain[best] <= np.log(len(data.scores)):
+        if gain[best] <= np.log(len(data.scores)):  # Eq. (2)
             break
         kept.add(best)
         left = left.given([first + best])
