@@ -151,7 +151,8 @@ def slam(
     from omnibench.cli.terminal.slam_summary import print_slam
     from omnibench.config import parse_settings, validate
     from omnibench.progress import Progress
-    from omnibench.report.recording.section import write_recording_report
+    from omnibench.report.recording.section import recording_document
+    from omnibench.report.render import write_document
     from omnibench.slam.slam_options import SlamOptions
     from omnibench.slam.slam_request import SlamRequest
 
@@ -167,7 +168,8 @@ def slam(
         result = request.run(watch, table_format)
         if report is not None:
             watch(Progress("writing the report"))
-            write_recording_report(result.dataset, report, truth=result.truth, accuracy=result.accuracy)
+            document = recording_document(result.dataset, truth=result.truth, accuracy=result.accuracy)
+            write_document(document, report)
     warn(result.summary.warnings)
     if as_json:
         return print_json(result.summary)
@@ -215,7 +217,8 @@ def simulate(
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.cli.terminal.slam_summary import print_slam_accuracy
     from omnibench.progress import Progress
-    from omnibench.report.recording.section import write_recording_report
+    from omnibench.report.recording.section import recording_document
+    from omnibench.report.render import write_document
     from omnibench.simulate.simulation_request import SimulationRequest
 
     hidden = tuple(effects or ())
@@ -226,14 +229,8 @@ def simulate(
         if report is not None:
             watch(Progress("writing the report"))
             shown = made.simulation
-            write_recording_report(
-                made.dataset,
-                report,
-                truth=shown.paths or None if shown else None,
-                plan=shown.plan if shown else None,
-                starts=shown.starts if shown else None,
-                accuracy=made.accuracy,
-            )
+            known: dict[str, Any] = {"truth": shown.paths, "plan": shown.plan, "starts": shown.starts} if shown else {}
+            write_document(recording_document(made.dataset, accuracy=made.accuracy, **known), report)
     warn(made.dataset.warnings)
     if made.accuracy is not None:
         print_slam_accuracy(make_console(), made.accuracy)

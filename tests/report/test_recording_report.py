@@ -21,7 +21,8 @@ from omnibench.data.scans import ScansInMemory
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError
 from omnibench.report.recording.runs import representative_runs
-from omnibench.report.recording.section import has_recording, recording_section, write_recording_report
+from omnibench.report.recording.section import has_recording, recording_document, recording_section
+from omnibench.report.render import write_document
 from omnibench.slam.accuracy import run_errors, slam_accuracy
 
 CONTENTS = "What was recorded"
@@ -36,15 +37,15 @@ def made() -> Sample:
 @pytest.fixture(scope="module")
 def report(made: Sample, tmp_path_factory: pytest.TempPathFactory) -> Page:
     file = tmp_path_factory.mktemp("recording") / "report.html"
-    write_recording_report(
-        made.dataset, file, truth=made.truth, plan=made.plan, starts=made.starts, notes=("Made for a test.",)
-    )
+    notes = ("Made for a test.",)
+    document = recording_document(made.dataset, truth=made.truth, plan=made.plan, starts=made.starts, notes=notes)
+    write_document(document, file)
     return Page(file.read_text(encoding="utf-8"))
 
 
 def page(dataset: Dataset, folder: Path, **options: Any) -> Page:
     """The report on a data set as its reader sees it."""
-    write_recording_report(dataset, folder / "report.html", **options)
+    write_document(recording_document(dataset, **options), folder / "report.html")
     return Page((folder / "report.html").read_text(encoding="utf-8"))
 
 
@@ -199,7 +200,7 @@ def test_broken_scans_are_one_line(made: Sample, tmp_path: Path) -> None:
 def test_a_report_that_cannot_be_written_is_one_line(made: Sample, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(DataError, match="cannot be written"):
-        write_recording_report(made.dataset, tmp_path / "file" / "report.html")
+        write_document(recording_document(made.dataset), tmp_path / "file" / "report.html")
 
 
 def test_long_runs_with_many_scans_stay_below_six_megabytes(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_NAME, DatasetView
@@ -137,17 +139,22 @@ def _doubts(view: DatasetView, best: EntryStatistics) -> list[str]:
             "above the lowest. That it does better on other data may be chance, or the splits differ in more than "
             "noise."
         )
-    lower = [
-        "{}: {} ({})".format(entry.label, *difference_in_words(entry.difference))
-        for entry, _ in view.calibrated
-        if entry.difference is not None and entry.practically_equal is False and entry.difference.value < 0
-    ]
+    lower = _apart(view, -1)
     if lower:
         doubts.append(
             f"Below {best.label} in {SPLIT_NAMES[split]} cost, as the mean difference with its 95 % interval, though "
             f"above it in training cost: {listing(lower, 20)}."
         )
     return doubts
+
+
+def _apart(view: DatasetView, sign: Literal[-1, 1]) -> list[str]:
+    """Entries whose cost is below (-1) or above (1) the best entry's by more than the noise, with the difference."""
+    return [
+        "{}: {} ({})".format(entry.label, *difference_in_words(entry.difference))
+        for entry, _ in view.calibrated
+        if entry.difference is not None and entry.practically_equal is False and sign * entry.difference.value > 0
+    ]
 
 
 def _worse_commands(view: DatasetView, best: EntryStatistics) -> list[str]:
@@ -187,11 +194,7 @@ def _remarks(view: DatasetView, best: EntryStatistics | None) -> Callout:
     if best is not None:
         doubts = _doubts(view, best) + _worse_commands(view, best)
         items += doubts
-        worse = [
-            "{}: {} ({})".format(entry.label, *difference_in_words(entry.difference))
-            for entry, _ in view.calibrated
-            if entry.difference is not None and entry.practically_equal is False and entry.difference.value > 0
-        ]
+        worse = _apart(view, 1)
         if worse:
             items.append(
                 f"Worse than {best.label} by more than the noise, as the mean difference in {SPLIT_NAMES[split]} cost "

@@ -59,23 +59,19 @@ def discovery_report(discovery: Discovery, options: str) -> Document:
         title=f"What the odometry model lacks: {dataset.name}",
         subtitle=dataset.description,
         sections=(
-            answer_section(discovery),
+            Section("answer", "Answer", tuple(_answer(discovery))),
             where_section(discovery),
-            what_section(discovery),
-            sure_section(discovery),
-            better_section(discovery),
-            basis_section(discovery, options),
+            Section("what", "What", tuple(what_blocks(discovery))),
+            Section("sure", "How sure", tuple(sure_blocks(discovery))),
+            Section("better", "How much better", tuple(_how_much_better(discovery))),
+            Section("basis", "What this rests on", tuple(_basis(discovery, options))),
         ),
         badges=simulated_badge(dataset.simulated),
     )
 
 
-def answer_section(discovery: Discovery) -> Section:
-    """The section with the answer in words and figures, and its warnings."""
-    return Section("answer", "Answer", tuple(_answer(discovery)))
-
-
 def _answer(discovery: Discovery) -> Iterator[Block]:
+    """The answer in words and figures, and its warnings."""
     yield Paragraph(discovery.headline, "lead")
     yield Facts(tuple(_tiles(discovery)), "tiles")
     yield Callout(
@@ -106,12 +102,8 @@ def _tiles(discovery: Discovery) -> Iterator[Fact]:
     yield Fact("Gap closed, Eq. (6)", closed_in_words(held.eq6), where)
 
 
-def what_section(discovery: Discovery) -> Section:
-    """The section on the effects: those found, with their parameters, and those that a matrix absorbs."""
-    return Section("what", "What", tuple(_what(discovery)))
-
-
-def _what(discovery: Discovery) -> Iterator[Block]:
+def what_blocks(discovery: Discovery) -> Iterator[Block]:
+    """The effects: those found, with their parameters, and those that a matrix absorbs."""
     yield Paragraph(VERDICTS_AT_LENGTH[discovery.verdict])
     if discovery.effects:
         for effect in discovery.effects:
@@ -141,12 +133,8 @@ def _effect_remarks(effect: NamedEffect) -> Iterator[str]:
         yield f"Described in: {effect.source}."
 
 
-def sure_section(discovery: Discovery) -> Section:
-    """The section on certainty: weights, candidates, what is left, look-alikes, effects that may still hide."""
-    return Section("sure", "How sure", tuple(_how_sure(discovery)))
-
-
-def _how_sure(discovery: Discovery) -> Iterator[Block]:
+def sure_blocks(discovery: Discovery) -> Iterator[Block]:
+    """Certainty: weights, candidates, what is left, look-alikes, effects that may still hide."""
     if discovery.effects:
         yield Facts(
             tuple(
@@ -196,12 +184,8 @@ def _hidden(discovery: Discovery) -> Iterator[Block]:
     yield Details(f"These effects in numbers ({len(discovery.hidden)})", (hidden_table(discovery.hidden),))
 
 
-def better_section(discovery: Discovery) -> Section:
-    """The section on the gain: errors before and after against the noise floor, on held-out runs."""
-    return Section("better", "How much better", tuple(_how_much_better(discovery)))
-
-
 def _how_much_better(discovery: Discovery) -> Iterator[Block]:
+    """The gain: errors before and after against the noise floor, on held-out runs."""
     if discovery.held_out:
         yield Paragraph(_better_in_words(discovery))
     yield from drawn(GAPS, discovery)
@@ -235,12 +219,8 @@ def _better_in_words(discovery: Discovery) -> str:
     )
 
 
-def basis_section(discovery: Discovery, options: str) -> Section:
-    """The section on the basis of it all: data, noise, options and files."""
-    return Section("basis", "What this rests on", tuple(_basis(discovery, options)))
-
-
 def _basis(discovery: Discovery, options: str) -> Iterator[Block]:
+    """The basis of it all: data, noise, options and files."""
     dataset, noise = discovery.dataset, discovery.noise
     position, heading = noise_in_words(noise.noise)
     runs = [run for run in dataset.trajectories if run.split == "train"]

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import plotly.graph_objects as go
 
-from omnibench.discover.report.before_after import AFTER, BEFORE, FLOOR
+from omnibench.discover.report.before_after import AFTER, ALONE, EXTENDED, FLOOR, PLAIN
 from omnibench.discover.report.wording import (
     METRICS,
     added,
@@ -29,9 +29,12 @@ from omnibench.report.traces import coordinates, marks
 
 EvidenceFigure = Callable[[Discovery], FigureGrid | None]
 _CANDIDATES = 8  # shown of each step, at most; only the drawing hangs on it
-_UNCHOSEN = "#b9c0c8"
-_GAINED, _LOST = "#7fb8d8", "#e3a3a3"
-_FLOOR_LEGEND = LegendItem("floor", "floor", FLOOR, "dash")
+_CHOSEN, _UNCHOSEN = LegendItem("chosen", "added", AFTER), LegendItem("other", "not added", "#b9c0c8")
+_FLOOR = LegendItem("floor", "floor", FLOOR)
+_FLOOR_LINE = LegendItem("floor", "floor", FLOOR, "dash")
+_GAINED = LegendItem("down", "gained by an effect", "#7fb8d8")
+_LOST = LegendItem("up", "lost by an effect", "#e3a3a3")
+_RESULT = LegendItem("after", "extended model", AFTER)
 _LIMIT = LegendItem("limit", "dot: could be this large (95 %)", AFTER)
 _DETECTABLE = LegendItem("detectable", "diamond: found nearly always from here on", INK, symbol="diamond-open")
 
@@ -61,7 +64,7 @@ def candidate_grid(discovery: Discovery) -> FigureGrid | None:
         return None
     return FigureGrid(
         tuple(figures),
-        (LegendItem("chosen", "added", AFTER), LegendItem("other", "not added", _UNCHOSEN)),
+        (_CHOSEN, _UNCHOSEN),
         2 if len(figures) > 1 else 1,
         "By how much each candidate would lower the whitened χ² of the training runs, the "
         f"{_CANDIDATES} largest; at the bars, the weight of the name and the degrees of freedom.",
@@ -82,7 +85,7 @@ def _candidate_bars(shown: Sequence[Candidate], chosen: str | None) -> go.Figure
             0.0,
             each.chi_square,
             f"{weight_in_words(each.weight)}, {each.degrees_of_freedom} df",
-            *(("chosen", AFTER) if each.name == chosen else ("other", _UNCHOSEN)),
+            _CHOSEN if each.name == chosen else _UNCHOSEN,
         )
         for each in shown
     ]
@@ -91,33 +94,32 @@ def _candidate_bars(shown: Sequence[Candidate], chosen: str | None) -> go.Figure
 
 @dataclass(frozen=True)
 class _Bar:
-    """A horizontal bar from low to high with its label. key: its entry in the legend."""
+    """A horizontal bar from low to high with its label, and its item of the legend."""
 
     name: str
     low: float
     high: float
     label: str
-    key: str
-    colour: str
+    item: LegendItem
 
 
 def _bars(bars: Sequence[_Bar], x_title: str, room: float) -> go.Figure:
     """A plot of bars from the top down. room: width of the plot as a multiple of the longest bar, for the labels."""
     traces = []
-    for key in dict.fromkeys(bar.key for bar in bars):
-        own = [bar for bar in bars if bar.key == key]
+    for item in dict.fromkeys(bar.item for bar in bars):
+        own = [bar for bar in bars if bar.item == item]
         traces.append(
             go.Bar(
                 y=[text(bar.name) for bar in own],
                 x=coordinates([bar.high - bar.low for bar in own]),
                 base=coordinates([bar.low for bar in own]),
                 orientation="h",
-                marker={"color": [bar.colour for bar in own]},
+                marker={"color": item.colour},
                 text=[bar.label for bar in own],
                 textposition="outside",
                 cliponaxis=False,
                 textfont={"size": 12, "color": INK},
-                legendgroup=key,
+                legendgroup=item.key,
                 hovertemplate="%{y}: %{text}<extra></extra>",
             )
         )
@@ -153,14 +155,9 @@ def waterfall_grid(discovery: Discovery) -> FigureGrid | None:
         )
         for title, own, floor in zip(METRICS.values(), values, floors, strict=True)
     )
-    legend = (
-        LegendItem("before", "plain matrix", BEFORE),
-        LegendItem("down", "gained by an effect", _GAINED),
-        *((LegendItem("up", "lost by an effect", _LOST),) if any(_rises(own) for own in values) else ()),
-        LegendItem("after", "extended model", AFTER),
-        *((_FLOOR_LEGEND,) if any(floor is not None for floor in floors) else ()),
-    )
-    return FigureGrid(figures, legend, 2)
+    lost = (_LOST,) if any(_rises(own) for own in values) else ()
+    line = (_FLOOR_LINE,) if any(floor is not None for floor in floors) else ()
+    return FigureGrid(figures, (ALONE, _GAINED, *lost, _RESULT, *line), 2)
 
 
 def _rises(values: Sequence[float | None]) -> bool:
@@ -170,12 +167,12 @@ def _rises(values: Sequence[float | None]) -> bool:
 
 def _waterfall(steps: Sequence[Step], values: Sequence[float], floor: float | None, title: str) -> go.Figure:
     decimals = max(2, min(6, 2 - _exponent(min(value for value in values if value > 0))))
-    bars = [_Bar("plain matrix", 0.0, values[0], fixed(values[0], decimals), "before", BEFORE)]
+    bars = [_Bar("plain matrix", 0.0, values[0], fixed(values[0], decimals), ALONE)]
     for step, (before, after) in zip(steps[1:], pairwise(values), strict=True):
-        key, colour = ("down", _GAINED) if after <= before else ("up", _LOST)
+        item = _GAINED if after <= before else _LOST
         label = fixed(after - before, decimals, signed=True)
-        bars.append(_Bar(_folded(f"+ {added(step)}"), min(before, after), max(before, after), label, key, colour))
-    bars.append(_Bar("extended model", 0.0, values[-1], fixed(values[-1], decimals), "after", AFTER))
+        bars.append(_Bar(_folded(f"+ {added(step)}"), min(before, after), max(before, after), label, item))
+    bars.append(_Bar("extended model", 0.0, values[-1], fixed(values[-1], decimals), _RESULT))
     figure = _bars(bars, title, 1.25)
     if floor is not None:
         figure.add_vline(x=floor, line={"color": FLOOR, "width": 2, "dash": "dash"})
@@ -201,11 +198,7 @@ def gap_grid(discovery: Discovery) -> FigureGrid:
     )
     return FigureGrid(
         figures,
-        (
-            LegendItem("before", "plain matrix (before)", BEFORE),
-            LegendItem("after", "extended model (after)", AFTER),
-            LegendItem("floor", "floor", FLOOR),
-        ),
+        (PLAIN, EXTENDED, _FLOOR),
         2 if len(figures) > 1 else 1,
         floor_in_words(discovery),
     )
@@ -213,11 +206,8 @@ def gap_grid(discovery: Discovery) -> FigureGrid:
 
 def _gap_bars(gap: Gap) -> go.Figure:
     decimals = gap_decimals(gap)
-    bars = [
-        _Bar("before", 0.0, gap.before, fixed(gap.before, decimals), "before", BEFORE),
-        _Bar("after", 0.0, gap.after, fixed(gap.after, decimals), "after", AFTER),
-        _Bar("floor", 0.0, gap.floor, fixed(gap.floor, decimals), "floor", FLOOR),
-    ]
+    values = (("before", gap.before, PLAIN), ("after", gap.after, EXTENDED), ("floor", gap.floor, _FLOOR))
+    bars = [_Bar(name, 0.0, value, fixed(value, decimals), item) for name, value, item in values]
     return _bars(bars, METRICS[gap.metric], 1.25)
 
 

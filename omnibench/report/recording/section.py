@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -20,7 +19,6 @@ from omnibench.report.recording.runs import representative_runs
 from omnibench.report.recording.slam_figures import error_figures
 from omnibench.report.recording.slam_tables import accuracy_blocks
 from omnibench.report.recording.wheel_figures import wheel_rates
-from omnibench.report.render import write_document
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.planar import placed, seen_from
@@ -41,36 +39,23 @@ class RoomPlan(Protocol):
     def outlines(self) -> Sequence[Array]: ...
 
 
-def write_recording_report(
+def recording_document(
     dataset: Dataset,
-    file: Path,
     *,
     truth: Mapping[str, TruePath] | None = None,
     plan: RoomPlan | None = None,
     starts: Mapping[str, Array] | None = None,
     accuracy: SlamAccuracy | None = None,
     notes: Sequence[str] = (),
-) -> None:
-    """Write the report on a recording as one HTML file: its contents, the room, the wheels, a run step by step.
+) -> Document:
+    """The report on a recording as blocks: its contents, the room, the wheels, a run step by step.
 
     For simulated data: truth: true path of each run, which the reference poses are compared with. plan: the room.
     starts: true start pose (3,) of each run in that room, m, m, rad (default: the plan's start). accuracy: errors of
     the reference poses (default: computed from the truth). notes: remarks at the top of the report.
 
-    DataError in one line: broken scans, a truth of other runs, or a disk that refuses the file.
+    DataError in one line: broken scans, or a truth of other runs.
     """
-    write_document(recording_document(dataset, truth, plan, starts, accuracy, notes), file)
-
-
-def recording_document(
-    dataset: Dataset,
-    truth: Mapping[str, TruePath] | None = None,
-    plan: RoomPlan | None = None,
-    starts: Mapping[str, Array] | None = None,
-    accuracy: SlamAccuracy | None = None,
-    notes: Sequence[str] = (),
-) -> Document:
-    """The report on a recording as blocks; arguments and errors as for :func:`write_recording_report`."""
     known = truth or {}
     for run in dataset.trajectories if known else ():
         if run.id not in known:

@@ -28,7 +28,7 @@ from report_page import Page
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.report.before_after import EXTENDED, PLAIN
 from omnibench.discover.report.command_figures import command_blocks
-from omnibench.discover.report.discovery_report import discovery_report, sure_section, what_section
+from omnibench.discover.report.discovery_report import discovery_report, sure_blocks, what_blocks
 from omnibench.discover.report.residuals import Residuals
 from omnibench.discover.result import Absorbed, Discovery, EstimatedParameter
 from omnibench.report.blocks import Document, FigureGrid, Section
@@ -134,14 +134,15 @@ def test_parameters_have_intervals_and_units(report: Page) -> None:
 
 def test_a_shape_was_chosen_and_has_no_interval() -> None:
     effect = replace(named().effects[0], parameters=(EstimatedParameter("rollers", 10.0, "1", 10.0, 10.0, shape=True),))
-    rows = part(what_section(replace(named(), effects=(effect,)))).tables["Parameters of the effects that were added"]
+    blocks = tuple(what_blocks(replace(named(), effects=(effect,))))
+    rows = part(Section("what", "", blocks)).tables["Parameters of the effects that were added"]
     assert rows[2][:3] == ["rollers", "10", "chosen among a few"]
 
 
 def test_a_class_names_its_members_and_the_experiment_that_separates_them() -> None:
     effect = replace(named().effects[0], weight=0.52, confusable_with=("load_transfer",), in_doubt="few turns")
     found = replace(named(), verdict="class", effects=(effect,), experiments=(EXPERIMENT,))
-    told = part(Section("both", "", (), (what_section(found), sure_section(found))))
+    told = part(Section("both", "", (*what_blocks(found), *sure_blocks(found))))
     assert "These data cannot tell it from load_transfer" in told.text
     assert "In doubt: few turns" in told.text
     assert EXPERIMENT.description in told.text
