@@ -11,7 +11,7 @@ import numpy as np
 from omnibench.config import read_yaml, validate
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.storage import load_dataset
-from omnibench.design.config import ComparedData, DesignConfig, TimedCommand
+from omnibench.design.config import DesignConfig, TimedCommand
 from omnibench.design.d_optimality import Counts
 from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError
 from omnibench.fit.problem import training_split
@@ -24,6 +24,7 @@ from omnibench.robot.odometry import Integration
 from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.flower import commanded_rates, commands_of, duration_of, stamps_of_run
+from omnibench.simulate.source import ComparedData
 from omnibench.words import noun_for
 
 

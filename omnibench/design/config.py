@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Discriminator, Field, FiniteFloat, Tag, field_validator, model_validator
+from pydantic import Discriminator, Field, FiniteFloat, Tag, field_validator, model_validator
 
 from omnibench.config import Model, NonNegative, Positive
 from omnibench.data.importers.robot_option import RobotOption
@@ -15,7 +15,6 @@ from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import Noise
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.config import MotionGrid
-from omnibench.simulate.dataset_source import DatasetSource
 from omnibench.simulate.flower import Command, grid_of
 from omnibench.words import plural
 
@@ -157,13 +156,3 @@ Use = Literal["final", "trajectory"]
 """Reference poses that a calibration uses: the final one alone, as Eq. (6), or all of them under the noise model."""
 Per = Literal["run", "second", "metre"]
 """Cost of a run: 1, its duration, or the distance that its wheels roll (mean of the wheels)."""
-
-
-class ComparedData(Model):
-    """Part of a comparison's config that a design takes: the data sets, and the integration of their odometry."""
-
-    model_config = ConfigDict(extra="ignore", frozen=True)
-
-    notes: tuple[str, ...] = ()
-    datasets: dict[Name, DatasetSource] = Field(min_length=1)
-    integration: Integration = "arc"

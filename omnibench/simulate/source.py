@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
@@ -14,18 +14,12 @@ from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import effects
 from omnibench.robot.calibration import EffectTerm
+from omnibench.robot.odometry import Integration
 from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.simulate.config import FlowerConfig, Truth
-from omnibench.simulate.simulate import SimulatedConfig, simulate_dataset
+from omnibench.simulate.dataset_source import DatasetSource
+from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.simulation import Simulation
-
-
-class _Source(Model):
-    """Source of one data set in a config; only ``simulate`` is used here."""
-
-    path: Any = None
-    simulate: SimulatedConfig | None = None
-    import_: Any = Field(default=None, alias="import")
 
 
 class SimulationConfig(Model):
@@ -35,13 +29,15 @@ class SimulationConfig(Model):
     description: str = ""
     notes: tuple[str, ...] = Field((), description="remarks for readers of the report")
     plugins: tuple[RelativePath, ...] = Field((), description="folders of effects; relative to the config file")
-    datasets: dict[Annotated[str, Field(min_length=1, max_length=60)], _Source]
+    datasets: dict[Annotated[str, Field(min_length=1, max_length=60)], DatasetSource] = Field(min_length=1)
 
 
-class _Comparison(SimulationConfig):
-    """Config of a comparison, of which only the data sets are read here."""
+class ComparedData(SimulationConfig):
+    """Part of a comparison's config that simulations and designs take: data sets, and the integration of odometry."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
+
+    integration: Integration = "arc"
 
 
 @dataclass(frozen=True)
@@ -81,7 +77,7 @@ def read_simulation(path: Path | str, dataset: str | None = None) -> SimulationS
     content = read_yaml(path)
     if not isinstance(content, dict) or "datasets" not in content:
         raise ConfigError(f"{path}: no data sets in it; name a data set folder or a comparison's config")
-    model = _Comparison if "calibrators" in content else SimulationConfig
+    model = ComparedData if "calibrators" in content else SimulationConfig
     config = validate(model, content, str(path), path.resolve().parent)
     sources = {name: source.simulate for name, source in config.datasets.items()}
     name, chosen = _chosen(sources, dataset, str(path))
