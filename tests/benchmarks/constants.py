@@ -10,20 +10,16 @@ again with the same file, and it goes on where it was. Sets are made as for disc
 from __future__ import annotations
 
 import argparse
-import ast
-import importlib
-import pkgutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from hidden.sets import Kind, make_set
+from named_constants import Constant, constants_of, modules_of
 
-import omnibench.discover
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
 from omnibench.discover.calibrations import Request
@@ -31,6 +27,7 @@ from omnibench.discover.discover import discover_effects
 from omnibench.discover.result import Discovery
 from omnibench.processes import one_thread
 
+PACKAGE = "omnibench.discover"
 FACTORS = (0.5, 2.0)
 SURE = 0.95  # weight from which on a name is stated with confidence: the verdict "named" in the design
 # What is the same whatever the constants after the screening are, and what none of those before the end can change.
@@ -124,58 +121,9 @@ class Result(Model):
         return self.set, self.constant, self.factor
 
 
-@dataclass(frozen=True)
-class Constant:
-    """A number that a module names in capitals."""
-
-    module: str
-    name: str
-    value: Any
-
-    @property
-    def title(self) -> str:
-        return f"{self.module.removeprefix('omnibench.discover.')}.{self.name}"
-
-    def times(self, factor: float) -> Any:
-        """The number times a factor: whole ones stay whole, and probabilities close to 1 probabilities."""
-        if isinstance(self.value, int):
-            return max(round(self.value * factor), 1)
-        if isinstance(self.value, float) and 0.9 <= self.value < 1:
-            return 1 - (1 - self.value) * factor
-        return self.value * factor
-
-    @contextmanager
-    def varied(self, factor: float) -> Iterator[None]:
-        """The constant at another value in its module, and under a public name in all that import it."""
-        modules = [each for each in _modules() if each.__name__ == self.module or not self.name.startswith("_")]
-        holding = [each for each in modules if hasattr(each, self.name)]
-        for module in holding:
-            setattr(module, self.name, self.times(factor))
-        try:
-            yield
-        finally:
-            for module in holding:
-                setattr(module, self.name, self.value)
-
-
 def constants() -> list[Constant]:
     """All numbers in capitals of omnibench.discover, without its report: there they shape drawings only."""
-    found = []
-    for module in _modules():
-        tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
-        targets = [node for each in tree.body if isinstance(each, ast.Assign) for node in ast.walk(each.targets[0])]
-        for name in (node.id for node in targets if isinstance(node, ast.Name)):
-            value = getattr(module, name)
-            if isinstance(value, int | float | np.ndarray) and name == name.upper():
-                found.append(Constant(module.__name__, name, value))
-    return found
-
-
-def _modules() -> list[ModuleType]:
-    """All modules of omnibench.discover, without its report."""
-    package = omnibench.discover
-    names = [each.name for each in pkgutil.walk_packages(package.__path__, "omnibench.discover.")]
-    return [importlib.import_module(name) for name in names if not name.startswith("omnibench.discover.report")]
+    return constants_of(PACKAGE, (f"{PACKAGE}.report",))
 
 
 class Memory:
@@ -188,7 +136,7 @@ class Memory:
     def of(self, names: Sequence[str]) -> Iterator[None]:
         """Let the functions of these names remember, wherever a module of discover uses them."""
         with ExitStack() as stack:
-            for module in _modules():
+            for module in modules_of(PACKAGE, (f"{PACKAGE}.report",)):
                 for name in names:
                     if callable(function := getattr(module, name, None)):
                         setattr(module, name, self._remembering(name, function))
