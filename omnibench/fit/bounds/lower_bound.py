@@ -39,8 +39,7 @@ h_j = H_j + dH_j.delta there,
         + sum_j [min over D_1j of D_1j Re h_j + min over D_2j of -D_2j Im h_j]                   (B6)
     F >= L - 1/2 sum_lm rho_l rho_m (B_0lm + sum_j max|zeta_j| B_jlm) - w (q + e),               (B7)
 
-w the largest weight, q the error of the quadrature of arcs and e that of rounding (stamp_sums.py). u_s with heading
-components alone have H = 0 and rule out distant parts early.
+w the largest weight, q the error of the quadrature of arcs and e that of rounding (stamp_sums.py).
 
 The part is cut where its width takes most from (B7), which is at most
 
@@ -66,11 +65,10 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex
 
-# The numbers below change how many parts a proof takes and not what is proven; tests/benchmarks/constants.py varies
-# them by 0.5 and 2.
-_CUT_OFF = 3.0  # preference for cutting rows 1 and 2 over row 3
-_IMBALANCE = 1e-9  # m or rad per rad: assumed slope of phi, so that no width of a part counts as exactly harmless
-_LOOSE = 0.9  # share of the expected cost below which a bound is tried again with headings alone
+# m or rad per rad: slope of phi that is assumed beside Eq. (B8), so that a part whose width does no harm to first order
+# is cut all the same. It decides only where nothing else does: a proof has the same parts with half of it and with
+# twice (tests/benchmarks/constants_fit.py).
+_IMBALANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +123,7 @@ class LowerBounds:
         Row 3 is halved. Rows 1 and 2, in which the cost is convex, are cut halfway between the good matrix and the
         farther side: the part without the good matrix is usually ruled out at once.
         """
-        worth = node.looseness * np.array([[_CUT_OFF], [_CUT_OFF], [1.0]])
-        row, column = np.unravel_index(int(np.argmax(worth)), worth.shape)
+        row, column = np.unravel_index(int(np.argmax(node.looseness)), node.looseness.shape)
         low, high = float(node.lower[row, column]), float(node.upper[row, column])
         border = (low + high) / 2
         if row < 2:
@@ -159,12 +156,6 @@ class LowerBounds:
         point, directions = least_sum_of_norms(residuals, jacobian, self._shares, *box)
         bounds = [self._dual_bound(part, sums, slopes, scaled) for scaled in into_unit_ball(directions)]
         bound, looseness = max(bounds, key=itemgetter(0))
-        expected = float(self._shares @ np.linalg.norm(residuals + jacobian @ point, axis=1))
-        if self._weights[2] and bound < _LOOSE * expected:
-            turns = least_sum_of_norms(residuals[:, 2:], jacobian[:, 2:], self._shares, *box).directions
-            headings = np.column_stack([np.zeros((len(turns), 2)), turns])
-            again = [self._dual_bound(part, sums, slopes, scaled)[0] for scaled in into_unit_ball(headings)]
-            bound = max(bound, *again)
         return Node(part.lower, part.upper, max(proven, bound), point.reshape(3, -1) + middle, looseness)
 
     def _linearised(self, part: ElementBox, sums: Complex, slopes: Complex, rows_12: Array) -> tuple[Array, Array]:
