@@ -203,3 +203,22 @@ class TestGeometry:
         with pytest.raises(ConfigError, match=r"^limits: ") as refusal:
             validate(GeometryLimits, limits, "limits")
         assert "\n" not in str(refusal.value)
+
+
+def test_the_derivatives_of_a_geometry_are_those_of_the_wheel_equations_inverse() -> None:
+    """With E the wheel equations, rows (-sin d, cos d, R) / r, the matrix is M = E^-1 and dM = -M dE M."""
+    geometry = WheelGeometry(APR_02)
+    slopes = geometry.slopes(geometry.start).reshape(3, 3, 9)
+    for index, wheel in enumerate(APR_02.wheels):
+        column = DESIGN[:, index]
+        of_distance = -np.outer(column, DESIGN[2]) / wheel.radius
+        of_angle = np.outer(column, np.cos(wheel.angle) * DESIGN[0] + np.sin(wheel.angle) * DESIGN[1]) / wheel.radius
+        np.testing.assert_allclose(slopes[:, index, index], column / wheel.radius, rtol=1e-8, atol=1e-11)
+        np.testing.assert_allclose(slopes[:, :, 3 + index], of_distance, rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(slopes[:, :, 6 + index], of_angle, rtol=1e-7, atol=1e-9)
+
+
+def test_the_derivatives_of_matrix_elements_are_zero_along_directions_that_are_kept() -> None:
+    slopes = MatrixElements(APR_02, "row", np.array([[0.6, 0.8, 0.0]])).slopes(DESIGN.ravel())
+    kept = np.array([[0.64, -0.48, 0.0], [-0.48, 0.36, 0.0], [0.0, 0.0, 1.0]])  # 1 - n n'
+    np.testing.assert_allclose(slopes, np.kron(np.eye(3), kept), rtol=0, atol=1e-15)

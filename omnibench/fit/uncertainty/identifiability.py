@@ -84,7 +84,7 @@ def identifiability(
     rows = np.abs(robot.inverse_kinematic_matrix).max(axis=1)
     every = wheel_directions(robot, span)
     driven = np.array([each.rates for each in every if each.state != "undriven"])
-    deviations = iter((_deviations(information, driven) / rows).tolist())
+    deviations = iter((deviations_along(information, driven) / rows).tolist())
     directions = tuple(
         DirectionIdentifiability(
             direction=each.words,
@@ -151,9 +151,12 @@ def _quick_noise(
     return noise_of_matrix(usable, matrix, integration), matrix
 
 
-def _deviations(information: Array, driven: Array) -> Array:
-    """Standard deviations (q, 3) of the three rows along orthonormal directions (q, N) that are fitted together."""
-    basis = np.kron(np.eye(3), driven)
+def deviations_along(information: Array, directions: Array) -> Array:
+    """Standard deviations (q, 3) of the three rows along orthonormal directions (q, N) that are fitted together.
+
+    information (3N, 3N): Fisher information of the matrix elements, row by row.
+    """
+    basis = np.kron(np.eye(3), directions)
     variances = np.diag(_inverse(basis @ information @ basis.T))
     deviations: Array = np.sqrt(variances).reshape(3, -1).T
     return deviations

@@ -15,7 +15,8 @@ from omnibench.errors import DataError
 from omnibench.fit.calibrators.closed_form import linear_start
 from omnibench.fit.inspect import inspect_dataset
 from omnibench.fit.span import aligned, driven_span, unidentified_directions
-from omnibench.fit.uncertainty.identifiability import Identifiability, identifiability
+from omnibench.fit.uncertainty.identifiability import Identifiability, deviations_along, identifiability
+from omnibench.fit.uncertainty.physical import identified_parameters, known_slopes
 from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
 from omnibench.testing.synthetic import synthetic_robot
 
@@ -33,6 +34,45 @@ def states(found: Identifiability) -> dict[str, str]:
 
 def untold(found: Identifiability) -> tuple[str, ...]:
     return tuple(each.name for each in found.parameters if not each.told)
+
+
+class TestSmallMatrices:
+    """Information matrices of two or three wheels, whose inverses are known."""
+
+    def test_independent_elements_have_the_inverse_root_of_their_information(self) -> None:
+        information = np.diag([1.0, 4.0, 16.0, 25.0, 100.0, 0.25])
+        np.testing.assert_allclose(
+            deviations_along(information, np.eye(2)), [[1.0, 0.25, 0.1], [0.5, 0.2, 2.0]], rtol=1e-12
+        )
+
+    def test_directions_that_are_fitted_together_share_their_information_and_kept_ones_take_none(self) -> None:
+        correlated = np.kron(np.eye(3), [[2.0, 1.0], [1.0, 2.0]])  # its inverse is [[2, -1], [-1, 2]] / 3
+        together = deviations_along(correlated, np.eye(2))
+        alone = deviations_along(correlated, np.array([[1.0, 0.0]]))
+        turned = deviations_along(correlated, np.array([[1.0, 1.0], [1.0, -1.0]]) / math.sqrt(2))
+        np.testing.assert_allclose(together, math.sqrt(2 / 3) * np.ones((2, 3)), rtol=1e-12)
+        np.testing.assert_allclose(alone, math.sqrt(1 / 2) * np.ones((1, 3)), rtol=1e-12)
+        np.testing.assert_allclose(turned.T, np.tile([math.sqrt(1 / 3), 1.0], (3, 1)), rtol=1e-12)
+
+    def test_a_direction_without_information_is_open_and_leaves_the_others_as_they_are(self) -> None:
+        deviations = deviations_along(np.diag([4.0, 0.0, 4.0, 0.0, 4.0, 0.0]), np.eye(2))
+        np.testing.assert_allclose(deviations[0], 0.5, rtol=1e-12)
+        assert (deviations[1] > 1e6).all()
+        assert np.isfinite(deviations).all()
+
+    def test_a_wheel_of_twice_the_radius_moves_the_robot_twice_as_far(self) -> None:
+        """A matrix column is proportional to its wheel's radius, so that its derivative is the column itself."""
+        matrix, slopes = ROBOT.inverse_kinematic_matrix, known_slopes(ROBOT, np.zeros((0, 3))).reshape(3, 3, 9)
+        for wheel in range(3):
+            column = np.where(np.arange(3) == wheel, matrix, 0.0)
+            np.testing.assert_allclose(slopes[:, :, wheel], column, rtol=1e-8, atol=1e-11)
+
+    def test_each_parameter_needs_the_directions_in_which_it_shows(self) -> None:
+        """Equal steps of all three wheels turn the robot: only the distances change with what it then does."""
+        turn = np.full((1, 3), 1 / math.sqrt(3))
+        assert identified_parameters(ROBOT, np.zeros((0, 3))) == (True,) * 9
+        assert identified_parameters(ROBOT, turn) == (True,) * 3 + (False,) * 3 + (True,) * 3
+        assert identified_parameters(ROBOT, np.eye(3)) == (False,) * 9
 
 
 class TestPrecision:
