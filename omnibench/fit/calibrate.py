@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.dataset import Dataset
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, RunResult, run_calibrator
@@ -122,7 +122,7 @@ def calibrate(
             box=problem.box,
             versions=package_versions(),
             training_cost=result.cost,
-            validation_cost=_cost(objective, model, validation) if validation else None,
+            validation_cost=objective.of_model(model, validation) if validation else None,
             outcome=result.outcome,
             reason=result.reason,
         ),
@@ -143,10 +143,3 @@ def _uncertainty(
         return uncertainty_of(problem, result), ()
     except NoCovarianceError as error:
         return None, (str(error),)
-
-
-def _cost(objective: Cost, model: OdometryModel, trajectories: Sequence[Trajectory]) -> float:
-    """The cost of a model's matrix on some trajectories."""
-    odometry = objective.batch(trajectories, model.integration)
-    errors = odometry.poses(model.matrix[None]) - objective.reference(trajectories)
-    return float(objective.combine(errors, odometry.trajectory)[0])

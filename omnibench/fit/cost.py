@@ -13,6 +13,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.registry import Options, costs
 from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
 
 
@@ -38,6 +39,12 @@ class Cost(ABC):
         """The cost (Z,) of every trajectory by itself, from errors (S, 3) of one candidate."""
         parts = (errors[None, trajectory == index] for index in range(int(trajectory[-1]) + 1))
         return np.array([self.combine(part, np.zeros(part.shape[1], dtype=np.intp))[0] for part in parts])
+
+    def of_model(self, model: OdometryModel, trajectories: Sequence[Trajectory]) -> float:
+        """The cost of a model on some trajectories. DataError: these lack what an effect of the model needs."""
+        poses = model.reported(self.logs(trajectories))
+        owner = np.repeat(np.arange(len(poses)), [len(of_run) for of_run in poses])
+        return float(self.combine((np.concatenate(poses) - self.reference(trajectories))[None], owner)[0])
 
     def logs(self, trajectories: Sequence[Trajectory]) -> list[WheelLog]:
         """The wheel logs of the trajectories with this cost's stamps. DataError: one has no pose after its start."""
