@@ -35,7 +35,7 @@ class Solution:
 
     converged: False when the calibrator hit a limit of its own (generations, programs) before its stopping rule held.
     Calibrators that estimate them also give the covariance (n, n) of the vector, the degrees_of_freedom of its
-    variances and the noise of the reference poses.
+    variances (one number, or (n,)), by which intervals are made, and the noise of the reference poses.
     """
 
     vector: Array
@@ -43,7 +43,7 @@ class Solution:
     converged: bool = True
     covariance: Array | None = None
     noise: Noise | None = None
-    degrees_of_freedom: int | None = None
+    degrees_of_freedom: Array | float | None = None
 
 
 class Calibrator(ABC):
@@ -82,7 +82,7 @@ class RunResult:
     """Result of one calibrator on one problem. ``vector``, ``matrix`` and ``cost`` are None if there is no answer.
 
     at_bounds, held: names of elements on a bound of the box, and of those kept at their start values.
-    covariance (n, n), degrees_of_freedom, noise: as in Solution, None if the calibrator does not estimate them.
+    covariance (n, n), degrees_of_freedom (n,), noise: as in Solution, None if the calibrator does not estimate them.
     """
 
     outcome: Outcome
@@ -97,7 +97,7 @@ class RunResult:
     held: tuple[str, ...] = ()
     covariance: JsonArray | None = None
     noise: Noise | None = None
-    degrees_of_freedom: int | None = None
+    degrees_of_freedom: JsonArray | None = None
 
 
 def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunResult:
@@ -122,13 +122,17 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
         outcome, reason = Outcome.FAILED, describe_error(error)
     seconds = problem.seconds
     vector, cost = None, None
+    freedom: Array | None = None
     if outcome not in (Outcome.FAILED, Outcome.INVALID):
         try:
+            if solution is not None and solution.degrees_of_freedom is not None:
+                freedom = np.broadcast_to(np.asarray(solution.degrees_of_freedom, dtype=float), problem.size)
             vector, cost, flaw = _examine(calibrator, problem, answer)
             if flaw:
                 outcome, reason = Outcome.INVALID, flaw
         except Exception as error:  # a cost may be a plug-in's, too
             outcome, reason = Outcome.FAILED, describe_error(error)
+    estimate = solution if vector is not None else None
     return RunResult(
         outcome=outcome,
         reason=reason,
@@ -140,9 +144,9 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
         history=tuple(problem.history),
         at_bounds=problem.at_bounds(vector) if vector is not None and calibrator.bounded else (),
         held=problem.held if calibrator.bounded else (),
-        covariance=solution.covariance if solution is not None and vector is not None else None,
-        noise=solution.noise if solution is not None and vector is not None else None,
-        degrees_of_freedom=solution.degrees_of_freedom if solution is not None and vector is not None else None,
+        covariance=estimate.covariance if estimate is not None else None,
+        noise=estimate.noise if estimate is not None else None,
+        degrees_of_freedom=freedom if estimate is not None else None,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 from pathlib import Path
 
@@ -52,6 +53,24 @@ def test_a_result_comes_back_to_the_last_bit(
 
 def test_a_run_that_is_not_there_is_none(tmp_path: Path) -> None:
     assert ResultStore(tmp_path / "runs", RunResult).get("key") is None
+
+
+@pytest.mark.parametrize(
+    ("freedom", "stored"), [("33", 33.0), ("null", None), (None, None), ("[8.5, 9.0]", [8.5, 9.0])]
+)
+def test_results_are_read_whether_they_hold_one_number_of_degrees_of_freedom_several_or_none(
+    freedom: str | None, stored: float | list[float] | None, tmp_path: Path
+) -> None:
+    store = ResultStore(tmp_path, RunResult)
+    store.put("key", RunResult(Outcome.TIME, "", None, None, None, 0, 0.0, ()))
+    fields = json.loads(store.file("key").read_text())
+    del fields["degrees_of_freedom"]
+    if freedom is not None:
+        fields["degrees_of_freedom"] = json.loads(freedom)
+    store.file("key").write_text(json.dumps(fields))
+    result = store.get("key")
+    assert result is not None
+    assert (None if result.degrees_of_freedom is None else result.degrees_of_freedom.tolist()) == stored
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:

@@ -49,6 +49,17 @@ def test_an_answer_by_the_calibrators_own_rule_has_converged() -> None:
     np.testing.assert_array_equal(result.matrix, problem.matrix(result.vector))
 
 
+def test_one_number_of_degrees_of_freedom_is_that_of_every_variance() -> None:
+    result = run(lambda problem: Solution(problem.start, "done", covariance=np.eye(problem.size), degrees_of_freedom=7))
+    np.testing.assert_array_equal(result.degrees_of_freedom, np.full(make_problem(RUNS).size, 7.0))
+
+
+def test_degrees_of_freedom_of_another_size_fail_the_run() -> None:
+    result = run(lambda problem: Solution(problem.start, "done", degrees_of_freedom=np.ones(problem.size + 1)))
+    assert result.outcome is Outcome.FAILED
+    assert result.vector is None
+
+
 def test_an_answer_at_a_limit_of_the_calibrators_own_has_not_converged() -> None:
     result = run(lambda problem: Solution(problem.start, "5 rounds", converged=False))
     assert (result.outcome, result.reason) == (Outcome.BUDGET, "5 rounds")

@@ -25,7 +25,6 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from omnibench.config import Positive
-from omnibench.errors import DataError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.cost_weights import cost_weightings
 from omnibench.fit.least_squares.gauss_newton import BoxedFit, Descent, descend, first_fit
@@ -35,6 +34,7 @@ from omnibench.fit.least_squares.start_noise import separate_start_noise
 from omnibench.fit.least_squares.trajectory_covariance import FitCovariance
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
 from omnibench.fit.problem import CalibrationProblem
+from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array
 
@@ -69,17 +69,15 @@ class TrajectoryMLOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryEstimate:
-    """The estimate with its covariance.
+    """The estimate of a vector (n,) with its covariance.
 
-    vector (n,), its covariance (n, n) and degrees_of_freedom. noise: noise model of the reference. nuisances: of the
-    runs that have reference poses after their start. misfit: evidence in words that the model is wrong, or empty.
-    description: source of the covariance, in words. rounds: number of rounds of noise and fit. settled: True if they
-    converged.
+    noise: noise model of the reference. nuisances: of each run with reference poses after its start. misfit: evidence
+    in words that the model is wrong, or empty. description: source of the covariance, in words. rounds: number of
+    rounds of noise and fit. settled: True if they converged.
     """
 
     vector: Array
-    covariance: Array
-    degrees_of_freedom: int
+    covariance: EstimatedCovariance
     noise: NoiseEstimate
     nuisances: Nuisances
     misfit: str
@@ -105,9 +103,9 @@ class TrajectoryML(Calibrator):
             estimate.vector,
             reason,
             estimate.settled,
-            estimate.covariance,
+            estimate.covariance.matrix,
             estimate.noise.noise,
-            estimate.degrees_of_freedom,
+            estimate.covariance.degrees_of_freedom,
         )
 
     def estimate(self, problem: CalibrationProblem) -> TrajectoryEstimate:
@@ -132,7 +130,7 @@ class TrajectoryML(Calibrator):
     def _conclude(self, now: Descent, noise: NoiseEstimate, rounds: int, settled: bool) -> TrajectoryEstimate:
         """The maximum likelihood estimate, or the one weighted by the cost if the model misfits; its covariance."""
         options, problem, fit = self.options, now.fit.problem, now.fit.trajectories
-        covariance = FitCovariance(problem, now.data, fit.runs)
+        covariance = self._covariance(now, noise)
         misfit = covariance.scatter.words if covariance.lack_of_fit and covariance.scatter else ""
         by_cost = options.weights == "cost" or (
             options.weights == "auto" and bool(misfit) and options.covariance != "model"
@@ -140,30 +138,25 @@ class TrajectoryML(Calibrator):
         if by_cost:
             weightings = cost_weightings(problem.objective, fit.runs, fit.residuals)
             now = descend(now.fit.with_nuisances(fit.nuisances.held()), weightings, options.tolerance)
-            covariance = FitCovariance(problem, now.data, fit.runs)
-        matrix, freedom, words = self._covariance(covariance, noise, by_cost)
+            covariance = self._covariance(now, noise)
+        robust = options.covariance == "robust" or (options.covariance == "auto" and covariance.scatter_is_wider)
+        chosen, words = covariance.chosen(by_cost or robust)
         return TrajectoryEstimate(
             vector=now.fit.vector,
-            covariance=matrix,
-            degrees_of_freedom=freedom,
+            covariance=chosen,
             noise=noise,
             nuisances=fit.nuisances,
             misfit=misfit,
-            description=words,
+            description=f"{words}; weighted by the cost" if by_cost else words,
             rounds=rounds,
             settled=settled and now.settled,
         )
 
-    def _covariance(self, covariance: FitCovariance, noise: NoiseEstimate, by_cost: bool) -> tuple[Array, int, str]:
-        """The covariance (n, n), its degrees of freedom and its source in words."""
-        asked, scatter = self.options.covariance, covariance.scatter
-        robust = by_cost or asked == "robust" or (asked == "auto" and covariance.scatter_is_wider)
-        if not robust:
-            return covariance.model, noise.degrees_of_freedom, f"the noise model ({noise.description})"
-        if scatter is None:
-            raise DataError("too few runs for a covariance from their scatter; use covariance: model, weights: noise")
-        words = f"{scatter.words}; weighted by the cost" if by_cost else scatter.words
-        return scatter.covariance, scatter.degrees_of_freedom, words
+    def _covariance(self, now: Descent, noise: NoiseEstimate) -> FitCovariance:
+        """The covariances of a descent's vector, held elements with none."""
+        problem = now.fit.problem
+        unit = np.where(problem.free, problem.upper - problem.lower, 0.0)
+        return FitCovariance(now.data, now.fit.trajectories.runs, noise, unit)
 
     def _with_deviations(self, fit: BoxedFit, start_heading: float) -> BoxedFit:
         """The fit with the nuisances' standard deviations; those that are not estimated are 0."""

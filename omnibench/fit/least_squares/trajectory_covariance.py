@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import chdtri, fdtrc
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
+from omnibench.fit.least_squares.noise import NoiseEstimate
 from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.fit.least_squares.whitened import Whitened
-from omnibench.fit.problem import CalibrationProblem
-from omnibench.fit.uncertainty.sandwich import Sandwich, Scores, sandwich
+from omnibench.fit.uncertainty.intervals import EstimatedCovariance
+from omnibench.fit.uncertainty.sandwich import Sandwich, Scores, roots_of, sandwich
 from omnibench.robot.kinematics import Array
 
 _CHANCE = 0.001  # level of the tests that decide whether runs scatter more than the noise; chosen strict
@@ -23,40 +26,38 @@ _DETERMINED = 1e-3
 
 
 class FitCovariance:
-    """Covariances (n, n) of the vector of a linearised fit; zero in rows and columns of held elements.
+    """Covariances of the numbers (n,) of a whitened fit, from its noise model and from the scatter of its runs.
 
-    model: inverse of the information, zero along undetermined directions. scatter: the sandwich of
-    uncertainty/sandwich.py, None if there are too few runs.
+    by_model: inverse of the information, zero along undetermined directions. scatter: the sandwich of
+    uncertainty/sandwich.py, None if there are too few runs. Both are zero in rows and columns whose ``unit`` (n,) is 0;
+    others are the units of the numbers in which directions are judged as undetermined.
     """
 
-    def __init__(self, problem: CalibrationProblem, data: Whitened, trajectories: Sequence[Trajectory]) -> None:
-        self._free = problem.free
-        self._unit = (problem.upper - problem.lower)[problem.free]
-        self._size = problem.size
-        scores = data.scores[:, self._free] * self._unit
-        information = data.information_of_runs[:, self._free][:, :, self._free] * np.outer(self._unit, self._unit)
-        values, vectors = np.linalg.eigh(information.sum(axis=0))
-        known = values > _RANK * values.max(initial=0.0)
-        self._roots, self._directions = np.sqrt(values[known]), vectors[:, known]
-        whiten = self._directions / self._roots  # to coordinates in which the model's covariance is the unit matrix
-        self._chance_of_misfit = _chance_of_misfit(scores @ whiten, whiten.T @ information @ whiten, trajectories)
-        self._scatter: Sandwich | None = None
-        if known.any():
-            try:
-                self._scatter = sandwich(Scores(scores, information, trajectories, np.zeros(len(self._unit))))
-            except DataError:
-                self._scatter = None
+    scatter: Sandwich | None = None
 
-    @property
-    def model(self) -> Array:
-        return self._whole((self._directions / self._roots**2) @ self._directions.T)
+    def __init__(self, data: Whitened, runs: Sequence[Trajectory], noise: NoiseEstimate, unit: Array) -> None:
+        scores, information = data.scores * unit, data.information_of_runs * np.outer(unit, unit)
+        roots = roots_of(information.sum(axis=0), _RANK)
+        self._noise, self._roots = noise, unit[:, None] * roots
+        # A difference between repetitions has two coordinates of position, of the same variances.
+        self.by_model = EstimatedCovariance(self._roots @ self._roots.T, 2 * noise.degrees_of_freedom)
+        self._chance_of_misfit = _chance_of_misfit(scores @ roots, roots.T @ information @ roots, runs)
+        if not roots.size:
+            return
+        with suppress(DataError):
+            found = sandwich(Scores(scores, information, runs, np.zeros(len(unit))))
+            self.scatter = replace(found, covariance=found.covariance * np.outer(unit, unit))
 
-    @property
-    def scatter(self) -> Sandwich | None:
-        if self._scatter is None:
-            return None
-        free = self._scatter
-        return Sandwich(self._whole(free.covariance), free.degrees_of_freedom, free.words, free.lack_of_fit)
+    def chosen(self, robust: bool) -> tuple[EstimatedCovariance, str]:
+        """The covariance of the noise model or, if ``robust``, of the scatter, and its source in words.
+
+        DataError: the runs are too few for their scatter.
+        """
+        if not robust:
+            return self.by_model, f"the noise model ({self._noise.description})"
+        if self.scatter is None:
+            raise DataError("too few runs for a covariance from their scatter; use covariance: model, weights: noise")
+        return EstimatedCovariance(self.scatter.covariance, self.scatter.effective_freedom), self.scatter.words
 
     @property
     def lack_of_fit(self) -> bool:
@@ -65,7 +66,7 @@ class FitCovariance:
         The likelihood's test is an F test between and within commands on the vectors that single commands would give,
         each direction in units of its noise, so that the size of the noise does not matter.
         """
-        return self._scatter is not None and self._scatter.lack_of_fit and self._chance_of_misfit < _CHANCE
+        return self.scatter is not None and self.scatter.lack_of_fit and self._chance_of_misfit < _CHANCE
 
     @property
     def scatter_is_wider(self) -> bool:
@@ -73,19 +74,13 @@ class FitCovariance:
 
         Scatter between commands counts only if the likelihood's test confirms it.
         """
-        if self._scatter is None or self._scatter.lack_of_fit:
+        if self.scatter is None or self.scatter.lack_of_fit:
             return self.lack_of_fit
-        whitened = self._directions * self._roots
-        values = np.linalg.eigvalsh(whitened.T @ self._scatter.covariance @ whitened)
+        back = np.linalg.pinv(self._roots)
+        values = np.linalg.eigvalsh(back @ self.scatter.covariance @ back.T)
         total = float(values.sum())
-        freedom = self._scatter.degrees_of_freedom * total**2 / float(np.square(values).sum())
+        freedom = self.scatter.degrees_of_freedom * total**2 / float(np.square(values).sum())
         return total / len(values) > float(chdtri(freedom, _CHANCE)) / freedom
-
-    def _whole(self, covariance: Array) -> Array:
-        """A covariance of the free elements, in units of the box, as one (n, n) of the vector."""
-        whole = np.zeros((self._size, self._size))
-        whole[np.ix_(self._free, self._free)] = covariance * np.outer(self._unit, self._unit)
-        return whole
 
 
 def _chance_of_misfit(scores: Array, information: Array, trajectories: Sequence[Trajectory]) -> float:

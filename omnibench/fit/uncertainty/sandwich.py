@@ -1,4 +1,29 @@
-"""Sandwich covariance of an estimate that minimises a sum of norms, from the scatter of the runs' score vectors."""
+"""Sandwich covariance of an estimate that minimises a sum over runs, from the scatter of the runs' score vectors.
+
+With s_z the score of run z, H_z its share of the Hessian H, and R with R'HR = 1, everything is said in the coordinates
+s = R's_z and L = R'H_z R, the leverage of a run; the leverages sum to 1. The covariance of the estimate (Huber 1967) is
+
+    H^-1 B H^-1 = R (R'BR) R',                                                                            (1)
+
+and R'BR is either the scatter within the groups g of n_g repetitions of a command,
+
+    sum_g n_g / (n_g - 1) sum_(z in g) (s_z - mean_g)(s_z - mean_g)',                                     (2)
+
+or that between clusters c, whose leverage and score are the sums of their runs'. A cluster's score is what is left of
+its errors u_c after the fit, s_c = u_c - L_c sum_d u_d, and the correction of Bell and McCaffrey (2002) undoes that:
+
+    sum_c M_c s_c s_c' M_c,   M_c = (1 - L_c)^(-1/2).                                                     (3)
+
+The variance of a number whose row of R is r' is a sum of squares, and is distributed nearly as chi-square with the
+degrees of freedom that its mean and its variance would have under errors of covariance L_z (Satterthwaite 1946). Of (2)
+and (3) they are
+
+    (sum_g w_g)^2 / sum_g w_g^2 / (n_g - 1),   w_g = r' L_g r,                                            (4)
+    (tr G)^2 / tr G^2,   G_cd = y_c' (1_cd L_c - L_c L_d) y_d,   y_c = M_c r,                             (5)
+
+(5) as in Imbens and Kolesar (2016): with few clusters, or one that tells more than the others, far fewer than clusters
+less one.
+"""
 
 from __future__ import annotations
 
@@ -42,13 +67,17 @@ class Scores:
 
 @dataclass(frozen=True, eq=False)
 class Sandwich:
-    """Sandwich covariance (n, n), the degrees of freedom of its variances, and the data behind it, in words.
+    """Sandwich covariance (n, n) and the data behind it, in words.
 
+    degrees_of_freedom: independent differences between repetitions, clusters less one, or runs beyond the fitted
+    numbers. effective_freedom (n,): degrees of freedom of each searched number's variance, Eq. (4) or (5), for
+    intervals by Student's t.
     lack_of_fit: True if commands or sessions scatter more than their repetitions explain.
     """
 
     covariance: Array
     degrees_of_freedom: int
+    effective_freedom: Array
     words: str
     lack_of_fit: bool = False
 
@@ -91,49 +120,48 @@ def scores_of_runs(
         squares = columns.T @ columns
         curvature += squares
         hessians.append(squares - rays.T @ rays)
-    step = -_pinv(curvature) @ np.sum(scores, axis=0)
+    roots = roots_of(curvature, _NOTHING)
+    step = -roots @ roots.T @ np.sum(scores, axis=0)
     return Scores(np.array(scores), np.array(hessians), trajectories, step)
 
 
 def sandwich(scores: Scores) -> Sandwich:
-    """The covariance H^-1 B H^-1 of an M-estimator (Huber 1967), H the Hessian and B the scores' covariance.
+    """The covariance H^-1 B H^-1 of an M-estimator (Huber 1967), H the Hessian and B the scores' covariance, Eq. (1).
 
-    B is estimated from the differences between repetitions of a command within a session. Where commands, or sessions,
-    scatter more than their repetitions explain, the model does not fit and other commands would give another
-    calibration. Commands, or sessions, then are the clusters of a cluster-robust B (small-sample correction of Bell and
-    McCaffrey 2002), which in no direction is smaller than B from repetitions. Without repetitions every run is a
-    cluster. DataError when fewer than two runs are left beyond those that the fit uses up.
+    B is estimated from the differences between repetitions of a command within a session, Eq. (2). Where commands, or
+    sessions, scatter more than their repetitions explain, the model does not fit and other commands would give another
+    calibration. Commands, or sessions, then are the clusters of a cluster-robust B, Eq. (3), which in no direction is
+    smaller than B from repetitions. Without repetitions every run is a cluster. DataError when fewer than two runs are
+    left beyond those that the fit uses up.
     """
     runs = scores.trajectories
-    hessian = scores.hessians.sum(axis=0)
-    bread = _root(_pinv(hessian))  # H^-1/2
-    count, size = len(runs), int(np.linalg.matrix_rank(hessian, _NOTHING * np.abs(hessian).max(), hermitian=True))
+    roots = roots_of(scores.hessians.sum(axis=0), _NOTHING)
+    count, size = len(runs), roots.shape[1]
     free_runs = count - max(1, -(-size // 3))  # a run has three numbers
     if free_runs < 1:
         raise DataError(f"runs are too few ({count}) for the scatter of {plural(size, 'fitted number')}")
+    whitened = _Whitened(scores.scores @ roots, roots.T @ scores.hessians @ roots)
     repeated = repetitions_of_commands(runs)
-    groups = repeated.groups
-    if not groups:
-        spread = _between([(index,) for index in range(count)], scores, bread)
+    if not repeated.groups:
+        scatter = whitened.between([(index,) for index in range(count)], roots)
         words = f"the scatter between {count} runs: no command is repeated, so what the model cannot express counts too"
-        return Sandwich(bread @ spread @ bread, free_runs, words)
-    within = _within(groups, scores, bread)
-    freedom = sum(len(group) - 1 for group in groups)
-    spread, clusters, words = within, None, f"the scatter between repetitions ({repeated.description})"
-    largest = 1.0
+        return Sandwich(roots @ scatter.spread @ roots.T, free_runs, scatter.freedom, words)
+    within = whitened.within(repeated.groups, roots)
+    nominal = sum(len(group) - 1 for group in repeated.groups)
+    spread, freedom, words = within.spread, within.freedom, f"the scatter between repetitions ({repeated.description})"
+    degrees_of_freedom, largest = nominal, 1.0
     for name, members in _clusterings(runs):
-        between = _between(members, scores, bread)
-        ratio = float(np.trace(between) / np.trace(within))
-        unlikely = float(fdtri(_effective(between, len(members) - 1), _effective(within, freedom), 1 - _CHANCE))
-        if ratio > max(unlikely, largest):
-            largest, clusters = ratio, members
-            spread = _wider(within, between)
+        between = whitened.between(members, roots)
+        ratio = float(np.trace(between.spread) / np.trace(within.spread))
+        numerator, denominator = _effective(between.spread, len(members) - 1), _effective(within.spread, nominal)
+        if ratio > max(float(fdtri(numerator, denominator, 1 - _CHANCE)), largest):
+            largest, degrees_of_freedom = ratio, len(members) - 1
+            spread, freedom = wider(within.spread, between.spread), between.freedom
             words = (
                 f"the scatter between {len(members)} {name}s, {np.sqrt(ratio):.1f} times what the repetitions within "
                 f"them explain: the model does not fit all of them at once"
             )
-    lack = clusters is not None
-    return Sandwich(bread @ spread @ bread, freedom if clusters is None else len(clusters) - 1, words, lack)
+    return Sandwich(roots @ spread @ roots.T, degrees_of_freedom, freedom, words, largest > 1.0)
 
 
 def _clusterings(runs: Sequence[Trajectory]) -> list[tuple[str, list[tuple[int, ...]]]]:
@@ -146,29 +174,68 @@ def _clusterings(runs: Sequence[Trajectory]) -> list[tuple[str, list[tuple[int, 
     return [(name, members) for name, members in clusterings if len(members) >= _FEWEST_CLUSTERS]
 
 
-def _within(groups: Sequence[tuple[int, ...]], scores: Scores, bread: Array) -> Array:
-    """Scatter (n, n) of whitened scores about the means of their commands; about zero for runs without repetition."""
-    whitened = scores.scores @ bread
-    total = np.zeros((whitened.shape[1],) * 2)
-    repeated: set[int] = set()
-    for group in groups:
-        apart = whitened[list(group)] - whitened[list(group)].mean(axis=0)
-        total += len(group) / (len(group) - 1) * apart.T @ apart
-        repeated.update(group)
-    alone = [(index,) for index in range(len(whitened)) if index not in repeated]
-    return total + (_between(alone, scores, bread) if alone else 0.0)
+@dataclass(frozen=True, eq=False)
+class _Scatter:
+    """An estimate (d, d) of B in whitened coordinates, and the degrees of freedom (n,) of the n variances."""
+
+    spread: Array
+    freedom: Array
 
 
-def _between(clusters: Sequence[tuple[int, ...]], scores: Scores, bread: Array) -> Array:
-    """Scatter (n, n) of whitened cluster scores, with Bell and McCaffrey's correction for what the fit absorbs."""
-    total = np.zeros(bread.shape)
-    for members in clusters:
-        score = bread @ scores.scores[list(members)].sum(axis=0)
-        leverage = bread @ scores.hessians[list(members)].sum(axis=0) @ bread
-        values, vectors = np.linalg.eigh(np.eye(len(leverage)) - leverage)
-        score = vectors @ ((vectors.T @ score) / np.sqrt(np.maximum(values, _LEAST_FREE)))
-        total += np.outer(score, score)
-    return total
+@dataclass(frozen=True, eq=False)
+class _Whitened:
+    """Scores (Z, d) and Hessians (Z, d, d) of Z runs in coordinates in which the Hessians sum to the unit matrix.
+
+    directions (n, d): rows of the matrix that turns these coordinates into the n searched numbers.
+    """
+
+    scores: Array
+    hessians: Array
+
+    def within(self, groups: Sequence[tuple[int, ...]], directions: Array) -> _Scatter:
+        """Scatter about the means of repeated commands, Eq. (2); about zero for runs without repetition."""
+        total = np.zeros(self.hessians.shape[1:])
+        shares, freedoms = [], []
+        for members in map(list, groups):
+            apart = self.scores[members] - self.scores[members].mean(axis=0)
+            total += len(members) / (len(members) - 1) * apart.T @ apart
+            shares.append(_sizes(self.hessians[members].sum(axis=0), directions))
+            freedoms.append(len(members) - 1)
+        alone = sorted(set(range(len(self.scores))).difference(*groups))
+        if alone:
+            total += self.between([(index,) for index in alone], directions).spread
+            shares += [_sizes(self.hessians[index], directions) for index in alone]
+            freedoms += [1] * len(alone)
+        weights = np.array(shares)
+        squares = (np.square(weights) / np.array(freedoms)[:, None]).sum(axis=0)
+        return _Scatter(total, _ratio(weights.sum(axis=0) ** 2, squares))  # Eq. (4)
+
+    def between(self, clusters: Sequence[tuple[int, ...]], directions: Array) -> _Scatter:
+        """Scatter of clusters about zero, with Bell and McCaffrey's correction for what the fit absorbs, Eq. (3)."""
+        total = np.zeros(self.hessians.shape[1:])
+        corrected, absorbed = [], []
+        for members in map(list, clusters):
+            leverage = self.hessians[members].sum(axis=0)
+            values, vectors = np.linalg.eigh(np.eye(len(leverage)) - leverage)
+            correction = (vectors / np.sqrt(np.maximum(values, _LEAST_FREE))) @ vectors.T
+            score = correction @ self.scores[members].sum(axis=0)
+            total += np.outer(score, score)
+            corrected.append(directions @ correction)
+            absorbed.append(corrected[-1] @ leverage)
+        own = np.einsum("cnd,cnd->nc", corrected, absorbed)
+        covariance = np.einsum("nc,ce->nce", own, np.eye(len(clusters))) - np.einsum("cnd,end->nce", absorbed, absorbed)
+        traces = np.trace(covariance, axis1=1, axis2=2)
+        return _Scatter(total, _ratio(traces**2, np.square(covariance).sum(axis=(1, 2))))  # Eq. (5)
+
+
+def _sizes(matrix: Array, directions: Array) -> Array:
+    """Quadratic forms (n,) of a matrix (d, d) along directions (n, d)."""
+    return np.einsum("nd,de,ne->n", directions, matrix, directions)
+
+
+def _ratio(numerators: Array, denominators: Array) -> Array:
+    """Degrees of freedom (n,), at least 1; of numbers that do not vary, 1."""
+    return np.maximum(numerators / np.maximum(denominators, 1e-300), 1.0)
 
 
 def _effective(spread: Array, freedom: int) -> float:
@@ -177,24 +244,24 @@ def _effective(spread: Array, freedom: int) -> float:
     return freedom * float(values.sum() ** 2 / np.square(values).sum())
 
 
-def _wider(first: Array, second: Array) -> Array:
-    """A scatter matrix (n, n) that in no direction is below the first, and equals the second where that is larger."""
-    root = _root(first)
-    inverse = np.linalg.pinv(root, hermitian=True)
-    values, vectors = np.linalg.eigh(inverse @ second @ inverse)
-    turned = root @ vectors
-    wider: Array = (turned * np.maximum(values, 1.0)) @ turned.T
-    return wider
+def roots_of(information: Array, share: float) -> Array:
+    """Roots R (n, d) with R'AR = 1 of a positive semi-definite matrix A (n, n).
+
+    Directions whose eigenvalue is below a share of the largest are left out: R R' is the pseudo-inverse of A.
+    """
+    values, vectors = np.linalg.eigh(information)
+    known = values > share * values.max(initial=0.0)
+    roots: Array = vectors[:, known] / np.sqrt(values[known])
+    return roots
 
 
-def _root(matrix: Array) -> Array:
-    """Symmetric square root (n, n) of a positive semi-definite matrix."""
-    values, vectors = np.linalg.eigh(matrix)
-    root: Array = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return root
+def wider(first: Array, second: Array) -> Array:
+    """A matrix (d, d) that is the larger of two positive semi-definite ones in every direction.
 
-
-def _pinv(matrix: Array) -> Array:
-    """Pseudo-inverse (n, n): zero along directions in which the cost is flat."""
-    inverse: Array = np.linalg.pinv(matrix, rcond=_NOTHING, hermitian=True)
-    return inverse
+    In coordinates in which both are diagonal and their sum is the unit matrix.
+    """
+    roots = roots_of(first + second, _NOTHING)
+    values, vectors = np.linalg.eigh(roots.T @ second @ roots)
+    turned = np.linalg.pinv(roots.T) @ vectors
+    larger: Array = (turned * np.maximum(values, 1 - values)) @ turned.T
+    return larger

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
 
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import RunResult
@@ -17,6 +16,7 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.span import driven_span, unidentified_directions
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals
 from omnibench.fit.uncertainty.information import noise_of_matrix
+from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.fit.uncertainty.physical import (
     ParameterEstimate,
     geometry_of,
@@ -24,12 +24,10 @@ from omnibench.fit.uncertainty.physical import (
     is_invertible,
     unit_of,
 )
-from omnibench.fit.uncertainty.sandwich import Scores, sandwich, scores_of_runs
+from omnibench.fit.uncertainty.sandwich import Sandwich, Scores, sandwich, scores_of_runs
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
-_INTERVAL = 0.95  # probability of the intervals
-_MANY = 10**9  # degrees of freedom that stand for infinity, where Student's t is the normal distribution
 _MOST_STEPS = 20  # steps of the check that an answer is a minimum; chosen
 _NO_GAIN = 1e-4  # relative decrease of the cost that ends these steps; chosen
 _NO_ERROR = 1e-9  # m, rad: a smaller cost is rounding
@@ -48,7 +46,7 @@ class Uncertainty:
     were kept at the design values. standard_deviations (3, N). intervals: 95 %, by Student's t. parameters: the wheels'
     geometry, if it was searched or follows from the matrix (three omni wheels); a parameter that the data do not
     identify has no standard deviation. noise: the reference poses'. basis: likelihood (the calibrator's own covariance)
-    or scatter of the runs. source: the data behind it, in words.
+    or scatter of the runs. degrees_of_freedom: of the scatter. source: the data behind it, in words.
     """
 
     covariance: Array
@@ -73,31 +71,29 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     """
     if result.matrix is None or result.vector is None:
         raise NoCovarianceError(f"no covariance without an answer: {result.reason}")
-    slopes = problem.parameterisation.slopes(result.vector)
-    freedom: int | None
-    if result.covariance is not None:
-        of_vector, freedom = result.covariance, None
-        source = "the calibrator's own (see its reason)"
+    scatter = _by_scatter(problem, result) if result.covariance is None else None
+    if scatter is not None:
+        of_vector = EstimatedCovariance(scatter.covariance, scatter.effective_freedom)
     else:
-        of_vector, freedom, source = _by_scatter(problem, result)
-    covariance = slopes @ of_vector @ slopes.T
-    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(result.matrix.shape)
-    reach = _quantile(freedom) * deviations
-    noise = result.noise or noise_of_matrix(problem.trajectories, result.matrix, problem.integration).noise
+        assert result.covariance is not None
+        freedom = np.inf if result.degrees_of_freedom is None else result.degrees_of_freedom
+        of_vector = EstimatedCovariance(result.covariance, freedom)
+    of_elements = of_vector.of(problem.parameterisation.slopes(result.vector))
+    reach = of_elements.reach.reshape(result.matrix.shape)
     return Uncertainty(
-        covariance=covariance,
-        standard_deviations=deviations,
+        covariance=of_elements.matrix,
+        standard_deviations=of_elements.standard_deviations.reshape(result.matrix.shape),
         intervals=ElementIntervals(result.matrix - reach, result.matrix + reach),
-        parameters=_parameters(problem, result, of_vector, covariance, _quantile(freedom)),
-        noise=noise,
-        basis="scatter" if result.covariance is None else "likelihood",
-        degrees_of_freedom=freedom,
-        source=source,
+        parameters=_parameters(problem, result, of_vector, of_elements),
+        noise=result.noise or noise_of_matrix(problem.trajectories, result.matrix, problem.integration).noise,
+        basis="likelihood" if scatter is None else "scatter",
+        degrees_of_freedom=None if scatter is None else scatter.degrees_of_freedom,
+        source="the calibrator's own (see its reason)" if scatter is None else scatter.words,
     )
 
 
-def _by_scatter(problem: CalibrationProblem, result: RunResult) -> tuple[Array, int, str]:
-    """Sandwich covariance (n, n) of the vector, its degrees of freedom, and the data behind it, in words."""
+def _by_scatter(problem: CalibrationProblem, result: RunResult) -> Sandwich:
+    """Sandwich covariance (n, n) of the vector."""
     objective = problem.objective
     assert result.vector is not None and result.matrix is not None  # noqa: PT018 (uncertainty_of has checked)
     if not isinstance(objective, SumOfNorms):
@@ -113,15 +109,17 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult) -> tuple[Array, 
         )
     try:
         scores = _scores(problem, objective, result.vector, free)
-        answer = sandwich(scores)
+        numbers = len(problem.trajectories) * sum(map(bool, objective.weights))
+        answer = sandwich(_less_curved(scores, numbers))
         _check_minimum(problem, objective, result.vector, free, scores)
     except NoCovarianceError:
         raise
     except DataError as error:
         raise NoCovarianceError(f"no covariance: {error}") from None
-    covariance = np.zeros((problem.size, problem.size))
+    covariance, freedom = np.zeros((problem.size, problem.size)), np.ones(problem.size)
     covariance[np.ix_(free, free)] = answer.covariance
-    return covariance, answer.degrees_of_freedom, answer.words
+    freedom[free] = answer.effective_freedom
+    return replace(answer, covariance=covariance, effective_freedom=freedom)
 
 
 def _scores(problem: CalibrationProblem, objective: SumOfNorms, vector: Array, free: NDArray[np.bool_]) -> Scores:
@@ -131,6 +129,16 @@ def _scores(problem: CalibrationProblem, objective: SumOfNorms, vector: Array, f
     slopes = problem.parameterisation.slopes(vector)[:, free]
     jacobian = problem.odometry.jacobian(matrix).reshape(len(errors), 3, -1) @ slopes
     return scores_of_runs(objective, problem.odometry, errors, jacobian, problem.trajectories)
+
+
+def _less_curved(scores: Scores, numbers: int) -> Scores:
+    """Score vectors with the curvature that the errors of the true matrix would have.
+
+    A fit of p numbers to n errors shortens them by sqrt(1 - p/n), and the curvature of a norm is the reciprocal of its
+    length: the correction of M-estimates for small samples (Huber 1981, section 7.6), to first order in p/n.
+    """
+    fitted = np.linalg.matrix_rank(scores.hessians.sum(axis=0), hermitian=True)
+    return replace(scores, hessians=np.sqrt(max(1 - fitted / numbers, 0.25)) * scores.hessians)
 
 
 def _check_minimum(
@@ -157,12 +165,11 @@ def _check_minimum(
 
 
 def _parameters(
-    problem: CalibrationProblem, result: RunResult, of_vector: Array, of_elements: Array, reach: float
+    problem: CalibrationProblem, result: RunResult, of_vector: EstimatedCovariance, of_elements: EstimatedCovariance
 ) -> tuple[ParameterEstimate, ...] | None:
     """The physical parameters with their intervals; None where the matrix does not determine them.
 
-    of_vector, of_elements: covariances of the searched vector and of the matrix elements. reach: half-width of the
-    interval in standard deviations.
+    of_vector, of_elements: covariances of the searched vector and of the matrix elements.
     """
     robot = problem.robot
     assert result.vector is not None and result.matrix is not None  # noqa: PT018 (uncertainty_of has checked)
@@ -171,13 +178,11 @@ def _parameters(
     elif is_invertible(robot):
         try:
             values = geometry_of(result.matrix, robot)
-            turned = np.linalg.inv(WheelGeometry(robot).slopes(values))
+            covariance = of_elements.of(np.linalg.inv(WheelGeometry(robot).slopes(values)))
         except (DataError, np.linalg.LinAlgError):
             return None
-        covariance = turned @ of_elements @ turned.T
     else:
         return None
-    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     kept = unidentified_directions(robot, driven_span(problem.trajectories))
     return tuple(
         ParameterEstimate(
@@ -185,15 +190,15 @@ def _parameters(
             value=float(value),
             unit=unit_of(name),
             standard_deviation=float(deviation) if identified else None,
-            low=float(value - reach * deviation) if identified else None,
-            high=float(value + reach * deviation) if identified else None,
+            low=float(value - reach) if identified else None,
+            high=float(value + reach) if identified else None,
         )
-        for name, value, deviation, identified in zip(
-            WheelGeometry(robot).names, values, deviations, identified_parameters(robot, kept), strict=True
+        for name, value, deviation, reach, identified in zip(
+            WheelGeometry(robot).names,
+            values,
+            covariance.standard_deviations,
+            covariance.reach,
+            identified_parameters(robot, kept),
+            strict=True,
         )
     )
-
-
-def _quantile(freedom: int | None) -> float:
-    """Half-width of the interval in standard deviations: quantile of Student's t, or normal without ``freedom``."""
-    return -float(stdtrit(freedom or _MANY, (1 - _INTERVAL) / 2))

@@ -39,6 +39,7 @@ def test_without_repetitions_a_mean_has_the_sample_covariance_over_the_number_of
     found = sandwich(scores_of_a_mean(VALUES, runs_of([None] * 12)))
     np.testing.assert_allclose(found.covariance, np.cov(VALUES.T) / 12, rtol=1e-12)
     assert found.degrees_of_freedom == 11
+    np.testing.assert_allclose(found.effective_freedom, 11.0)
     assert not found.lack_of_fit
 
 
@@ -48,6 +49,7 @@ def test_with_repetitions_a_mean_has_the_scatter_within_its_commands_alone() -> 
     within = sum(4 * np.cov(VALUES[first : first + 4].T) for first in (0, 4, 8))
     np.testing.assert_allclose(found.covariance, within / 12**2, rtol=1e-12)
     assert found.degrees_of_freedom == 9
+    np.testing.assert_allclose(found.effective_freedom, 9.0)
 
 
 def test_commands_that_scatter_more_than_their_repetitions_are_the_clusters() -> None:
@@ -89,6 +91,31 @@ def test_a_direction_in_which_the_cost_is_flat_has_no_variance() -> None:
     assert difference @ found.covariance @ difference == pytest.approx(0.0, abs=1e-15)
     total = np.array([1.0, 1.0])
     assert total @ found.covariance @ total == pytest.approx(VALUES[:, 0].var(ddof=1) / 12)
+
+
+def test_commands_repeated_unequally_have_the_degrees_of_freedom_of_welch_and_satterthwaite() -> None:
+    """Groups of 2 and 6 runs with weights 2/8 and 6/8: 1 / (0.25^2 / 1 + 0.75^2 / 5)."""
+    found = sandwich(scores_of_a_mean(VALUES[:8, :1], runs_of(["a"] * 2 + ["b"] * 6)))
+    assert found.effective_freedom == pytest.approx([1 / (0.25**2 + 0.75**2 / 5)])
+
+
+def test_a_line_with_one_far_point_has_the_degrees_of_freedom_of_bell_and_mccaffrey() -> None:
+    """From the residual maker I - X (X'X)^-1 X' of a line through five points, as Imbens and Kolesar write it."""
+    columns = np.column_stack([np.ones(5), [0.0, 1.0, 2.0, 3.0, 14.0]])
+    inverse = np.linalg.inv(columns.T @ columns)
+    values = np.array([0.3, -0.2, 0.5, 0.1, -0.4])
+    maker = np.eye(5) - columns @ inverse @ columns.T
+    scores = -columns * (maker @ values)[:, None]
+    found = sandwich(Scores(scores, np.einsum("zi,zj->zij", columns, columns), runs_of([None] * 5), np.zeros(2)))
+    corrected = (maker @ values) / np.sqrt(np.maximum(np.diag(maker), 0.05))
+    weights = inverse @ columns.T
+    np.testing.assert_allclose(np.diag(found.covariance), np.square(weights) @ np.square(corrected), rtol=1e-9)
+    for number in range(2):
+        shares = weights[number] / np.sqrt(np.maximum(np.diag(maker), 0.05))
+        spread = np.outer(shares, shares) * maker
+        freedom = np.trace(spread) ** 2 / np.square(spread).sum()
+        assert found.effective_freedom[number] == pytest.approx(max(freedom, 1.0))
+    assert found.effective_freedom.max() < 3 < found.degrees_of_freedom + 1
 
 
 def test_as_many_numbers_as_the_runs_can_hold_have_no_scatter() -> None:

@@ -166,6 +166,13 @@ class TestCovariance:
         np.testing.assert_allclose(uncertainty.standard_deviations.ravel() ** 2, np.arange(1.0, 10.0) * 1e-8)
         assert (uncertainty.basis, uncertainty.noise) == ("likelihood", NOISE)
 
+    @pytest.mark.parametrize(("freedom", "quantile"), [(None, 1.960), (np.full(9, 4.0), 2.776)])
+    def test_its_own_degrees_of_freedom_widen_the_intervals(self, freedom: Array | None, quantile: float) -> None:
+        problem = make_problem(driven(FLOWER))
+        own = replace(solved(problem), covariance=1e-8 * np.eye(9), degrees_of_freedom=freedom)
+        intervals = uncertainty_of(problem, own).intervals
+        np.testing.assert_allclose((intervals.high - intervals.low) / 2, quantile * 1e-4, rtol=2e-4)
+
 
 class TestBasis:
     """What the covariance rests on, chosen by rule and said in words."""
