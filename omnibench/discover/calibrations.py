@@ -85,6 +85,6 @@ def _with_shapes(extended: Extended) -> Array:
     for group in extended.groups:
         fitted += range(count, count + len(group.parameters))
         count += len(group.parameters) + len(group.shapes)
-    covariance = np.zeros((count, count))
-    covariance[np.ix_(fitted, fitted)] = (extended.covariance + extended.covariance.T) / 2
+    covariance, fitted_covariance = np.zeros((count, count)), extended.covariance.matrix
+    covariance[np.ix_(fitted, fitted)] = (fitted_covariance + fitted_covariance.T) / 2
     return covariance

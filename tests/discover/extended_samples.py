@@ -13,6 +13,7 @@ from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit
 from omnibench.fit.least_squares.noise import NoiseEstimate
 from omnibench.fit.least_squares.nuisances import Nuisances
+from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
@@ -45,8 +46,8 @@ def extended_of(
     nuisances = Nuisances(np.zeros((len(runs), 3)), np.zeros(3))
     fit = Fit(OdometryModel(ROBOT, matrix, "arc", (), 0.1), recorded, nuisances, UNIT_NOISE)
     slopes = tuple(columns) if columns is not None else tuple(np.zeros((2, 3, 0)) for _ in runs)
-    covariances = np.zeros((9, 9)) if covariance is None else covariance
-    return Extended(fit, (), fit.whitened(slopes), slopes, np.zeros(0), covariances)
+    of_elements = EstimatedCovariance(np.zeros((9, 9)) if covariance is None else covariance)
+    return Extended(fit, (), fit.whitened(slopes), slopes, np.zeros(0), of_elements)
 
 
 def _with_residuals(run: Trajectory, residuals: np.ndarray, matrix: np.ndarray) -> Trajectory:

@@ -1,15 +1,7 @@
 """The model extended by effects: matrix and parameters fitted together, noise and nuisances estimated anew.
 
-With s_z the scores of the Z runs at the fit, R the roots of the information I of all columns (R' I R = 1) and n their
-rank, the scatter of the runs, by which model errors that runs do not share count as noise, is
-
-    S = R' (sum over runs of s_z s_z') R Z / (Z - n)                                                                (1)
-
-(Liang and Zeger, "Longitudinal data analysis using generalized linear models", Biometrika 73, 1986), in expectation the
-identity where the noise model is right. With S = U diag(l) U', the covariance of the fitted numbers, never below what
-the noise model says, is
-
-    R U diag(max(l, 1)) U' R'.                                                                                      (2)
+The covariance of matrix elements and parameters is that of every trajectory fit
+(fit/least_squares/trajectory_covariance.py).
 """
 
 from __future__ import annotations
@@ -23,18 +15,20 @@ from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.model_fit import (
     Fit,
     at_model,
+    at_runs,
     model_with,
     paths_of,
     with_noise,
 )
 from omnibench.discover.regressors.column_group import Group
-from omnibench.discover.regressors.paths import Paths, make_paths
+from omnibench.discover.regressors.paths import Paths
+from omnibench.fit.least_squares.trajectory_covariance import FitCovariance
 from omnibench.fit.least_squares.trajectory_fit import split_runs
 from omnibench.fit.least_squares.whitened import Whitened, given
+from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array
-from omnibench.robot.odometry import OdometryBatch
 
 _STEPS = 4  # Gauss-Newton steps, at most; chosen
 _STILL = 0.05  # standard errors: smaller steps end the fit; chosen
@@ -46,7 +40,7 @@ class Extended:
 
     data: whitened columns of the matrix elements, then of the effects' linear parameters. columns (K, 3, p): each run's
     columns, before whitening. values (n,): the effects' linear parameters. covariance (p, p): of matrix elements and
-    parameters, by the scatter of the runs' scores where that is wider than the noise model says.
+    parameters.
     """
 
     fit: Fit
@@ -54,7 +48,7 @@ class Extended:
     data: Whitened
     columns: tuple[Array, ...]
     values: Array
-    covariance: Array
+    covariance: EstimatedCovariance
 
     @property
     def residuals_without_effects(self) -> list[Array]:
@@ -76,7 +70,7 @@ def extend(plain: Fit, groups: Sequence[Group]) -> Extended:
             fit = with_noise(fit)
         else:
             break
-    return Extended(fit, tuple(groups), data, columns, values, _covariance(data))
+    return Extended(fit, tuple(groups), data, columns, values, _covariance(fit, data))
 
 
 def without_effects(plain: Fit, extended: Extended) -> Extended:
@@ -106,14 +100,8 @@ def columns_of(fit: Fit, groups: Sequence[Group]) -> tuple[Array, ...]:
 
 def columns_at(extended: Extended, runs: Sequence[Trajectory]) -> list[Array]:
     """Slopes (K, 3, n) of other runs' poses by matrix elements and by the effects' parameters."""
-    model = extended.fit.model
-    assert model.sample_period is not None
     ordered = sorted(range(len(runs)), key=lambda index: str(runs[index].session))
-    logs = [runs[index].reference_log for index in ordered]
-    batch = OdometryBatch(logs, model.integration)
-    paths = make_paths(model.robot, model.matrix, logs, model.sample_period)
-    columns = [batch.jacobian(model.matrix).reshape(len(batch.trajectory), 3, -1), *_of_groups(paths, extended.groups)]
-    parts = split_runs(np.concatenate(columns, axis=2), [runs[index] for index in ordered])
+    parts = columns_of(at_runs(extended.fit, [runs[index] for index in ordered]), extended.groups)
     return [part for _, part in sorted(zip(ordered, parts, strict=True), key=lambda pair: pair[0])]
 
 
@@ -145,14 +133,8 @@ def _size(step: Array, covariance: Array) -> float:
     return float((np.abs(step) / np.maximum(deviations, 1e-300)).max())
 
 
-def _covariance(data: Whitened) -> Array:
-    """Covariance (p, p) of the fitted numbers: by the noise model, or wider where the runs' scores scatter more."""
-    now = given(data, [])
-    roots = now.roots(list(range(data.information.shape[0])))
-    runs = len(data.scores)
-    centred = data.scores @ roots
-    scatter = centred.T @ centred * runs / max(runs - roots.shape[1], 1)  # Eq. (1)
-    sizes, directions = np.linalg.eigh(scatter)
-    wider = (directions * np.maximum(sizes, 1.0)) @ directions.T
-    covariance: Array = roots @ wider @ roots.T  # Eq. (2)
-    return covariance
+def _covariance(fit: Fit, data: Whitened) -> EstimatedCovariance:
+    """Covariance (p, p) of the fitted numbers: by the noise model, or by the runs where they scatter more."""
+    unit = 1 / np.sqrt(np.maximum(np.diag(data.information), 1e-300))
+    covariance = FitCovariance(data, fit.runs, fit.noise, unit)
+    return covariance.chosen(covariance.scatter_is_wider)[0]

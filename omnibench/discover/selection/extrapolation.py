@@ -73,5 +73,5 @@ def _bound(runs: Sequence[Trajectory], models: Sequence[tuple[float, Extended]])
         scatter = float(np.mean([np.square(of_run[-1, :2]).sum() for of_run in residuals]))
         for row, columns in enumerate(columns_at(model, runs)):
             last = columns[-1, :2]
-            within[row] += weight * (scatter + float(np.trace(last @ model.covariance @ last.T)))  # Eq. (1)
+            within[row] += weight * (scatter + float(np.trace(last @ model.covariance.matrix @ last.T)))  # Eq. (1)
     return float(_QUANTILE * np.sqrt(np.mean(between + within) / 2))  # Eq. (2)

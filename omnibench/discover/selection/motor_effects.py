@@ -24,6 +24,7 @@ from omnibench.discover.selection.candidate_groups import Groups
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.screening import Screening
 from omnibench.fit.least_squares.whitened import Whitened
+from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect
 from omnibench.robot.kinematics import Array, Robot
@@ -42,12 +43,12 @@ _EQUAL = 1e-9  # rad/s: rates nearer to their targets are copies of them
 class MotorEffects:
     """Effects between targets and measured wheel rates.
 
-    values (n,), covariance (n, n): the parameters of the effects that were selected, in turn.
+    values (n,) and their covariance: the parameters of the effects that were selected, in turn.
     """
 
     selection: Selection
     values: Array
-    covariance: Array
+    covariance: EstimatedCovariance
 
 
 def select_motor_effects(
@@ -157,11 +158,13 @@ def _bases(runs: Sequence[Trajectory]) -> Iterator[tuple[str, str, list[Array]]]
     )
 
 
-def _fitted(runs: Sequence[Trajectory], errors: Sequence[Array], chosen: Sequence[Group]) -> tuple[Array, Array]:
+def _fitted(
+    runs: Sequence[Trajectory], errors: Sequence[Array], chosen: Sequence[Group]
+) -> tuple[Array, EstimatedCovariance]:
     """Parameters (n,) of all chosen effects, whose changes add up, and their covariance by the scatter of the runs."""
     parameters = [each for group in chosen for each in group.parameters]
     if not parameters:
-        return np.zeros(0), np.zeros((0, 0))
+        return np.zeros(0), EstimatedCovariance(np.zeros((0, 0)), 1)
     scale = np.array([_STEP * each.largest for each in parameters])
 
     def residuals(scaled: Array) -> Array:
@@ -179,5 +182,6 @@ def _fitted(runs: Sequence[Trajectory], errors: Sequence[Array], chosen: Sequenc
     ends = np.cumsum([of_run.size for of_run in errors])[:-1]
     of_runs = zip(np.split(answer.jac, ends), np.split(answer.fun, ends), strict=True)
     scores = np.array([slopes.T @ remaining for slopes, remaining in of_runs])
-    covariance = bread @ scores.T @ scores @ bread * len(runs) / max(len(runs) - len(parameters), 1)  # Eq. (1)
-    return answer.x * scale, covariance * np.outer(scale, scale)
+    freedom = max(len(runs) - len(parameters), 1)
+    covariance = bread @ scores.T @ scores @ bread * len(runs) / freedom  # Eq. (1)
+    return answer.x * scale, EstimatedCovariance(covariance * np.outer(scale, scale), freedom)

@@ -1,17 +1,11 @@
 """Named effects: those that were selected, with 95 % intervals, probabilities and doubts; and all that were tried.
 
-With b the estimate of a parameter, sigma its standard error by the scatter of Z runs, and n numbers that were fitted,
-the interval has Student's quantile, as the scatter is known by no more than the runs:
-
-    b +- t(0.975; Z - n) sigma.                                                                                     (1)
+The intervals are those of the fit's covariance by Student's t, fit/uncertainty/intervals.py.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-
-import numpy as np
-from scipy.special import stdtrit
 
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.significance import Significance
@@ -24,8 +18,8 @@ from omnibench.robot.kinematics import Array, Robot
 
 def named_effects(models: CompetingModels, motors: MotorEffects | None) -> tuple[NamedEffect, ...]:
     """The effects of the model that is used, then those of the motors."""
-    used, model, runs = models.used, models.used.fit.model, len(models.used.fit.runs)
-    effects = _effects(models.selection, model.robot, used.values, used.covariance, model.matrix.size, runs)
+    used, model = models.used, models.used.fit.model
+    effects = _effects(models.selection, model.robot, used.values, used.covariance.reach[model.matrix.size :])
     effects = tuple(
         replace(effect, in_doubt="; ".join(filter(None, (effect.in_doubt, reason))))
         if effect.confusable_with
@@ -34,7 +28,7 @@ def named_effects(models: CompetingModels, motors: MotorEffects | None) -> tuple
     )
     if motors is None:
         return effects
-    return effects + _effects(motors.selection, model.robot, motors.values, motors.covariance, 0, runs)
+    return effects + _effects(motors.selection, model.robot, motors.values, motors.covariance.reach)
 
 
 def candidates_of(selection: Selection) -> tuple[tuple[Candidate, ...], ...]:
@@ -42,12 +36,8 @@ def candidates_of(selection: Selection) -> tuple[tuple[Candidate, ...], ...]:
     return tuple(_candidates(step, selection) for step in selection.steps)
 
 
-def _effects(
-    selection: Selection, robot: Robot, values: Array, covariance: Array, first: int, runs: int
-) -> tuple[NamedEffect, ...]:
-    """The chosen effects. first: the row of the covariance at which their parameters begin."""
-    deviations = np.sqrt(np.diag(covariance))[first:]
-    quantile = float(stdtrit(max(runs - len(deviations) - first, 1), 0.975))  # Eq. (1)
+def _effects(selection: Selection, robot: Robot, values: Array, reach: Array) -> tuple[NamedEffect, ...]:
+    """The chosen effects. reach (n,): half-widths of the intervals of their linear parameters."""
     tried = {
         group.name: (chi_square, rank)
         for step in selection.steps[::-1]
@@ -71,7 +61,7 @@ def _effects(
                 name=group.name,
                 stage=group.effect.stage,
                 weight=weight,
-                parameters=(*_estimates(group, values[rows], quantile * deviations[rows]), *_shapes(group, robot)),
+                parameters=(*_estimates(group, values[rows], reach[rows]), *_shapes(group, robot)),
                 confusable_with=confusable,
                 physics=group.effect.physics,
                 source=group.effect.source,

@@ -51,7 +51,7 @@ def test_an_effect_is_named_and_its_parameter_is_exact_to_its_standard_error(
     motors = found(runs(name, **values))
     assert motors is not None
     assert [group.name for group in motors.selection.chosen] == [name]
-    error = float(np.sqrt(motors.covariance[0, 0]))
+    error = motors.covariance.standard_deviations[0]
     assert motors.values[0] == pytest.approx(*values.values(), abs=4 * error)
     assert error < 0.02 * abs(next(iter(values.values())))
 
@@ -61,7 +61,7 @@ def test_the_standard_error_of_a_gain_is_that_of_a_regression_on_the_targets() -
     motors = found(recorded)
     assert motors is not None
     squares = sum(float(np.square(run.targets).sum()) for run in recorded if run.targets is not None)
-    assert float(np.sqrt(motors.covariance[0, 0])) == pytest.approx(NOISE / np.sqrt(squares), rel=0.5)
+    assert motors.covariance.standard_deviations[0] == pytest.approx(NOISE / np.sqrt(squares), rel=0.5)
 
 
 def test_of_motors_that_only_scatter_nothing_is_named() -> None:
