@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -37,7 +38,7 @@ def folder_of(info: ValidationInfo) -> Path | None:
 
 def _from_folder(path: Path, info: ValidationInfo) -> Path:
     folder = folder_of(info)
-    return path if folder is None else (folder / path).resolve()
+    return path if folder is None else Path(os.path.abspath(folder / path))  # links stay: they may change
 
 
 # A path in a document, relative to the document's file; absolute once the file is read.

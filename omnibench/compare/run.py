@@ -36,8 +36,10 @@ def run_comparison(
     """Run every calibrator of the config on every data set, score the answers, and write results and report.
 
     output: the folder of results; runs whose results are there are not repeated. progress: told of the making of data
-    sets and of every run. ConfigError or DataError: something
-    that the user can correct. Interrupted: Ctrl-C; the results of all runs that had ended are kept.
+    sets and of every run.
+
+    ConfigError or DataError: the config, a data set or the folder is unfit, or the disk refuses. Interrupted: Ctrl-C;
+    the results of all runs that had ended are kept.
     """
     failures = load_calibrators(config)
     with _naming_failed_plugins(failures):

@@ -16,7 +16,7 @@ from omnibench.progress import Progress, Reporter
 
 T = TypeVar("T")
 
-_TRIES = 3  # of a job whose worker is killed each time (chosen: two chances that memory is free again)
+_TRIES = 3  # how often a job whose worker is killed is begun: two chances that memory is free again; chosen
 
 
 @dataclass(frozen=True)

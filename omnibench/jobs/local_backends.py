@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import pickle
 import threading
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent import futures
@@ -10,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection, wait
-from signal import SIG_DFL, SIGABRT, SIGKILL, SIGSEGV, SIGTERM, Signals, signal
+from signal import SIG_DFL, SIGABRT, SIGHUP, SIGINT, SIGKILL, SIGSEGV, SIGTERM, Signals, signal
 from typing import Any, TypeVar
 
 from pebble import ProcessExpired
@@ -25,7 +26,8 @@ from omnibench.progress import Progress
 
 T = TypeVar("T")
 
-_PERIOD = 0.2  # s between two looks at jobs that report nothing (chosen)
+_PERIOD = 0.2  # s between two looks at jobs that report nothing; chosen
+_FROM_OUTSIDE = (SIGKILL, SIGTERM, SIGHUP, SIGINT)  # signals by which people and the system end processes
 
 
 def local_backend(workers: int, preload: Sequence[str] = ()) -> Backend:
@@ -44,7 +46,7 @@ class InPlace:
             try:
                 with one_thread():
                     job.run(store, partial(watch.moved, number))
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 failure = _raised(job, error)
             yield Ended(number, job, failure)
 
@@ -114,7 +116,7 @@ class _Active:
             return Ended(self.number, self.job, None)
         if isinstance(error, ProcessExpired):
             return Ended(self.number, self.job, _death(self.job, error.exitcode or 0, self.kills))
-        if isinstance(error, TimeoutError) and self.job.seconds is not None:
+        if isinstance(error, TimeoutError) and error.args[1:] == (self.job.seconds,):  # pebble's, not the job's own
             return Ended(self.number, self.job, Failure(f"over time (limit {self.job.seconds:g} s)", over_time=True))
         return Ended(self.number, self.job, _raised(self.job, error))
 
@@ -163,8 +165,23 @@ def _work(job: Job[T], store: ResultStore[T], progress: Connection) -> None:
         with suppress(OSError):  # a plug-in may have closed it
             progress.send(event)
 
-    with one_thread(), limited_memory(job.memory_mb):
-        job.run(store, report)
+    try:
+        with one_thread(), limited_memory(job.memory_mb):
+            job.run(store, report)
+    except Exception as error:
+        raise _sendable(error) from error
+
+
+class _InWordsError(Exception):
+    """An error in words, in the place of one that cannot be pickled."""
+
+
+def _sendable(error: Exception) -> Exception:
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:  # whatever the error's class raises
+        return _InWordsError(_in_words(error))
+    return error
 
 
 def _raised(job: Job[Any], error: BaseException) -> Failure:
@@ -172,7 +189,11 @@ def _raised(job: Job[Any], error: BaseException) -> Failure:
         return Failure(
             "out of memory" if job.memory_mb is None else f"out of memory (limit {job.memory_mb:g} MB)", error
         )
-    return Failure(one_line(f"{type(error).__name__}: {error}"), error)
+    return Failure(str(error) if isinstance(error, _InWordsError) else _in_words(error), error)
+
+
+def _in_words(error: BaseException) -> str:
+    return one_line(f"{type(error).__name__}: {error}")
 
 
 def _death(job: Job[Any], code: int, kills: int) -> Failure:
@@ -185,4 +206,4 @@ def _death(job: Job[Any], code: int, kills: int) -> Failure:
         how += ": the system was out of memory"
     elif code in (-SIGABRT, -SIGSEGV) and job.memory_mb is not None:  # compiled code may end so without memory
         how += f"; its memory was limited to {job.memory_mb:g} MB"
-    return Failure(f"the process died without an answer ({how})", killed=code == -SIGKILL)
+    return Failure(f"the process died without an answer ({how})", killed=-code in _FROM_OUTSIDE)

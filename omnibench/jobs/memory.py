@@ -22,7 +22,8 @@ def limited_memory(megabytes: float | None) -> Iterator[None]:
     import resource  # not on Windows
 
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    resource.setrlimit(resource.RLIMIT_DATA, (int(megabytes * _MEGABYTE), hard))
+    limit = int(megabytes * _MEGABYTE)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
     try:
         yield
     finally:

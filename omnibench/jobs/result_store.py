@@ -67,8 +67,8 @@ class ResultStore(Generic[T]):
         return self.folder / f"{key}.json"
 
     def remove(self) -> None:
-        """Remove all results, and the folder if nothing else is in it. DataError when the disk refuses."""
-        for file in self.folder.glob("*.json"):
+        """Remove the results, half-written ones too, and the folder if it is then empty. DataError: the disk refuses."""
+        for file in (*self.folder.glob("*.json"), *self.folder.glob(".*.json.*.partial")):
             remove(file)
         with suppress(OSError):
             self.folder.rmdir()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ from omnibench.robot.kinematics import Array
 Values = Sequence[float] | Sequence[str] | Array  # numbers, or the names of categories
 START = LegendItem("", "start", INK, symbol="circle-open")
 ORIGIN = LegendItem("", "start", INK)  # where several paths start
+_DIGITS = 5  # significant digits of coordinates: below a pixel in a figure magnified ten times
 
 
 def line(
@@ -66,9 +68,22 @@ def joined(paths: Sequence[Array]) -> Array:
     return np.vstack([part for each in paths for part in (each, gap)][:-1])
 
 
-def coordinates(values: Values, digits: int = 5) -> list[float | None]:
-    """Values to so many significant digits; NaN becomes None."""
-    return [None if value != value else float(f"{value:.{digits}g}") for value in np.asarray(values, float).tolist()]
+def coordinates(values: Values) -> list[float | None]:
+    """Values to five significant digits, of their range where that is smaller; NaN becomes None.
+
+    So a path is as fine far from the origin of its map as near it, and small values stay on logarithmic axes.
+    """
+    numbers = np.asarray(values, float)
+    finite = numbers[np.isfinite(numbers)]
+    span = float(np.ptp(finite)) if finite.size else 0.0
+    if not 0 < span < np.inf:
+        return [None if math.isnan(value) else value for value in numbers.tolist()]
+    decimals = _DIGITS - math.floor(math.log10(span))
+    return [None if math.isnan(value) else _rounded(value, span, decimals) for value in numbers.tolist()]
+
+
+def _rounded(value: float, span: float, decimals: int) -> float:
+    return round(value, decimals) if abs(value) > span else float(f"{value:.{_DIGITS}g}")
 
 
 def _trace(

@@ -118,12 +118,15 @@ class Calibration(Model):
         """The matrix as an array (3, N)."""
         return np.array(self.matrix)
 
-    def check_wheels(self, robot: Robot, owner: str) -> None:
-        """DataError: the calibration is for other wheels than a robot's. owner: of the robot, for the message."""
+    def check_wheels(self, robot: Robot, owner: str, place: str = "") -> None:
+        """DataError: the calibration is for other wheels than a robot's.
+
+        owner: whose wheels these are, for the message. place: what the message begins with, as an option.
+        """
         ours, theirs = self.robot.wheel_names, robot.wheel_names
         if ours != theirs:
             raise DataError(
-                f"calibration {self.name!r} is for wheels {', '.join(ours)}, {owner} has {', '.join(theirs)}; "
+                f"{place}calibration {self.name!r} is for wheels {', '.join(ours)}, {owner} has {', '.join(theirs)}; "
                 "take a calibration of the same robot"
             )
 

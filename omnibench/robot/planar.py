@@ -1,6 +1,6 @@
 """Algebra of planar poses (x, y, heading), m, m, rad. Headings are not wrapped.
 
-Of arrays (..., 3) every pose is taken with its counterpart, by NumPy's rules of broadcasting.
+Functions of two arrays (..., 3) take every pose with its counterpart, by NumPy's rules of broadcasting.
 """
 
 from __future__ import annotations

@@ -104,7 +104,7 @@ S = TypeVar("S", bound=RobotSession)
 
 
 class Experiment(Model, Generic[S]):
-    """What the simulated experiments share: a robot of known truth drives every command in one session or two."""
+    """A simulated experiment: a robot of known truth drives every command in one session or two."""
 
     generator: str
     robot: NamedRobot

@@ -71,8 +71,8 @@ class SlamRequest:
         if self.output is not None:
             check_dataset_folder(self.output)
         local = _has_local_terms(model)
-        folder = None if local or self.output is None else self.output.with_name(f"{self.output.name}.slam-paths")
-        with _kept(folder, len(recorded.trajectories)):
+        folder = None if local or self.output is None else _paths_beside(self.output)
+        with _kept(folder):
             workers = 1 if local else _WORKERS
             paths = slam_paths(recorded, self.options, model=model, workers=workers, folder=folder, watch=watch)
             found = with_paths(recorded, paths)
@@ -98,7 +98,7 @@ class SlamRequest:
         if self.model is None:
             return None
         calibration = read_calibration(self.model)
-        calibration.check_wheels(recorded.robot, f"the data set {recorded.name}")
+        calibration.check_wheels(recorded.robot, f"the data set {recorded.name}", place=f"--model {self.model}: ")
         return calibration.model
 
 
@@ -108,8 +108,13 @@ def _has_local_terms(model: OdometryModel | None) -> bool:
     return not all(type(term.effect).__module__.startswith("omnibench.") for term in terms)
 
 
+def _paths_beside(output: Path) -> Path:
+    named = output if output.name not in ("", "..") else output.resolve()
+    return named.with_name(f"{named.name}.slam-paths")
+
+
 @contextmanager
-def _kept(folder: Path | None, total: int) -> Iterator[None]:
+def _kept(folder: Path | None) -> Iterator[None]:
     """Remove the folder of paths when the block ends well. Interrupted says after Ctrl-C how to go on with them."""
     if folder is None:
         yield
@@ -117,9 +122,8 @@ def _kept(folder: Path | None, total: int) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        kept = len(list(folder.glob("*.json")))
-        if not kept:
+        if not any(folder.glob("*.json")):
             raise
-        message = f"interrupted; the paths of {kept} of {total} runs are kept in {folder}: run the command again"
+        message = f"interrupted; the paths found so far are kept in {folder}: run the command again"
         raise Interrupted(message) from None
     ResultStore(folder, SlamPath).remove()

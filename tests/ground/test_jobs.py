@@ -93,10 +93,26 @@ def two_is_wrong(number: int, _: Reporter) -> Answer:
     return Answer(number)
 
 
-def killed(folder: Path, _: Reporter) -> Answer:
+def killed(order: tuple[Path, signal.Signals], _: Reporter) -> Answer:
+    folder, by = order
     tried(folder, "killed")
-    os.kill(os.getpid(), signal.SIGKILL)
+    os.kill(os.getpid(), by)
     raise AssertionError
+
+
+def out_of_its_own_time(_: Any, __: Reporter) -> Answer:
+    raise TimeoutError("the map's server does not answer")
+
+
+class TwoPartError(Exception):
+    """An error that cannot be made again from its message, as unpickling does."""
+
+    def __init__(self, part: str, other: str) -> None:
+        super().__init__(f"{part} and {other}")
+
+
+def wrong_in_two_parts(_: Any, __: Reporter) -> Answer:
+    raise TwoPartError("one", "another")
 
 
 def killed_once(folder: Path, _: Reporter) -> Answer:
@@ -176,6 +192,18 @@ class TestEveryBackend:
         assert (failure.reason, failure.over_time, failure.killed) == ("DataError: two is wrong", False, False)
         assert notes.answers() == {0: 0, 1: 1, 3: 3}
 
+    def test_says_what_a_job_raised_where_no_other_process_could_raise_it_again(
+        self, backend: Backend, tmp_path: Path
+    ) -> None:
+        notes = run(tmp_path, jobs_of(wrong_in_two_parts, [0]), backend)
+        assert notes.reason() == "TwoPartError: one and another"
+
+    def test_tells_a_job_that_waited_in_vain_from_one_over_its_time(self, backend: Backend, tmp_path: Path) -> None:
+        failure = run(tmp_path, jobs_of(out_of_its_own_time, [0], seconds=60.0), backend).endings[0]
+        assert isinstance(failure, Failure)
+        assert failure.reason == "TimeoutError: the map's server does not answer"
+        assert not failure.over_time
+
     def test_does_not_run_a_job_whose_result_is_there(self, backend: Backend, tmp_path: Path) -> None:
         run(tmp_path, jobs_of(squared, range(3)), backend)
         (tmp_path / "job-1.json").write_text('{"number": 1')
@@ -229,10 +257,11 @@ def test_one_worker_is_this_process_where_no_isolation_is_needed(tmp_path: Path)
 
 
 class TestWorkersThatDie:
-    def test_a_job_that_is_killed_is_tried_three_times(self, tmp_path: Path) -> None:
-        jobs = [*jobs_of(killed, [tmp_path]), Job("other", squared, 3)]
+    @pytest.mark.parametrize("by", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
+    def test_a_job_that_is_killed_is_tried_three_times(self, by: signal.Signals, tmp_path: Path) -> None:
+        jobs = [*jobs_of(killed, [(tmp_path, by)]), Job("other", squared, 3)]
         notes = run(tmp_path / "results", jobs, Processes(2))
-        assert notes.reason() == "the process died without an answer (killed by SIGKILL) in each of 3 tries"
+        assert notes.reason() == f"the process died without an answer (killed by {by.name}) in each of 3 tries"
         assert (tmp_path / "killed").stat().st_size == 3
         assert notes.endings[1] == ResultStore(tmp_path / "results", Answer).get("other")
 

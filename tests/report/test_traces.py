@@ -15,7 +15,14 @@ ITEM = LegendItem("key", "a <name>", "#0072b2", "dot", "square-open")
 def test_a_line_breaks_at_nan_and_between_joined_paths() -> None:
     drawn = line(ITEM, 2.0, *joined([np.zeros((2, 2)), np.ones((1, 2))]).T)
     assert drawn.x == (0.0, 0.0, None, 1.0)
-    assert coordinates([math.nan, 1.234567]) == [None, 1.2346]
+    assert coordinates([math.nan, 1.2345678, 3.0]) == [None, 1.2346, 3.0]
+
+
+def test_coordinates_are_as_fine_far_from_the_origin_as_near_it() -> None:
+    assert coordinates([500000.0, 500000.12345, 500005.0]) == [500000.0, 500000.12345, 500005.0]
+    assert coordinates([-500000.0, -500000.1, -500005.0]) == [-500000.0, -500000.1, -500005.0]
+    assert coordinates([1e-9, 1.23456789e-6, 1.0]) == [1e-9, 1.2346e-6, 1.0]  # of a logarithmic axis
+    assert coordinates([1234.5678] * 2) == [1234.5678] * 2
 
 
 def test_a_trace_has_the_style_of_its_item_and_is_switched_by_it() -> None:

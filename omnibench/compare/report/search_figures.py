@@ -18,7 +18,7 @@ from omnibench.fit.problem import Improvement
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem, Paragraph, Section
 from omnibench.report.numbers import listing, significant
 from omnibench.report.style import logarithmic, plot, text
-from omnibench.report.traces import coordinates, joined, line, marks
+from omnibench.report.traces import joined, line, marks
 from omnibench.robot.kinematics import Array
 
 TARGETS: Array = np.logspace(0, -8, 81)  # relative gaps above the best known cost (chosen)
@@ -126,7 +126,7 @@ def _lowest_costs(view: DatasetView) -> Mapping[SearchSpace, float]:
 
 
 def targets_reached(group: Sequence[Course], runs: int, axis: Axis) -> tuple[Array, Array]:
-    """When targets were reached (sorted) and the share of all (targets x runs) reached by then.
+    """Times at which targets were reached, sorted, and the share of all (targets x runs) reached by then.
 
     ``runs`` counts those without a course too: they reached nothing.
     """
@@ -148,7 +148,7 @@ def thinned(along: Array, gaps: Array, limit: int) -> list[int]:
 
 
 def _first_times(course: Course, axis: Axis) -> Array:
-    """When each target was first reached; infinite where it was not."""
+    """Time at which each target was first reached; infinite where it was not."""
     along: Array = _along(course, axis)
     gaps = course.costs / course.best_known - 1.0
     # 1e-12 allows for rounding: the best known cost itself has a gap of zero.
@@ -232,7 +232,7 @@ def _against(axis: Axis, searches: _Searches, traces: Sequence[go.Scatter], y_ti
 
 
 def _steps(searches: _Searches, axis: Axis, name: str, values: Callable[[Course], Array]) -> list[go.Scatter]:
-    """For each entry one trace of all its seeds, with a break between them, and a mark at each end."""
+    """Traces, one an entry, of all its seeds with a break between them, and marks at their ends."""
     traces = []
     for style, group in _groups(searches.courses).items():
         steps = []
@@ -247,13 +247,13 @@ def _steps(searches: _Searches, axis: Axis, name: str, values: Callable[[Course]
             (joined(steps), line, 1.8, {"line_shape": "hv", "opacity": 0.8}),
             (ends, marks, 8, {"marker_line_width": 1.8}),
         ):
-            seeds = coordinates(points[:, 2], 17)
+            seeds = [None if np.isnan(seed) else int(seed) for seed in points[:, 2]]
             traces.append(trace(style, size, *points[:, :2].T, hover=hover, customdata=seeds, **looks))
     return traces
 
 
 def _extent(drawn: Sequence[Course], axis: Axis) -> tuple[float, float]:
-    """From the first improvement of any run to the end of the longest."""
+    """Extent of the axis: from the first improvement of any run to the end of the longest."""
     ends = [(float(_along(course, axis)[0]), float(_along(course, axis)[-1])) for course in drawn]
     return max(min(first for first, _ in ends), 1e-4), max(last for _, last in ends)
 

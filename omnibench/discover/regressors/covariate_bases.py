@@ -245,7 +245,7 @@ def _command(paths: Paths, twists: _Twists, trajectories: Sequence[Trajectory]) 
 
 
 def _near_motions(paths: Paths, motions: Array) -> Iterator[dict[str, float]]:
-    """For each of several motions (n, 3): centre and width of a bump that ends before the nearest other motion."""
+    """Centre and width of a bump about each of several motions (n, 3), which ends before the nearest other motion."""
     at_wheels = motions * [1.0, 1.0, lever(paths.robot)]
     away = np.linalg.norm(at_wheels[:, None] - at_wheels, axis=2) + np.diag(np.full(len(motions), np.inf))
     least = _SMALL + _NARROW * float(np.linalg.norm(at_wheels, axis=1).max())

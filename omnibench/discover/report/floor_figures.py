@@ -108,7 +108,7 @@ def arrow_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid
 
 
 def _cell_means(residuals: Residuals, style: ModelStyle, cells: _Cells) -> _Means:
-    """For each cell with poses: mean residual (3,), standard error of its x and y (m), number of runs."""
+    """Cells with poses: mean residual (3,), standard error of its x and y (m), number of runs."""
     gathered: dict[int, list[tuple[Array, float]]] = {}
     values = residuals.each[style.index]
     noise = residuals.noise

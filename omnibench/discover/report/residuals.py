@@ -122,7 +122,7 @@ class Residuals:
 
     @cached_property
     def _white(self) -> list[tuple[Whitener, Array]]:
-        """For each run its whitener and its whitened residuals (3 K, 2), before and after."""
+        """Whitener of each run, and its whitened residuals (3 K, 2), before and after."""
         whiteners: dict[bytes, Whitener] = {}
         found = []
         for (run, chosen), before, after in zip(self._thinned, *self.each, strict=True):

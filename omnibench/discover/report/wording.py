@@ -127,7 +127,7 @@ def weight_in_words(weight: float) -> str:
 
 
 def worst_of_each(hidden: Sequence[Hidden]) -> tuple[Hidden, ...]:
-    """For each effect the parameter that could be largest as a share of its plausible size; the largest share first."""
+    """The parameter of each effect that could be largest as a share of its plausible size; the largest share first."""
     ordered = sorted(hidden, key=share_of_plausible, reverse=True)
     first: dict[str, Hidden] = {}
     for each in ordered:

@@ -16,7 +16,7 @@ class PublishedStamps:
     def __init__(self, remembered: int = 120_000) -> None:
         self._remembered = remembered
         self._order: deque[int] = deque()
-        self._known: set[int] = set()  # the same stamps as in _order
+        self._known: set[int] = set()  # the stamps of _order, for looking up
         self._shift = 1  # ns by which the last repeated stamp was moved; a recording in a loop moves all alike
 
     def __len__(self) -> int:

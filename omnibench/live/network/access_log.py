@@ -169,7 +169,7 @@ def _descriptor_1_read_by(take: Callable[[str], bool]) -> Iterator[None]:
     with suppress(OSError, ValueError):  # a stream without a file stays as it is
         if stdout.fileno() == 1:
             lines = 1 if stdout.isatty() else -1
-            sys.stdout = os.fdopen(outside, "w", lines, stdout.encoding, stdout.errors, closefd=False)
+            sys.stdout = os.fdopen(os.dup(outside), "w", lines, stdout.encoding, stdout.errors)
     os.dup2(writing, 1)
     os.close(writing)
     thread = threading.Thread(target=_read, args=(reading, outside, take), name="zenoh log", daemon=True)
@@ -178,6 +178,8 @@ def _descriptor_1_read_by(take: Callable[[str], bool]) -> Iterator[None]:
         yield
     finally:
         sys.stdout.flush()
+        if sys.stdout is not stdout:
+            sys.stdout.close()  # whoever keeps it finds it closed, and not another file
         sys.stdout = stdout
         os.dup2(outside, 1)  # closes the pipe's last writer, which ends the thread
         thread.join(timeout=1.0)
