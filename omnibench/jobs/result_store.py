@@ -67,7 +67,7 @@ class ResultStore(Generic[T]):
         return self.folder / f"{key}.json"
 
     def remove(self) -> None:
-        """Remove the results, half-written ones too, and the folder if it is then empty. DataError: the disk refuses."""
+        """Remove all results, half-written ones too, and the folder if it is then empty. DataError: disk refuses."""
         for file in (*self.folder.glob("*.json"), *self.folder.glob(".*.json.*.partial")):
             remove(file)
         with suppress(OSError):

@@ -208,6 +208,7 @@ def test_the_truth_gives_errors_bias_and_drift_and_the_report_is_written(command
         (["DATA", "-o", "DATA"], ["is the recording itself; name another folder"]),
         (["nowhere", "-o", "found"], ["nowhere: no such folder"]),
         (["BARE", "-o", "found"], ["data set driven: it has no scans (scans.parquet), which SLAM needs"]),
+        (["BARE", "-o", "."], ["data set driven: it has no scans (scans.parquet), which SLAM needs"]),
         (["PART", "-o", "found"], ["trajectory 02 has no scans"]),
         (["EMPTY", "-o", "found"], ["scans.parquet, row 2: the scan of trajectory 01 at ", " is empty: no range from"]),
         (["DATA", "-o", "EMPTY/dataset.yaml"], ["is a file; name a folder"]),
