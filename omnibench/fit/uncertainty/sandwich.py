@@ -22,7 +22,15 @@ and (3) they are
     (tr G)^2 / tr G^2,   G_cd = y_c' (1_cd L_c - L_c L_d) y_d,   y_c = M_c r,                             (5)
 
 (5) as in Imbens and Kolesar (2016): with few clusters, or one that tells more than the others, far fewer than clusters
-less one.
+less one. An F test of the traces of (3) and (2) decides whether clusters scatter more than repetitions explain. A trace
+has the degrees of freedom of one direction, by the same reasoning
+
+    tr E^2 / sum_g tr L_g^2 / (n_g - 1),   E = sum_g L_g,                                                 (6)
+    tr E^2 / tr G^2,   G_cd = M_c (1_cd L_c - L_c L_d) M_d,   E = sum_c G_cc,                             (7)
+
+times the effective number of directions in which the scatter S was seen,
+
+    (tr S)^2 / tr S^2.                                                                                    (8)
 """
 
 from __future__ import annotations
@@ -153,8 +161,8 @@ def sandwich(scores: Scores) -> Sandwich:
     for name, members in _clusterings(runs):
         between = whitened.between(members, roots)
         ratio = float(np.trace(between.spread) / np.trace(within.spread))
-        numerator, denominator = _effective(between.spread, len(members) - 1), _effective(within.spread, nominal)
-        if ratio > max(float(fdtri(numerator, denominator, 1 - _CHANCE)), largest):
+        unlikely = float(fdtri(between.freedom_of_trace, within.freedom_of_trace, 1 - _CHANCE))
+        if ratio > max(unlikely, largest):
             largest, degrees_of_freedom = ratio, len(members) - 1
             spread, freedom = wider(within.spread, between.spread), between.freedom
             words = (
@@ -176,10 +184,20 @@ def _clusterings(runs: Sequence[Trajectory]) -> list[tuple[str, list[tuple[int, 
 
 @dataclass(frozen=True, eq=False)
 class _Scatter:
-    """An estimate (d, d) of B in whitened coordinates, and the degrees of freedom (n,) of the n variances."""
+    """An estimate (d, d) of B in whitened coordinates.
+
+    freedom (n,): degrees of freedom of the n variances, Eq. (4) or (5). of_direction: those of a direction, Eq. (6) or
+    (7).
+    """
 
     spread: Array
     freedom: Array
+    of_direction: float
+
+    @property
+    def freedom_of_trace(self) -> float:
+        """Degrees of freedom of the trace: those of a direction times the effective number of directions, Eq. (8)."""
+        return self.of_direction * float(np.trace(self.spread) ** 2 / np.square(self.spread).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,53 +213,46 @@ class _Whitened:
     def within(self, groups: Sequence[tuple[int, ...]], directions: Array) -> _Scatter:
         """Scatter about the means of repeated commands, Eq. (2); about zero for runs without repetition."""
         total = np.zeros(self.hessians.shape[1:])
-        shares, freedoms = [], []
         for members in map(list, groups):
             apart = self.scores[members] - self.scores[members].mean(axis=0)
             total += len(members) / (len(members) - 1) * apart.T @ apart
-            shares.append(_sizes(self.hessians[members].sum(axis=0), directions))
-            freedoms.append(len(members) - 1)
-        alone = sorted(set(range(len(self.scores))).difference(*groups))
+        alone = [(index,) for index in sorted(set(range(len(self.scores))).difference(*groups))]
         if alone:
-            total += self.between([(index,) for index in alone], directions).spread
-            shares += [_sizes(self.hessians[index], directions) for index in alone]
-            freedoms += [1] * len(alone)
-        weights = np.array(shares)
-        squares = (np.square(weights) / np.array(freedoms)[:, None]).sum(axis=0)
-        return _Scatter(total, _ratio(weights.sum(axis=0) ** 2, squares))  # Eq. (4)
+            total += self.between(alone, directions).spread
+        leverages = np.array([self.hessians[list(members)].sum(axis=0) for members in (*groups, *alone)])
+        freedoms = np.array([max(len(members) - 1, 1) for members in (*groups, *alone)])
+        weights = np.einsum("nd,gde,ne->gn", directions, leverages, directions)
+        freedom = _ratio(weights.sum(axis=0) ** 2, (np.square(weights) / freedoms[:, None]).sum(axis=0))  # Eq. (4)
+        squares = float((np.square(leverages).sum(axis=(1, 2)) / freedoms).sum())
+        return _Scatter(total, freedom, len(total) / squares)  # Eq. (6)
 
     def between(self, clusters: Sequence[tuple[int, ...]], directions: Array) -> _Scatter:
         """Scatter of clusters about zero, with Bell and McCaffrey's correction for what the fit absorbs, Eq. (3)."""
-        total = np.zeros(self.hessians.shape[1:])
-        corrected, absorbed = [], []
-        for members in map(list, clusters):
-            leverage = self.hessians[members].sum(axis=0)
-            values, vectors = np.linalg.eigh(np.eye(len(leverage)) - leverage)
-            correction = (vectors / np.sqrt(np.maximum(values, _LEAST_FREE))) @ vectors.T
-            score = correction @ self.scores[members].sum(axis=0)
-            total += np.outer(score, score)
-            corrected.append(directions @ correction)
-            absorbed.append(corrected[-1] @ leverage)
-        own = np.einsum("cnd,cnd->nc", corrected, absorbed)
-        covariance = np.einsum("nc,ce->nce", own, np.eye(len(clusters))) - np.einsum("cnd,end->nce", absorbed, absorbed)
-        traces = np.trace(covariance, axis1=1, axis2=2)
-        return _Scatter(total, _ratio(traces**2, np.square(covariance).sum(axis=(1, 2))))  # Eq. (5)
+        leverages = np.array([self.hessians[list(members)].sum(axis=0) for members in clusters])
+        scores = np.array([self.scores[list(members)].sum(axis=0) for members in clusters])
+        values, vectors = np.linalg.eigh(np.eye(leverages.shape[1]) - leverages)
+        corrections = (vectors / np.sqrt(np.maximum(values, _LEAST_FREE))[:, None]) @ vectors.swapaxes(1, 2)
+        corrected = np.einsum("cde,ce->cd", corrections, scores)
+        along = directions @ corrections  # y_c for every number
+        absorbed = along @ leverages
+        own, lengths = (along * absorbed).sum(axis=2), np.square(absorbed).sum(axis=2)
+        shared = np.square(np.einsum("cnd,cne->nde", absorbed, absorbed)).sum(axis=(1, 2))
+        squares = (own * (own - 2 * lengths)).sum(axis=0) + shared  # tr G^2, the C^2 blocks of G not formed
+        freedom = _ratio((own - lengths).sum(axis=0) ** 2, squares)  # Eq. (5)
+        return _Scatter(corrected.T @ corrected, freedom, _freedom_of_direction(leverages, corrections))
 
 
-def _sizes(matrix: Array, directions: Array) -> Array:
-    """Quadratic forms (n,) of a matrix (d, d) along directions (n, d)."""
-    return np.einsum("nd,de,ne->n", directions, matrix, directions)
+def _freedom_of_direction(leverages: Array, corrections: Array) -> float:
+    """Eq. (7) from the leverages (C, d, d) of clusters and their corrections M."""
+    own = corrections @ leverages @ corrections
+    absorbed = corrections @ leverages @ leverages @ corrections
+    squares = float((own * (own - 2 * absorbed)).sum() + np.square(absorbed.sum(axis=0)).sum())
+    return float(np.square((own - absorbed).sum(axis=0)).sum()) / squares
 
 
 def _ratio(numerators: Array, denominators: Array) -> Array:
     """Degrees of freedom (n,), at least 1; of numbers that do not vary, 1."""
     return np.maximum(numerators / np.maximum(denominators, 1e-300), 1.0)
-
-
-def _effective(spread: Array, freedom: int) -> float:
-    """Degrees of freedom of the trace of a scatter matrix: ``freedom`` times its effective number of directions."""
-    values = np.linalg.eigvalsh(spread)
-    return freedom * float(values.sum() ** 2 / np.square(values).sum())
 
 
 def roots_of(information: Array, share: float) -> Array:

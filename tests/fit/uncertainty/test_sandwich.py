@@ -162,3 +162,17 @@ def test_the_hessian_of_headings_alone_is_twice_the_density_of_their_errors_at_z
     found = scores_of_norms("final_heading", errors, jacobian)
     assert found.hessians.sum() == pytest.approx(2 / np.sqrt(2 * np.pi), rel=0.05)
     assert sandwich(found).covariance[0, 0] == pytest.approx(np.pi / 2 / count, rel=0.1)
+
+
+def test_commands_that_scatter_as_their_repetitions_do_are_seldom_taken_for_a_lack_of_fit() -> None:
+    """Planes through five commands of unequal leverage: two are left over, and the level of the test is 0.1 %."""
+    rng = np.random.default_rng(11)
+    commands = [name for name in "abcde" for _ in range(3)]
+    misfits = 0
+    for _ in range(400):
+        columns = np.repeat(rng.standard_normal((5, 3)), 3, axis=0)
+        values = rng.standard_normal(15)
+        left = values - columns @ np.linalg.lstsq(columns, values)[0]
+        hessians = np.einsum("zi,zj->zij", columns, columns)
+        misfits += sandwich(Scores(-columns * left[:, None], hessians, runs_of(commands), np.zeros(3))).lack_of_fit
+    assert misfits <= 4
