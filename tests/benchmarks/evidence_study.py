@@ -56,13 +56,13 @@ class Names(Model):
 
 
 class Result(Model):
-    """One set. discrepancy: square of the discrepancy per direction of the right names' forms; None without any."""
+    """One set. discrepancy: squares of the discrepancy of the right names' forms along each other effect, if any."""
 
     kind: str
     effects: tuple[str, ...]
     seed: int
     explained: tuple[Names, ...]
-    discrepancy: float | None
+    discrepancy: tuple[float, ...]
 
     @property
     def key(self) -> tuple[str, tuple[str, ...], int]:
@@ -85,7 +85,7 @@ def measured(kind: Kind, effects: tuple[str, ...], seed: int) -> Result:
     plain = fit_matrix(runs, dataset.robot, dataset.sample_period, dataset.robot.inverse_kinematic_matrix)
     screening = screen_plain(plain, ())
     right = _best_shapes(screening, effects) if kind != "outside" else []
-    explained, discrepancy = [], None
+    explained, discrepancy = [], ()
     if right:
         screening = screen_again(extend(plain, right), screening, ())
         right = _best_shapes(screening, effects)
@@ -118,12 +118,12 @@ def _largest(start: Given, groups: Sequence[Group], count: int) -> list[Group]:
     return list(max(combinations(groups, count), key=lambda some: start.chi_square(indices_of(some))))
 
 
-def _discrepancy(start: Given, right: Sequence[Group], others: Sequence[Group]) -> float:
-    """The mean of (Q / d - 1) / N over the other effects beyond the right ones: delta^2 of Eq. (3) in evidence.py."""
+def _discrepancy(start: Given, right: Sequence[Group], others: Sequence[Group]) -> tuple[float, ...]:
+    """(Q / d - 1) / N of the other effects beyond the right ones: delta^2 of Eq. (3) in evidence.py, along each."""
     after = start.given(indices_of(right))
     energy = start.chi_square(indices_of(right)) - start.rank(indices_of(right))
     seen = [(after.chi_square(group.index), after.rank(group.index)) for group in others]
-    return float(np.mean([chi_square / rank - 1 for chi_square, rank in seen if rank])) / energy
+    return tuple((chi_square / rank - 1) / energy for chi_square, rank in seen if rank)
 
 
 def _names(screening: Screening, chosen: Sequence[Group], rng: np.random.Generator, *, right: bool) -> Names:
@@ -149,9 +149,11 @@ def _names(screening: Screening, chosen: Sequence[Group], rng: np.random.Generat
 def print_table(results: Sequence[Result]) -> None:
     """The figures that evidence.py names."""
     every = [names for result in results for names in result.explained]
-    squares = [result.discrepancy for result in results if result.discrepancy is not None and result.kind == "single"]
-    print(f"discrepancy, root of the mean over {len(squares)} sets with one effect: {np.sqrt(np.mean(squares)):.3f}")
-    print("   quartiles", np.round(np.sqrt(np.maximum(np.quantile(squares, [0.25, 0.5, 0.75]), 0)), 3))
+    of_sets = [result.discrepancy for result in results if result.kind == "single"]
+    print(f"discrepancy along other effects, {len(of_sets)} sets with one effect")
+    for words, squares in (("mean", map(np.mean, of_sets)), ("largest", map(max, of_sets))):
+        roots = np.sqrt(np.maximum(list(squares), 0.0))
+        print(f"   {words:8} 50, 75, 90, 100 % of sets {np.round(np.quantile(roots, [0.5, 0.75, 0.9, 1.0]), 3)}")
     for right in (True, False):
         for count in (1, 2):
             some = [names for names in every if names.right == right and len(names.names) == count]

@@ -33,9 +33,9 @@ _MEDIAN = (
     0.6745  # standard deviations: the median of the size of a normal number (Hampel, J. Am. Stat. Assoc. 69, 1974)
 )
 _LEAST = 0.1  # share of the mean difference of neighbouring samples that the noise is at least: ramps take few samples
-_STEP = 0.2  # share of the plausible range: step of a parameter for its slope; chosen
-_KNOTS = 7  # knots of the functions of target rates; chosen
-_ORDERS = 5  # orders of the functions of time; chosen
+_STEP = 0.2  # share of the plausible range: step of a parameter for its slope, wide enough to leave a dead band
+_KNOTS = 7  # knots of the functions of target rates
+_ORDERS = 5  # orders of the functions of time
 _EQUAL = 1e-9  # rad/s: rates nearer to their targets are copies of them
 
 
