@@ -3,7 +3,7 @@
     python tests/benchmarks/constants.py --out constants.jsonl [--only evidence] [--table]
 
 Every number that a module of omnibench.discover names in capitals is varied by itself, over a dozen small blind sets.
-A probability close to 1 is varied by its distance from 1. One line of JSON a set and constant, added as it comes: run
+Of a share above one half, the rest to 1 is varied. One line of JSON a set and constant, added as it comes: run
 again with the same file, and it goes on where it was. Sets are made as for discover_study.py.
 """
 
@@ -34,7 +34,7 @@ SURE = 0.95  # weight from which on a name is stated with confidence: the verdic
 FRONT = ("usable_runs", "_start_matrix", "fit_matrix", "screen_plain", "screen_extended", "screen_again", "extend",
          "without_effects")  # fmt: skip
 TAIL = ("validation_runs", "compare_held_out", "waterfall_steps", "extrapolations_of", "calibration_of")
-OF_FRONT = ("fitting", "regressors.covariate_bases", "regressors.paths", "regressors.whitened", "selection.screening",
+OF_FRONT = ("fitting", "regressors.covariate_bases", "regressors.paths", "selection.screening",
             "selection.candidate_groups", "selection.encoder_quantisation", "conclude")  # fmt: skip
 OF_TAIL = ("held_out", "selection.extrapolation")
 

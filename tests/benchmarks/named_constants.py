@@ -29,7 +29,7 @@ class Constant:
         return f"{self.module.removeprefix(self.package + '.')}.{self.name}"
 
     def times(self, factor: float) -> Any:
-        """The number times a factor: whole ones stay whole, and probabilities close to 1 probabilities."""
+        """The number times a factor: whole ones stay whole; of a share above one half, the rest to 1 is multiplied."""
         return _times(self.value, factor)
 
     @contextmanager
@@ -84,7 +84,7 @@ def _times(value: Any, factor: float) -> Any:
         return tuple(_times(each, factor) for each in value)
     if isinstance(value, int):
         return max(round(value * factor), 1)
-    if isinstance(value, float) and 0.9 <= value < 1:
+    if isinstance(value, float) and 0.5 < value < 1:
         return 1 - (1 - value) * factor
     return value * factor
 

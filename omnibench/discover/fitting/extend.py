@@ -30,8 +30,9 @@ from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array
 
-_STEPS = 4  # Gauss-Newton steps, at most; chosen
-_STILL = 0.05  # standard errors: smaller steps end the fit; chosen
+# tests/benchmarks/constants.py varies both by 0.5 and 2: FRONT
+_STEPS = 4  # Gauss-Newton steps, at most
+_STILL = 0.05  # standard errors: a smaller step, which no interval shows, ends the fit
 
 
 @dataclass(frozen=True, eq=False)

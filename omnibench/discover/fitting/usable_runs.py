@@ -11,9 +11,10 @@ from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
-_MOST_STAMPS = 80  # reference poses used of a run (chosen: neighbours in denser references share their errors)
-_STANDING = 1e-3  # rad/s: slower wheels count as standing (chosen)
-_OVERHANG = 0.5  # s after the last wheel sample in which reference poses are still used (chosen; see ``log_of``)
+# tests/benchmarks/constants.py varies each number by 0.5 and 2: FRONT
+_MOST_STAMPS = 80  # reference poses used of a run: neighbours in denser references share their errors
+_STANDING = 1e-3  # rad/s: slower wheels count as standing; one of 0.1 m moves 0.1 mm in a second
+_OVERHANG = 0.5  # s after the last wheel sample in which reference poses are still used, see ``log_of``
 
 
 def usable_runs(trajectories: Sequence[Trajectory], split: str = "train") -> tuple[Trajectory, ...]:

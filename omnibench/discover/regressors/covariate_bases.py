@@ -42,12 +42,13 @@ from omnibench.robot.effects.smooth_wheels import (
 from omnibench.robot.effects.wheel_angle import mean_waves
 from omnibench.robot.kinematics import Array
 
-_ORDERS = 6  # smooth functions of time; chosen
-_FREQUENCIES = 32  # frequencies at which errors of a clock are tried; chosen
-_GRID = 5  # patches along each side of the area; chosen
-_WIDE = 0.7  # radius of a patch, of the distance between two: they cover the area evenly; chosen
-_SEEN = 0.002  # share of the samples that must lie in a patch; chosen
-_NARROW = 0.02  # share of the largest motion: least width of a bump about one motion; chosen
+# tests/benchmarks/constants.py varies each number by 0.5 and 2: FRONT
+_ORDERS = 6  # smooth functions of time
+_FREQUENCIES = 32  # frequencies at which errors of a clock are tried: about as many as 80 stamps a run tell apart
+_GRID = 5  # patches along each side of the area
+_WIDE = 0.7  # radius of a patch, of the distance between two: half the diagonal of a cell, so that no place is left out
+_SEEN = 0.002  # share of the samples that must lie in a patch
+_NARROW = 0.02  # share of the largest motion: least width of a bump about one motion
 _TOP = 0.999  # quantile of the wheel rates up to which functions of them reach
 _SMALL = 1e-9  # range below which a covariate does not vary
 
@@ -161,7 +162,7 @@ def _patches(places: Array) -> Iterator[dict[str, float]]:
 
 def _order(paths: Paths, twists: _Twists, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:
     time = paths.signals.session_time
-    if time is not None and len(paths.logs) > 3:
+    if time is not None and len(paths.logs) > 3:  # any three times lie on a parabola
         effect, shapes = SmoothOrderOfRuns(), {"duration": max(float(time.max()), _SMALL)}
         columns = twists.of_effect(effect, shapes, _ORDERS)
         yield _of_effect(effect, "the time since the start of the session", columns, shapes, stage="wheel")
@@ -234,7 +235,7 @@ def _units(
 
 def _command(paths: Paths, twists: _Twists, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:
     commands = list(dict.fromkeys(run.command for run in trajectories if run.command is not None))
-    if len(commands) < 4:
+    if len(commands) < 4:  # three motions are what some matrix makes of any wheel rates
         return
     belongs = np.array([[run.command == command for command in commands] for run in trajectories], dtype=float)
     shares = belongs[paths.owner]
@@ -250,4 +251,5 @@ def _near_motions(paths: Paths, motions: Array) -> Iterator[dict[str, float]]:
     away = np.linalg.norm(at_wheels[:, None] - at_wheels, axis=2) + np.diag(np.full(len(motions), np.inf))
     least = _SMALL + _NARROW * float(np.linalg.norm(at_wheels, axis=1).max())
     for (forward, left, turn), nearest in zip(motions.tolist(), away.min(axis=1).tolist(), strict=True):
-        yield {"vx": forward, "vy": left, "omega": turn, "width": max(nearest / 3, least)}
+        width = max(nearest / 3, least)  # 1 % of a bump is left at three widths
+        yield {"vx": forward, "vy": left, "omega": turn, "width": width}

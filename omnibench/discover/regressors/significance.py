@@ -78,7 +78,7 @@ class Significance:
         if exceeded >= int(_ENOUGH * tail):
             return (exceeded + 1) / (len(chance) + 1)  # Eq. (2)
         edge = float(chance[-tail])
-        scale = max(float((chance[-tail:] - edge).mean()), 1e-3)
+        scale = max(float((chance[-tail:] - edge).mean()), 1e-3)  # above 0 where all flips tie
         return float(max(tail / len(chance) * np.exp(-(evidence - edge) / scale), 1e-300))  # Eq. (3)
 
     @property

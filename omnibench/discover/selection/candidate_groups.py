@@ -17,7 +17,9 @@ from omnibench.registry import effects
 from omnibench.robot.effects.effect import Effect, MotionEffect, ReferenceEffect
 from omnibench.robot.kinematics import Array
 
-_FEW = 6  # shapes of an effect: with more of them, one comes near enough to any other form
+# Shapes of an effect: with more of them, one comes near enough to any other form. tests/benchmarks/constants.py varies
+# it by 0.5 and 2: FRONT
+_FEW = 6
 
 
 class Missing(Enum):

@@ -177,7 +177,8 @@ def _fitted(
                 changes[row] = changes[row] + _change(group.effect, run, of_group)
         return np.concatenate([(error - change).ravel() for error, change in zip(errors, changes, strict=True)])
 
-    answer = least_squares(residuals, np.full(len(parameters), 0.1), method="trf", diff_step=1e-3)
+    start = np.full(len(parameters), 0.1)  # steps: off 0, where a dead band has no slope
+    answer = least_squares(residuals, start, method="trf", diff_step=1e-3)
     bread = np.linalg.pinv(answer.jac.T @ answer.jac)
     ends = np.cumsum([of_run.size for of_run in errors])[:-1]
     of_runs = zip(np.split(answer.jac, ends), np.split(answer.fun, ends), strict=True)

@@ -18,7 +18,9 @@ from omnibench.fit.least_squares.trajectory_fit import split_runs
 from omnibench.fit.least_squares.whitened import Given, Whitened, given
 from omnibench.robot.kinematics import Array
 
-_COARSE = 0.03  # s: shorter wheel samples are merged up to this duration (chosen: the covariates vary more slowly)
+# s: shorter wheel samples are merged up to this duration, as covariates vary more slowly. tests/benchmarks/constants.py
+# varies it by 0.5 and 2: FRONT
+_COARSE = 0.03
 
 
 @dataclass(frozen=True, eq=False)
