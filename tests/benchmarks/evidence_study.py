@@ -21,7 +21,6 @@ from hidden.forms import FORMS
 from hidden.outside import OUTSIDE
 from hidden.pairs import PAIRS
 from hidden.sets import LEVELS, Kind, make_set
-from scipy.optimize import minimize
 
 from omnibench.config import Model
 from omnibench.discover.fitting.extend import extend
@@ -30,7 +29,7 @@ from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.significance import significance_of
 from omnibench.discover.selection.evidence import credibility_of, effect_sets, indices_of, joint_share
-from omnibench.discover.selection.model_selection import ABSORBED
+from omnibench.discover.selection.model_selection import ABSORBED, SURE
 from omnibench.discover.selection.screening import Screening, screen_again, screen_plain
 from omnibench.fit.least_squares.whitened import Given
 from omnibench.processes import one_thread
@@ -163,20 +162,15 @@ def print_table(results: Sequence[Result]) -> None:
                 deciles = np.quantile(values, [0.1, 0.25, 0.5, 0.75, 0.9])
                 print(f"   {field:12} mean {values.mean():.3f}   10, 25, 50, 75, 90 % {np.round(deciles, 3)}")
     for count in (1, 2):
-        print(f"\nprior odds of {count} that would make the stated probabilities right here: {fair_odds(every, count)}")
+        low, high = sure_odds([names for names in every if len(names.names) == count])
+        print(f"\nwith {low:.2g} to {high:.2g} times the odds of {count}, all right names are sure, and no wrong one")
 
 
-def fair_odds(every: Sequence[Names], count: int) -> str:
-    """The factor on the odds of names that makes them likeliest, with its slope: 1 if Bayes factors are as they say."""
-    some = [names for names in every if len(names.names) == count]
-    stated = np.clip([names.probability for names in some], 1e-12, 1 - 1e-12)
-    right, logit = np.array([names.right for names in some]), np.log(stated / (1 - stated))
-
-    def surprise(line: np.ndarray) -> float:
-        return float(np.logaddexp(0.0, np.where(right, -1.0, 1.0) * (line[0] + line[1] * logit)).sum())
-
-    shift, slope = minimize(surprise, [0.0, 1.0], method="Nelder-Mead").x
-    return f"times {np.exp(shift):.2g}, slope {slope:.2f}; {right.sum()} right, {(~right).sum()} wrong"
+def sure_odds(every: Sequence[Names]) -> tuple[float, float]:
+    """Factors on the odds of names, from which on all right ones are sure, and up to which no wrong one is."""
+    right, wrong = (np.array([names.probability for names in every if names.right == side]) for side in (True, False))
+    sure = SURE / (1 - SURE)
+    return float(sure * (1 / right.min() - 1)), float(sure * (1 / wrong.max() - 1))
 
 
 def main() -> None:
