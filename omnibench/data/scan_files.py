@@ -121,8 +121,7 @@ class ScansOnDisk(Scans):
         """Rows and stamps of every trajectory, in its order."""
         table = self._names_and_stamps()
         times = table.numbers("t")
-        for row in np.flatnonzero(times < 0)[:1]:
-            raise table.fail(int(row), f"t is {times[row]:g}; it must not be negative")
+        table.refuse(times < 0, lambda row: f"t is {times[row]:g}; it must not be negative")
         index = {}
         grouped = table.frame.with_row_index("row").group_by("trajectory", maintain_order=True).agg(pl.col("row"))
         for trajectory, rows in zip(grouped["trajectory"], grouped["row"], strict=True):

@@ -207,35 +207,30 @@ def _check_runs(runs: Table) -> None:
     for column in (*_RUN_NUMBERS, "repetition"):
         if column in runs.frame.columns:
             series = runs.floats(column)
-            bad = (series.is_finite().not_() & series.is_not_null()).arg_true()
-            if len(bad):
-                raise runs.fail(int(bad[0]), f"{column} is {series[int(bad[0])]}; leave it empty if it is not known")
+            _refuse_infinite(runs, series)
             runs.frame = runs.frame.with_columns(series.alias(column))
     if "repetition" in runs.frame.columns:
-        broken = (runs.frame["repetition"] % 1 != 0).arg_true()
-        if len(broken):
-            raise runs.fail(
-                int(broken[0]), f"repetition is {runs.frame['repetition'][int(broken[0])]}, not a whole number"
-            )
-    repeated = runs.frame["trajectory"].is_first_distinct().not_().arg_true()
-    if len(repeated):
-        row = int(repeated[0])
-        raise runs.fail(row, f"trajectory {runs.frame['trajectory'][row]} is there twice; give each its own id")
+        numbers = runs.frame["repetition"]
+        runs.refuse(numbers % 1 != 0, lambda row: f"repetition is {numbers[row]}, not a whole number")
+    ids = runs.frame["trajectory"]
+    runs.refuse(~ids.is_first_distinct(), lambda row: f"trajectory {ids[row]} is there twice; give each its own id")
     for row, split in enumerate(runs.frame["split"]):
         if split not in SPLITS:
             raise runs.fail(row, f"split is {split!r}; {nearest(str(split), SPLITS)}it must be train or validation")
+
+
+def _refuse_infinite(runs: Table, values: pl.Series) -> None:
+    infinite = ~values.is_finite() & values.is_not_null()
+    runs.refuse(infinite, lambda row: f"{values.name} is {values[row]}; leave it empty if it is not known")
 
 
 def _rows_by_trajectory(runs: Table, table: Table) -> list[np.ndarray[Any, np.dtype[np.intp]]]:
     """For each run the rows of ``table`` that belong to it, in the file's order."""
     ids = runs.frame["trajectory"].to_list()
     number = {identity: index for index, identity in enumerate(ids)}
-    codes = np.array([number.get(identity, -1) for identity in table.frame["trajectory"]])
-    strangers = np.flatnonzero(codes < 0)
-    if len(strangers):
-        row = int(strangers[0])
-        identity = table.frame["trajectory"][row]
-        raise table.fail(row, f"trajectory {identity} is not in {runs.file.name}")
+    named = table.frame["trajectory"]
+    codes = np.array([number.get(identity, -1) for identity in named])
+    table.refuse(codes < 0, lambda row: f"trajectory {named[row]} is not in {runs.file.name}")
     order = np.argsort(codes, kind="stable")
     counts = np.bincount(codes, minlength=len(ids))
     for index, count in enumerate(counts):
@@ -247,20 +242,14 @@ def _rows_by_trajectory(runs: Table, table: Table) -> list[np.ndarray[Any, np.dt
 
 def _check_wheel_times(wheels: Table, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]) -> None:
     times = wheels.numbers("t")
-    early = np.flatnonzero(times <= 0)
-    if len(early):
-        row = int(early[0])
-        raise wheels.fail(
-            row, f"t is {times[row]:g}; wheel samples start after t = 0 (a row holds the rate up to its t)"
-        )
+    why = "wheel samples start after t = 0 (a row holds the rate up to its t)"
+    wheels.refuse(times <= 0, lambda row: f"t is {times[row]:g}; {why}")
     _check_increasing(wheels, times, groups)
 
 
 def _check_pose_times(poses: Table, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]) -> None:
     times = poses.numbers("t")
-    early = np.flatnonzero(times < 0)
-    if len(early):
-        raise poses.fail(int(early[0]), f"t is {times[early[0]]:g}; it must not be negative")
+    poses.refuse(times < 0, lambda row: f"t is {times[row]:g}; it must not be negative")
     _check_increasing(poses, times, groups)
     for rows in groups:
         first = int(rows[0])

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from omnibench.data.delimited import missing_column
 from omnibench.errors import DataError
@@ -28,6 +29,11 @@ class Table:
         """The error to raise for ``row``, counted from 0."""
         return DataError(f"{self.file}, row {row + 1}: {what}")
 
+    def refuse(self, faulty: NDArray[np.bool_] | pl.Series, words: Callable[[int], str]) -> None:
+        """DataError for the first row that is ``faulty`` (rows,). words: what is wrong in that row, counted from 0."""
+        for row in np.flatnonzero(faulty)[:1]:
+            raise self.fail(int(row), words(int(row)))
+
     def floats(self, column: str) -> pl.Series:
         """A column as floats, null where a cell is empty. DataError for text and other things."""
         series = self.frame[column]
@@ -36,24 +42,20 @@ class Table:
                 raise DataError(f"{self.file}: column {column!r} holds {series.dtype}, expected numbers")
             return series.cast(pl.Float64)
         values = series.str.strip_chars().cast(pl.Float64, strict=False)  # one odd cell makes a CSV column text
-        odd = (values.is_null() & series.is_not_null()).arg_true()
-        if len(odd):
-            raise self.fail(int(odd[0]), f"{column} is {series[int(odd[0])]!r}, expected a number")
+        odd = values.is_null() & series.is_not_null()
+        self.refuse(odd, lambda row: f"{column} is {series[row]!r}, expected a number")
         return values
 
     def numbers(self, column: str) -> Array:
         """A column as finite floats (rows,). DataError names the first value that is missing or not finite."""
         series = self.floats(column)
         values = series.fill_null(np.nan).to_numpy()
-        bad = np.flatnonzero(~np.isfinite(values))
-        if len(bad):
-            value = series[int(bad[0])]
-            raise self.fail(
-                int(bad[0]), f"{column} is {'missing' if value is None else value}; remove or repair the row"
-            )
-        huge = np.flatnonzero(np.abs(values) > _LARGEST)
-        if len(huge):
-            raise self.fail(int(huge[0]), f"{column} is {values[huge[0]]:g}, which no robot can reach; check the units")
+        self.refuse(
+            ~np.isfinite(values),
+            lambda row: f"{column} is {'missing' if series[row] is None else series[row]}; remove or repair the row",
+        )
+        huge = np.abs(values) > _LARGEST
+        self.refuse(huge, lambda row: f"{column} is {values[row]:g}, which no robot can reach; check the units")
         return values
 
     def name_trajectories(self) -> None:
@@ -61,8 +63,7 @@ class Table:
         ids = self.frame["trajectory"]
         if ids.dtype.is_nested():
             raise DataError(f"{self.file}: column 'trajectory' holds {ids.dtype}, expected names or numbers")
-        for row in ids.is_null().arg_true()[:1]:
-            raise self.fail(int(row), "trajectory is missing")
+        self.refuse(ids.is_null(), lambda _: "trajectory is missing")
         self.frame = self.frame.with_columns(ids.cast(pl.String))
 
     def stack(self, columns: Sequence[str]) -> Array | None:

@@ -123,15 +123,13 @@ def _overview(datasets: list[DatasetView]) -> Table:
         reached = None if best is None else best.cost(view.scored)
         decimals = cost_decimals(view)
         rows.append(
-            Row(
-                (
-                    Cell(view.name, "simulated" if view.dataset.simulated else ""),
-                    Cell(NOTHING) if best is None else Cell(best.label, level_in_words(view)),
-                    Cell(SPLIT_NAMES[view.scored]),
-                    Cell(fixed(view.theoretical_cost(view.scored), decimals)),
-                    Cell(NOTHING if reached is None else fixed(reached.value, decimals)),
-                    Cell(NOTHING) if best is None else Cell(*improvement_in_words(best, view.scored, 1)),
-                )
+            Row.of(
+                Cell(view.name, "simulated" if view.dataset.simulated else ""),
+                NOTHING if best is None else Cell(best.label, level_in_words(view)),
+                SPLIT_NAMES[view.scored],
+                fixed(view.theoretical_cost(view.scored), decimals),
+                NOTHING if reached is None else fixed(reached.value, decimals),
+                NOTHING if best is None else Cell(*improvement_in_words(best, view.scored, 1)),
             )
         )
     return Table(

@@ -24,7 +24,7 @@ def cost_table(view: DatasetView, split: Split) -> Table:
     decimals = cost_decimals(view)
     before = fixed(theoretical, decimals)
     design = Cell(before, _span(view.design_costs.get(split), decimals))
-    rows = [Row((entry_cell(view, None), design, Cell(NOTHING), Cell(NOTHING)))]
+    rows = [Row.of(entry_cell(view, None), design, NOTHING, NOTHING)]
     searched = [entry for entry in view.statistics if entry.calibrator != THEORETICAL_NAME]
     rows += [_cost_row(view, entry, split, before) for entry in searched]
     rows += _published_rows(view, split)
@@ -48,14 +48,14 @@ def _cost_row(view: DatasetView, entry: EntryStatistics, split: Split, before: s
     if reached is None:
         failed = [run.record for run in view.runs if run.record.label == entry.label]
         outcome = failed[0].outcome.value if failed else "no run"
-        return Row((entry_cell(view, entry), Cell(before), Cell("no answer", outcome), Cell(NOTHING)), "failed")
-    cells = (
+        return Row.of(entry_cell(view, entry), before, Cell("no answer", outcome), NOTHING, role="failed")
+    return Row.of(
         entry_cell(view, entry),
-        Cell(before),
+        before,
         Cell(fixed(reached.value, cost_decimals(view)), _span(reached, cost_decimals(view))),
         Cell(*improvement_in_words(entry, split, 2)),
+        role="best" if entry.is_best else "plain",
     )
-    return Row(cells, "best" if entry.is_best else "plain")
 
 
 def _published_rows(view: DatasetView, split: Split) -> list[Row]:
@@ -65,15 +65,10 @@ def _published_rows(view: DatasetView, split: Split) -> list[Row]:
         if published is None:
             continue
         before, after = published
-        cells = (
-            Cell(result.label, result.source),
-            Cell(fixed(before, 4)),
-            Cell(fixed(after, 4)),
-            Cell(percent(1 - after / before, 2)),
-        )
-        rows.append(Row(cells, "muted"))
+        costs = (fixed(before, 4), fixed(after, 4), percent(1 - after / before, 2))
+        rows.append(Row.of(Cell(result.label, result.source), *costs, role="muted"))
     if rows:
-        rows.insert(0, Row((Cell("Published, on other data: not comparable row by row"),), "group"))
+        rows.insert(0, Row.of("Published, on other data: not comparable row by row", role="group"))
     return rows
 
 

@@ -15,7 +15,6 @@ from omnibench.data.dataset import Split, Trajectory
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.report.blocks import (
     Block,
-    Cell,
     Column,
     Details,
     Figure,
@@ -57,14 +56,10 @@ def final_error_table(view: DatasetView, split: Split) -> Table:
     rows = []
     for entry_or_none, of_entry in errors:
         positions, headings = positions_and_headings(of_entry)
-        cells = (
-            entry_cell(view, entry_or_none),
-            Cell(fixed(factor * positions.mean(), decimals)),
-            Cell(fixed(factor * positions.max(), decimals)),
-            Cell(fixed(np.degrees(headings.mean()), 2)),
-            Cell(fixed(np.degrees(headings.max()), 2)),
-        )
-        rows.append(Row(cells, "best" if entry_or_none and entry_or_none.is_best else "plain"))
+        cells = [fixed(factor * value, decimals) for value in (positions.mean(), positions.max())]
+        cells += [fixed(np.degrees(value), 2) for value in (headings.mean(), headings.max())]
+        is_best = entry_or_none is not None and entry_or_none.is_best
+        rows.append(Row.of(entry_cell(view, entry_or_none), *cells, role="best" if is_best else "plain"))
     return Table(
         caption=f"Error of the final pose, {SPLIT_NAMES[split]}",
         columns=(

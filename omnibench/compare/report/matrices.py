@@ -73,7 +73,7 @@ def parameter_table(view: DatasetView) -> Table | None:
         cells.append(Cell(_shown(known.design, known.unit)))
         for parameter, (_, record) in zip(values, fitted, strict=True):
             cells.append(_parameter_cell(parameter, _marks(record).get(name, "")))
-        rows.append(Row(tuple(cells)))
+        rows.append(Row.of(*cells))
     columns = (Column("Parameter", numeric=False), Column("design"), *(Column(entry.label) for entry, _ in fitted))
     return Table(
         "Physical parameters and their deviation from the design values",
@@ -86,16 +86,16 @@ def parameter_table(view: DatasetView) -> Table | None:
 
 
 def _element_table(view: DatasetView) -> Table:
-    rows = [Row((entry_cell(view, None), *(Cell(fixed(float(v), 6)) for v in view.design_matrix.ravel())))]
+    rows = [Row.of(entry_cell(view, None), *(fixed(float(v), 6) for v in view.design_matrix.ravel()))]
     for entry, run in view.calibrated:
         if run.matrix is None:
             continue
         marks = _marks(run.record) if entry.parameterisation == "matrix" else {}
         cells = [
-            Cell(fixed(float(value), 6) + marks.get(name, ""))
+            fixed(float(value), 6) + marks.get(name, "")
             for name, value in zip(_element_names(view), run.matrix.ravel(), strict=True)
         ]
-        rows.append(Row((entry_cell(view, entry), *cells), "best" if entry.is_best else "plain"))
+        rows.append(Row.of(entry_cell(view, entry), *cells, role="best" if entry.is_best else "plain"))
     held = any(run.record.held for entry, run in view.calibrated if entry.parameterisation == "matrix")
     return Table(
         "Inverse kinematic matrices M⁻¹",
@@ -119,7 +119,7 @@ def _difference_table(view: DatasetView, against: str | None) -> Table:
         share = differences(matrix, reference).ravel()
         moved = (matrix - reference).ravel()
         cells = tuple(_difference_cell(float(s), float(d)) for s, d in zip(share, moved, strict=True))
-        rows.append(Row((entry_cell(view, entry), *cells)))
+        rows.append(Row.of(entry_cell(view, entry), *cells))
     name = "the design values" if against is None else against
     note = "Eq. (10) and (11) of the paper, element by element. Where the reference is 0 the change itself is given."
     if project is not None:

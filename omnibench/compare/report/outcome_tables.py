@@ -37,17 +37,15 @@ def entry_table(view: DatasetView) -> Table:
     for entry in view.statistics:
         digits = decimals_for(entry.train_median, 5)
         rows.append(
-            Row(
-                (
-                    entry_cell(view, entry),
-                    Cell(f"{entry.answers} of {entry.runs}"),
-                    Cell(fixed(entry.train_median, digits), _spread(entry)),
-                    Cell(gap(entry.gap_median), proven(entry.proven_gap_median)),
-                    Cell(count(entry.evaluations_median), seconds(entry.seconds_median)),
-                    _difference(entry),
-                    _verdict(view, entry),
-                ),
-                "best" if entry.is_best else "plain" if entry.answers else "failed",
+            Row.of(
+                entry_cell(view, entry),
+                f"{entry.answers} of {entry.runs}",
+                Cell(fixed(entry.train_median, digits), _spread(entry)),
+                Cell(gap(entry.gap_median), proven(entry.proven_gap_median)),
+                Cell(count(entry.evaluations_median), seconds(entry.seconds_median)),
+                _difference(entry),
+                _verdict(view, entry),
+                role="best" if entry.is_best else "plain" if entry.answers else "failed",
             )
         )
     return Table(
@@ -93,14 +91,12 @@ def run_table(view: DatasetView, typical: bool = False) -> Table:
 def certificate_table(certificates: Sequence[BoxCertificate]) -> Table:
     """Lower bounds on the training cost, one for each box for which one is proven."""
     rows = [
-        Row(
-            (
-                Cell(certificate.box),
-                Cell(significant(certificate.best_cost, 6)),
-                Cell(significant(certificate.lower_bound, 6)),
-                Cell(percent(certificate.gap, 2), "" if certificate.finished else "time or parts ran out"),
-                Cell(count(certificate.parts), seconds(certificate.seconds)),
-            )
+        Row.of(
+            certificate.box,
+            significant(certificate.best_cost, 6),
+            significant(certificate.lower_bound, 6),
+            Cell(percent(certificate.gap, 2), "" if certificate.finished else "time or parts ran out"),
+            Cell(count(certificate.parts), seconds(certificate.seconds)),
         )
         for certificate in certificates
     ]
@@ -169,14 +165,14 @@ def _held_in_words(view: DatasetView) -> str:
 
 def _run_row(view: DatasetView, record: RunRecord) -> Row:
     answered = record.matrix is not None
-    cells = (
+    return Row.of(
         Cell(record.label, colour=view.styles[record.label].colour),
-        Cell(str(record.seed)),
+        str(record.seed),
         Cell(record.outcome.value, record.reason),
-        Cell(fixed(record.train_cost, 6)),
-        Cell(fixed(record.validation_cost, 6)),
+        fixed(record.train_cost, 6),
+        fixed(record.validation_cost, 6),
         Cell(gap(record.gap), proven(record.proven_gap)),
         Cell(count(record.evaluations), seconds(record.seconds)),
-        Cell(", ".join(on_bounds(record)) if answered and on_bounds(record) else NOTHING),
+        ", ".join(on_bounds(record)) if answered and on_bounds(record) else NOTHING,
+        role="plain" if answered else "failed",
     )
-    return Row(cells, "plain" if answered else "failed")

@@ -31,14 +31,12 @@ from omnibench.words import plural
 def dependence_table(dependences: Sequence[CovariateDependence], caption: str) -> Table:
     """The covariates that the residual depends on, with their significance."""
     rows = tuple(
-        Row(
-            (
-                Cell(each.covariate, f"{each.stage}: {STAGES[each.stage]}"),
-                Cell(each.description),
-                Cell(chance(each.p_value)),
-                Cell(significant(each.excess, 3)),
-                Cell(count(each.degrees_of_freedom)),
-            )
+        Row.of(
+            Cell(each.covariate, f"{each.stage}: {STAGES[each.stage]}"),
+            each.description,
+            chance(each.p_value),
+            significant(each.excess, 3),
+            count(each.degrees_of_freedom),
         )
         for each in dependences
     )
@@ -65,14 +63,12 @@ def parameter_table(found: Sequence[NamedEffect], dataset: Dataset) -> Table:
         others = [name for name in effect.confusable_with if name != effect.name]
         alike = f", cannot be told from {' and '.join(others)}" if others else ""
         rows.append(
-            Row((Cell(f"{effect.name} ({effect.stage}), weight {weight_in_words(effect.weight)}{alike}"),), "group")
+            Row.of(f"{effect.name} ({effect.stage}), weight {weight_in_words(effect.weight)}{alike}", role="group")
         )
         for each in effect.parameters:
             value, interval, unit = value_and_interval(each)
             kept = "chosen among a few" if each.shape else interval or NOTHING
-            rows.append(
-                Row((Cell(each.name, meanings.get(each.name, "")), Cell(value), Cell(kept), Cell(unit or NOTHING)))
-            )
+            rows.append(Row.of(Cell(each.name, meanings.get(each.name, "")), value, kept, unit or NOTHING))
     return Table(
         "Parameters of the effects that were added",
         (Column("Parameter", numeric=False), Column("Value"), Column("95 % interval"), Column("Unit", numeric=False)),
@@ -94,7 +90,7 @@ def held_out_table(discovery: Discovery) -> Table:
     rows: list[Row] = []
     for each in discovery.held_out:
         where = f"{held_out_in_words(discovery, each)}: {plural(each.runs, 'run')}"
-        rows += [Row((Cell(where),), "group"), _gap_row(each.eq6), _gap_row(each.chi2)]
+        rows += [Row.of(where, role="group"), _gap_row(each.eq6), _gap_row(each.chi2)]
         position, heading = final_errors_in_words(each)
         rows += [_plain_row("Final position error, mean", position), _plain_row("Final heading error, mean", heading)]
     return Table("On held-out runs", _GAP_COLUMNS, tuple(rows), _gap_note(discovery))
@@ -124,32 +120,23 @@ def _gap_note(discovery: Discovery) -> str:
 
 def _gap_row(gap: Gap) -> Row:
     decimals = gap_decimals(gap)
-    values = (gap.before, gap.after, gap.floor)
-    cells = (Cell(fixed(value, decimals)) for value in values)
-    return Row(
-        (Cell(METRICS[gap.metric]), *cells, Cell(closed_in_words(gap)), Cell(significant(gap.standard_error, 2)))
-    )
+    cells = (fixed(value, decimals) for value in (gap.before, gap.after, gap.floor))
+    return Row.of(METRICS[gap.metric], *cells, closed_in_words(gap), significant(gap.standard_error, 2))
 
 
 def _plain_row(name: str, words: str) -> Row:
     before, _, after = words.partition(" → ")
     unit = " mm" if after.endswith(" mm") else ""
-    return Row((Cell(name), Cell(f"{before}{unit}"), Cell(after), Cell(NOTHING), Cell(NOTHING), Cell(NOTHING)))
+    return Row.of(name, f"{before}{unit}", after, NOTHING, NOTHING, NOTHING)
 
 
 def step_table(discovery: Discovery) -> Table:
     """The error after each step."""
-    steps = discovery.steps
-    rows = tuple(
-        Row(
-            (
-                Cell(step.name if index == 0 else f"+ {added(step)}"),
-                *(Cell(significant(value, 4)) for value in
-                  (step.eq6_train, step.eq6_held_out, step.train, step.held_out)),
-            )
-        )
-        for index, step in enumerate(steps)
-    )  # fmt: skip
+    rows = []
+    for index, step in enumerate(discovery.steps):
+        values = (step.eq6_train, step.eq6_held_out, step.train, step.held_out)
+        name = step.name if index == 0 else f"+ {added(step)}"
+        rows.append(Row.of(name, *(significant(value, 4) for value in values)))
     return Table(
         "Step by step",
         (
@@ -159,7 +146,7 @@ def step_table(discovery: Discovery) -> Table:
             Column("χ² per residual", "training"),
             Column("χ² per residual", "held out"),
         ),
-        rows,
+        tuple(rows),
     )
 
 
@@ -169,16 +156,14 @@ def hidden_table(hidden: Sequence[Hidden]) -> Table:
     for each in sorted(hidden, key=share_of_plausible, reverse=True):
         shown, share = reading(each.unit), share_of_plausible(each)
         rows.append(
-            Row(
-                (
-                    Cell(each.name),
-                    Cell(each.parameter),
-                    Cell(f"±{shown.number(each.limit, 2)}"),
-                    Cell(f"±{shown.number(each.detectable, 2)}"),
-                    Cell(f"±{shown.number(each.plausible, 2)}"),
-                    Cell(shown.unit or NOTHING),
-                    Cell(percent(share, 0) if share < 100 else "> 10,000 %"),
-                )
+            Row.of(
+                each.name,
+                each.parameter,
+                f"±{shown.number(each.limit, 2)}",
+                f"±{shown.number(each.detectable, 2)}",
+                f"±{shown.number(each.plausible, 2)}",
+                shown.unit or NOTHING,
+                percent(share, 0) if share < 100 else "> 10,000 %",
             )
         )
     return Table(
@@ -200,7 +185,7 @@ def hidden_table(hidden: Sequence[Hidden]) -> Table:
 def absorbed_table(discovery: Discovery) -> Table:
     """Effects that a matrix reproduces, and the measurement that would show them."""
     rows = tuple(
-        Row((Cell(each.name), Cell(each.stage, STAGES[each.stage]), Cell(each.measurement or NOTHING)))
+        Row.of(each.name, Cell(each.stage, STAGES[each.stage]), each.measurement or NOTHING)
         for each in discovery.measurements
     )
     return Table(
@@ -213,7 +198,7 @@ def absorbed_table(discovery: Discovery) -> Table:
 
 def not_looked_for_table(discovery: Discovery) -> Table:
     """Effects that these recordings cannot show."""
-    rows = tuple(Row((Cell(each.name), Cell(each.reason))) for each in discovery.not_looked_for)
+    rows = tuple(Row.of(each.name, each.reason) for each in discovery.not_looked_for)
     columns = (Column("Effect", numeric=False), Column("Why", numeric=False))
     return Table("Not looked for", columns, rows)
 
@@ -221,14 +206,7 @@ def not_looked_for_table(discovery: Discovery) -> Table:
 def extrapolation_table(extrapolations: Sequence[Extrapolation]) -> Table:
     """Motions that no training run had, with the error bounds there."""
     rows = tuple(
-        Row(
-            (
-                Cell(each.command),
-                Cell(each.description),
-                Cell(significant(1e3 * each.before_m, 3)),
-                Cell(significant(1e3 * each.after_m, 3)),
-            )
-        )
+        Row.of(each.command, each.description, significant(1e3 * each.before_m, 3), significant(1e3 * each.after_m, 3))
         for each in extrapolations
     )
     return Table(

@@ -102,8 +102,8 @@ def _every(times: Iterable[Array], first: float | None = None) -> str:
 
 
 def _row(name: str, symbol: str, number: int, noun: str, every: str, remark: str) -> Row:
-    return Row((Cell(name, symbol), Cell(f"{count(number)} {noun}"), Cell(every or NOTHING), Cell(remark)))
+    return Row.of(Cell(name, symbol), f"{count(number)} {noun}", every or NOTHING, remark)
 
 
 def _missing(name: str, symbol: str) -> Row:
-    return Row((Cell(name, symbol), Cell("not recorded"), Cell(NOTHING), Cell("")), "muted")
+    return Row.of(Cell(name, symbol), "not recorded", NOTHING, "", role="muted")
