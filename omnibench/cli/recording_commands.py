@@ -98,8 +98,9 @@ def design(
     from omnibench.cli.terminal.design_summary import print_design
     from omnibench.config import to_json
     from omnibench.design.design import design_experiment
-    from omnibench.design.report.design_report import write_design_report
+    from omnibench.design.report.design_report import design_document
     from omnibench.files import write_text
+    from omnibench.report.render import write_document
 
     load_given_plugins(plugins)
     chosen = design_experiment(
@@ -107,7 +108,7 @@ def design(
     )
     if output is not None:
         write_text(output / "design.json", to_json(chosen) + "\n")
-        write_design_report(chosen, output / "report.html")
+        write_document(design_document(chosen), output / "report.html")
     if as_json:
         return print_json(chosen)
     print_design(make_console(), chosen)

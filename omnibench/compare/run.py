@@ -13,7 +13,7 @@ from omnibench.compare.effective_config import effective_config, load_calibrator
 from omnibench.compare.execute import PRELOAD, execute
 from omnibench.compare.output import prepare_output, write_results
 from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
-from omnibench.compare.report.comparison_report import write_report
+from omnibench.compare.report.comparison_report import comparison_document
 from omnibench.compare.result import ComparisonResult, ScoredRun
 from omnibench.compare.scoring import score
 from omnibench.compare.statistics import design_costs, entry_statistics, is_mean
@@ -26,6 +26,7 @@ from omnibench.jobs.result_store import ResultStore
 from omnibench.processes import one_thread_processes
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import PluginFailure
+from omnibench.report.render import write_document
 from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.slam.slam_options import PRELOAD as SLAM_PRELOAD
 
@@ -68,7 +69,7 @@ def run_comparison(
             warnings=tuple(_warnings(failures, datasets, runs)),
         )
         write_results(result)
-        write_report(result, folder / "report.html")
+        write_document(comparison_document(result), folder / "report.html")
     return result
 
 

@@ -14,6 +14,7 @@ from omnibench.data.table import read_table
 from omnibench.errors import DataError
 from omnibench.files import write_table
 from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.planar import interpolated
 
 TRUTH_FILE = "truth.yaml"
 _NAME = "poses"
@@ -28,7 +29,7 @@ class TruePath:
 
     def at(self, stamps: Array) -> Array:
         """Poses (..., 3) at stamps (...), s, interpolated by straight lines; before and after the path it rests."""
-        return np.stack([np.interp(stamps, self.times, column) for column in self.poses.T], axis=-1)
+        return interpolated(stamps, self.times, self.poses)
 
 
 def write_true_poses(folder: Path, paths: Mapping[str, TruePath]) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
+from omnibench.robot.planar import interpolated
 
 Unidentified = Literal["keep", "fit"]
 State = Literal["driven", "weak", "undriven"]
@@ -209,4 +210,4 @@ def _angles_at_poses(trajectory: Trajectory) -> Array:
     driven = np.cumsum(trajectory.rates * np.diff(trajectory.times, prepend=0.0)[:, None], axis=0)
     times = np.concatenate([[0.0], trajectory.times])
     angles = np.vstack([np.zeros(driven.shape[1]), driven])
-    return np.stack([np.interp(trajectory.pose_times, times, column) for column in angles.T], axis=1)
+    return interpolated(trajectory.pose_times, times, angles)

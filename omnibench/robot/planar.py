@@ -50,6 +50,16 @@ def moved_to(start: Array, poses: Array) -> Array:
     return compose(start, relative(poses[0], poses))
 
 
+def interpolated(times: Array | float, stamps: Array, rows: Array) -> Array:
+    """Rows (..., n) at times (...), s, by straight lines between the rows (K, n) at the stamps (K,); held beyond."""
+    return np.stack([np.interp(times, stamps, column) for column in rows.T], axis=-1)
+
+
+def wrapped(angles: Array) -> Array:
+    """Angles in [-pi, pi), rad, that differ from the given ones by whole turns."""
+    return (angles + np.pi) % (2 * np.pi) - np.pi
+
+
 def unit_twist(motion: Array) -> Array:
     """The constant twist that makes a motion in unit time: the logarithm map of SE(2).
 

@@ -10,6 +10,7 @@ from pydantic import Field
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import interpolated, wrapped
 from omnibench.slam.accuracy import SlamAccuracy
 from omnibench.slam.slam_run import SlamPath
 
@@ -84,7 +85,7 @@ def distances(one: Dataset, other: Dataset) -> Distances | None:
     if not len(errors):
         return None
     position = np.hypot(errors[:, 0], errors[:, 1])
-    heading = np.abs((errors[:, 2] + np.pi) % (2 * np.pi) - np.pi)
+    heading = np.abs(wrapped(errors[:, 2]))
     return Distances(
         poses=len(errors),
         position_mean_m=float(position.mean()),
@@ -98,5 +99,4 @@ def _apart(one: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
     """Differences (K, 3) at the common times after the start; headings not wrapped."""
     (times, poses), (dense_times, dense) = sorted((one, other), key=lambda path: len(path[0]))
     common = (times > _SAME_TIME) & (times >= dense_times[0] - _SAME_TIME) & (times <= dense_times[-1] + _SAME_TIME)
-    between = [np.interp(times[common], dense_times, column) for column in dense.T]
-    return np.asarray(poses[common] - np.column_stack(between))
+    return poses[common] - interpolated(times[common], dense_times, dense)

@@ -17,8 +17,9 @@ from omnibench.cli.terminal.design_summary import print_design
 from omnibench.design.candidates import candidates_of_config, candidates_of_dataset
 from omnibench.design.config import DesignConfig
 from omnibench.design.design import design_experiment
-from omnibench.design.report.design_report import write_design_report
+from omnibench.design.report.design_report import design_document
 from omnibench.design.result import Design
+from omnibench.report.render import write_document
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
@@ -44,7 +45,7 @@ def designed(sets: dict[str, Any] | None = None, **arguments: Any) -> Design:
 
 
 def page(design: Design, folder: Path) -> Page:
-    write_design_report(design, folder / "report.html")
+    write_document(design_document(design), folder / "report.html")
     return Page((folder / "report.html").read_text(encoding="utf-8"))
 
 

@@ -8,7 +8,15 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from omnibench.robot.odometry import advance
-from omnibench.robot.planar import compose, correction, moved_to, relative, unit_twist
+from omnibench.robot.planar import (
+    compose,
+    correction,
+    interpolated,
+    moved_to,
+    relative,
+    unit_twist,
+    wrapped,
+)
 
 POSES = arrays(float, 3, elements=st.floats(-10, 10))
 
@@ -50,3 +58,13 @@ def test_the_twist_of_a_motion_makes_it_along_an_arc(x: float, y: float, turn: f
 @given(st.floats(-20, 20))
 def test_the_twist_of_whole_turns_is_finite(turn: float) -> None:
     assert np.isfinite(unit_twist(np.array([1.0, -1.0, turn]))).all()
+
+
+def test_rows_are_interpolated_by_straight_lines_and_held_beyond_their_stamps() -> None:
+    rows = np.array([[0.0, 1.0, 0.0], [2.0, 1.0, -4.0]])
+    found = interpolated(np.array([-1.0, 1.5, 9.0]), np.array([1.0, 2.0]), rows)
+    np.testing.assert_array_equal(found, [[0.0, 1.0, 0.0], [1.0, 1.0, -2.0], [2.0, 1.0, -4.0]])
+
+
+def test_wrapped_angles_differ_by_whole_turns() -> None:
+    np.testing.assert_allclose(wrapped(np.array([0.1, np.pi, -np.pi, 7.0])), [0.1, -np.pi, -np.pi, 7.0 - 2 * np.pi])

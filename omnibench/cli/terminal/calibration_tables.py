@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from rich.console import Console
 
 from omnibench.cli.terminal.tables import print_table
+from omnibench.discover.report.wording import noise_in_words
 from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.certify import CertifiedCalibration
 from omnibench.fit.evaluate import Evaluation
@@ -15,7 +16,6 @@ from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals
 from omnibench.fit.uncertainty.physical import ParameterEstimate
 from omnibench.report.blocks import Cell, Column, Row, Table
-from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.words import plural
 
@@ -50,7 +50,7 @@ def print_calibration(console: Console, run: CalibrationRun) -> None:
         print_table(console, _parameter_table(calibration.robot, run.uncertainty.parameters))
     if run.uncertainty is not None:
         console.print(f"95 % intervals: {run.uncertainty.source}", soft_wrap=True)
-        console.print(f"noise of the reference: {_noise_in_words(run.uncertainty.noise)}", soft_wrap=True)
+        console.print(f"noise of the reference: {'; '.join(noise_in_words(run.uncertainty.noise))}", soft_wrap=True)
     console.print(
         f"{result.outcome}: {result.reason}; {plural(result.evaluations, 'evaluation')}, {result.seconds:.2f} s",
         soft_wrap=True,
@@ -80,18 +80,6 @@ def _intervals(run: CalibrationRun) -> Iterator[tuple[str, ElementIntervals]]:
         yield "95 %", run.uncertainty.intervals
     if run.intervals is not None:
         yield "95 %, bootstrap", run.intervals
-
-
-def _noise_in_words(noise: Noise) -> str:
-    """White noise, random walk and bias of a run: those of positions, then those of headings."""
-    kinds = (("white", ""), ("walk", "/sqrt s"), ("bias of a run", ""))
-    position = (noise.pose_position, noise.walk_position, noise.bias_position)
-    heading = (noise.pose_heading, noise.walk_heading, noise.bias_heading)
-    parts = [
-        ", ".join(f"{kind} {factor * value:.2g} {unit}{per}" for (kind, per), value in zip(kinds, values, strict=True))
-        for values, factor, unit in ((position, 1000.0, "mm"), (heading, math.degrees(1.0), "deg"))
-    ]
-    return "; ".join(parts)
 
 
 def _parameter_table(robot: Robot, parameters: Sequence[ParameterEstimate]) -> Table:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 from omnibench.compare.report.cost_tables import cost_section
 from omnibench.compare.report.data_section import data_section
@@ -37,13 +36,7 @@ from omnibench.report.blocks import (
 )
 from omnibench.report.numbers import NOTHING, count, fixed, listing
 from omnibench.report.recording.section import has_recording, recording_section
-from omnibench.report.render import write_document
 from omnibench.words import plural
-
-
-def write_report(result: ComparisonResult, path: Path) -> None:
-    """Write the report of a comparison to ``path``, whole or not at all. DataError when the disk refuses."""
-    write_document(comparison_document(result), path)
 
 
 def comparison_document(result: ComparisonResult) -> Document:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from omnibench.design.report.design_figures import efficiency_figure, path_figures, precision_figures
 from omnibench.design.report.design_wording import (
     USE_IN_WORDS,
@@ -29,13 +27,7 @@ from omnibench.report.blocks import (
     simulated_badge,
 )
 from omnibench.report.numbers import listing, percent, significant
-from omnibench.report.render import write_document
 from omnibench.words import plural
-
-
-def write_design_report(design: Design, path: Path) -> None:
-    """Write the report of a design to ``path``, whole or not at all. DataError when the disk refuses."""
-    write_document(design_document(design), path)
 
 
 def design_document(design: Design) -> Document:

@@ -23,7 +23,7 @@ from omnibench.discover.report.wording import (
 )
 from omnibench.discover.result import Candidate, Discovery, Gap, Hidden, Step
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
-from omnibench.report.numbers import fixed
+from omnibench.report.numbers import decimals_for, fixed
 from omnibench.report.style import INK, QUIET, logarithmic, plot, text
 from omnibench.report.traces import coordinates, marks
 
@@ -166,7 +166,7 @@ def _rises(values: Sequence[float | None]) -> bool:
 
 
 def _waterfall(steps: Sequence[Step], values: Sequence[float], floor: float | None, title: str) -> go.Figure:
-    decimals = max(2, min(6, 2 - _exponent(min(value for value in values if value > 0))))
+    decimals = max(2, min(6, decimals_for(min(value for value in values if value > 0))))
     bars = [_Bar("plain matrix", 0.0, values[0], fixed(values[0], decimals), ALONE)]
     for step, (before, after) in zip(steps[1:], pairwise(values), strict=True):
         item = _GAINED if after <= before else _LOST
@@ -254,10 +254,6 @@ def _folded(name: str) -> str:
     cuts = [index for index, letter in enumerate(name) if letter == "_"]
     cut = min(cuts, key=lambda index: abs(index - len(name) / 2))
     return f"{name[: cut + 1]}\n{name[cut + 1 :]}"
-
-
-def _exponent(value: float) -> int:
-    return int(f"{value:e}".split("e")[1])
 
 
 # Figures of the report, by the part that shows them: a figure that is added here is shown.

@@ -16,7 +16,7 @@ from omnibench.discover.report.residuals import NORMAL_95, Residuals
 from omnibench.report.blocks import FigureGrid
 from omnibench.report.numbers import fixed
 from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import rotated
+from omnibench.robot.planar import interpolated, rotated
 from omnibench.words import plural
 
 _TIMES = 14  # times at which the mean residual is drawn; only the drawing hangs on it
@@ -195,10 +195,7 @@ def _velocities(paths: Paths) -> Array:
     found = []
     for log, path in zip(paths.logs, paths.ends, strict=True):
         times = np.concatenate([[0.0], log.times])
-        late, early = (
-            np.column_stack([np.interp(log.stamps + shift, times, path[:, axis]) for axis in range(3)])
-            for shift in (0.05, -0.05)
-        )
+        late, early = (interpolated(log.stamps + shift, times, path) for shift in (0.05, -0.05))
         found.append((late - early) / 0.1)
     return np.concatenate(found)
 

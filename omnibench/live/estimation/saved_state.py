@@ -20,7 +20,6 @@ from omnibench.config import Model, NonNegative, read_model, to_yaml
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import remove, write_text
 from omnibench.robot.calibration import Calibration, read_calibration
-from omnibench.robot.kinematics import Array
 
 LOG = logging.getLogger("omnibench.live")
 _SLOT = 4096  # bytes, a block of most disks; a state takes some 1000
@@ -36,7 +35,7 @@ class SavedState(Model):
     rad. map_pose: fused pose, once SLAM has located the robot. session_time: s since the session began.
     """
 
-    sequence: int = Field(ge=0)
+    sequence: int = Field(0, ge=0)
     stamp: int = Field(ge=-(2**63), lt=2**63)
     wall: FiniteFloat
     positions: tuple[FiniteFloat, ...] | None
@@ -98,31 +97,13 @@ class RobotMemory:
         self._sequence = 0 if newest is None else newest.sequence
         return newest
 
-    def save(
-        self,
-        stamp: int,
-        wall: float,
-        positions: Array | None,
-        odometry: tuple[Array, Array],
-        fused: tuple[Array, Array] | None,
-        session_time: float = 0.0,
-    ) -> None:
-        """Write a state; odometry, fused: pose (3,) and covariance (3, 3). OSError: the disk refuses."""
+    def save(self, state: SavedState) -> None:
+        """Write a state under the next number. OSError: the disk refuses."""
         if self._file is None:
             return
         self._sequence += 1
-        state = {
-            "sequence": self._sequence,
-            "stamp": stamp,
-            "wall": wall,
-            "positions": None if positions is None else positions.tolist(),
-            "pose": odometry[0].tolist(),
-            "covariance": odometry[1].ravel().tolist(),
-            "map_pose": None if fused is None else fused[0].tolist(),
-            "map_covariance": None if fused is None else fused[1].ravel().tolist(),
-            "session_time": session_time,
-        }
-        text = json.dumps(state).encode().ljust(_SLOT - 1) + b"\n"
+        numbered = state.model_copy(update={"sequence": self._sequence})
+        text = numbered.model_dump_json().encode().ljust(_SLOT - 1) + b"\n"
         os.pwrite(self._file, text, (self._sequence % 2) * _SLOT)
 
     def keep_calibration(self, calibration: Calibration) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from omnibench.errors import DataError
 from omnibench.live.estimation.live_odometry import Motion
 from omnibench.live.estimation.robot_state import RobotState
 from omnibench.live.estimation.saved_state import RobotMemory, SavedState
+from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
 _PERIOD = 0.1  # s between two states; chosen: a node that is killed loses no more
@@ -37,13 +39,20 @@ class StateWriter:
             return
         self._due = state.arrival + _PERIOD
         stamp, positions = last
-        fused = None
-        if state.fusion is not None and state.fusion.located:
-            fused = state.fusion.pose, state.fusion.covariance
-        wall = time.time() - (time.monotonic() - state.arrival)
-        odometry = state.odometry.pose, state.odometry.covariance
+        fusion = state.fusion
+        fused = (fusion.pose, fusion.covariance) if fusion is not None and fusion.located else (None, None)
+        saved = SavedState.model_construct(  # what is not finite is refused when it is read
+            stamp=stamp,
+            wall=time.time() - (time.monotonic() - state.arrival),
+            positions=_row(positions),
+            pose=_row(state.odometry.pose),
+            covariance=_row(state.odometry.covariance),
+            map_pose=_row(fused[0]),
+            map_covariance=_row(fused[1]),
+            session_time=state.odometry.session_time,
+        )
         try:
-            self._memory.save(stamp, wall, positions, odometry, fused, state.odometry.session_time)
+            self._memory.save(saved)
         except OSError as error:  # a full disk must not stop the odometry
             state.counts.failures += 1
             state.last_refusal = f"the state could not be written: {error.strerror}"
@@ -55,6 +64,10 @@ class StateWriter:
         if self._memory is not None:
             self._memory.close()
             self._memory = None
+
+
+def _row(values: Array | None) -> Any:
+    return None if values is None else tuple(values.ravel().tolist())
 
 
 def resume_state(state: RobotState, saved: SavedState, now: float, wall: float) -> Motion:

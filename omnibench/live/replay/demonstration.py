@@ -24,7 +24,7 @@ from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.calibration import Calibration, read_calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.planar import moved_to
+from omnibench.robot.planar import interpolated, moved_to, wrapped
 from omnibench.words import plural
 
 _LAST_MESSAGES = 5.0  # s to wait for the last messages after a replay; chosen
@@ -173,7 +173,10 @@ def _evaluated(
         against, reference = "the simulated truth", concatenated_truth(drive, recording)
         chosen = rows
     else:
-        against, reference = "the reference poses of the recording", _interpolated(drive)
+        against, reference = (
+            "the reference poses of the recording",
+            interpolated(times, drive.slam_times, drive.slam_poses),
+        )
         chosen = rows[(times[rows] >= drive.slam_times[0]) & (times[rows] <= drive.slam_times[-1])]
     return Demonstration(
         robot=health.robot,
@@ -205,21 +208,11 @@ def _fused_deviation(
     return _deviation(fused.poses[known], reference[rows[known]])
 
 
-def _interpolated(drive: ConcatenatedDrive) -> Array:
-    columns = [np.interp(drive.wheel_times, drive.slam_times, drive.slam_poses[:, axis]) for axis in range(3)]
-    return np.column_stack(columns)
-
-
-def _wrapped(difference: Array) -> Array:
-    """Heading differences wrapped to [-pi, pi)."""
-    return (difference + np.pi) % (2 * np.pi) - np.pi
-
-
 def _difference(poses: Array, others: Array) -> float:
     if not len(poses):
         return math.nan
     difference = poses - others
-    difference[:, 2] = _wrapped(difference[:, 2])
+    difference[:, 2] = wrapped(difference[:, 2])
     return float(np.abs(difference).max())
 
 
@@ -227,5 +220,5 @@ def _deviation(poses: Array, reference: Array) -> Deviation:
     if not len(poses):
         return Deviation(math.nan, math.nan, math.nan)
     distance = np.hypot(*(poses - reference)[:, :2].T)
-    heading = _wrapped(poses[:, 2] - reference[:, 2])
+    heading = wrapped(poses[:, 2] - reference[:, 2])
     return Deviation(float(np.sqrt(np.mean(distance**2))), float(np.sqrt(np.mean(heading**2))), float(distance[-1]))

@@ -24,7 +24,7 @@ from omnibench.report.recording.scan_points import evenly, poses_at, scan_points
 from omnibench.report.style import INK
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.planar import compose, placed
+from omnibench.robot.planar import compose, interpolated, placed
 
 _FRAMES = 240  # frames drawn of a run (chosen: steps of the slider that can be told apart)
 _MEAN_OVER = 0.1  # s; wheel rates are means over this time before each frame
@@ -111,8 +111,8 @@ def _means(run: Trajectory, values: Array, times: Array) -> Array:
     angles = np.vstack([np.zeros(values.shape[1]), np.cumsum(values * durations, axis=0)])
     late = np.clip(times, _MEAN_OVER / 2, ends[-1])
     early = np.maximum(late - _MEAN_OVER, 0.0)
-    driven = [np.interp(late, ends, column) - np.interp(early, ends, column) for column in angles.T]
-    means: Array = np.column_stack(driven) / (late - early)[:, None]
+    driven = interpolated(late, ends, angles) - interpolated(early, ends, angles)
+    means: Array = driven / (late - early)[:, None]
     return means
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from omnibench.data.dataset import Trajectory
 from omnibench.data.scans import Scanner, TrajectoryScans
 from omnibench.robot.kinematics import Array
-from omnibench.robot.planar import compose
+from omnibench.robot.planar import compose, interpolated
 
 _GOES_ON = 0.1  # s of motion after the last pose: longer than a scan takes
 
@@ -21,7 +21,7 @@ def poses_at(trajectory: Trajectory, times: Array) -> Array:
     if len(stamps) > 1:
         velocity = (poses[-1] - poses[-2]) / (stamps[-1] - stamps[-2])
         stamps, poses = np.append(stamps, stamps[-1] + _GOES_ON), np.vstack([poses, poses[-1] + velocity * _GOES_ON])
-    return np.stack([np.interp(times, stamps, column) for column in poses.T], axis=-1)
+    return interpolated(times, stamps, poses)
 
 
 def scan_points(trajectory: Trajectory, scanner: Scanner, scans: TrajectoryScans, scan: int, stride: int = 1) -> Array:

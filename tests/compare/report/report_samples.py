@@ -13,7 +13,7 @@ from shared_results import made_once
 from omnibench.compare.certificates import certify
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
-from omnibench.compare.report.comparison_report import write_report
+from omnibench.compare.report.comparison_report import comparison_document
 from omnibench.compare.result import ComparisonResult, EntryStatistics
 from omnibench.compare.scoring import score
 from omnibench.compare.statistics import design_costs, entry_statistics
@@ -21,6 +21,7 @@ from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
 from omnibench.fit.calibrator import RunResult, run_calibrator
 from omnibench.registry import calibrators
+from omnibench.report.render import write_document
 
 APR02 = {
     "name": "APR-02",
@@ -94,7 +95,7 @@ def solve(planned: PlannedRun) -> RunResult:
 
 def page(result: ComparisonResult, folder: Path) -> Page:
     """The comparison's report as its reader sees it."""
-    write_report(result, folder / "report.html")
+    write_document(comparison_document(result), folder / "report.html")
     return Page((folder / "report.html").read_text(encoding="utf-8"))
 
 

@@ -15,13 +15,14 @@ from recording_samples import sample
 from report_page import Page
 from report_samples import config, flower, page, run, statistics
 
-from omnibench.compare.report.comparison_report import write_report
+from omnibench.compare.report.comparison_report import comparison_document
 from omnibench.compare.result import ComparisonResult
 from omnibench.data.dataset import make_dataset
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError
 from omnibench.fit.problem import Improvement
 from omnibench.report.numbers import fixed
+from omnibench.report.render import write_document
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
@@ -243,7 +244,7 @@ def test_scans_that_cannot_be_read_cost_the_pictures_and_not_the_report(tmp_path
 def test_a_report_that_cannot_be_written_is_one_line(result: ComparisonResult, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(DataError, match="cannot be written"):
-        write_report(result, tmp_path / "file" / "report.html")
+        write_document(comparison_document(result), tmp_path / "file" / "report.html")
 
 
 def test_a_browser_draws_every_plot_and_finds_no_fault(result: ComparisonResult, tmp_path: Path) -> None:
@@ -260,7 +261,7 @@ def test_a_browser_draws_every_plot_and_finds_no_fault(result: ComparisonResult,
 
 def in_browser(browser: str, result: ComparisonResult, folder: Path) -> tuple[str, str]:
     """The report's page after its scripts have run, and what the browser logged."""
-    write_report(result, folder / "report.html")
+    write_document(comparison_document(result), folder / "report.html")
     flags = [
         *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
         *("--disable-background-networking", "--disable-component-update", "--enable-logging=stderr"),

@@ -16,7 +16,6 @@ from omnibench.errors import DataError
 from omnibench.live.estimation.saved_state import RobotMemory, SavedState
 from omnibench.robot.calibration import write_calibration
 
-AT = np.array([1.0, 2.0, 0.3]), np.diag([1e-4, 1e-4, 1e-5])
 STATE: dict[str, Any] = {
     "sequence": 5,
     "stamp": 10**18,
@@ -45,11 +44,11 @@ def loaded(folder: Path, content: str) -> SavedState | None:
 
 
 def test_a_state_comes_back_as_it_was(memory: RobotMemory) -> None:
-    memory.save(10**18, 1.8e9, np.array([1.0, 2.0, 3.0]), AT, None)
+    memory.save(SavedState(**STATE))
     found = memory.load()
     assert found is not None
     assert found.pose == (1.0, 2.0, 0.3)
-    np.testing.assert_array_equal(np.reshape(found.covariance, (3, 3)), AT[1])
+    np.testing.assert_array_equal(np.reshape(found.covariance, (3, 3)), np.diag([1e-4, 1e-4, 1e-5]))
 
 
 def test_the_state_of_the_examples_below_is_taken(tmp_path: Path) -> None:
@@ -129,9 +128,9 @@ def test_a_kept_calibration_that_is_damaged_says_which_file_to_remove(tmp_path: 
 
 def test_a_closed_memory_writes_nothing_more(tmp_path: Path) -> None:
     memory = RobotMemory(tmp_path, "apr")
-    memory.save(1, 0.0, None, AT, None)
+    memory.save(SavedState(**STATE))
     memory.close()
     memory.close()
     before = (tmp_path / "apr.state.json").read_bytes()
-    memory.save(2, 0.0, None, AT, None)  # of a sample that was on its way
+    memory.save(SavedState(**STATE))  # of a sample that was on its way
     assert (tmp_path / "apr.state.json").read_bytes() == before

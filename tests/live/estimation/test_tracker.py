@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from omnibench.errors import ConfigError, DataError
-from omnibench.live.estimation.saved_state import RobotMemory
+from omnibench.live.estimation.saved_state import RobotMemory, SavedState
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.estimation.update import Update
 from omnibench.live.fusion.pose_fusion import FusionSettings
@@ -352,9 +352,9 @@ def test_a_robot_goes_on_where_it_was_after_its_node_was_killed(tmp_path: Path) 
 
 def test_a_state_torn_by_a_crash_leaves_the_one_before(tmp_path: Path) -> None:
     memory = RobotMemory(tmp_path, "apr")
-    pair = np.zeros(3), np.eye(3)
+    rows = {"positions": (0.0,) * 3, "pose": (0.0,) * 3, "covariance": tuple(np.eye(3).ravel())}
     for stamp in (1, 2, 3):
-        memory.save(stamp, 0.0, np.zeros(3), pair, None)
+        memory.save(SavedState(stamp=stamp, wall=0.0, **rows))
     file = tmp_path / "apr.state.json"
     memory.close()
     content = bytearray(file.read_bytes())

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import interpolated
 
 _KEPT_REST = 0.5  # s of rest that are kept before and after a run (chosen)
 
@@ -118,6 +119,6 @@ def _arrival(rest: tuple[float, float], shared: bool, stamps: Array) -> float:
 
 
 def _stood(times: Array, angles: Array, begin: float, end: float, turned: float) -> bool:
-    inside = [np.interp([begin, end], times, column) for column in angles.T]
+    inside = interpolated(np.array([begin, end]), times, angles)
     between = angles[(times >= begin) & (times <= end)]
-    return bool((np.ptp(np.vstack([np.transpose(inside), between]), axis=0) <= turned).all())
+    return bool((np.ptp(np.vstack([inside, between]), axis=0) <= turned).all())
