@@ -38,13 +38,12 @@ from omnibench.discover.regressors.column_group import Group, best_shapes
 from omnibench.fit.least_squares.whitened import Given, Whitened, given
 from omnibench.robot.kinematics import Array
 
+# tests/benchmarks/constants.py varies each number by 0.5 and 2 on small blind sets: no verdict and no name changes.
 _FLIPS = 499  # B; Eq. (3) gives chances smaller than 1 / B (at 5 %, 99 would do: Davison and Hinkley, section 4.2.5)
-_TAIL = (
-    0.1  # k / B: Knijnenburg et al. fit no more than a quarter of the flips; varied in tests/benchmarks/constants.py
-)
+_TAIL = 0.1  # k / B: Knijnenburg et al. fit no more than a quarter of the flips
 _ENOUGH = 0.25  # share of the k that must reach z for Eq. (2): 12 flips, at least 10 in Knijnenburg et al.
-_PLAIN = 3.0  # -log10 of the chance from which on a group is plainly significant
-_MOST_TAKEN = 3  # groups, at most, that are taken out of the residuals that stand for noise
+_PLAIN = 3.0  # z, Eq. (1), from which on a group is plainly significant: so much by chance is one group of 1000
+_MOST_TAKEN = 3  # groups, at most, that are taken out of the residuals that stand for noise: as many as are named
 
 
 @dataclass(frozen=True, eq=False)

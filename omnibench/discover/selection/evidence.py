@@ -63,11 +63,11 @@ from omnibench.fit.least_squares.whitened import Given
 from omnibench.robot.kinematics import Array
 
 # tests/benchmarks/evidence_study.py prints again what is measured here, on 16 blind sets with one strong effect, 4 with
-# two and 4 with what no catalogue has; tests/benchmarks/constants.py what changes on eight others if a number is half
+# two and 4 with what no catalogue has; tests/benchmarks/constants.py what changes on seven others if a number is half
 # or twice as large: no verdict and no name, but for DISCREPANCY.
 #
 # delta, along the other effect in whose direction the catalogue's form is farthest off: below 0.09 in nine sets of ten,
-# 0.06 in half of them. With 0.2, three sets of eight would lose a sure name; with 0.05 none would change.
+# 0.06 in half of them. With 0.2, three of eight others would lose a sure name; with 0.05 none would change.
 DISCREPANCY = 0.1
 _PRIOR = float(np.log(20))  # an effect is missing in one of 20 robots
 # u: mean share of the chi-square that right names leave, three times the 0.013 of strong effects, whose forms show
@@ -79,9 +79,8 @@ _MOST_ODDS = 10.0  # F_max: below 1 / u, so that what is left beside the names a
 _CANCELLING = 0.45  # share of Eq. (10): 1.0 or more of right pairs, 0.2 to 0.3 of the best wrong ones in 4 sets of 24
 _SURELY = 3.0  # standard errors: a normal number is below minus three of them in one of 740 cases
 _IMITATION = 1.0  # odds, at most, of effects that cancel each other or have an impossible sign: even
-# odds(1), odds(2): with 0.4 to 42 and 0.3 to 8, all right names of the study are sure, and no wrong one.
-_ODDS_OF_ONE = 9.0
-_ODDS_OF_TWO = 1.0
+_ODDS_OF_ONE = 9.0  # odds(1): with 0.4 to 42 all right names of the study are sure, and no wrong one
+_ODDS_OF_TWO = 1.0  # odds(2): with 0.3 to 8 all right names of the study are sure, and no wrong one
 _WINDOW = 8.0  # standard deviations about what is left that are integrated over: beyond them is 1e-15 of the integral
 
 
