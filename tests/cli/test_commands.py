@@ -23,6 +23,7 @@ from commands import (
     write_config,
     write_plugin,
 )
+from timing import PATIENCE
 
 from omnibench.data.storage import load_dataset
 from omnibench.robot.calibration import read_calibration
@@ -147,7 +148,7 @@ def test_a_terminal_without_a_letter_shows_another(prepared: Prepared, tmp_path:
         env=ENVIRONMENT | {"PYTHONIOENCODING": "ascii"},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
         check=False,
     )
     assert (run.returncode, run.stderr) == (0, "")

@@ -8,13 +8,14 @@ import os
 import pty
 import re
 import subprocess
-import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 from commands import COMMAND, ENVIRONMENT, compared, compared_here, flower, search, summary, write_config
 from rich.console import Console
+from timing import PATIENCE
 
 from omnibench.cli.terminal.comparison_tables import print_result
 from omnibench.compare.result import ComparisonResult
@@ -133,17 +134,12 @@ def on_a_terminal(*arguments: object, **others: Any) -> tuple[int, str]:
         **others,
     )
     os.close(theirs)
-    shown, deadline = b"", time.monotonic() + 60
-    while time.monotonic() < deadline:
-        try:
-            chunk = os.read(ours, 65536)
-        except OSError:  # the terminal's other end is closed
-            break
-        if not chunk:
-            break
-        shown += chunk
+    shown = b""
+    with suppress(OSError):  # the terminal's other end is closed
+        while chunk := os.read(ours, 65536):
+            shown += chunk
     os.close(ours)
-    return process.wait(timeout=10), shown.decode()
+    return process.wait(timeout=PATIENCE), shown.decode()
 
 
 def test_a_terminal_shows_a_bar_for_all_runs_and_one_for_each_that_is_under_way(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import polars as pl
 import pytest
 from commands import COMMAND, ENVIRONMENT, Command, assert_refused, omnibench
 from discovery_samples import EXPERIMENT, named, nothing, simulated
+from timing import PATIENCE
 
 from omnibench.config import parse_yaml
 from omnibench.data.dataset import Dataset
@@ -194,7 +195,7 @@ def test_ctrl_c_leaves_nothing_half_written(data: Path, tmp_path: Path) -> None:
     try:
         assert process.stderr.readline() == "fitting the plain matrix\n"
         os.kill(process.pid, signal.SIGINT)
-        _, told = process.communicate(timeout=60)
+        _, told = process.communicate(timeout=PATIENCE)
     finally:
         process.kill()
     assert process.returncode == 130

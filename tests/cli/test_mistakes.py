@@ -21,6 +21,7 @@ from commands import (
     omnibench,
     run_here,
 )
+from timing import PATIENCE
 
 from omnibench.data.storage import load_dataset
 
@@ -162,7 +163,7 @@ def test_nothing_typed_shows_the_help(command: Command) -> None:
 def test_a_reader_that_has_gone_is_no_error(prepared: Prepared) -> None:
     shell = f"{COMMAND[0]} -m omnibench inspect {prepared.data} --json | true; exit ${{PIPESTATUS[0]}}"
     run = subprocess.run(
-        ["bash", "-c", shell], env=ENVIRONMENT, capture_output=True, text=True, timeout=60, check=False
+        ["bash", "-c", shell], env=ENVIRONMENT, capture_output=True, text=True, timeout=PATIENCE, check=False
     )
     assert run.returncode in (0, 1)
     assert run.stderr == ""
@@ -185,7 +186,7 @@ def test_a_full_disk_behind_standard_output_is_one_line() -> None:
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
-            timeout=60,
+            timeout=PATIENCE,
             check=False,
         )
     assert (run.returncode, run.stderr) == (2, "error: output: No space left on device\n")

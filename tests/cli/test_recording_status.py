@@ -19,6 +19,7 @@ from mcap_recordings import disk_with_room_for, messages_of, publishers
 from rich.console import Console
 from samples import sample
 from sessions import Loopback, until
+from timing import PATIENCE
 
 from omnibench.cli.terminal.recording_status import record
 from omnibench.errors import DataError
@@ -102,7 +103,7 @@ def recording_process(loopback: Loopback, path: Path) -> Iterator[subprocess.Pop
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1] / "live")},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
 
     def some_are_written() -> bool:
@@ -111,7 +112,7 @@ def recording_process(loopback: Loopback, path: Path) -> Iterator[subprocess.Pop
         return path.exists() and path.stat().st_size > 1000
 
     try:
-        until(some_are_written, "the other process to have written something", seconds=30)
+        until(some_are_written, "the other process to have written something")
         yield process
     finally:
         process.kill()
@@ -125,7 +126,7 @@ def test_a_recording_that_is_told_to_stop_is_complete(
     path = tmp_path / "run.mcap"
     with recording_process(loopback, path) as process:
         process.send_signal(number)
-        output, errors = process.communicate(timeout=20)
+        output, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, errors
     assert errors == ""
     with path.open("rb") as file:

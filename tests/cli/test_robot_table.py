@@ -16,6 +16,7 @@ from announced_robot import AnnouncedRobot
 from rich.console import Console
 from samples import odometry
 from sessions import Loopback
+from timing import PATIENCE
 
 from omnibench.cli.terminal.robot_table import describe, listen, plain_line, view
 from omnibench.errors import ConfigError, DataError
@@ -36,7 +37,7 @@ def listened(loopback: Loopback, robot: str | None, *, terminal: bool = False, w
     """The output of ``listen`` after one reading."""
     text = StringIO()
     console = Console(file=text, width=width, force_terminal=terminal, color_system=None)
-    listen(robot, loopback.client(), KEYS, console, Event(), **{"seconds": 0.05, "patience": 0.5, **options})
+    listen(robot, loopback.client(), KEYS, console, Event(), **{"seconds": 0.05, "patience": PATIENCE, **options})
     return text.getvalue()
 
 
@@ -47,12 +48,12 @@ def test_a_robot_that_is_not_there_is_one_line_with_the_nearest_that_is(
     with pytest.raises(
         DataError, match=r"'apr2': nothing was received from it in 0\.5 s; did you mean 'apr02'\? alive: apr02"
     ):
-        listened(loopback, "apr2")
+        listened(loopback, "apr2", patience=0.5)
 
 
 def test_when_nobody_is_there_the_line_says_so(loopback: Loopback) -> None:
     with pytest.raises(DataError, match="no robot is alive; is its node running"):
-        listened(loopback, "apr02")
+        listened(loopback, "apr02", patience=0.5)
 
 
 def test_a_name_that_no_robot_can_have_is_refused(loopback: Loopback) -> None:
@@ -66,7 +67,20 @@ def test_listening_to_all_goes_on_while_nobody_is_there(loopback: Loopback) -> N
 
 def test_a_piped_listener_prints_plain_lines(loopback: Loopback, apr02: AnnouncedRobot) -> None:
     apr02.answer_health("ok", "calibrated")
-    lines = listened(loopback, "apr02", seconds=1.2).splitlines()
+    stop = Event()
+
+    class TwoLines(StringIO):
+        """Stops after two lines."""
+
+        def write(self, text: str) -> int:
+            written = super().write(text)
+            if self.getvalue().count("\n") == 2:
+                stop.set()
+            return written
+
+    text = TwoLines()
+    listen("apr02", loopback.client(), KEYS, Console(file=text, width=100), stop, PATIENCE, patience=PATIENCE)
+    lines = text.getvalue().splitlines()
     assert len(lines) == 2
     assert lines[1].startswith("apr02: no odometry yet, ok: calibrated")
 
@@ -87,7 +101,7 @@ def test_json_is_one_document_a_line_without_nan(loopback: Loopback, apr02: Anno
             return super().write(text)
 
     text = Feeder()
-    listen("apr02", loopback.client(), KEYS, Console(file=text, width=80), stop, seconds=10.0, as_json=True)
+    listen("apr02", loopback.client(), KEYS, Console(file=text, width=80), stop, seconds=PATIENCE, as_json=True)
     document = json.loads(text.getvalue().splitlines()[-1], parse_constant=pytest.fail)  # NaN, Infinity
     assert document["robot"] == "apr02"
     assert document["odom"]["pose"] == pytest.approx(odometry().pose.tolist())

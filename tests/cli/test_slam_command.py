@@ -17,6 +17,7 @@ import polars as pl
 import pytest
 import yaml
 from commands import COMMAND, ENVIRONMENT, Command, Printed, assert_refused, run_here
+from timing import PATIENCE
 
 from omnibench.data.dataset import make_dataset
 from omnibench.data.scans import ScansInMemory
@@ -301,7 +302,7 @@ def test_after_ctrl_c_the_command_goes_on(
         assert process.poll() is None
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=PATIENCE)
     assert (process.returncode, out) == (130, "")
     files = {file: file.stat().st_mtime_ns for file in (tmp_path / "found.slam-paths").iterdir()}
     assert kept <= len(files) < 30
@@ -326,7 +327,7 @@ def test_ctrl_c_before_the_first_path_leaves_nothing(driven: Driven, tmp_path: P
         env=ENVIRONMENT,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE,
         check=False,
     )
     assert run.returncode == 130

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from timing import PATIENCE
 
 LOADED = """
 import sys
@@ -23,7 +24,7 @@ def packages(statements: str) -> set[str]:
         [sys.executable, "-c", LOADED.format(statements=statements)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
         check=True,
     )
     return set(run.stderr.split())
@@ -68,5 +69,5 @@ main()
 )
 def test_ctrl_c_during_the_imports_of_a_command_is_one_line(module: str, arguments: list[str]) -> None:
     program = INTERRUPTED.format(module=module, arguments=arguments)
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert (run.returncode, run.stdout, run.stderr) == (130, "", "interrupted\n")

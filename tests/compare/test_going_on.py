@@ -25,6 +25,7 @@ from commands import (
     write_config,
     write_plugin,
 )
+from timing import PATIENCE
 
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.effective_config import effective_config
@@ -105,7 +106,7 @@ def alive(group: int) -> list[str]:
 
 
 def wait_until_gone(group: int) -> list[str]:
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + PATIENCE
     while (left := alive(group)) and time.monotonic() < deadline:
         time.sleep(0.05)
     return left
@@ -116,7 +117,7 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Stopped:
     folder = tmp_path_factory.mktemp("stopped")
     process = started(write_config(folder, **waiting(folder), workers=1), folder / "out")
     os.killpg(process.pid, signal.SIGINT)
-    _, stderr = process.communicate(timeout=60)
+    _, stderr = process.communicate(timeout=PATIENCE)
     return Stopped(folder, folder / "out", process.returncode, stderr, process.pid, files_of(folder / "out"))
 
 
@@ -192,7 +193,7 @@ def test_the_runs_end_with_a_comparison_that_is_killed_which_then_goes_on(name: 
     config = write_config(tmp_path, plugins=[str(plugins)], calibrators=entries, workers=4)  # none starts later
     process = started(config, tmp_path / "out")
     process.send_signal(signal.Signals[name])
-    _, stderr = process.communicate(timeout=30)
+    _, stderr = process.communicate(timeout=PATIENCE)
     assert "Traceback" not in stderr
     assert wait_until_gone(process.pid) == []
     before = files_of(tmp_path / "out" / "runs")

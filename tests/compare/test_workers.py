@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from commands import COMMAND, ENVIRONMENT, compared_here, rows, search, small, summary, write_config, write_plugin
+from timing import PATIENCE
 
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import load_datasets
@@ -93,7 +94,7 @@ def test_a_script_needs_no_guard(tmp_path: Path) -> None:
         "print(sorted(run.record.outcome for run in result.runs))\n"
     )
     run = subprocess.run(
-        [COMMAND[0], str(script)], env=ENVIRONMENT, capture_output=True, text=True, timeout=60, check=False
+        [COMMAND[0], str(script)], env=ENVIRONMENT, capture_output=True, text=True, timeout=PATIENCE, check=False
     )
     assert run.stderr == ""
     assert run.stdout.splitlines()[0] == "once"
@@ -114,7 +115,7 @@ def test_a_comparison_leaves_the_process_as_it_was(tmp_path: Path) -> None:
 def test_a_comparison_runs_in_another_thread_than_the_main_one(tmp_path: Path) -> None:
     thread = threading.Thread(target=compared_here, args=(tmp_path / "out",))
     thread.start()
-    thread.join(timeout=60)
+    thread.join(timeout=PATIENCE)
     assert [run["outcome"] for run in summary(tmp_path / "out")["runs"]] == ["converged", "converged", "budget"]
 
 
@@ -140,7 +141,7 @@ def test_every_run_has_one_thread_and_leaves_ctrl_c_to_the_comparison(tmp_path: 
         [*COMMAND, "compare", str(config), "--output", str(tmp_path / "out")],
         env=environment,
         capture_output=True,
-        timeout=60,
+        timeout=PATIENCE,
         check=True,
     )
     assert rows(tmp_path / "out")["tells"]["reason"] == "1 1 1 1, SIG_IGN"

@@ -17,6 +17,7 @@ import polars as pl
 import pytest
 import yaml
 from storage_samples import FORMATS, Format, everything_known, read_frame, table_file, write_frame
+from timing import PATIENCE
 
 from omnibench.data.dataset import Dataset
 from omnibench.data.scan_files import ScansOnDisk
@@ -337,6 +338,7 @@ _LONG = """
 import resource, sys
 from dataclasses import replace
 import numpy as np
+from timing import PATIENCE
 from omnibench.data.scans import Scanner, Scans, TrajectoryScans
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.testing.synthetic import synthetic_dataset
@@ -359,7 +361,7 @@ print(total // 1000, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
 @pytest.mark.skipif(not hasattr(resource, "RUSAGE_SELF"), reason="the system does not tell a process's memory")
 def test_scans_are_saved_and_read_without_being_in_memory_at_once(tmp_path: Path) -> None:
     ended = subprocess.run(
-        [sys.executable, "-c", _LONG, str(tmp_path)], capture_output=True, text=True, check=True, timeout=120
+        [sys.executable, "-c", _LONG, str(tmp_path)], capture_output=True, text=True, check=True, timeout=PATIENCE
     )
     total, grown = map(int, ended.stdout.split())  # kB
     assert total > 60_000

@@ -175,7 +175,7 @@ def test_a_searched_geometry_cannot_keep_it_and_says_so() -> None:
 
 def test_progress_is_shown(dataset: Dataset) -> None:
     shown: list[Progress] = []
-    calibrate(dataset, "crs", budget=Budget(seconds=0.4), watch=shown.append)
+    calibrate(dataset, "crs", budget=Budget(evaluations=500), watch=shown.append)
     assert {event.task for event in shown} == {"crs"}
     assert [event.done for event in shown] == sorted(event.done for event in shown)
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from timing import PATIENCE
 
 from omnibench.errors import DataError
 from omnibench.jobs.job import Backend, Failure, Job, JobWatch, run_jobs
@@ -376,12 +377,11 @@ def until_told(folder: Path, _: Reporter) -> Answer:
 
 
 def wait_for(happened: Any) -> None:
-    """Wait for an event, for a minute at most."""
-    for _ in range(1200):
-        if happened():
-            return
+    """Wait for an event."""
+    deadline = time.monotonic() + PATIENCE
+    while not happened():
+        assert time.monotonic() < deadline, "it did not happen"
         time.sleep(0.05)
-    pytest.fail("it did not happen")
 
 
 def alive(session: int) -> list[str]:

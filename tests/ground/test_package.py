@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from timing import PATIENCE
 
 import omnibench
 
@@ -48,11 +49,13 @@ main()
 
 
 def test_ctrl_c_during_the_first_imports_is_one_line() -> None:
-    run = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=60, check=False)
+    run = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=PATIENCE, check=False
+    )
     assert (run.returncode, run.stdout, run.stderr) == (130, "", "interrupted\n")
 
 
 def test_importing_the_package_loads_no_heavy_library() -> None:
     program = "import sys, omnibench; print(sorted({'numpy', 'polars', 'plotly', 'cvxpy'} & set(sys.modules)))"
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=True)
     assert run.stdout == "[]\n"

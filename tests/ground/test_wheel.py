@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import yaml
 from commands import ROOT
+from timing import PATIENCE
 
 Run = Callable[..., str]
 
@@ -33,12 +34,12 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
     packages = sysconfig.get_path("purelib")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-q"]
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder / "venv"], check=True, timeout=120)
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder / "venv"], check=True, timeout=PATIENCE)
     isolation = ["--no-build-isolation"] if find_spec("hatchling") else []  # else pip fetches what the build needs
     subprocess.run([*pip, "wheel", "--no-deps", *isolation, "-w", folder, ROOT], check=True, timeout=300)
     wheel = next(folder.glob("omnibench-*.whl"))
     into = ["--python", folder / "venv" / "bin" / "python"]
-    subprocess.run([*pip, *into, "install", "--no-deps", "--no-index", wheel], check=True, timeout=120)
+    subprocess.run([*pip, *into, "install", "--no-deps", "--no-index", wheel], check=True, timeout=PATIENCE)
     library = next((folder / "venv" / "lib").glob("python*")) / "site-packages"
     (library / "dependencies.pth").write_text(f"{packages}\n", encoding="utf-8")
     return folder / "venv"
@@ -57,7 +58,7 @@ def run(installed: Path, tmp_path: Path) -> Run:
             env=environment,
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=PATIENCE,
             check=False,
         )
         assert ended.returncode == 0, ended.stderr

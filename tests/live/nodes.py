@@ -16,6 +16,7 @@ import zenoh
 from commands import COMMAND, ENVIRONMENT
 from drives import calibration
 from sessions import free_port, raw_session
+from timing import PATIENCE
 
 from omnibench.config import to_yaml
 from omnibench.live.config import LiveConfig, read_live_config
@@ -56,29 +57,38 @@ def running(config: LiveConfig) -> Iterator[tuple[LiveNode, zenoh.Session]]:
 
 
 class Command:
-    """``omnibench`` as a process, with what it says on standard error."""
+    """``omnibench`` as a process, with what it says on standard error, which can be read while it runs."""
 
     def __init__(self, *arguments: object, cwd: Path | None = None) -> None:
+        self._errors = os.memfd_create("errors")  # a file in memory, which can be read while it is written
         self.process = subprocess.Popen(
             [*COMMAND, *map(str, arguments)],
             cwd=cwd,
             env=ENVIRONMENT,
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=self._errors,
             text=True,
         )
+
+    def said(self) -> str:
+        """What it has said on standard error."""
+        return os.pread(self._errors, os.fstat(self._errors).st_size, 0).decode()
 
     def kill(self) -> None:
         """As when the machine fails: no farewell."""
         self.process.kill()
-        self.process.communicate(timeout=60)
+        self.process.communicate()
 
     def stop(self, number: int = signal.SIGINT) -> tuple[str, str]:
         """End it as a user does; what it printed."""
         if self.process.poll() is None:
             os.kill(self.process.pid, number)
-        out, err = self.process.communicate(timeout=60)
-        return out, err
+        return self.ended()
+
+    def ended(self) -> tuple[str, str]:
+        """What it printed, when it has ended."""
+        out, _ = self.process.communicate(timeout=PATIENCE)
+        return out, self.said()
 
     def __enter__(self) -> Command:
         return self
@@ -86,11 +96,12 @@ class Command:
     def __exit__(self, *_: object) -> None:
         if self.process.poll() is None:
             self.kill()
+        os.close(self._errors)
 
 
 def asked(session: zenoh.Session, selector: str, payload: str | bytes | None = None) -> Any:
     """The one answer to a query: its JSON, with ``error`` in it when it was refused."""
-    (reply,) = list(session.get(selector, payload=payload, timeout=60.0))
+    (reply,) = list(session.get(selector, payload=payload, timeout=PATIENCE))
     answer = reply.ok if reply.ok is not None else reply.err
     assert answer is not None
     return json.loads(answer.payload.to_bytes())

@@ -6,16 +6,27 @@ import json
 import socket
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import count
+from zlib import crc32
 
 import zenoh
+from shared_results import shared_folder
+from timing import PATIENCE
 
 
 def free_port() -> int:
-    """A TCP port of 127.0.0.1 that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """A TCP port of 127.0.0.1 that nobody listens on; each is given out once a run of the suite.
+
+    Linux gives ports from 32768 on to outgoing connections, one of which could take a port before its listener does.
+    """
+    for port in count(20_000 + crc32(str(shared_folder()).encode()) % 10_000):  # another run begins elsewhere
+        with suppress(OSError), socket.socket() as probe:
+            probe.bind(("127.0.0.1", port))
+            (shared_folder() / f"port-{port}").touch(exist_ok=False)
+            return port
+    raise AssertionError
 
 
 def raw_session(mode: str, *, listen: Sequence[str] = (), connect: Sequence[str] = ()) -> zenoh.Session:
@@ -60,7 +71,7 @@ def open_loopback() -> Loopback:
     return Loopback(port, raw_session("router", listen=[f"tcp/127.0.0.1:{port}"]))
 
 
-def until(condition: Callable[[], object], what: str, seconds: float = 60.0) -> None:
+def until(condition: Callable[[], object], what: str, seconds: float = PATIENCE) -> None:
     """Wait until ``condition`` holds; the test fails, saying ``what`` was waited for, when it does not in time."""
     deadline = time.monotonic() + seconds
     while not condition():

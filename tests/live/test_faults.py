@@ -79,12 +79,10 @@ def test_a_frozen_subscriber_does_not_delay_the_others(tmp_path: Path) -> None:
 
             session.declare_subscriber("apr/odom", came)
             wheels, path = wheels_of(session), drive(30.0)
-            begin = time.perf_counter()
-            # 500 Hz for 6 s: 6 MB of odometry, filtered and tf, many times what the sockets and queues hold
+            # 6 MB of odometry, filtered and tf, many times what the sockets and queues hold; as fast as the healthy
+            # subscriber takes them, so that a busy machine does not delay them
             for index, sample in enumerate(path.samples()[:3000]):
-                rest = begin + index * 0.002 - time.perf_counter()
-                if rest > 0:
-                    time.sleep(rest)
+                until(lambda index=index: index - len(delays) < 20, "earlier odometry in the healthy subscriber")
                 sent_at[sample.stamp] = time.perf_counter()
                 wheels.put(JOINT_STATE.encode(sample))
             until(lambda: len(delays) >= 3000, "every odometry in the healthy subscriber")
@@ -290,7 +288,7 @@ def test_a_port_that_is_taken_is_told_in_one_line(tmp_path: Path) -> None:
     router = raw_session("router", listen=[f"tcp/127.0.0.1:{port}"])
     try:
         node = Command("live", write_node(tmp_path, "apr", port=port))
-        out, said = node.process.communicate(timeout=60)
+        out, said = node.ended()
         assert node.process.returncode == 2
         assert said.startswith("error: ")
         assert said.count("\n") == 1

@@ -15,6 +15,7 @@ from drives import drive
 from mcap.reader import make_reader
 from nodes import asked, config_of, running, sent
 from sessions import free_port, until
+from timing import PATIENCE
 
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.config import LiveConfig
@@ -148,7 +149,7 @@ def test_a_config_with_foxglove_serves_the_robots_topics(tmp_path: Path) -> None
         client.connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], close_timeout=0.5) as viewer,
     ):
         while len(offered) < len(TOPICS):
-            message = json.loads(viewer.recv(timeout=60))
+            message = json.loads(viewer.recv(timeout=PATIENCE))
             if message["op"] == "advertise":
                 offered |= {channel["topic"]: channel["schemaName"] for channel in message["channels"]}
     assert offered["/apr/odom"] == "nav_msgs/msg/Odometry"

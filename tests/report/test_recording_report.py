@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from recording_samples import COMMANDS, PERIOD, TICK, Sample, sample
 from report_page import Page
+from timing import PATIENCE
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.scans import ScansInMemory
@@ -270,7 +271,11 @@ def test_a_browser_draws_every_plot_and_plays_the_runs(made: Sample, tmp_path: P
         *(f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=20000", "--dump-dom"),
     ]
     done = subprocess.run(
-        [browser, *flags, (tmp_path / "driven.html").as_uri()], capture_output=True, text=True, timeout=120, check=False
+        [browser, *flags, (tmp_path / "driven.html").as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
     )
     body = dict(re.findall(r'data-([a-z-]+)="([^"]*)"', re.findall(r"<body[^>]*>", done.stdout)[0]))
     left = next(run for run in representative_runs(made.dataset).values() if run.omega and run.omega > 0)

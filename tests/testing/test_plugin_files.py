@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from timing import PATIENCE
 
 from omnibench.errors import ConfigError, DataError, OmnibenchError, PluginError
 from omnibench.registry import registered_from
@@ -53,7 +54,7 @@ def test_the_tests_of_new_plugins_pass_in_pytest(tmp_path: Path) -> None:
         env=os.environ | {"OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE,
         check=False,
     )
     assert run.returncode == 0, run.stdout + run.stderr
@@ -68,7 +69,7 @@ def test_the_cases_run_where_pytest_is_not_installed(tmp_path: Path) -> None:
         "from omnibench.testing.plugin_files import check_plugin\n"
         f"print(check_plugin({str(tmp_path / 'bare_search.py')!r}).passed)"
     )
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert run.stdout == "True\n", run.stderr
 
 

@@ -14,6 +14,7 @@ import pytest
 from recording_samples import sample
 from report_page import Page
 from report_samples import config, flower, page, run, statistics
+from timing import PATIENCE
 
 from omnibench.compare.report.comparison_report import comparison_document
 from omnibench.compare.result import ComparisonResult
@@ -268,5 +269,5 @@ def in_browser(browser: str, result: ComparisonResult, folder: Path) -> tuple[st
         *(f"--user-data-dir={folder / 'profile'}", "--virtual-time-budget=20000", "--dump-dom"),
     ]
     page_url = (folder / "report.html").as_uri()
-    done = subprocess.run([browser, *flags, page_url], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run([browser, *flags, page_url], capture_output=True, text=True, timeout=PATIENCE, check=False)
     return done.stdout, done.stderr

@@ -33,6 +33,7 @@ from bag_samples import (
     write_rosbag2,
 )
 from commands import Command, assert_refused
+from timing import PATIENCE
 
 from omnibench.data.storage import load_dataset
 from omnibench.errors import DataError
@@ -177,7 +178,7 @@ def test_looking_the_importers_up_does_not_load_rosbags() -> None:
     script = (
         "import sys\nfrom omnibench.registry import importers\nimporters.entries()\nassert 'rosbags' not in sys.modules"
     )
-    subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=PATIENCE)
 
 
 class TestRosbagConforms(ImporterConformance):

@@ -13,6 +13,7 @@ from drives import ORIGIN, SECOND, calibration, drive
 from nodes import as_text, asked, config_of, running, sent
 from received_messages import ReceivedMessages
 from sessions import Loopback, until
+from timing import PATIENCE
 
 from omnibench.live.control.query_server import QueryServer
 from omnibench.live.estimation.tracker import RobotTracker
@@ -113,7 +114,7 @@ def test_each_robot_and_service_that_a_question_is_for_answers_it_once(
 ) -> None:
     names = [f"r{number}" for number in range(10)]
     with running(config_of(tmp_path, *names, fusion="none")) as (_, session):
-        replies = list(session.get(f"omnibench/{selector}", consolidation=EVERY_REPLY, timeout=60.0))
+        replies = list(session.get(f"omnibench/{selector}", consolidation=EVERY_REPLY, timeout=PATIENCE))
     assert len(replies) == answers
     keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
     assert len(set(keys)) == len(keys)
@@ -143,7 +144,7 @@ def test_more_requests_than_the_server_holds_are_refused_and_the_stream_goes_on(
         wheels = session.declare_publisher("bob/joint_states")
         until(lambda: wheels.matching_status.matching, "the node's subscription")
         with node.trackers["apr"]._state_lock:  # the query server is held up by the first
-            waiting = [session.get("omnibench/apr/health", timeout=60.0) for _ in range(100)]
+            waiting = [session.get("omnibench/apr/health", timeout=PATIENCE) for _ in range(100)]
             sent(wheels, path.samples())
             until(lambda: len(received["bob__odom"]) == 101, "the odometry")
         replies = [reply for each in waiting for reply in each]

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import zenoh
 from sessions import free_port, until
+from timing import PATIENCE
 
 from omnibench.errors import ConfigError
 from omnibench.live.network.session import open_session
@@ -64,7 +65,7 @@ def running(folder: Path, config: dict[str, Any]) -> Iterator[RouterProcess]:
         yield router
     finally:
         try:
-            process.communicate(timeout=60)
+            process.communicate(timeout=PATIENCE)
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()

@@ -18,6 +18,7 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from samples import COVARIANCE, odometry, sample
 from sessions import Loopback, free_port, until
+from timing import PATIENCE
 
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.live.wire.foxglove import FoxgloveServer
@@ -44,7 +45,7 @@ def advertised(socket: Any) -> dict[str, dict[str, Any]]:
     """The channels that the server offers, by topic."""
     channels: dict[str, dict[str, Any]] = {}
     while len(channels) < len(TOPICS):
-        message = json.loads(socket.recv(timeout=60))
+        message = json.loads(socket.recv(timeout=PATIENCE))
         if message["op"] == "advertise":
             channels.update({channel["topic"]: channel for channel in message["channels"]})
     return channels
@@ -69,7 +70,7 @@ def test_a_message_comes_through_with_its_numbers(loopback: Loopback, server: Fo
         until(lambda: server.subscribed("/apr02/odom"), "the client's subscription")
         before = time.time_ns()
         odom.put(odometry(3))
-        message = socket.recv(timeout=60)
+        message = socket.recv(timeout=PATIENCE)
     opcode, subscription, stamp = struct.unpack_from("<BIQ", message)
     assert (opcode, subscription) == (1, 7)
     assert before <= stamp <= time.time_ns()
@@ -85,7 +86,7 @@ def test_robots_can_be_added_while_it_serves(loopback: Loopback, server: Foxglov
     with connected(server) as socket:
         advertised(socket)
         server.forward(loopback.client(), KEYS, ["apr03"], ["odom"])
-        message = json.loads(socket.recv(timeout=60))
+        message = json.loads(socket.recv(timeout=PATIENCE))
     assert [channel["topic"] for channel in message["channels"]] == ["/apr03/odom"]
 
 
@@ -159,4 +160,4 @@ def test_a_client_that_does_not_read_holds_up_nobody(loopback: Loopback, server:
             until(arrives, "a first message")
         for _ in range(1500):  # 15 MB: more than the sockets and the backlog of the frozen client hold
             joints.put_encoded(payload)
-            assert reader.recv(timeout=60)
+            assert reader.recv(timeout=PATIENCE)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from samples import PERIOD, STAMP, odometry, sample
 from sessions import Loopback, free_port, until
+from timing import PATIENCE
 
 from omnibench.errors import ConfigError
 from omnibench.live.wire.messages import JOINT_STATE, Odometry
@@ -298,7 +299,7 @@ def test_ctrl_c_ends_a_reader_that_waits_at_once(loopback: Loopback) -> None:
         assert process.stdout is not None
         assert process.stdout.readline() == "waits\n"
         process.send_signal(signal.SIGINT)
-        assert process.communicate(timeout=60)[0] == "interrupted\n"
+        assert process.communicate(timeout=PATIENCE)[0] == "interrupted\n"
         assert process.returncode == 0
     finally:
         process.kill()
