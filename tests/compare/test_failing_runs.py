@@ -38,7 +38,6 @@ BODIES = {
     "wants_memory": "np.ones(10**9)",
     "wants_memory_bit_by_bit": "held = [bytes(10**5) for _ in range(10**9)]",
 }
-HANGS = "problem.cost(problem.start[None]); time.sleep(3600)"
 UNMAKEABLE = """
 @calibrators.register("unmakeable")
 class Unmakeable(Calibrator):
@@ -136,20 +135,6 @@ def test_the_row_has_outcome_and_reason(comparison: Compared, label: str, outcom
     assert row["outcome"] == outcome
     assert reason in row["reason"]
     assert "\n" not in row["reason"]
-
-
-@pytest.mark.usefixtures("registries_as_before")
-def test_a_run_over_its_time_is_ended_by_force_and_not_repeated(command: Command, tmp_path: Path) -> None:
-    plugins = write_plugin(tmp_path / "plugins", "hangs", CALIBRATOR.format(name="hangs", body=HANGS))
-    budget = {"evaluations": 500, "seconds": 0.5}
-    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=["hangs"], budget=budget)
-    run = command("compare", config, "--output", tmp_path / "out")
-    row = rows(tmp_path / "out")["hangs"]
-    assert (row["outcome"], row["reason"]) == ("time", "ended by force: 0.5 s spent without an answer")
-    assert (row["train_cost"], row["matrix"]) == (None, None)
-    assert "flower hangs seed 1: time, no answer" in run.stderr
-    again = command("compare", config, "--output", tmp_path / "out")
-    assert "kept from an earlier run" in again.stderr
 
 
 @pytest.mark.parametrize("label", sorted(WITHOUT_ANSWER))

@@ -7,13 +7,16 @@ import shutil
 import signal
 import subprocess
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+import yaml
 from commands import (
     COMMAND,
     ENVIRONMENT,
+    Command,
     compared,
     compared_here,
     flower,
@@ -83,8 +86,8 @@ def files_of(folder: Path) -> dict[str, tuple[int, bytes]]:
     return {str(file.relative_to(folder)): (file.stat().st_mtime_ns, file.read_bytes()) for file in files}
 
 
-def started(config: Path, output: Path) -> subprocess.Popen[str]:
-    """A comparison in a process group of its own, whose first run has ended."""
+def started(config: Path, output: Path, ended: int = 1) -> subprocess.Popen[str]:
+    """A comparison in a process group of its own, of which so many runs have ended."""
     process = subprocess.Popen(
         [*COMMAND, "compare", str(config), "--output", str(output)],
         env=ENVIRONMENT,
@@ -94,8 +97,9 @@ def started(config: Path, output: Path) -> subprocess.Popen[str]:
         start_new_session=True,
     )
     assert process.stderr is not None
-    assert process.stderr.readline() == "comparing: 4 runs\n"
-    assert next(line for line in process.stderr if line.startswith("[1/4] flower "))
+    runs = len(yaml.safe_load(config.read_text())["calibrators"])
+    assert process.stderr.readline() == f"comparing: {runs} runs\n"
+    assert next(line for line in process.stderr if line.startswith(f"[{ended}/{runs}] flower "))
     return process
 
 
@@ -172,36 +176,91 @@ def test_ctrl_c_before_the_first_run_ends_in_one_line(tmp_path: Path) -> None:
     assert [line.split(";")[0] for line in run.stderr.splitlines() if line] == ["interrupted"]
 
 
-ASLEEP = """
-@calibrators.register("asleep")
-class Asleep(Calibrator):
-    "Does not look whether anybody waits for it."
-
-    class Options(Options):
-        number: int = 1
-
-    def calibrate(self, problem):
-        time.sleep(300)
-"""
-
-
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGKILL"])
 def test_the_runs_end_with_a_comparison_that_is_killed_which_then_goes_on(name: str, tmp_path: Path) -> None:
-    plugins = write_plugin(tmp_path / "plugins", "asleep", ASLEEP)
-    others = [{"name": "asleep", "label": f"{number}", "options": {"number": number}} for number in (2, 3)]
-    entries = ["theoretical", "asleep", *others]
-    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=entries, workers=4)  # none starts later
+    config = write_config(tmp_path, **waiting(tmp_path), workers=4)  # none starts later
     process = started(config, tmp_path / "out")
     process.send_signal(signal.Signals[name])
     _, stderr = process.communicate(timeout=PATIENCE)
     assert "Traceback" not in stderr
     assert wait_until_gone(process.pid) == []
     before = files_of(tmp_path / "out" / "runs")
-    write_config(tmp_path, calibrators=["theoretical", search("other")])
+    (tmp_path / "go").touch()
     run = compared(config, tmp_path / "out")
-    assert run.stderr.count("kept from an earlier run") == len(before) == 1
+    assert run.stderr.count("kept from an earlier run") == len(before) > 0
     assert before.items() <= files_of(tmp_path / "out" / "runs").items()
-    assert [run["outcome"] for run in summary(tmp_path / "out")["runs"]] == ["converged", "budget"]
+    outcomes = {run["label"]: run["outcome"] for run in summary(tmp_path / "out")["runs"]}
+    assert outcomes == {"theoretical": "converged", "waiting": "budget", "second": "budget", "third": "budget"}
+
+
+MISBEHAVING = """
+class Misbehaving(Calibrator):
+    "Never answers."
+
+    def calibrate(self, problem):
+        with open(os.path.join({folder!r}, type(self).__name__ + ".tries"), "a") as file:
+            file.write(".")
+        self.misbehave()
+
+@calibrators.register("is_killed")
+class is_killed(Misbehaving):
+    def misbehave(self):
+        os.kill(os.getpid(), 9)
+
+@calibrators.register("wants_memory")
+class wants_memory(Misbehaving):
+    def misbehave(self):
+        held = [bytes(10**5) for _ in range(10**9)]
+
+@calibrators.register("hangs")
+class hangs(Misbehaving):
+    def misbehave(self):
+        time.sleep(3600)
+"""
+
+
+def test_a_killed_comparison_of_runs_that_are_killed_hang_or_want_memory_goes_on_and_has_all_rows(
+    command: Command, tmp_path: Path
+) -> None:
+    plugins = write_plugin(tmp_path / "plugins", "misbehaving", MISBEHAVING.format(folder=str(tmp_path)))
+    entries = ["theoretical", "is_killed", "wants_memory", "hangs"]
+    budget = {"evaluations": 500, "seconds": 0.5}
+    limits = {"budget": budget, "memory_mb": 1000, "workers": 2}
+    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=entries, **limits)
+    process = started(config, tmp_path / "out", ended=2)  # what was killed is tried again when all others have ended
+    process.kill()
+    process.communicate(timeout=PATIENCE)
+    assert wait_until_gone(process.pid) == []
+    before, began = files_of(tmp_path / "out" / "runs"), tries(tmp_path)
+    assert 0 < len(before) < len(entries)
+
+    run = omnibench("compare", config, "--output", tmp_path / "out")
+    assert (run.returncode, run.stderr.count("kept from an earlier run")) == (0, len(before)), run.stderr
+    assert "flower hangs seed 1: time, no answer" in run.stderr
+    after = files_of(tmp_path / "out" / "runs")
+    assert before.items() <= after.items()
+    rows = {run["label"]: run for run in summary(tmp_path / "out")["runs"]}
+    assert rows.pop("theoretical")["outcome"] == "converged"
+    assert {label: (row["outcome"], row["reason"]) for label, row in rows.items()} == {
+        "is_killed": ("failed", "the process died without an answer (killed by SIGKILL) in each of 3 tries"),
+        "wants_memory": ("failed", "out of memory (limit 1000 MB)"),
+        "hangs": ("time", "ended by force: 0.5 s spent without an answer"),
+    }
+    assert {(row["train_cost"], row["matrix"]) for row in rows.values()} == {(None, None)}
+    now = tries(tmp_path)
+    assert {name: now[name] - began[name] for name in ("is_killed", "wants_memory")} == {
+        "is_killed": 3,
+        "wants_memory": 1,
+    }
+
+    again = command("compare", config, "--output", tmp_path / "out")
+    assert again.stderr.count("kept from an earlier run") == 2  # who hung for all its time would do so again
+    assert files_of(tmp_path / "out" / "runs") == after
+
+
+def tries(folder: Path) -> Counter[str]:
+    """How many times each misbehaving run has begun."""
+    return Counter({file.stem: file.stat().st_size for file in folder.glob("*.tries")})
 
 
 class Watch:
