@@ -119,7 +119,7 @@ def test_listening_ends_at_once_when_told_to(loopback: Loopback) -> None:
     listener = Thread(target=listen, args=(None, loopback.client(), KEYS, Console(file=StringIO()), stop))
     listener.start()
     stop.set()
-    listener.join(5)
+    listener.join(PATIENCE)
     assert not listener.is_alive()
 
 

@@ -17,6 +17,7 @@ import zenoh
 from drives import SECOND, calibration, drive, slam
 from nodes import Command, as_text, asked, config_of, running, sent, write_node
 from sessions import free_port, raw_session, until
+from timing import PATIENCE
 
 from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY, JointState, Odometry
 
@@ -34,7 +35,7 @@ for sample in subscriber:  # the node's diagnostics at first
 """
 
 
-def client(port: int, patience: float = 20.0) -> zenoh.Session:
+def client(port: int) -> zenoh.Session:
     """A client of whoever listens there, once somebody does."""
     found: list[zenoh.Session] = []
 
@@ -45,7 +46,7 @@ def client(port: int, patience: float = 20.0) -> zenoh.Session:
             return False
         return True
 
-    until(connected, "a router", patience)
+    until(connected, "a router")
     return found[0]
 
 
@@ -96,7 +97,7 @@ def test_a_killed_router_is_found_again_when_it_is_back(tmp_path: Path) -> None:
     port = free_port()
     (tmp_path / "router").mkdir()
     router_config = write_node(tmp_path / "router", port=port)
-    connected = {"mode": "client", "connect": [f"tcp/127.0.0.1:{port}"], "wait": 20}
+    connected = {"mode": "client", "connect": [f"tcp/127.0.0.1:{port}"], "wait": PATIENCE}
     (tmp_path / "node").mkdir()
     node_config = write_node(tmp_path / "node", "apr", zenoh=connected)
     path = drive(20.0)
@@ -266,7 +267,7 @@ def test_memory_stays_flat_over_many_samples(tmp_path: Path) -> None:
                 wheels.put(JOINT_STATE.encode(turned))
                 if index % 25 == 0:
                     poses.put(slam(sample.stamp + shift, [0, 0, 0], np.eye(3)))
-            until(lambda count=6000 * (minute + 1): node.health("apr").counts["samples"] >= count, "samples", 60)
+            until(lambda count=6000 * (minute + 1): node.health("apr").counts["samples"] >= count, "samples")
             sizes.append(resident())
         assert node.health("apr").counts["samples"] == 60_000
     assert sizes[-1] - sizes[2] < 8e6, sizes

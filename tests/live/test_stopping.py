@@ -9,6 +9,7 @@ import time
 from itertools import pairwise
 
 import pytest
+from timing import PATIENCE
 
 from omnibench.live.stopping import stop_on_signals, ticks
 
@@ -17,13 +18,13 @@ from omnibench.live.stopping import stop_on_signals, ticks
 def test_a_signal_sets_the_event(number: signal.Signals) -> None:
     with stop_on_signals() as stop:
         os.kill(os.getpid(), number)
-        assert stop.wait(60)
+        assert stop.wait(PATIENCE)
 
 
 def interrupted_twice() -> None:
     with stop_on_signals() as stop:
         os.kill(os.getpid(), signal.SIGINT)
-        assert stop.wait(60)
+        assert stop.wait(PATIENCE)
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(60)
 

@@ -16,6 +16,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from samples import COVARIANCE, sample
 from sessions import Loopback, open_loopback, until
+from timing import PATIENCE
 
 from omnibench.live.wire.recorder import Recorder
 from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace, Profile, Publisher
@@ -273,7 +274,7 @@ def test_another_ros_client_reads_the_content(
     try:
         until(lambda: rmw_node[topic].matched, "the subscription")
         rmw_node[topic].put(sample(topic))
-        assert came.wait(60)
+        assert came.wait(PATIENCE)
     finally:
         subscriber.close()
     until(lambda: not rmw_node[topic].matched, "the subscription to go")

@@ -209,7 +209,7 @@ def test_several_threads_may_close_at_once(loopback: Loopback) -> None:
 
         with ThreadPoolExecutor(4) as threads:
             for done in [threads.submit(close) for _ in range(4)]:
-                done.result(60)
+                done.result(PATIENCE)
 
 
 def test_closing_ends_who_waits_for_the_latest(subscription: Subscription) -> None:
@@ -229,7 +229,7 @@ def test_a_callback_may_close_its_subscription(loopback: Loopback, odom: Publish
     own = subscribe("apr02", connect=loopback.address, callback=callback)
     until(lambda: odom.matched, "the subscription")
     odom.put(odometry())
-    assert closed.wait(60)
+    assert closed.wait(PATIENCE)
     until(lambda: not odom.matched, "the subscription to go")
     own.close()
 
