@@ -146,9 +146,11 @@ def test_a_killed_node_goes_on_with_its_pose_and_calibration(tmp_path: Path) -> 
         until(lambda: poses.matching_status.matching, "the node's subscription")
         poses.put(slam(path.stamps[140], [7.0, 8.0, 0.5]))
         until(lambda: asked(session, "omnibench/apr/health")["counts"]["poses"] == 1, "the pose")
-        time.sleep(0.15)
+        time.sleep(0.15)  # a sample is saved when the last one that was is 0.1 s old, or older
         sent(wheels, path.samples()[150:200])
         until(lambda: len(heard) == 200, "odometry before")
+        saved = tmp_path / "state" / "apr.state.json"
+        until(lambda: '"map_pose": [' in saved.read_text(errors="replace"), "the located robot on disk")
         mapped = asked(session, "omnibench/apr/pose")["map"]
         node.kill()
         session.close()
