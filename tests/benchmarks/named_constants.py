@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from omnibench.robot.calibration import Noise
+
 
 @dataclass(frozen=True)
 class Constant:
@@ -76,12 +78,14 @@ def modules_of(package: str, leave_out: Sequence[str] = ()) -> list[ModuleType]:
 def _is_number(value: Any) -> bool:
     if isinstance(value, tuple):
         return bool(value) and all(isinstance(each, int | float) for each in value)
-    return isinstance(value, int | float | np.ndarray)
+    return isinstance(value, int | float | np.ndarray | Noise)
 
 
 def _times(value: Any, factor: float) -> Any:
     if isinstance(value, tuple):
         return tuple(_times(each, factor) for each in value)
+    if isinstance(value, Noise):
+        return Noise(**{name: number * factor for name, number in value.model_dump().items()})
     if isinstance(value, int):
         return max(round(value * factor), 1)
     if isinstance(value, float) and 0.5 < value < 1:
