@@ -18,8 +18,9 @@ from omnibench.simulate.config import MotionGrid
 from omnibench.simulate.flower import Command, grid_of
 from omnibench.words import plural
 
-_MOST_COMMANDS = 5000  # commands of a set, at most (chosen)
-_MOST_SAMPLES = 2e7  # wheel samples and poses of a set's commands together, at most (chosen)
+# They guard memory against slips of the pen and decide nothing else: so many samples of four wheels take 640 MB.
+_MOST_COMMANDS = 5000  # commands of a set, at most
+_MOST_SAMPLES = 2e7  # wheel samples and poses of a set's commands together, at most
 Name = Annotated[str, Field(min_length=1, max_length=60)]
 
 

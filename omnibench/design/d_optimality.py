@@ -31,6 +31,8 @@ from omnibench.words import plural
 
 Counts = NDArray[np.intp]
 
+# Half of each of these numbers and twice give the same designs of twelve commands; only a _NEAR of 2e-4 takes another
+# one, whose standard deviations differ by 0.03 % (tests/benchmarks/constants_fit.py).
 # Information added in every direction, as a share of that of an average candidate: designs of the first few runs, whose
 # determinant is zero, can then be compared. Much smaller, and rounding would decide between them.
 _RIDGE = 1e-6
@@ -40,8 +42,12 @@ _NULL_SHARE = 1e-4
 # Smallest gain of log det(M) that counts. Smaller ones are rounding, and exchanging runs for them may never end.
 _NO_GAIN = 1e-6
 _BLOCK = 256  # pairs whose exchange is tried at once
-_NEAR = 1e-4  # relative distance from the bound within which a design is not improved further (chosen)
+_NEAR = 1e-4  # relative distance from the bound within which a design is not improved further
 _STARTS = 120  # random starts of the exchange for designs of 1 run; 120 / n for n runs, where a start matters less
+# Share of the largest information, on a unit diagonal, below which candidates leave a direction open.
+_UNDETERMINED = 1e-9
+_ROUNDING = 1e-9  # runs: a number of runs that is whole up to rounding
+_BEGIN = 0.9  # share of the least cost at which the search for an equal design begins; a lower one takes longer
 
 
 class Candidates:
@@ -59,7 +65,7 @@ class Candidates:
         # Scaled to a unit diagonal first: metres and radians may lie orders apart.
         scale = 1 / np.sqrt(np.maximum(np.diagonal(mean), np.finfo(float).tiny))
         values, vectors = np.linalg.eigh(mean * scale * scale[:, None])
-        if not (np.isfinite(values).all() and values[0] > 1e-9 * values[-1]):
+        if not (np.isfinite(values).all() and values[0] > _UNDETERMINED * values[-1]):
             raise ValueError("the candidates together leave a direction of the parameters undetermined")
         self.basis: Array = scale[:, None] * vectors / np.sqrt(values)
         standard = self.basis.T @ information @ self.basis
@@ -188,7 +194,7 @@ def rounded(candidates: Candidates, shares: Array, runs: int, enough: float = ma
         )
     wanted = shares / candidates.costs
     wanted = runs * wanted / wanted.sum()
-    counts: Counts = np.minimum(np.floor(wanted + 1e-9).astype(np.intp), limit)
+    counts: Counts = np.minimum(np.floor(wanted + _ROUNDING).astype(np.intp), limit)
     while (missing := runs - int(counts.sum())) > 0:
         short = np.where(counts < limit, wanted - counts, -np.inf)
         counts[np.argsort(-short, kind="stable")[: min(missing, int((counts < limit).sum()))]] += 1
@@ -202,7 +208,7 @@ def equal_design(candidates: Candidates, optimum: ContinuousDesign, target: floa
     """
     least = target / optimum.bound  # cost
     runs_per_cost = float((optimum.shares / candidates.costs).sum())
-    runs = max(1, math.ceil(least / candidates.costs.max()), math.floor(0.9 * least * runs_per_cost))
+    runs = max(1, math.ceil(least / candidates.costs.max()), math.floor(_BEGIN * least * runs_per_cost))
     limit = math.inf if candidates.most is None else candidates.most * len(candidates)
     while runs <= limit:
         counts = rounded(candidates, optimum.shares, runs, (1 - _NEAR) * optimum.bound)

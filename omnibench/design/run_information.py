@@ -21,7 +21,7 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.planar import relative
 
 USES: tuple[Use, ...] = get_args(Use)
-_PATH_POINTS = 160  # points that a path is drawn with
+_PATH_POINTS = 160  # points that a path is drawn with, one for each few pixels of a figure
 
 
 class DesignProblem:

@@ -20,6 +20,7 @@ from omnibench.config import Model
 from omnibench.data.dataset import Dataset
 from omnibench.errors import DataError
 from omnibench.fit.bounds.lower_bound import LowerBounds, Node
+from omnibench.fit.bounds.stamp_sums import QUADRATURE
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
 from omnibench.processes import one_thread
@@ -27,8 +28,6 @@ from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
-
-_NO_ERROR = 1e-9  # m, rad: the error of the quadrature of arcs, which every bound subtracts (bounds/stamp_sums.py)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +159,8 @@ def prove(
             lowest, _, node = boxes[0]
             proven = min(lowest, best_cost)  # Eq. (C1)
             spent = time.perf_counter() - began
-            finished = proven >= (1 - gap) * best_cost or best_cost < _NO_ERROR or not node.looseness.any()  # Eq. (C2)
+            closed = proven >= (1 - gap) * best_cost or best_cost < QUADRATURE  # Eq. (C2); no bound sees less
+            finished = closed or not node.looseness.any()
             proof = Proof(proven, best_cost, best_vector, count, spent, finished)
             watch(Progress("proof", count, None, "part", best_cost, f"bound {proven:.6f}"))
             if finished or spent > seconds or count >= (parts or math.inf):

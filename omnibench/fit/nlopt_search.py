@@ -11,7 +11,9 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options
 from omnibench.robot.kinematics import Array
 
-_LARGE = 1e10  # replaces a cost that is not finite: NLopt's searches cannot compare NaN
+# m, rad: replaces a cost that is not finite, since NLopt's searches cannot compare NaN. Any number above all costs will
+# do; half of it and twice change nothing (tests/benchmarks/constants_fit.py).
+_LARGE = 1e10
 _REASONS = {
     nlopt.SUCCESS: "done",
     nlopt.STOPVAL_REACHED: "stop value reached",

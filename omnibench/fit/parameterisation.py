@@ -15,7 +15,13 @@ from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrices
 
 ParameterisationName = Literal["matrix", "geometry"]
 
-_STEP = 1e-6  # share of each parameter's scale: step of central differences, near the cube root of the rounding
+# Share of each parameter's scale: step of central differences, near the cube root of the rounding (Press et al.,
+# Numerical Recipes, 2007, section 5.7). Half of it and twice change nothing (tests/benchmarks/constants_fit.py).
+_STEP = 1e-6
+_PAPER_WIDTH = 0.10  # share of each start element: the box of the paper
+# Share of each row's largest element: the optimum of the recordings that are known is up to 18 % from the start
+# elements (configs/omni3.yaml).
+_ROW_WIDTH = 0.25
 
 
 class ExplicitBox(Model):
@@ -196,9 +202,9 @@ def make_bounds(robot: Robot, box: Box) -> Bounds:
                 raise ConfigError(f"box: lower and upper must have 3 rows of {start.shape[1]} values")
         return Bounds("custom", np.array(box.lower).ravel(), np.array(box.upper).ravel())
     if box == "paper":
-        width = 0.10 * np.abs(start)
+        width = _PAPER_WIDTH * np.abs(start)
     else:
-        width = np.repeat(0.25 * np.abs(start).max(axis=1, keepdims=True), start.shape[1], axis=1)
+        width = np.repeat(_ROW_WIDTH * np.abs(start).max(axis=1, keepdims=True), start.shape[1], axis=1)
     return Bounds(box, (start - width).ravel(), (start + width).ravel())
 
 

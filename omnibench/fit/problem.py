@@ -30,8 +30,12 @@ from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration
 
-_PROGRESS_PERIOD = 0.1  # s, least time between two reports of progress
-_WORTH_BUILDING = 50  # evaluations from which on the fast evaluator repays the time it takes to build; chosen
+_PROGRESS_PERIOD = 0.1  # s, least time between two reports of progress: ten a second are all that a reader sees
+# Evaluations from which on the fast evaluator repays the time it takes to build. Both ways give the same costs to 1e-11
+# m; half of it and twice change no estimate (tests/benchmarks/constants_fit.py).
+_WORTH_BUILDING = 50
+_ON_BOUND = 1e-6  # share of the box's width: an element closer than that to a bound lies on it
+_ROUNDING = 1e-12  # share of a bound: an element beyond it by less lies in the box
 
 
 class Budget(Model):
@@ -192,13 +196,13 @@ class CalibrationProblem:
 
     def inside(self, vectors: Array) -> NDArray[np.bool_]:
         """True (P,) for the vectors (P, n) that lie in the box, up to rounding."""
-        slack = 1e-12 * np.maximum(np.abs(self.lower), np.abs(self.upper))
+        slack = _ROUNDING * np.maximum(np.abs(self.lower), np.abs(self.upper))
         within = (vectors >= self.lower - slack) & (vectors <= self.upper + slack)
         return np.asarray(within.all(axis=-1))
 
     def at_bounds(self, vector: Array) -> tuple[str, ...]:
         """Names of the free elements that lie on a bound of the box."""
-        margin = 1e-6 * (self.upper - self.lower)
+        margin = _ON_BOUND * (self.upper - self.lower)
         on_bound = self.free & ((vector <= self.lower + margin) | (vector >= self.upper - margin))
         return tuple(name for name, touching in zip(self.names, on_bound, strict=True) if touching)
 

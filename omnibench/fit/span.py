@@ -17,17 +17,24 @@ from omnibench.robot.planar import interpolated
 Unidentified = Literal["keep", "fit"]
 State = Literal["driven", "weak", "undriven"]
 
-# Share of the strongest direction below which a direction holds noise and no motion. Chosen.
+# Share of the strongest direction below which a direction holds noise and no motion. Half of it changes nothing; twice
+# of it counts slip of 2 % as no motion in the place of a weak one, and both keep the design
+# (tests/benchmarks/constants_fit.py).
 _NULL_SHARE = 1e-2
 
 # Share of the strongest direction below which slip alone may explain what was driven. Slip of 1 % of the strongest
 # motion changes the matrix along a direction driven with a tenth of it by 10 %, more than a calibration corrects. Festo
 # Robotino runs without commanded turns have 0.051 and 0.053 along the direction that turns the robot (slip, uneven
-# motors); recordings with commanded turns have 0.53 (omni3) and 0.56 (flower of the APR-02).
+# motors); recordings with commanded turns have 0.53 (omni3) and 0.56 (flower of the APR-02). Half of it and twice
+# change nothing (tests/benchmarks/constants_fit.py).
 WEAK_SHARE = 0.1
 
-_SAME_DIRECTION = 0.99  # cosine from which on a direction is called by one of the robot's motions; chosen
-_ALMOST = math.tan(math.radians(5))  # ratio of speeds below which the smaller one is not mentioned; chosen
+# The following decide on names of directions alone; half of each and twice give the same names
+# (tests/benchmarks/constants_fit.py).
+_SAME_DIRECTION = 0.99  # cosine from which on a direction is called by one of the robot's motions: 8 degrees
+_ALMOST = math.tan(math.radians(5))  # ratio of speeds below which the smaller one is not mentioned
+_NO_MOTION = 0.05  # m per metre that the wheels roll: a direction that moves the robot less only slips
+_ROUND = 0.02  # share of the largest element: a smaller one is not named, and one so close to 1 is called 1
 
 
 @dataclass(frozen=True)
@@ -162,9 +169,9 @@ def direction_in_words(direction: Array, wheels: Sequence[str]) -> str:
     """A direction of wheel rates (N,) as text like ``a - b + 0.5 c``, its largest element 1 and its sign arbitrary."""
     large = np.abs(direction) > 0.5 * np.abs(direction).max()
     scaled = direction * np.sign(direction[large][0]) / np.abs(direction).max()
-    terms = [(value, name) for value, name in zip(scaled, wheels, strict=True) if abs(value) > 0.02]
+    terms = [(value, name) for value, name in zip(scaled, wheels, strict=True) if abs(value) > _ROUND]
     text = " ".join(
-        f"{'-' if value < 0 else '+'} {'' if abs(abs(value) - 1) < 0.02 else f'{abs(value):.2g} '}{name}"
+        f"{'-' if value < 0 else '+'} {'' if abs(abs(value) - 1) < _ROUND else f'{abs(value):.2g} '}{name}"
         for value, name in terms
     )
     return text.removeprefix("+ ")
@@ -178,7 +185,8 @@ def motion_in_words(direction: Array, robot: Robot) -> str:
     x, y, turn = robot.inverse_kinematic_matrix @ direction
     reach = float(np.mean([wheel.distance for wheel in robot.wheels]))
     speed, spin = math.hypot(x, y), abs(turn) * reach
-    if max(speed, spin) < 0.05 * float(np.mean([wheel.radius for wheel in robot.wheels])) * np.linalg.norm(direction):
+    rolled = float(np.mean([wheel.radius for wheel in robot.wheels]) * np.linalg.norm(direction))
+    if max(speed, spin) < _NO_MOTION * rolled:
         return ""
     if speed < _ALMOST * spin:
         return "turning on the spot"

@@ -11,10 +11,13 @@ import numpy as np
 from omnibench.errors import OmnibenchError
 from omnibench.robot.kinematics import Array
 
-# Tighter than Clarabel's defaults (1e-8): the optimum is a reference that searches are measured against.
+# Relative and absolute gaps, tighter than Clarabel's defaults (1e-8) and near the rounding of its sums: the optimum is
+# a reference that searches are measured against.
 _ACCURACY = {"tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12, "tol_feas": 1e-12}
 
-_MOST_PREPARED = 5000  # stamps; beyond it the program is compiled anew for every step, to save memory; chosen
+# Stamps from which on the program is compiled anew for every step: prepared, it would take memory that grows with their
+# square. Both ways solve the same program; half of it and twice change nothing (tests/benchmarks/constants_fit.py).
+_MOST_PREPARED = 5000
 
 
 class SolverError(OmnibenchError):

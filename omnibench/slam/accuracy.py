@@ -16,7 +16,8 @@ from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import moved_to, rotated
 
-_SINGULAR = 1e-14  # share of the largest variance below which a covariance counts as singular
+# Share of the largest variance below which a covariance counts as singular: rounding of its eigenvalues.
+_SINGULAR = 1e-14
 
 
 class ErrorSummary(Model):

@@ -28,9 +28,11 @@ from omnibench.slam.pose_errors import FLOOR
 from omnibench.slam.slam_options import PRELOAD, SlamOptions
 from omnibench.slam.slam_run import SlamPath, run_slam
 
-_AT_START = 1e-6  # s; a scan that is nearer to t = 0 counts as taken at t = 0
-_STEP = 0.05  # s between the odometry poses whose distances add up to the way before the first scan
-_FAR = 5e-3  # m; a longer way before the first scan is warned of (chosen)
+_AT_START = 1e-6  # s: rounding of stamps; a scan that is nearer to t = 0 counts as taken at t = 0
+# s between the odometry poses whose distances add up to the way before the first scan. Coarser and finer steps measure
+# the same way up to its bends: 0.1 s on a circle at 1 rad/s shorten it by 0.04 % (the chord, 1 - (w t)^2 / 24).
+_STEP = 0.05
+_FAR = 5e-3  # m: a longer way before the first scan is warned of; poses of SLAM are known to 1 mm (slam_study.py)
 
 
 def slam_dataset(

@@ -22,7 +22,7 @@ from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.slam_run import SlamPath
 from omnibench.slam.summary import SlamSummary, summarise
 
-_WORKERS = 2  # processes
+_WORKERS = 2  # processes at a time: results do not depend on their number
 
 
 @dataclass(frozen=True, eq=False)

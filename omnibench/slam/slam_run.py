@@ -19,9 +19,11 @@ from omnibench.slam.path_warnings import PathWarning, path_warnings
 from omnibench.slam.pose_errors import PoseErrors
 from omnibench.slam.slam_options import SlamOptions
 
+# The study tests/benchmarks/constants_fit.py varies these numbers by 0.5 and 2. In three rooms _SKEWED moves poses by
+# 0.2 of their deviations at most, the others not at all.
 _SKEWED = 1e-3  # m or rad of unknown motion between a scan's first and last ray: less does not matter
 _CORRECTIONS = 4  # times at most that the motion within a scan is corrected
-_KEYFRAMES = 300  # keyframes with an error of their own; older ones are merged
+_KEYFRAMES = 300  # keyframes with an error of their own: older ones are merged, so that the time of a step is limited
 _SAMPLE = 100  # scans that the noise of ranges is estimated from
 _NEEDED = 0.6  # share of matched points: with fewer, the scan goes into the map even if it may be skewed
 

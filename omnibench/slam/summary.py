@@ -14,7 +14,7 @@ from omnibench.robot.planar import interpolated, wrapped
 from omnibench.slam.accuracy import SlamAccuracy
 from omnibench.slam.slam_run import SlamPath
 
-_SAME_TIME = 1e-6  # s
+_SAME_TIME = 1e-6  # s: rounding of stamps; poses that are nearer in time are of the same time
 
 
 class Distances(Model):

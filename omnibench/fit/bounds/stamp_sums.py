@@ -32,8 +32,9 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex
 
-# m: error of the quadrature of arcs, which the bound subtracts: a millionth of the millimetre that poses are known to.
-_QUADRATURE = 1e-9
+# m: error of the quadrature of arcs, which bounds subtract: a millionth of the millimetre that poses are known to.
+# Half of it and twice move a bound by 6e-6 of the gap that is asked for (tests/benchmarks/constants_fit.py).
+QUADRATURE = 1e-9
 
 
 class StampSums:
@@ -49,10 +50,10 @@ class StampSums:
         integration = problem.integration
         paths = [make_path(log, integration) for log in logs]
         row, speed = elements.largest[2], elements.speed
-        nodes = quadrature(paths, row, speed, _QUADRATURE, integration)
+        nodes = quadrature(paths, row, speed, QUADRATURE, integration)
         if nodes is None:
             raise ConfigError("samples turn too far for a lower bound with arcs; use integration euler")
-        self._quadrature = _QUADRATURE if integration == "arc" else 0.0
+        self._quadrature = QUADRATURE if integration == "arc" else 0.0
         self._runs: list[tuple[Array, Array, Array, NDArray[np.intp]]] = []
         curvature = []
         for path, log in zip(paths, logs, strict=True):

@@ -25,9 +25,12 @@ from omnibench.robot.kinematics import Array
 if TYPE_CHECKING:
     from omnibench.fit.sum_of_norms import SumOfNormsProgram
 
-_MOST_HALVINGS = 30
+# The matrices of closed_form are the same with half of each of these numbers and with twice
+# (tests/benchmarks/constants_fit.py).
+_MOST_HALVINGS = 30  # lengths of one step that are tried, each half the one before: down to a billionth
 _FLAT = 1e-6  # share of the matrix's range: a smaller step that does not lower the cost is rounding of the solver
 _NO_ERROR = 1e-10  # m, rad: a smaller cost is close to rounding, and a program finds no direction
+_NO_STEP = 1e-12  # m or rad per rad of wheel: a shorter step is rounding of the solver
 
 
 class ClosedFormOptions(Options):
@@ -109,7 +112,7 @@ def _descend(problem: CalibrationProblem, vector: Array, cost: float, step: Arra
         trial_cost = float(problem.cost(trial[None])[0])
         if trial_cost <= cost:
             return trial, trial_cost, True
-        if np.abs(trial - vector).max() < 1e-12:
+        if np.abs(trial - vector).max() < _NO_STEP:
             break
         trial = (trial + vector) / 2
     return vector, cost, False

@@ -38,9 +38,12 @@ from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array
 
+# Rounds of noise and fit settle after two or three; only where the clocks' errors are estimated, too, do they take more
+# than five. In tests/benchmarks/constants_fit.py five rounds at most, or a change of 0.2, move an estimate with clocks
+# by 0.1 and 0.2 of its standard deviation; 20 rounds, a change of 0.05 and half and twice _NEAR move none.
 _MOST_ROUNDS = 10
-_NEAR = 0.01  # share of the largest component of the noise by which components of the same noise differ; chosen
-_STILL = 0.1  # standard errors: a smaller change of the vector ends the rounds of noise and fit; chosen
+_NEAR = 0.01  # share of the largest component of the noise by which components of the same noise differ
+_STILL = 0.1  # standard errors: a smaller change of the vector ends the rounds
 
 
 class TrajectoryMLOptions(Options):
@@ -112,7 +115,7 @@ class TrajectoryML(Calibrator):
         """Fit and noise estimated in turn until neither changes, then weights and covariance chosen."""
         fit = first_fit(problem)
         stamps = fit.trajectories.stamps
-        now = descend(self._with_deviations(fit, 0.0), whiteners(FIRST_NOISE, stamps), 0.1)
+        now = descend(self._with_deviations(fit, 0.0), whiteners(FIRST_NOISE, stamps), _STILL)
         noise: _Noise | None = None
         rounds, settled = 0, False
         while not settled and rounds < _MOST_ROUNDS:

@@ -9,7 +9,11 @@ import numpy as np
 from omnibench.fit.parameterisation import Parameterisation
 from omnibench.robot.kinematics import Array
 
-_MARGIN = 0.1  # share by which the box of a curved parameterisation is widened beyond its linear reach; chosen
+# Share by which the box of a curved parameterisation is widened beyond its linear reach. Candidates outside are
+# integrated directly, so that it decides on speed alone: half of it and twice change costs by 4e-14 m and the memory by
+# a third at most (tests/benchmarks/constants_fit.py).
+_MARGIN = 0.1
+_ROUNDING = 1e-9, 1e-15  # shares of the reach and of a row's largest element by which a box is widened against rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +32,8 @@ class ElementBox:
         middle, half = (lower + upper) / 2, (upper - lower) / 2
         centre, *moved = parameterisation.matrices(middle + np.vstack([np.zeros(len(half)), np.diag(half)]))
         reach: Array = np.abs(np.array(moved) - centre).sum(axis=0)
-        reach *= 1 + (1e-9 if parameterisation.name == "matrix" else _MARGIN)
-        slack = 1e-15 * np.abs(centre).max(axis=1, keepdims=True)
+        reach *= 1 + (_ROUNDING[0] if parameterisation.name == "matrix" else _MARGIN)
+        slack = _ROUNDING[1] * np.abs(centre).max(axis=1, keepdims=True)
         return cls(centre - reach - slack, centre + reach + slack)
 
     @property

@@ -26,8 +26,11 @@ from omnibench.processes import one_thread
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
 
-_ROUNDING = 1e-12  # share of the largest pose: rounding of a direct sum, which the check allows beside the bound
-_BLOCK = 250_000  # values of the large product at a time, so that they stay in the processor's cache; chosen
+# Share of the largest pose: rounding of a direct sum of some thousand samples, which the check allows beside the bound.
+_ROUNDING = 1e-12
+# Values of the large product at a time, 2 MB, so that they stay in the processor's cache. It changes the order of sums
+# alone, hence costs by 1e-16 m (tests/benchmarks/constants_fit.py); bench_evaluator.py measures the speed.
+_BLOCK = 250_000
 
 
 class PoseEvaluator:

@@ -20,8 +20,13 @@ from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array
 
-_MOST_TERMS = 3000  # terms of a basis, at most; chosen
-_LARGEST_ANGLE = 4.0  # rad: beyond it the power series of J_n loses digits
+# Terms of a basis, at most: it bounds memory. Half of it and twice choose the same bases
+# (tests/benchmarks/constants_fit.py).
+_MOST_TERMS = 3000
+# rad: beyond it the power series of J_n loses digits, since its alternating terms add up to I_0(4) = 11 (Abramowitz and
+# Stegun 1964, 9.1.10 and 9.6.10). Half of it and twice choose the same bases (tests/benchmarks/constants_fit.py).
+_LARGEST_ANGLE = 4.0
+_ROUNDING = 1e-17  # share of the first term of a power series: less than a tenth of the rounding of its sum
 
 
 @dataclass(frozen=True)
@@ -121,7 +126,7 @@ def _power_series(order: int, square: Array) -> Array:
     """sum_m (-square)^m / (m! (order + m)!), to rounding."""
     largest = float(square.max(initial=0.0))
     terms = 1
-    while largest**terms / (factorial(terms) * factorial(order + terms)) * factorial(order) > 1e-17:
+    while largest**terms / (factorial(terms) * factorial(order + terms)) * factorial(order) > _ROUNDING:
         terms += 1
     total = np.full(square.shape, 1.0 / (factorial(terms) * factorial(order + terms)))
     for m in range(terms - 1, -1, -1):

@@ -16,14 +16,19 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, WheelLog
 
 # Largest error of a position by truncation, by quadrature and by the decomposition, as shares of the longest path (at
-# least 1 m). They bound sums of absolute values; the true errors are about a thousand times smaller.
+# least 1 m): some ten times the rounding of direct integration. They bound sums of absolute values; half of each and
+# twice change costs by 1e-13 m and the memory by a tenth at most (tests/benchmarks/constants_fit.py).
 _TRUNCATION, _QUADRATURE, _DECOMPOSITION = 1e-12, 1e-12, 5e-12
+# The numbers from here on decide only which way is faster (bench_evaluator.py). Half of each and twice change costs by
+# 5e-14 m and the memory by less than a factor of two (tests/benchmarks/constants_fit.py).
 # How far the box may turn the heading of a segment about its anchor, rad; infinity leaves recordings whole.
 _LIMITS = (np.inf, 2.0, 1.0, 0.5, 0.25)
 # Time that a sample of direct integration, a segment and a term of the basis take, in units of one multiplication and
-# addition of a matrix product. Measured roughly; they decide only which way is faster.
+# addition of a matrix product.
 _SAMPLE, _SEGMENT, _TERM = 400.0, 1000.0, 100.0
-_MOST_BYTES = 48e6  # bytes of the large matrix product, at most; chosen
+_MOST_BYTES = 48e6  # bytes of the large matrix product, at most
+_RANK, _POWER = 1.65, 0.7  # likely rank of the decomposition of n terms: a power law through omnibench's recordings
+_NO_WIDTH = 1e-14  # share of row 3's largest element: one with less width in the box is fixed, up to rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +74,7 @@ def make_plan(logs: Sequence[WheelLog], integration: Integration, box: ElementBo
     nodes = quadrature(paths, row, speed, _QUADRATURE * length, integration)
     if nodes is None:
         return None
-    free = box.reach[2] > 1e-14 * np.abs(box.centre[2]).max()
+    free = box.reach[2] > _NO_WIDTH * np.abs(box.centre[2]).max()
     wheels = int(free.sum())
     steps = np.concatenate([np.abs(path.angles) @ speed for path in paths])
     firsts = np.cumsum([0, *(len(path.angles) for path in paths[:-1])])
@@ -99,8 +104,8 @@ def make_plan(logs: Sequence[WheelLog], integration: Integration, box: ElementBo
 
 
 def _likely_rank(terms: int) -> float:
-    """Rank that the decomposition will have for so many terms: a power law through omnibench's recordings."""
-    return min(float(terms), 1.65 * terms**0.7)
+    """Rank that the decomposition will have for so many terms."""
+    return min(float(terms), _RANK * terms**_POWER)
 
 
 def _largest_turns(path: Path, segments: list[Segment], reach: Array) -> Array:

@@ -18,8 +18,12 @@ from numpy.typing import NDArray
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, WheelLog
 
-_MOST_NODES = 8  # nodes of the quadrature, at most; chosen
-_LONGEST_SEGMENT = 4096  # pieces: keeps the time of cutting linear in the length of a recording; chosen
+# Nodes of the quadrature, at most: samples that need more turn by radians. Half of it and twice change nothing
+# (tests/benchmarks/constants_fit.py).
+_MOST_NODES = 8
+# Pieces of a segment, at most, so that the time of cutting is linear in the length of a recording. Half of it and twice
+# change nothing (tests/benchmarks/constants_fit.py).
+_LONGEST_SEGMENT = 4096
 
 
 @dataclass(frozen=True)

@@ -31,11 +31,13 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import WheelLog
 
 NUISANCES = ("start heading", "clock offset", "clock slope")
-TURN, OFFSET, SLOPE = range(3)
+TURN, OFFSET, SLOPE = range(3)  # their columns
 # Twice the gain in log-likelihood that a variance of zero exceeds by chance once in 200 times: under the null half of
 # it is chi-square with one degree of freedom, half is 0 (Self and Liang 1987).
 _LEAST_GAIN = 6.6
-_LARGEST = np.array([0.3, 0.5, 0.02])  # rad, s, s per s: deviations that are searched; chosen
+# rad, s, s per s: largest deviations that are searched, several times those of clocks that are synchronised by hand
+# (0.2 s, 0.003). Half and twice as wide, the search finds the same to 1e-5 (tests/benchmarks/constants_fit.py).
+_LARGEST = np.array([0.3, 0.5, 0.02])
 # A function from a run's residuals (K, 3), or their derivatives (K, 3, n), to weighted ones (k, 3) or (k, 3, n).
 Weighting = Callable[[Array], Array]
 

@@ -25,7 +25,11 @@ _NAMES = ("pose_position", "walk_position", "bias_position", "pose_heading", "wa
 # Critical value (5 %) of the likelihood ratio statistic for one variance that may be zero: under the null half of it is
 # chi-square with one degree of freedom, half is 0 (Self and Liang 1987).
 _CHI_SQUARE = 2.71
-_LARGEST = 0.3  # rad, largest start heading error that is searched; chosen
+# Share of it that the start headings alone must gain before all components are fitted with them: the others do not add
+# four times as much. Half of this and of the next number and twice give the same estimates from right and wrong starts
+# (tests/benchmarks/constants_fit.py).
+_PROMISING = 0.25
+_LARGEST = 0.3  # rad: largest start heading error that is searched, 17 degrees
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,7 @@ def separate_start_noise(
         method="bounded",
         options={"xatol": 1e-6},
     )
-    if before - float(first.fun) < _CHI_SQUARE / 4:  # fitting the other components again will not add that much
+    if before - float(first.fun) < _PROMISING * _CHI_SQUARE:
         return StartNoise(noise, 0.0)
     likeliest, deviation, after = _polished(differences, apart(float(first.x)), float(first.x))
     return StartNoise(likeliest, deviation) if before - after > _CHI_SQUARE else StartNoise(noise, 0.0)

@@ -18,10 +18,12 @@ from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.fit.uncertainty.sandwich import Sandwich, Scores, roots_of, sandwich
 from omnibench.robot.kinematics import Array
 
-_CHANCE = 0.001  # level of the tests that decide whether runs scatter more than the noise; chosen strict
-_RANK = 1e-12  # share of the largest eigenvalue of the information below which a direction is undetermined
+# Five calibrations of tests/benchmarks/constants_fit.py are the same with half of each of these numbers and with twice.
+# Level of the tests that decide whether runs scatter more than the noise: strict, as in uncertainty/sandwich.py.
+_CHANCE = 0.001
+_RANK = 1e-12  # share of the largest eigenvalue of the information below which a direction is undetermined: rounding
 # Share of the largest eigenvalue of a command's information below which a direction has information from encoder noise
-# alone. Chosen.
+# alone: wheel rates that are 3 % of the strongest.
 _DETERMINED = 1e-3
 
 

@@ -10,7 +10,10 @@ from omnibench.errors import DataError
 from omnibench.fit.parameterisation import MatrixElements, WheelGeometry
 from omnibench.robot.kinematics import Array, Robot
 
-_UNIDENTIFIED = 1e-3  # share of a parameter's axis in the unidentified space from which on it is not identified; chosen
+# Both are far above the rounding of derivatives (1e-10) and below any share that a direction of wheel rates can have;
+# half of each and twice name the same parameters (tests/benchmarks/constants_fit.py).
+_UNIDENTIFIED = 1e-3  # share of a parameter's axis in the unidentified space from which on it is not identified
+_NO_CHANGE = 1e-6  # share of the largest singular value below which a change of the geometry leaves the matrix as it is
 
 
 @dataclass(frozen=True)
@@ -76,5 +79,5 @@ def identified_parameters(robot: Robot, kept: Array) -> tuple[bool, ...]:
     """
     rows = np.repeat(np.abs(robot.inverse_kinematic_matrix).max(axis=1), len(robot.wheels))
     _, strengths, directions = np.linalg.svd(known_slopes(robot, kept) / rows[:, None])
-    unidentified = directions[strengths <= 1e-6 * strengths[0]]
+    unidentified = directions[strengths <= _NO_CHANGE * strengths[0]]
     return tuple(bool(share < _UNIDENTIFIED) for share in np.square(unidentified).sum(axis=0))

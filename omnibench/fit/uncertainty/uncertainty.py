@@ -28,8 +28,10 @@ from omnibench.fit.uncertainty.sandwich import Sandwich, Scores, sandwich, score
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
-_MOST_STEPS = 20  # steps of the check that an answer is a minimum; chosen
-_NO_GAIN = 1e-4  # relative decrease of the cost that ends these steps; chosen
+# The check that an answer is a minimum says the same with half of each of these numbers and with twice
+# (tests/benchmarks/constants_fit.py).
+_MOST_STEPS = 20  # steps
+_NO_GAIN = 1e-4  # relative decrease of the cost that ends the steps
 _NO_ERROR = 1e-9  # m, rad: a smaller cost is rounding
 
 

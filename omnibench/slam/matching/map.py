@@ -17,11 +17,13 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import rotation
 from omnibench.slam.matching.lines import Lines
 
+# The study tests/benchmarks/constants_fit.py varies these numbers by 0.5 and 2. In three rooms the median error of SLAM
+# stays between 0.95 and 1.09 mm (1.07 mm as they are) and the median NEES between 2.2 and 2.6.
 _CROSS = 1e-3  # m between the points of a cross
 _FEWEST = 20  # points that a map needs to be matched against
 _WORTH = 5  # new points that are worth rebuilding the search tree
-_SAME_SIDE = 0.7  # least cosine between normals that may be of one surface
-_FINEST = 1e-5  # m and rad; small_gicp's search ends with a step shorter than this
+_SAME_SIDE = 0.7  # least cosine between normals that may be of one surface: 45 degrees
+_FINEST = 1e-5  # m and rad: small_gicp's search ends with a step shorter than this
 _ITERATIONS = 20  # iterations of small_gicp, at most
 
 
