@@ -9,8 +9,9 @@ from scipy.special import stdtrit
 
 from omnibench.robot.kinematics import Array
 
-INTERVAL = 0.95  # probability of the intervals; chosen, as in every table of the program
-MANY = 1e9  # degrees of freedom that stand for infinity, where Student's t is the normal distribution
+INTERVAL = 0.95  # probability of the intervals, by convention; every table of the program says 95 %
+# Degrees of freedom that stand for infinity: the quantile of Student's t differs from the normal one by 2e-9 there.
+MANY = 1e9
 
 
 @dataclass(frozen=True, eq=False)
