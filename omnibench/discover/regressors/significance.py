@@ -10,16 +10,18 @@ number of groups of its kind, of which the best is taken, the evidence of the gr
 
     z = -log10 P(chi2(d) > Q / v) - log10 t,    at least 0,                                                        (1)
 
-and the evidence of flip b is the largest of all groups, m_b = max z. Of B flips, the chance p of an evidence z is
+and the evidence of flip b is the largest of all groups, m_b = max z. The evidence of what was observed is the z of the
+least Q that a group has without any one run, as one run that went wrong is no effect; flips keep all runs, so that the
+chance is stated too large rather than too small. Of B flips, the chance p of an evidence z is
 
     p = (1 + number of m_b >= z) / (B + 1)                                                                         (2)
 
 (Davison and Hinkley, Bootstrap methods and their application, 1997, Eq. 4.11). Where hardly any flip reaches z, an
 exponential tail is fitted to the k largest m_b (Knijnenburg et al., "Fewer permutations, more accurate P-values",
 Bioinformatics 25, 2009, with shape 0): z of a single group is -log10 of a uniform number, and so exponential itself.
-With m_(k) the least of these k, by maximum likelihood:
+With m_(k) the least of these k, above which k - 1 lie, by maximum likelihood:
 
-    p = k / B exp(-(z - m_(k)) / s),    s = mean of m_b - m_(k) over the k largest.                                 (3)
+    p = k / B exp(-(z - m_(k)) / s),    s = sum of m_b - m_(k) over the k largest / (k - 1).                        (3)
 
 How much the group that stands out most explains beyond chance, in standard deviations of a chi-square, is
 
@@ -77,7 +79,7 @@ class Significance:
         if exceeded >= int(_ENOUGH * tail):
             return (exceeded + 1) / (len(chance) + 1)  # Eq. (2)
         edge = float(chance[-tail])
-        scale = max(float((chance[-tail:] - edge).mean()), 1e-3)  # above 0 where all flips tie
+        scale = max(float((chance[-tail:] - edge).sum()) / max(tail - 1, 1), 1e-3)  # above 0 where all flips tie
         return float(max(tail / len(chance) * np.exp(-(evidence - edge) / scale), 1e-300))  # Eq. (3)
 
     @property

@@ -15,7 +15,7 @@ With b the estimate of a parameter and sigma its standard error, the parameter l
 
     |b| + z(0.975) sigma,                                                                                          (3)
 
-and is found nearly always from z(alpha / (2 G)) sigma + z(0.93) sigma on, as the largest of G effects at the chance
+and is found nearly always from z(1 - alpha / (2 G)) sigma + z(0.93) sigma on, as the largest of G effects at the chance
 alpha (Bonferroni).                                                                                                (4)
 """
 

@@ -11,6 +11,8 @@ largest at g = Q(A) / d - 1, where 2 ln B is the conditional maximum likelihood 
 
     2 ln B(A) = Q(A) - d (1 + max(ln(Q(A) / d), 0)).                                                               (2)
 
+Below Q(A) = d, where no g raises (1) above 1, (2) is negative, as their criterion is: to explain little costs.
+
 Tempering by model discrepancy. The form that the catalogue gives an effect is an idealisation. If the true signature
 is sqrt(N) (f + delta h), with N the effect's non-centrality, f its form in the catalogue and h of unit variance along
 any direction, residuals scatter with variance 1 + delta^2 N beside it, and chi-square differences count so much less
@@ -18,13 +20,15 @@ any direction, residuals scatter with variance 1 + delta^2 N beside it, and chi-
 
     Q'(A) = Q(A) / (1 + delta^2 N),    N = max over A of Q(A) - d(A), at least 0.                                  (3)
 
-Prior odds. An effect is missing in one of 20 robots; of its t shapes, if it has several, each is as likely:
+Prior odds. The odds that an effect is missing are 1 to 20; of its t shapes, if it has several, each is as likely:
 
     ln P(A) = ln B'(A) - sum over A of ln(20 t) + constant.                                                        (4)
 
 A name's probability against others in its place, the names A of all other places given, has no need of the 20:
 
-    P(i | A) = (B'(i | A) / t_i) / sum over j of B'(j | A) / t_j.                                                  (5)
+    P(i | A) = (B'(i | A) / t_i) / sum over j of B'(j | A) / t_j,                                                  (5)
+
+with the largest N of these j in Eq. (3).
 
 What is left over. Names that are wrong leave more than right ones. Generic bases still find a chi-square x beyond the
 names, of standard deviation sigma by chance. Names that explain N and leave a share s of the whole leave N s / (1 - s)
@@ -69,7 +73,7 @@ from omnibench.robot.kinematics import Array
 # delta, along the other effect in whose direction the catalogue's form is farthest off: below 0.09 in nine sets of ten,
 # 0.06 in half of them. With 0.2, three of eight others would lose a sure name; with 0.05 none would change.
 DISCREPANCY = 0.1
-_PRIOR = float(np.log(20))  # an effect is missing in one of 20 robots
+_PRIOR = float(np.log(20))  # odds of 1 to 20 that an effect is missing
 # u: mean share of the chi-square that right names leave, three times the 0.013 of strong effects, whose forms show
 # most; the best wrong names leave 0.6 in the mean.
 _LEFT_RIGHT = 0.04

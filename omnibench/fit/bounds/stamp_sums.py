@@ -8,11 +8,12 @@ At row 3 = m3 + d, with the angles a_k that sample k drives and c_k before it al
 An Euler step is one sample k. An arc is an integral along the sample, taken by Gauss-Legendre quadrature with enough
 nodes that its error (impulses.py) sums up to q = 1e-9 m at most over a run, for every matrix of the box.
 
-Rounding: with u = 2^-53, n additions into one number have a relative error below 1.01 n u of the sum of the magnitudes
-(Higham, Accuracy and Stability of Numerical Algorithms, 2002, sections 3.1 and 4.2). With L the longest path of the box
-(m) and A the largest angle (rad), the phases are wrong by at most 1.01 n u A, hence the sums by 1.01 n u (1 + A) L. In
-a part of the box the slopes are multiplied by delta with |delta.c_k| <= C, the bounds of curvature by C^2 / 2. Offsets
-and headings are differences of numbers of size P. Altogether the rounding is below
+Rounding: with u = 2^-53, n additions into one number are wrong by less than 1.01 n u of the largest magnitude that
+their partial sums have (Higham, Accuracy and Stability of Numerical Algorithms, 2002, sections 3.1 and 4.2). With L the
+longest path of the box (m) and A the largest heading that it allows at any sample (rad), partial sums of phases are at
+most A and those of the sums at most L: the phases are wrong by at most 1.01 n u A, hence the sums by 1.01 n u (1 + A)
+L. In a part of the box the slopes are multiplied by delta with |delta.c_k| <= C, the bounds of curvature by C^2 / 2.
+Offsets and headings are differences of numbers of size P. Altogether the rounding is below
 
     e = 8 n u (1 + L) (2 + A) (1 + C)^2 (1 + P).                                                   (S3)
 

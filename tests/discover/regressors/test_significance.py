@@ -78,9 +78,18 @@ def test_a_chance_that_many_flips_reach_is_their_share_with_the_data_as_one_more
 
 
 def test_a_chance_that_hardly_any_flip_reaches_is_that_of_an_exponential_tail() -> None:
-    tail = np.concatenate([[1.0], 1.0 + np.linspace(0.0, 49 / 48, 48)])  # 49 of them, by 0.5 beyond 1 in the mean
+    tail = np.concatenate([[1.0], 1.0 + np.linspace(0.0, 1.0, 48)])  # 48 of them beyond the least, by 0.5 in the mean
     chance = np.concatenate([np.zeros(450), tail])
     assert by_chance(3.0, chance).p_value(0) == pytest.approx(49 / 499 * np.exp(-(3 - 1) / 0.5))
+
+
+def test_the_scale_of_the_tail_is_right_in_the_mean() -> None:
+    rng = np.random.default_rng(3)
+    drawn = np.sort(rng.exponential(size=(2000, 499)), axis=1)
+    told = np.array(
+        [-np.log(by_chance(edge + 20.0, chance).p_value(0) * 499 / 49) for chance in drawn if (edge := chance[-49])]
+    )
+    assert np.mean(20.0 / told) == pytest.approx(1.0, abs=0.01)  # the scale of these exponentials; its error is 0.003
 
 
 def test_the_tail_of_the_surest_of_many_uniform_chances_goes_on_at_ten_to_the_minus_z() -> None:
