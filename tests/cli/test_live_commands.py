@@ -119,15 +119,15 @@ def test_a_recording_goes_out_and_comes_back_as_a_calibration_that_is_swapped_in
         assert node.process.poll() is None
 
 
-def test_listen_prints_a_line_a_second_when_piped(workplace: Path) -> None:
+def test_listen_prints_a_line_a_second_when_piped(command: InProcess, workplace: Path) -> None:
     config = workplace / "node.yaml"
     with Command("live", config):
         wait_for(endpoint(config)).close()
         with Command("replay", workplace / "data", "--robot", "apr", "--connect", endpoint(config)):
-            run = omnibench("listen", "apr", "--config", config, "--seconds", "3", "--json")
+            run = command("listen", "apr", "--config", config, "--seconds", "2", "--json")
     assert run.returncode == 0, run.stderr
     documents = [json.loads(line) for line in run.stdout.splitlines()]
-    assert 1 <= len(documents) <= 4  # fewer when the machine is busy
+    assert 1 <= len(documents) <= 3  # fewer when the machine is busy
     assert documents[-1]["robot"] == "apr"
 
 

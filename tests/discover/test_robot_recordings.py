@@ -18,7 +18,7 @@ from omnibench.discover.selection.encoder_quantisation import quantisation_steps
 from omnibench.simulate.simulate import simulate_dataset
 
 FEW: dict[str, Any] = {
-    "commands": {"speeds": [0.2], "directions_deg": [0, 90, 180, 270], "turn_rates": [-0.35, 0.0, 0.35]},
+    "commands": {"speeds": [0.2], "directions_deg": [0, 120, 240], "turn_rates": [-0.35, 0.0, 0.35]},
     "repetitions": 2,
 }
 
