@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -151,8 +151,8 @@ def _tables(result: ComparisonResult) -> dict[str, pl.DataFrame]:
     statistics = [_statistics_row(entry) for entry in result.statistics]
     return {
         "runs": _table([_run_row(run) for run in result.runs], RunRecord),
-        "errors": pl.DataFrame(list(_error_rows(result)), _ERROR_COLUMNS),
-        "history": pl.DataFrame(list(_history_rows(result.runs)), _HISTORY_COLUMNS),
+        "errors": pl.DataFrame(list(_error_rows(result)), _ERROR_COLUMNS, orient="row"),
+        "history": pl.DataFrame(list(_history_rows(result.runs)), _HISTORY_COLUMNS, orient="row"),
         "statistics": _table(statistics, EntryStatistics, _INTERVAL_COLUMNS),
     }
 
@@ -190,34 +190,22 @@ def _interval_cell(interval: Interval | None) -> dict[str, float] | None:
     return None if interval is None else asdict(interval)
 
 
-def _error_rows(result: ComparisonResult) -> Iterable[dict[str, Any]]:
+def _error_rows(result: ComparisonResult) -> Iterator[tuple[Any, ...]]:
+    """Rows of _ERROR_COLUMNS."""
     for run in result.runs:
         for split, score in run.scores.items():
             trajectories = result.datasets[run.record.dataset].split(split)
             costs = score.costs.tolist()
             for trajectory, error, cost in zip(trajectories, score.errors.tolist(), costs, strict=True):
-                yield {
-                    "dataset": run.record.dataset,
-                    "label": run.record.label,
-                    "seed": run.record.seed,
-                    "split": split,
-                    "trajectory": trajectory.id,
-                    "command": trajectory.command,
-                    "x_error_m": error[0],
-                    "y_error_m": error[1],
-                    "heading_error_rad": error[2],
-                    "cost": cost,
-                }
+                yield (*_key(run), split, trajectory.id, trajectory.command, *error, cost)
 
 
-def _history_rows(runs: Iterable[ScoredRun]) -> Iterable[dict[str, Any]]:
+def _history_rows(runs: Iterable[ScoredRun]) -> Iterator[tuple[Any, ...]]:
+    """Rows of _HISTORY_COLUMNS."""
     for run in runs:
         for step in run.history:
-            yield {
-                "dataset": run.record.dataset,
-                "label": run.record.label,
-                "seed": run.record.seed,
-                "evaluations": step.evaluations,
-                "seconds": step.seconds,
-                "best_cost": step.cost,
-            }
+            yield (*_key(run), step.evaluations, step.seconds, step.cost)
+
+
+def _key(run: ScoredRun) -> tuple[str, str, int]:
+    return run.record.dataset, run.record.label, run.record.seed

@@ -25,6 +25,16 @@ def direction_of(run: Trajectory) -> float:
     return round(math.degrees(run.alpha or 0.0), 3) % 360
 
 
+def motion_in_words(name: str, speed: float | None, direction: float | None, turn_rate: float | None) -> str:
+    """A command as ``0.2 m/s at 30°, −0.35 rad/s``; its name if speed, m/s, direction, rad, or rate are not known."""
+    if speed is None or direction is None or turn_rate is None:
+        return name
+    turn = f"{turn_rate:.3g} rad/s".replace("-", "−")
+    if speed == 0:
+        return f"on the spot, {turn}"
+    return f"{speed:.3g} m/s at {fixed(math.degrees(direction) % 360, 0)}°, {turn if turn_rate else 'straight'}"
+
+
 def moves(run: Trajectory) -> bool:
     """True unless the command is known to turn the robot on the spot."""
     return run.v is None or run.v > 0

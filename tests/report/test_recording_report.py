@@ -218,11 +218,9 @@ def test_long_runs_with_many_scans_stay_below_six_megabytes(tmp_path: Path) -> N
 def test_more_than_wheels_and_poses_makes_a_section_for_other_reports(made: Sample) -> None:
     assert has_recording(made.dataset)
     assert not has_recording(bare(made.dataset))
-    section = recording_section(made.dataset, "data-2-")
-    assert section.key == "data-2-recording"
-    assert [part.key for part in section.sections] == [
-        f"data-2-recording-{part}" for part in ("room", "wheels", "player")
-    ]
+    section = recording_section(made.dataset)
+    assert section.key == "recording"
+    assert [part.key for part in section.sections] == [f"recording-{part}" for part in ("room", "wheels", "player")]
 
 
 def hostile(run: Trajectory) -> Trajectory:

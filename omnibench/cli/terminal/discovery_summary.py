@@ -63,7 +63,7 @@ def _remarks(discovery: Discovery) -> Iterator[str]:
         if len(effect.parameters) > _PARAMETERS:
             yield f"{effect.name}: {plural(len(effect.parameters) - _PARAMETERS, 'more parameter')} in the report"
     if (more := len(worst_of_each(discovery.hidden)) - _HIDDEN) > 0:
-        yield f"What could still hide is the largest for its kind; {plural(more, 'more effect')} in the report."
+        yield f"Of what could still hide, the largest are shown; {plural(more, 'more effect')} in the report."
     if discovery.left:
         first = {dependence.covariate: dependence for dependence in reversed(discovery.left)}
         left = listing([f"{p.covariate} ({chance(p.p_value)})" for p in discovery.left if first[p.covariate] is p])

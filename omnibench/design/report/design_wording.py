@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from omnibench.design.config import Per, Use
 from omnibench.design.result import Candidate, Design, Effort, SetDesign
+from omnibench.report.motions import motion_in_words
 from omnibench.report.numbers import count, fixed, percent, significant
 from omnibench.words import noun_for, plural
 
@@ -15,14 +16,7 @@ UNIT_OF_COST: Mapping[Per, str] = {"run": "runs", "second": "s", "metre": "m of 
 
 
 def command_in_words(candidate: Candidate) -> str:
-    """A command as ``0.2 m/s at 30°, −0.35 rad/s``; its name where speed, direction or turn rate are not known."""
-    if candidate.speed is None or candidate.direction is None or candidate.turn_rate is None:
-        return candidate.name
-    turn = f"{_plain(candidate.turn_rate)} rad/s"
-    if candidate.speed == 0:
-        return f"on the spot, {turn}"
-    degrees = math.degrees(candidate.direction) % 360
-    return f"{_plain(candidate.speed)} m/s at {fixed(degrees, 0)}°, {turn if candidate.turn_rate else 'straight'}"
+    return motion_in_words(candidate.name, candidate.speed, candidate.direction, candidate.turn_rate)
 
 
 def duration_in_words(seconds: float) -> str:
@@ -96,7 +90,3 @@ def least_in_words(least: float) -> str:
 def baseline_runs(design: Design) -> str:
     """Number of the baseline's runs."""
     return count(design.baseline.precision.effort.runs)
-
-
-def _plain(value: float) -> str:
-    return f"{value:.3g}".replace("-", "−")

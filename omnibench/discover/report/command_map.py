@@ -11,7 +11,8 @@ import plotly.graph_objects as go
 from omnibench.discover.report.before_after import BAND, NOISE, ModelStyle, legend
 from omnibench.discover.report.residuals import CIRCLE_95, CommandResidual
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
-from omnibench.report.numbers import fixed, round_down
+from omnibench.report.motions import motion_in_words
+from omnibench.report.numbers import round_down
 from omnibench.report.style import QUIET, plan
 from omnibench.report.traces import ORIGIN, area, arrows, joined, marks
 from omnibench.robot.kinematics import Array
@@ -75,12 +76,7 @@ def mean_of(each: CommandResidual, style: ModelStyle) -> Array:
 
 def command_in_words(each: CommandResidual) -> str:
     """A command described by speed, direction and rate of turn; by its name if these are unknown."""
-    run = each.run
-    if run.alpha is None or run.omega is None or run.v is None:
-        return each.name
-    if run.v == 0:
-        return f"on the spot, {fixed(run.omega, 2)} rad/s"
-    return f"{run.v:.3g} m/s at {fixed(math.degrees(run.alpha) % 360, 0)}°, {fixed(run.omega, 2)} rad/s"
+    return motion_in_words(each.name, each.run.v, each.run.alpha, each.run.omega)
 
 
 def _in_words(residual: Array) -> str:

@@ -73,9 +73,9 @@ class Reading:
         """A value to ``digits`` significant digits, without its unit."""
         return significant(self.factor * value, digits, signed)
 
-    def words(self, value: float, digits: int = 3, signed: bool = False) -> str:
+    def words(self, value: float, digits: int = 3) -> str:
         """A value to ``digits`` significant digits, with its unit."""
-        return with_unit(self.number(value, digits, signed), self.unit)
+        return with_unit(self.number(value, digits), self.unit)
 
 
 def reading(unit: str) -> Reading:

@@ -63,15 +63,15 @@ class LiveOdometry:
     Effects take the session that the calibration names as the one that is driven. Wheel angles that the sender does not
     give are counted from 0.
 
-    standstill: share of the noise that is left while no wheel turns. session_time: s since the session began; a new
-    node starts at 0.
+    standstill: share of the noise that is left while no wheel turns. session_time: s since the session began; 0 for a
+    new node.
     """
 
-    def __init__(self, calibration: Calibration, standstill: float = 0.01, session_time: float = 0.0) -> None:
+    def __init__(self, calibration: Calibration, standstill: float = 0.01) -> None:
         self._standstill = standstill
         self._calibration = calibration
-        self._stream = self._new_stream(session_time)
-        self.session_time = session_time
+        self.session_time = 0.0
+        self._stream = self._new_stream(self.session_time)
         self._recent: deque[WheelStep] = deque(maxlen=_REMEMBERED)
         self._wheel_angles: Array = np.zeros(len(calibration.robot.wheels))
         self.twist: Array = np.zeros(3)

@@ -82,13 +82,10 @@ def has_recording(dataset: Dataset) -> bool:
     return dataset.scans is not None or any(run.targets is not None for run in dataset.trajectories)
 
 
-def recording_section(dataset: Dataset, prefix: str = "") -> Section:
-    """The section on a recording for another report; ``prefix`` is put before the keys of its parts.
-
-    DataError in one line: broken scans.
-    """
-    parts = _pictures(dataset, f"{prefix}recording-", {}, None, {})
-    return Section(f"{prefix}recording", "Recording", (contents_table(dataset),), tuple(parts))
+def recording_section(dataset: Dataset) -> Section:
+    """The section on a recording for another report. DataError in one line: broken scans."""
+    parts = _pictures(dataset, "recording-", {}, None, {})
+    return Section("recording", "Recording", (contents_table(dataset),), tuple(parts))
 
 
 def _about(dataset: Dataset, notes: Sequence[str]) -> tuple[Block, ...]:
