@@ -3,7 +3,8 @@
     python tests/benchmarks/interval_coverage.py --out coverage.jsonl --sets 1000 [--only "closed_form start"] [--table]
 
 One line of JSON a set, added as it comes: run again with the same file, and it goes on where it was. With --table the
-table is printed from what is there.
+table is printed from what is there. --doubt sets another level for the test by which closed_form's intervals rest on
+commands or sessions.
 
 The truth shares nothing with what fits: every run is one exact arc of constant twist, in closed form, and the robot's
 wheel equations (Eq. 3) stand here. Kinds of noise, beside white noise of 5 mm and 5 mrad of every pose:
@@ -43,6 +44,7 @@ from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.discover.regressors.column_group import Group
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.problem import Budget
+from omnibench.fit.uncertainty import sandwich
 from omnibench.processes import one_thread
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Array, Robot, Wheel
@@ -230,12 +232,13 @@ def read_rows(path: Path) -> list[Row]:
     return [Row(**json.loads(line)) for line in lines]
 
 
-def carry_out(missing: Sequence[tuple[Case, int]], path: Path, jobs: int) -> Iterator[Row]:
+def carry_out(missing: Sequence[tuple[Case, int]], path: Path, jobs: int, doubt: float) -> Iterator[Row]:
     """Fit sets and add each row to the file at once."""
     written = path.read_bytes() if path.exists() else b""
     with path.open("wb") as file:
         file.write(written[: written.rfind(b"\n") + 1])
-    with one_thread(), ProcessPoolExecutor(jobs) as pool, path.open("a") as file:
+    pool = ProcessPoolExecutor(jobs, initializer=setattr, initargs=(sandwich, "DOUBT", doubt))
+    with one_thread(), pool, path.open("a") as file:
         for done in as_completed([pool.submit(covered, case, seed) for case, seed in missing]):
             row = done.result()
             file.write(json.dumps(asdict(row)) + "\n")
@@ -271,6 +274,7 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=1000)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--only", action="append", default=[], help="part of a cell's name; may be given several times")
+    parser.add_argument("--doubt", type=float, default=sandwich.DOUBT)
     parser.add_argument("--table", action="store_true", help="only print the table")
     arguments = parser.parse_args()
     chosen, rows = cases(arguments.only), read_rows(arguments.out)
@@ -278,7 +282,7 @@ def main() -> None:
         done = {(row.case, row.seed) for row in rows}
         wanted = [(case, seed) for seed in range(arguments.sets) for case in chosen]
         missing = [(case, seed) for case, seed in wanted if (str(case), seed) not in done]
-        rows += carry_out(missing, arguments.out, arguments.jobs)
+        rows += carry_out(missing, arguments.out, arguments.jobs, arguments.doubt)
     print("\n".join(table(rows, chosen)))
 
 

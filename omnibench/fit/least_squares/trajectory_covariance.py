@@ -15,7 +15,7 @@ from omnibench.fit.least_squares.noise import NoiseEstimate
 from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.fit.least_squares.whitened import Whitened
 from omnibench.fit.uncertainty.intervals import EstimatedCovariance
-from omnibench.fit.uncertainty.sandwich import Sandwich, Scores, roots_of, sandwich
+from omnibench.fit.uncertainty.sandwich import DOUBT, Sandwich, Scores, roots_of, sandwich
 from omnibench.robot.kinematics import Array
 
 # Five calibrations of tests/benchmarks/constants_fit.py are the same with half of each of these numbers and with twice.
@@ -74,10 +74,12 @@ class FitCovariance:
     def scatter_is_wider(self) -> bool:
         """True if the runs scatter significantly more than the noise model predicts.
 
-        Scatter between commands counts only if the likelihood's test confirms it.
+        Scatter between commands counts only if the likelihood's test confirms it, at the level of the sandwich's.
         """
-        if self.scatter is None or self.scatter.lack_of_fit:
-            return self.lack_of_fit
+        if self.scatter is None:
+            return False
+        if self.scatter.clustered:
+            return self._chance_of_misfit < DOUBT
         back = np.linalg.pinv(self._roots)
         values = np.linalg.eigvalsh(back @ self.scatter.covariance @ back.T)
         total = float(values.sum())

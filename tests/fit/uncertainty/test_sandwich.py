@@ -72,6 +72,15 @@ def test_sessions_are_the_clusters_where_they_scatter_most() -> None:
     assert "4 sessions" in found.words
 
 
+def test_clusters_that_may_scatter_more_count_for_the_interval_and_are_no_lack_of_fit() -> None:
+    """Six means of two: their F ratio of 12 has a chance of 0.4 %."""
+    values = (np.repeat([-2.0, -1.0, 0.0, 0.0, 1.0, 2.0], 2) + np.tile([0.58, -0.58], 6))[:, None]
+    found = sandwich(scores_of_a_mean(values, runs_of([name for name in "abcdef" for _ in range(2)])))
+    np.testing.assert_allclose(found.covariance, [[2.0 / 6]], rtol=1e-9)
+    assert (found.clustered, found.lack_of_fit) == (True, False)
+    assert found.effective_freedom == pytest.approx([5.0])
+
+
 def test_in_no_direction_clusters_make_the_covariance_smaller_than_repetitions_do() -> None:
     """Commands scatter along x and repetitions along y: the one is taken from commands, the other from repetitions."""
     centres = np.array([-30.0, -7.0, 2.0, 5.0, 11.0, 19.0])
