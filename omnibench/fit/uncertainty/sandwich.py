@@ -113,7 +113,8 @@ def scores_of_runs(
     numbers; second derivatives of the poses are neglected.
 
     A norm |e| is smoothed to sqrt(|e|^2 + h^2), with h small against the errors. A norm of one component needs it: its
-    Hessian then is twice a kernel estimate of the error density at zero. Others hardly change.
+    Hessian then is twice a kernel estimate of the error density at zero. Others hardly change. Errors that the fit made
+    zero do not count for h. DataError if these are half of all.
     """
     weights = np.array(objective.weights)
     used = np.flatnonzero(weights)
@@ -123,13 +124,16 @@ def scores_of_runs(
     count = len(trajectories)
     norms = np.linalg.norm(errors, axis=1)
     shares = objective.shares(owner)
+    middle = float(np.median(norms))
+    if middle <= _INTERPOLATED * norms.max():
+        raise DataError("the answer passes exactly through half of the poses, and the others are too few")
+    left = norms > _INTERPOLATED * middle
     if len(used) == 1:  # the fit makes n errors exactly zero; they do not belong to the density of the others
-        left = norms > _INTERPOLATED * np.median(norms)
-        shares = np.where(left, shares * len(left) / max(left.sum(), 1), 0.0)
-        width = _KERNEL * count**-0.2 * float(np.median(norms[left])) if left.any() else 0
+        shares = np.where(left, shares * len(left) / left.sum(), 0.0)
+        width = _KERNEL * count**-0.2 * float(np.median(norms[left]))
     else:
-        width = count**-0.5 * float(np.median(norms))
-    lengths = np.sqrt(norms**2 + max(width, 1e-15) ** 2)
+        width = count**-0.5 * float(np.median(norms[left]))
+    lengths = np.sqrt(norms**2 + width**2)
     along = np.einsum("ski,sk->si", slopes, errors)
     scores, hessians = [], []
     curvature = np.zeros((slopes.shape[2],) * 2)
@@ -273,7 +277,7 @@ def _freedom_of_direction(leverages: Array, corrections: Array) -> float:
     own = corrections @ leverages @ corrections
     absorbed = corrections @ leverages @ leverages @ corrections
     squares = float((own * (own - 2 * absorbed)).sum() + np.square(absorbed.sum(axis=0)).sum())
-    return float(np.square((own - absorbed).sum(axis=0)).sum()) / squares
+    return float(np.square((own - absorbed).sum(axis=0)).sum()) / max(squares, 1e-300)
 
 
 def _ratio(numerators: Array, denominators: Array) -> Array:

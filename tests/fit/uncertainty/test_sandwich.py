@@ -185,3 +185,18 @@ def test_commands_that_scatter_as_their_repetitions_do_are_seldom_taken_for_a_la
         hessians = np.einsum("zi,zj->zij", columns, columns)
         misfits += sandwich(Scores(-columns * left[:, None], hessians, runs_of(commands), np.zeros(3))).lack_of_fit
     assert misfits <= 4
+
+
+def test_poses_that_the_answer_passes_through_do_not_make_the_cost_sharper() -> None:
+    rng = np.random.default_rng(4)
+    errors, jacobian = rng.standard_normal((9, 3)), rng.standard_normal((9, 3, 2))
+    errors[:2] = 1e-13
+    found = scores_of_norms("final_pose", errors, jacobian)
+    width = np.median(np.linalg.norm(errors[2:], axis=1)) * 9**-0.5
+    np.testing.assert_allclose(found.hessians[0], jacobian[0].T @ jacobian[0] / width / 9, rtol=1e-6)
+
+
+def test_an_answer_that_passes_through_half_of_the_poses_has_no_scatter() -> None:
+    errors = np.vstack([np.zeros((3, 3)), np.ones((2, 3))])
+    with pytest.raises(DataError, match="passes exactly through half of the poses"):
+        scores_of_norms("final_pose", errors, np.ones((5, 3, 2)))
