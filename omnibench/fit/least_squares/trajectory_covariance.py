@@ -1,4 +1,24 @@
-"""Covariance of a trajectory fit, from its noise model or from the scatter of the runs."""
+"""Covariance of a trajectory fit, from its noise model or from the scatter of the runs.
+
+Scores s_z and information L_z of the runs z are said in coordinates in which the information of all runs is the unit
+matrix, as in uncertainty/sandwich.py. If one vector of n numbers fits all commands g, and q_g = rank L_g, then
+
+    F = [sum_g s_g' L_g^+ s_g / (sum_g q_g - n)]
+        / [(sum_z s_z' L_z^+ s_z - sum_g s_g' L_g^+ s_g) / sum_g (n_g - 1) q_g]                           (1)
+
+has the F distribution whatever the size of the noise. Where no lack of fit shows, the scatter S of d directions, whose
+expectation under the noise model is the unit matrix, is wider than that at the level a if
+
+    tr S / d > chi2(1 - a; v) / v,   v = f (tr S)^2 / tr S^2,                                             (2)
+
+f being the sandwich's degrees of freedom (Satterthwaite 1946). The noise model itself is known from D differences
+between runs. The part of the noise that all poses of a run share is one number a difference and coordinate, and a
+position has two coordinates of the same variance. The variances of the noise model have at least
+
+    2 D                                                                                                   (3)
+
+degrees of freedom, more where white noise dominates.
+"""
 
 from __future__ import annotations
 
@@ -41,8 +61,7 @@ class FitCovariance:
         scores, information = data.scores * unit, data.information_of_runs * np.outer(unit, unit)
         roots = roots_of(information.sum(axis=0), _RANK)
         self._noise, self._roots = noise, unit[:, None] * roots
-        # A difference between repetitions has two coordinates of position, of the same variances.
-        self.by_model = EstimatedCovariance(self._roots @ self._roots.T, 2 * noise.degrees_of_freedom)
+        self.by_model = EstimatedCovariance(self._roots @ self._roots.T, 2 * noise.degrees_of_freedom)  # Eq. (3)
         self._chance_of_misfit = _chance_of_misfit(scores @ roots, roots.T @ information @ roots, runs)
         if not roots.size:
             return
@@ -84,7 +103,7 @@ class FitCovariance:
         values = np.linalg.eigvalsh(back @ self.scatter.covariance @ back.T)
         total = float(values.sum())
         freedom = self.scatter.degrees_of_freedom * total**2 / float(np.square(values).sum())
-        return total / len(values) > float(chdtri(freedom, _CHANCE)) / freedom
+        return total / len(values) > float(chdtri(freedom, _CHANCE)) / freedom  # Eq. (2)
 
 
 def _chance_of_misfit(scores: Array, information: Array, trajectories: Sequence[Trajectory]) -> float:
@@ -106,5 +125,5 @@ def _chance_of_misfit(scores: Array, information: Array, trajectories: Sequence[
             within_freedom += (len(members) - 1) * rank
     if between_freedom <= 0 or within_freedom <= 0 or within <= 0:
         return 1.0
-    ratio = (between / between_freedom) / (within / within_freedom)
+    ratio = (between / between_freedom) / (within / within_freedom)  # Eq. (1)
     return float(fdtrc(between_freedom, within_freedom, ratio))

@@ -32,6 +32,7 @@ from omnibench.robot.kinematics import Array
 # (tests/benchmarks/constants_fit.py).
 _MOST_STEPS = 20  # steps
 _NO_GAIN = 1e-4  # relative decrease of the cost that ends the steps
+_LEAST_LEFT = 0.25  # share of the errors' numbers beyond those fitted: first order in p/n says nothing below it; chosen
 _NO_ERROR = 1e-9  # m, rad: a smaller cost is rounding
 
 
@@ -140,7 +141,7 @@ def _less_curved(scores: Scores, numbers: int) -> Scores:
     length: the correction of M-estimates for small samples (Huber 1981, section 7.6), to first order in p/n.
     """
     fitted = np.linalg.matrix_rank(scores.hessians.sum(axis=0), hermitian=True)
-    return replace(scores, hessians=np.sqrt(max(1 - fitted / numbers, 0.25)) * scores.hessians)
+    return replace(scores, hessians=np.sqrt(max(1 - fitted / numbers, _LEAST_LEFT)) * scores.hessians)
 
 
 def _check_minimum(
