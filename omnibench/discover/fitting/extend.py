@@ -30,7 +30,8 @@ from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array
 
-# tests/benchmarks/constants.py varies both by 0.5 and 2.
+# tests/benchmarks/constants.py varies both by 0.5 and 2: on a small set with heading drift no verdict and no name
+# changes.
 _STEPS = 4  # Gauss-Newton steps, at most
 _STILL = 0.05  # standard errors: a smaller step, which no interval shows, ends the fit
 

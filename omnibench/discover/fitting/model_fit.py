@@ -23,7 +23,8 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
 _UNKNOWN_NOISE = NoiseEstimate(FIRST_NOISE, "within runs", 1, "")
-# tests/benchmarks/constants.py varies each number by 0.5 and 2.
+# tests/benchmarks/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
+# name changes.
 _FIRST_STEPS = 3  # Gauss-Newton steps from the design values on, before anything is known of the noise
 _ROUNDS = 4  # rounds that fit noise and matrix by turns, at most; fewer where the noise stays within 2 %
 _NEAR = 0.02  # share of the largest component of the noise by which two noises may differ, see is_near

@@ -11,7 +11,8 @@ from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
-# tests/benchmarks/constants.py varies each number by 0.5 and 2.
+# tests/benchmarks/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
+# name changes.
 _MOST_STAMPS = 80  # reference poses used of a run: neighbours in denser references share their errors
 _STANDING = 1e-3  # rad/s: slower wheels count as standing; one of 0.1 m moves 0.1 mm in a second
 _OVERHANG = 0.5  # s after the last wheel sample in which reference poses are still used, see ``log_of``
