@@ -19,6 +19,7 @@ from scipy import stats
 
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
+from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.robot.model import OdometryModel
@@ -145,8 +146,7 @@ def fitted(seed: int, noise: EncoderNoise, calibrator: str = "trajectory_ml") ->
     errors = (result.matrix - true_matrix(config.truth, config.robot)).ravel()
     covered = np.zeros(9, dtype=bool)
     if result.covariance is not None and result.degrees_of_freedom is not None:
-        reach = stats.t.isf(0.025, result.degrees_of_freedom) * np.sqrt(np.diag(result.covariance))
-        covered = np.abs(errors) < reach
+        covered = np.abs(errors) < EstimatedCovariance(result.covariance, result.degrees_of_freedom).reach
     return Fitted(errors, covered, "noise model" not in result.reason)
 
 

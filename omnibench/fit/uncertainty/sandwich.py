@@ -55,8 +55,8 @@ from omnibench.words import plural
 # test a clustering is made and a wrong alarm doubts a model that is right.
 _CHANCE = 0.001
 # Level of the same test by which intervals rest on the clusters. A test that decides what an interval rests on must not
-# be strict: at 0.001, intervals of closed_form from five sessions whose scales differ by 2 % hold the truth in 84 % of
-# sets, at 0.05 in 96 %, and sets of equal sessions lose nothing (tests/benchmarks/interval_coverage.py).
+# be strict: of closed_form's intervals from five sessions whose scales differ by 2 %, 83 % hold the truth at 0.001 and
+# 96 % at 0.05, in 55 sets, and sets of equal sessions lose nothing (tests/benchmarks/interval_coverage.py --doubt).
 DOUBT = 0.05
 # Least eigenvalue of I - H_c, H_c a cluster's share of the Hessian: where a cluster alone determines a direction the
 # correction of Bell and McCaffrey divides by zero.
