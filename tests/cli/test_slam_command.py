@@ -122,7 +122,9 @@ def test_the_table_says_how_sure_the_poses_are_and_how_far_from_the_recorded_ref
     assert "distance from the recorded reference (12 poses)" in " ".join(printed.split())
     assert "3 trajectories: found" in printed
     assert "truth" not in printed
-    assert found.run.stderr == "SLAM: 3 runs\n"
+    first, *others = found.run.stderr.splitlines()
+    assert first == "SLAM: 3 runs"
+    assert all(line.startswith("SLAM: ") for line in others)  # a busy machine is told every 10 s how far it is
 
 
 def test_json_holds_the_same_figures(document: dict[str, Any]) -> None:
