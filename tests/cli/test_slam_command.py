@@ -309,7 +309,7 @@ def test_after_ctrl_c_the_command_goes_on(
     files = {file: file.stat().st_mtime_ns for file in (tmp_path / "found.slam-paths").iterdir()}
     assert kept <= len(files) < 16
     paths = "interrupted; the paths found so far are kept in found.slam-paths: run the command again"
-    assert err.removeprefix("SLAM: 16 runs\n") == f"{paths}\n"
+    assert [line for line in err.splitlines() if not line.startswith("SLAM: ")] == [paths]
     assert {file.name for file in tmp_path.iterdir()} == {"many", "found.slam-paths"}
     monkeypatch.chdir(tmp_path)
     run = command("slam", "many", "-o", "found")
