@@ -39,7 +39,8 @@ h_j = H_j + dH_j.delta there,
         + sum_j [min over D_1j of D_1j Re h_j + min over D_2j of -D_2j Im h_j]                   (B6)
     F >= L - 1/2 sum_lm rho_l rho_m (B_0lm + sum_j max|zeta_j| B_jlm) - w (q + e),               (B7)
 
-w the largest weight, q the error of the quadrature of arcs and e that of rounding (stamp_sums.py).
+w the largest weight, q the error of the quadrature of arcs and e that of rounding (stamp_sums.py). u_s with heading
+components alone have H = 0: they are taken where others prove nothing beyond the part that was cut, as in wide boxes.
 
 The part is cut where its width takes most from (B7), which is at most
 
@@ -156,6 +157,10 @@ class LowerBounds:
         point, directions = least_sum_of_norms(residuals, jacobian, self._shares, *box)
         bounds = [self._dual_bound(part, sums, slopes, scaled) for scaled in into_unit_ball(directions)]
         bound, looseness = max(bounds, key=itemgetter(0))
+        if self._weights[2] and bound <= proven:
+            turns = least_sum_of_norms(residuals[:, 2:], jacobian[:, 2:], self._shares, *box).directions
+            headings = np.column_stack([np.zeros((len(turns), 2)), turns])
+            proven = max(proven, *(self._dual_bound(part, sums, slopes, each)[0] for each in into_unit_ball(headings)))
         return Node(part.lower, part.upper, max(proven, bound), point.reshape(3, -1) + middle, looseness)
 
     def _linearised(self, part: ElementBox, sums: Complex, slopes: Complex, rows_12: Array) -> tuple[Array, Array]:

@@ -48,6 +48,12 @@ def test_the_bound_is_just_below_the_least_cost_of_a_grid_over_three_elements(co
     assert 0.97 * least <= proof.lower_bound <= least
 
 
+def test_a_box_too_wide_for_positions_is_bounded_by_headings_from_its_first_part_on() -> None:
+    widths = [(row, column, 0.1 if row < 2 else 0.2) for row, column in product(range(3), repeat=2)]
+    problem = make_problem(noisy_trajectories(noise=0.03), cost="trajectory", box=box_about_the_design(*widths))
+    assert prove(problem, problem.start, gap=1e-3, seconds=np.inf, parts=1).lower_bound > 0.02
+
+
 def test_of_one_straight_run_the_bound_is_the_distance_to_the_nearest_end_of_the_box() -> None:
     """Wheel b alone turns by 2 rad in Euler steps without a heading: x = 2 m12, which the box holds below 0.1 m."""
     times = np.array([1.0, 2.0])
