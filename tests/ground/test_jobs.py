@@ -176,7 +176,7 @@ IMPORTING_THIS = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__)
 BACKENDS = [InPlace(), Processes(1), Processes(3)]
 
 
-@pytest.mark.parametrize("backend", BACKENDS, ids=str)
+@pytest.mark.parametrize("backend", BACKENDS, ids=("in place", "one process", "three processes"))
 class TestEveryBackend:
     def test_gives_the_result_of_every_job(self, backend: Backend, tmp_path: Path) -> None:
         notes = run(tmp_path, jobs_of(squared, range(7)), backend)
@@ -258,7 +258,7 @@ def test_one_worker_is_this_process_where_no_isolation_is_needed(tmp_path: Path)
 
 
 class TestWorkersThatDie:
-    @pytest.mark.parametrize("by", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
+    @pytest.mark.parametrize("by", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP], ids=str)
     def test_a_job_that_is_killed_is_tried_three_times(self, by: signal.Signals, tmp_path: Path) -> None:
         jobs = [*jobs_of(killed, [(tmp_path, by)]), Job("other", squared, 3)]
         notes = run(tmp_path / "results", jobs, Processes(2))
