@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import OdometryBatch, WheelLog
+from omnibench.robot.planar import wrapped
 
 _DEGREE = math.pi / 180
 # Units that a column may have been recorded in: factor to the SI unit, and warning.
@@ -87,7 +88,7 @@ class _Recording:
         driven = odometry[..., 0] + 1j * odometry[..., 1]
         turned = self._turns(odometry[..., 2])
         # Whole turns between two moments do not show in the headings.
-        missed = np.remainder(turned - self._turns(moved[:, 2]) + math.pi, 2 * math.pi) - math.pi
+        missed = wrapped(turned - self._turns(moved[:, 2]))
         lengths = (np.abs(driven) + np.abs(path)).sum(axis=1)
         angles = (np.abs(turned) + np.abs(turned - missed)).sum(axis=1)
         # Noise and slip may amount to a radian and the robot's size at every moment, and to more while it turns.

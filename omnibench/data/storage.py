@@ -225,7 +225,7 @@ def _refuse_infinite(runs: Table, values: pl.Series) -> None:
 
 
 def _rows_by_trajectory(runs: Table, table: Table) -> list[np.ndarray[Any, np.dtype[np.intp]]]:
-    """For each run the rows of ``table`` that belong to it, in the file's order."""
+    """The rows of ``table`` that belong to each run, in the file's order."""
     ids = runs.frame["trajectory"].to_list()
     number = {identity: index for index, identity in enumerate(ids)}
     named = table.frame["trajectory"]

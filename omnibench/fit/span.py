@@ -25,8 +25,9 @@ _NULL_SHARE = 1e-2
 # Share of the strongest direction below which slip alone may explain what was driven. Slip of 1 % of the strongest
 # motion changes the matrix along a direction driven with a tenth of it by 10 %, more than a calibration corrects. Festo
 # Robotino runs without commanded turns have 0.051 and 0.053 along the direction that turns the robot (slip, uneven
-# motors); recordings with commanded turns have 0.53 (omni3) and 0.56 (flower of the APR-02). Half of it and twice
-# change nothing (tests/benchmarks/constants_fit.py).
+# motors); recordings with commanded turns have 0.53 (omni3) and 0.56 (flower of the APR-02).
+# On the simulated recordings of tests/benchmarks/constants_fit.py half of it and twice change nothing; with half of it
+# Robotino's would count as driven.
 WEAK_SHARE = 0.1
 
 # The following decide on names of directions alone; half of each and twice give the same names

@@ -108,7 +108,7 @@ class _Active:
             watch.moved(self.number, event)
 
     def ending(self) -> Ended:
-        """How the job ended."""
+        """The job's end: with a result, an error, over its time or with its process."""
         if self.progress is not None:
             self.progress.close()
         error = self.future.exception()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,8 +20,6 @@ def limited_memory(megabytes: float | None) -> Iterator[None]:
     if megabytes is None:
         yield
         return
-    import resource  # not on Windows
-
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     limit = int(megabytes * _MEGABYTE)
     resource.setrlimit(resource.RLIMIT_DATA, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
@@ -32,10 +31,6 @@ def limited_memory(megabytes: float | None) -> Iterator[None]:
 
 def memory_limit() -> float | None:
     """The limit of this process's private memory in 10^6 bytes; None without one."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
     soft, _ = resource.getrlimit(resource.RLIMIT_DATA)
     return None if soft == resource.RLIM_INFINITY else soft / _MEGABYTE
 

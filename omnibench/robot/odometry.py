@@ -240,7 +240,7 @@ def advance(pose: Array, moved: Array, integration: Integration) -> Array:
 
 
 def locate(times: Array, stamps: Array) -> tuple[NDArray[np.intp], Array]:
-    """For each stamp (S,) the sample that contains it and the share of it before then. times (F,): samples' ends."""
+    """The sample that contains each stamp (S,), and the share of it before then. times (F,): samples' ends."""
     sample = np.minimum(np.searchsorted(times, stamps), len(times) - 1)
     begin = np.where(sample > 0, times[sample - 1], 0.0)
     share = np.clip((stamps - begin) / (times[sample] - begin), 0.0, 1.0)

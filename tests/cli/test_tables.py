@@ -95,3 +95,8 @@ def test_one_description_gives_the_cells_of_the_report_and_of_the_terminal() -> 
     assert [re.sub(r" \| (.+)", r" (\1)", cell) for row in shown[1:] for cell in row] == [
         cell for line in below_heading for cell in re.split(r" {2,}", line.strip())
     ]
+
+
+def test_a_table_without_rows_shows_its_headings() -> None:
+    empty = Table("None yet", (Column("Entry", numeric=False), Column("Cost")), ())
+    assert "Entry" in printed(empty, 60)

@@ -76,7 +76,7 @@ class ProgressDisplay:
 
 
 def _state(event: Progress) -> str:
-    """How far a task is, in words."""
+    """Progress of a task in words."""
     parts = []
     if event.total is not None:
         parts.append(f"{event.done:,} of {event.total:,}")

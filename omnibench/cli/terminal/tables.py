@@ -113,7 +113,7 @@ def _extent(table: Table, index: int, notes: Place) -> _Extent:
     words = [word for text in (heading, *lines) for word in _tied(text).split(" ") if len(word) <= _UNBROKEN]
     numbers = [cell.text for cell in cells] if column.numeric else []
     least = max(map(len, (*words, *numbers)), default=1)
-    of_cells = max(least, *map(len, lines))
+    of_cells = max((least, *map(len, lines)))
     return _Extent(max(of_cells, (len(heading) + 1) // 2), of_cells, least)
 
 

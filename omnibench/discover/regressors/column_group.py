@@ -33,7 +33,7 @@ class Group:
 
 
 def best_shapes(groups: Sequence[Group], chi_square: Sequence[float]) -> list[int]:
-    """For each name the index of its group with the largest chi-square difference, in the order of the names."""
+    """Indices of the groups with the largest chi-square difference, one a name, in the order of the names."""
     best: dict[str, int] = {}
     for index, group in enumerate(groups):
         if chi_square[index] > chi_square[best.setdefault(group.name, index)]:

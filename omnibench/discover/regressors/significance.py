@@ -89,7 +89,7 @@ class Significance:
 
     @property
     def best_shapes(self) -> list[int]:
-        """For each name the index of its group with the largest chi-square difference, of those that have any rank."""
+        """Indices of the groups with the largest chi-square difference, one a name, of those that have any rank."""
         known = np.flatnonzero(self.rank).tolist()
         return [
             known[index] for index in best_shapes([self.groups[row] for row in known], self.chi_square[known].tolist())

@@ -166,8 +166,8 @@ def credibility_of(
 def bayes_factor(left: float, deviation: float, energy: float, usual: float) -> float:
     """Bayes factor F of right names against wrong ones where a chi-square ``left`` is found beside them, Eq. (8).
 
-    deviation: standard deviation of ``left``. energy: non-centrality N that the names explain. usual: mean share u of
-    the whole that right names leave.
+    deviation: standard deviation of ``left``, above 0. energy: non-centrality N that the names explain. usual: mean
+    share u of the whole that right names leave.
     """
     nearest, farthest = (max(left + side * _WINDOW * deviation, 0.0) for side in (-1, 1))
     low, middle, high = (size / (energy + size) for size in (nearest, left, farthest))

@@ -64,7 +64,7 @@ class Selection:
 
     @property
     def confusable(self) -> tuple[tuple[str, ...], ...]:
-        """For each chosen effect, the names of the others that could take its place."""
+        """Names that could take the place of each chosen effect."""
         return tuple(tuple(group.name for group in groups) for groups in self.stand_ins)
 
     def is_same_as(self, other: Selection) -> bool:
