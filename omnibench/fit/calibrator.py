@@ -127,7 +127,7 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
         try:
             if solution is not None and solution.degrees_of_freedom is not None:
                 freedom = np.broadcast_to(np.asarray(solution.degrees_of_freedom, dtype=float), problem.size)
-            vector, cost, flaw = _examine(calibrator, problem, answer)
+            vector, cost, flaw = _examine(calibrator, problem, answer, freedom)
             if flaw:
                 outcome, reason = Outcome.INVALID, flaw
         except Exception as error:  # a cost may be a plug-in's, too
@@ -176,7 +176,7 @@ def unloadable(failure: PluginFailure) -> type[Calibrator]:
 
 
 def _examine(
-    calibrator: Calibrator, problem: CalibrationProblem, answer: Any
+    calibrator: Calibrator, problem: CalibrationProblem, answer: Any, freedom: Array | None
 ) -> tuple[Array | None, float | None, str]:
     """The answer as a vector (n,), its cost, and its flaw in words; vector and cost are None if there is a flaw."""
     try:
@@ -194,6 +194,8 @@ def _examine(
             if not low <= value <= high
         ]
         return None, None, f"the answer is outside the box ({', '.join(outside)})"
+    if freedom is not None and not (freedom > 0).all():
+        return None, None, f"degrees_of_freedom of the answer's variances must be above 0, found {freedom.min():g}"
     cost = float(problem.values(vector[None])[0])
     if not np.isfinite(cost):
         return None, None, "the answer's cost is not finite"

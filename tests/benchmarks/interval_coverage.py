@@ -15,6 +15,7 @@ wheel equations (Eq. 3) stand here. Kinds of noise, beside white noise of 5 mm a
 - bias: an error of the whole run of 1 cm and 0.01 rad.
 - commands: the path of every command is pulled by 1 cm / s and 0.01 rad / s, alike in all its repetitions, so that no
   matrix fits.
+- turn: that of bias, in straight runs without repetition beside a single run that turns on the spot.
 - sessions: the reference of every session has a scale that is off by 2 %, as with a wheel or a map that changes by day.
 
 Clusters are commands, each driven three times in one session; for ``sessions`` they are sessions of four commands that
@@ -50,7 +51,7 @@ from omnibench.registry import effects
 from omnibench.robot.kinematics import Array, Robot, Wheel
 
 METHODS = ("closed_form", "trajectory_ml", "discover")
-KINDS = ("white", "start", "walk", "bias", "commands", "sessions")
+KINDS = ("white", "start", "walk", "bias", "turn", "commands", "sessions")
 CLUSTERS = (5, 8, 12)
 SPEED, TURNS = 0.25, (0.5, -0.5, 0.0)  # m/s, rad/s
 TIMES = 0.2 * np.arange(1, 21)  # s, wheel samples
@@ -107,16 +108,18 @@ def simulated(kind: str, clusters: int, seed: int, drift: float = 0.0) -> tuple[
     design = np.concatenate([np.full(3, 0.148), np.full(3, 0.195), ANGLES])
     truth = design + np.repeat([0.002, 0.004, math.radians(1)], 3) * rng.standard_normal(9)
     by_session = kind == "sessions"
-    commands, sessions, repetitions = (4, clusters, 2) if by_session else (clusters, 1, 3)
+    commands, sessions, repetitions = (4, clusters, 2) if by_session else (clusters, 1, 1 if kind == "turn" else 3)
     first = rng.uniform(0, 2 * math.pi)
     twists = [
-        np.array([SPEED * math.cos(angle), SPEED * math.sin(angle), TURNS[number % 3]])
+        np.array([SPEED * math.cos(angle), SPEED * math.sin(angle), 0.0 if kind == "turn" else TURNS[number % 3]])
         for number, angle in enumerate(first + 2 * math.pi * np.arange(commands) / commands)
     ]
-    pulls = UNITS * rng.standard_normal((commands, 3)) * (kind == "commands")
+    if kind == "turn":
+        twists.append(np.array([0.0, 0.0, TURNS[0]]))
+    pulls = UNITS * rng.standard_normal((len(twists), 3)) * (kind == "commands")
     scales = 1 + 0.02 * rng.standard_normal(sessions) * by_session
     runs = []
-    for session, command, repetition in product(range(sessions), range(commands), range(repetitions)):
+    for session, command, repetition in product(range(sessions), range(len(twists)), range(repetitions)):
         poses = arc(twists[command] + [0.0, 0.0, drift], STAMPS)
         poses[:, :2] *= scales[session]
         poses += np.outer(STAMPS, pulls[command]) + noise_of(kind, rng)
@@ -166,7 +169,7 @@ def noise_of(kind: str, rng: np.random.Generator) -> Array:
         errors[0] = extra[0] * [1.0, 1.0, 1.75]
     elif kind == "walk":
         errors[1:] += 0.5 * np.cumsum(np.sqrt(np.diff(STAMPS))[:, None] * extra, axis=0)
-    elif kind == "bias":
+    elif kind in ("bias", "turn"):
         errors[1:] += extra[0]
     return UNITS * errors
 
@@ -277,6 +280,8 @@ def main() -> None:
     parser.add_argument("--doubt", type=float, default=sandwich.DOUBT)
     parser.add_argument("--table", action="store_true", help="only print the table")
     arguments = parser.parse_args()
+    if arguments.doubt != sandwich.DOUBT and any(case.method != "closed_form" for case in cases(arguments.only)):
+        parser.error('--doubt is closed_form\'s alone: add --only closed_form, or --only "closed_form sessions"')
     chosen, rows = cases(arguments.only), read_rows(arguments.out)
     if not arguments.table:
         done = {(row.case, row.seed) for row in rows}

@@ -18,6 +18,7 @@ import numpy as np
 import omnibench.fit.uncertainty.sandwich as module
 from omnibench.data.dataset import Trajectory
 from omnibench.registry import costs
+from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
 
@@ -43,7 +44,9 @@ def ratios(draw: Callable[[int], Array], density: float, count: int, draws: int)
         errors, jacobian = np.zeros((count, 3)), np.zeros((count, 3, 1))
         errors[:, 2], jacobian[:, 2] = draw(count), 1.0
         errors[:, 2] -= np.median(errors[:, 2])
-        hessian = module.scores_of_runs(objective, odometry, errors, jacobian, runs).hessians.sum()
+        hessian = module.scores_of_runs(
+            objective, odometry, errors, jacobian, runs, Noise(pose_heading=1.0)
+        ).hessians.sum()
         found.append(2 * density / hessian)  # the Hessian is twice the density that the kernel estimates
     return np.array(found)
 

@@ -60,6 +60,14 @@ def test_degrees_of_freedom_of_another_size_fail_the_run() -> None:
     assert result.vector is None
 
 
+@pytest.mark.parametrize("freedom", [np.nan, 0.0, -3.0])
+def test_variances_without_degrees_of_freedom_make_an_answer_invalid(freedom: float) -> None:
+    result = run(lambda problem: Solution(problem.start, "done", degrees_of_freedom=freedom))
+    assert result.outcome is Outcome.INVALID
+    assert result.reason == f"degrees_of_freedom of the answer's variances must be above 0, found {freedom:g}"
+    assert (result.vector, result.degrees_of_freedom) == (None, None)
+
+
 def test_an_answer_at_a_limit_of_the_calibrators_own_has_not_converged() -> None:
     result = run(lambda problem: Solution(problem.start, "5 rounds", converged=False))
     assert (result.outcome, result.reason) == (Outcome.BUDGET, "5 rounds")

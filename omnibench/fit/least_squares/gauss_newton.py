@@ -11,6 +11,7 @@ from scipy.optimize import lsq_linear
 
 from omnibench.errors import DataError
 from omnibench.fit.least_squares.nuisances import Nuisances, Weighting
+from omnibench.fit.least_squares.roots import roots_of
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
 from omnibench.fit.least_squares.whitened import Whitened
 from omnibench.fit.problem import CalibrationProblem
@@ -25,7 +26,6 @@ _MOST_HALVINGS = 8  # lengths of one step that are tried, each half the one befo
 _SHARES = (1.0, 0.3, 0.0)  # parts of the nuisances' step that every run tries
 # Decrease of chi2 that ends the steps with free nuisances: absolute, and as a share of chi2.
 _NO_GAIN, _NO_SHARE = 1e-2, 1e-5
-_RANK = 1e-12  # share of the largest eigenvalue of the information below which a direction is undetermined: rounding
 _ROUNDING = 1e-12  # share of chi2: an increase that is no increase
 _ROOM = 1e-9  # share of the box: lsq_linear needs an interior, and the vector is clipped afterwards
 
@@ -157,14 +157,13 @@ def bounded_step(problem: CalibrationProblem, vector: Array, information: Array,
     if not free.any():
         return step
     unit = (problem.upper - problem.lower)[free]
-    values, directions = np.linalg.eigh(information[np.ix_(free, free)] * np.outer(unit, unit))
-    known = values > _RANK * max(float(values[-1]), 0.0)
-    roots, directions = np.sqrt(values[known]), directions[:, known]
-    target = -(directions.T @ (score[free] * unit)) / roots
-    inner = directions @ (target / roots)
+    information = information[np.ix_(free, free)] * np.outer(unit, unit)
+    roots = roots_of(information)
+    target = -roots.T @ (score[free] * unit)
+    inner = roots @ target
     low, high = ((bound - vector)[free] / unit for bound in (problem.lower, problem.upper))
-    if ((inner < low) | (inner > high)).any() and known.any():
+    if ((inner < low) | (inner > high)).any() and roots.size:
         bounds = (np.minimum(low, 0.0) - _ROOM, np.maximum(high, 0.0) + _ROOM)
-        inner = lsq_linear(roots[:, None] * directions.T, target, bounds=bounds, tol=1e-12).x
+        inner = lsq_linear(roots.T @ information, target, bounds=bounds, tol=1e-12).x
     step[free] = inner * unit
     return step

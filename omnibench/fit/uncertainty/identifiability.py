@@ -10,6 +10,7 @@ from omnibench.config import Model
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.least_squares.noise import NoiseEstimate
+from omnibench.fit.least_squares.roots import roots_of
 from omnibench.fit.linear_fit import linear_fit
 from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.fit.span import DrivenSpan, State, driven_span, unidentified_directions, wheel_directions
@@ -30,7 +31,6 @@ ROWS = ("x", "y", "heading")
 # same of three recordings (tests/benchmarks/constants_fit.py).
 LARGEST_DEVIATION = 0.10
 _OPEN = 1e-14  # share of the largest eigenvalue of the information: less is rounding, and the direction is open
-_RANK = 1e-12  # share of the largest eigenvalue of the parameters' information: less is the rounding of its derivatives
 
 
 class DirectionIdentifiability(Model):
@@ -177,8 +177,7 @@ def _parameters(robot: Robot, span: DrivenSpan, information: Array) -> tuple[Par
     """Identifiability of the physical parameters if the matrix is unknown along unidentified directions."""
     kept = unidentified_directions(robot, span)
     identified, slopes, geometry = identified_parameters(robot, kept), known_slopes(robot, kept), WheelGeometry(robot)
-    covariance = np.linalg.pinv(slopes.T @ information @ slopes, rcond=_RANK, hermitian=True)
-    deviations = geometry.scale * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    deviations = geometry.scale * np.linalg.norm(roots_of(slopes.T @ information @ slopes), axis=1)
     return tuple(
         ParameterIdentifiability(
             name=name,

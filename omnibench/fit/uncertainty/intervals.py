@@ -22,7 +22,7 @@ class EstimatedCovariance:
     degrees_of_freedom: Array | float = np.inf
 
     def of(self, slopes: Array) -> EstimatedCovariance:
-        """That of q functions of the numbers, with derivatives (q, n).
+        """Covariance of q functions of the numbers, with derivatives (q, n), and degrees of freedom of their variances.
 
         The reciprocal of a function's degrees of freedom is the mean of those of the numbers, weighted by their shares
         in its variance: what depends on one number has that number's, and numbers that agree give theirs.

@@ -28,11 +28,13 @@ from omnibench.fit.uncertainty.sandwich import Sandwich, Scores, sandwich, score
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
-# The check that an answer is a minimum says the same with half of each of these numbers and with twice
+# The check that an answer is a minimum says the same with half of _MOST_STEPS and _NO_GAIN and with twice
 # (tests/benchmarks/constants_fit.py).
 _MOST_STEPS = 20  # steps
 _NO_GAIN = 1e-4  # relative decrease of the cost that ends the steps
-_LEAST_LEFT = 0.25  # share of the errors' numbers beyond those fitted: first order in p/n says nothing below it; chosen
+# Share of the errors' numbers beyond those fitted at which the correction of the curvature stops: first order in p/n
+# says nothing below it. Chosen; no study has a cost that leaves so few.
+_LEAST_LEFT = 0.25
 _NO_ERROR = 1e-9  # m, rad: a smaller cost is rounding
 
 
@@ -45,11 +47,12 @@ class Uncertainty:
     """Uncertainty of a calibration, given that the values it kept are right.
 
     covariance (3N, 3N): the elements' covariance, row by row, m and rad per rad of wheel. Rows and columns of elements
-    that are held at their start or lie on a bound are zero, and so is the variance along directions of wheel rates that
-    were kept at the design values. standard_deviations (3, N). intervals: 95 %, by Student's t. parameters: the wheels'
+    that are held at their start are zero, with scatter as the basis also of those on a bound, and so is the variance
+    along directions of wheel rates that were kept at the design values.
+    standard_deviations (3, N). intervals: 95 %, by Student's t. parameters: the wheels'
     geometry, if it was searched or follows from the matrix (three omni wheels); a parameter that the data do not
     identify has no standard deviation. noise: the reference poses'. basis: likelihood (the calibrator's own covariance)
-    or scatter of the runs. degrees_of_freedom: of the scatter. source: the data behind it, in words.
+    or scatter of the runs. source: the data behind it, in words.
     """
 
     covariance: Array
@@ -58,7 +61,6 @@ class Uncertainty:
     parameters: tuple[ParameterEstimate, ...] | None
     noise: Noise
     basis: Literal["likelihood", "scatter"]
-    degrees_of_freedom: int | None
     source: str
 
 
@@ -74,7 +76,8 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     """
     if result.matrix is None or result.vector is None:
         raise NoCovarianceError(f"no covariance without an answer: {result.reason}")
-    scatter = _by_scatter(problem, result) if result.covariance is None else None
+    noise = result.noise or noise_of_matrix(problem.trajectories, result.matrix, problem.integration).noise
+    scatter = _by_scatter(problem, result, noise) if result.covariance is None else None
     if scatter is not None:
         of_vector = EstimatedCovariance(scatter.covariance, scatter.effective_freedom)
     else:
@@ -88,14 +91,13 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
         standard_deviations=of_elements.standard_deviations.reshape(result.matrix.shape),
         intervals=ElementIntervals(result.matrix - reach, result.matrix + reach),
         parameters=_parameters(problem, result, of_vector, of_elements),
-        noise=result.noise or noise_of_matrix(problem.trajectories, result.matrix, problem.integration).noise,
+        noise=noise,
         basis="likelihood" if scatter is None else "scatter",
-        degrees_of_freedom=None if scatter is None else scatter.degrees_of_freedom,
         source="the calibrator's own (see its reason)" if scatter is None else scatter.words,
     )
 
 
-def _by_scatter(problem: CalibrationProblem, result: RunResult) -> Sandwich:
+def _by_scatter(problem: CalibrationProblem, result: RunResult, noise: Noise) -> Sandwich:
     """Sandwich covariance (n, n) of the vector."""
     objective = problem.objective
     assert result.vector is not None and result.matrix is not None  # noqa: PT018 (uncertainty_of has checked)
@@ -111,10 +113,10 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult) -> Sandwich:
             "no covariance: the answer fits the runs exactly, and their scatter about it is what a covariance rests on"
         )
     try:
-        scores = _scores(problem, objective, result.vector, free)
+        scores = _scores(problem, objective, result.vector, free, noise)
         numbers = len(problem.trajectories) * sum(map(bool, objective.weights))
         answer = sandwich(_less_curved(scores, numbers))
-        _check_minimum(problem, objective, result.vector, free, scores)
+        _check_minimum(problem, objective, result.vector, free, scores, noise)
     except NoCovarianceError:
         raise
     except DataError as error:
@@ -125,13 +127,15 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult) -> Sandwich:
     return replace(answer, covariance=covariance, effective_freedom=freedom)
 
 
-def _scores(problem: CalibrationProblem, objective: SumOfNorms, vector: Array, free: NDArray[np.bool_]) -> Scores:
+def _scores(
+    problem: CalibrationProblem, objective: SumOfNorms, vector: Array, free: NDArray[np.bool_], noise: Noise
+) -> Scores:
     """Score vectors of the runs in the free numbers, at a vector (n,)."""
     matrix = problem.matrix(vector)
     errors = problem.odometry.poses(matrix[None])[0] - problem.reference
     slopes = problem.parameterisation.slopes(vector)[:, free]
     jacobian = problem.odometry.jacobian(matrix).reshape(len(errors), 3, -1) @ slopes
-    return scores_of_runs(objective, problem.odometry, errors, jacobian, problem.trajectories)
+    return scores_of_runs(objective, problem.odometry, errors, jacobian, problem.trajectories, noise)
 
 
 def _less_curved(scores: Scores, numbers: int) -> Scores:
@@ -145,7 +149,12 @@ def _less_curved(scores: Scores, numbers: int) -> Scores:
 
 
 def _check_minimum(
-    problem: CalibrationProblem, objective: SumOfNorms, vector: Array, free: NDArray[np.bool_], scores: Scores
+    problem: CalibrationProblem,
+    objective: SumOfNorms,
+    vector: Array,
+    free: NDArray[np.bool_],
+    scores: Scores,
+    noise: Noise,
 ) -> None:
     """Raise NoCovarianceError if steps to a lower cost lead farther than a standard deviation, as estimated there."""
     better, cost = vector, float(problem.values(vector[None])[0])
@@ -156,7 +165,7 @@ def _check_minimum(
         if not value < cost * (1 - _NO_GAIN):
             break
         better, cost = moved, value
-        scores = _scores(problem, objective, better, free)
+        scores = _scores(problem, objective, better, free, noise)
     deviations = np.sqrt(np.maximum(np.diag(sandwich(scores).covariance), 0.0))
     away = np.abs(better - vector)[free]
     count = float(np.max(away[deviations > 0] / deviations[deviations > 0], initial=0.0))

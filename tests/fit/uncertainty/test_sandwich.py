@@ -9,8 +9,10 @@ import pytest
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
+from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.fit.uncertainty.sandwich import Scores, sandwich, scores_of_runs
 from omnibench.registry import costs
+from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
 
@@ -29,7 +31,7 @@ def scores_of_a_mean(values: Array, runs: Sequence[Trajectory]) -> Scores:
     """Scores of the mean (n,) of values (Z, n): the minimiser of sum_i |x_i - m|^2 / 2Z."""
     count, size = values.shape
     hessians = np.tile(np.eye(size) / count, (count, 1, 1))
-    return Scores((values.mean(axis=0) - values) / count, hessians, runs, np.zeros(size))
+    return Scores((values.mean(axis=0) - values) / count, hessians, runs, np.zeros(size), hessians)
 
 
 VALUES = np.random.default_rng(3).standard_normal((12, 2)) @ np.array([[1.0, 0.5], [0.0, 2.0]])
@@ -38,7 +40,6 @@ VALUES = np.random.default_rng(3).standard_normal((12, 2)) @ np.array([[1.0, 0.5
 def test_without_repetitions_a_mean_has_the_sample_covariance_over_the_number_of_runs() -> None:
     found = sandwich(scores_of_a_mean(VALUES, runs_of([None] * 12)))
     np.testing.assert_allclose(found.covariance, np.cov(VALUES.T) / 12, rtol=1e-12)
-    assert found.degrees_of_freedom == 11
     np.testing.assert_allclose(found.effective_freedom, 11.0)
     assert not found.lack_of_fit
 
@@ -48,7 +49,6 @@ def test_with_repetitions_a_mean_has_the_scatter_within_its_commands_alone() -> 
     found = sandwich(scores_of_a_mean(apart, runs_of(["a"] * 4 + ["b"] * 4 + ["c"] * 4)))
     within = sum(4 * np.cov(VALUES[first : first + 4].T) for first in (0, 4, 8))
     np.testing.assert_allclose(found.covariance, within / 12**2, rtol=1e-12)
-    assert found.degrees_of_freedom == 9
     np.testing.assert_allclose(found.effective_freedom, 9.0)
 
 
@@ -58,7 +58,6 @@ def test_commands_that_scatter_more_than_their_repetitions_are_the_clusters() ->
     found = sandwich(scores_of_a_mean(values, runs_of([name for name in "abcdef" for _ in range(2)])))
     means = values.reshape(6, 2).mean(axis=1)
     np.testing.assert_allclose(found.covariance, [[means.var(ddof=1) / 6]], rtol=1e-9)
-    assert found.degrees_of_freedom == 5
     assert found.lack_of_fit
     assert "the scatter between 6 commands" in found.words
 
@@ -95,7 +94,8 @@ def test_in_no_direction_clusters_make_the_covariance_smaller_than_repetitions_d
 def test_a_direction_in_which_the_cost_is_flat_has_no_variance() -> None:
     flat = np.array([[1.0, 1.0], [1.0, 1.0]]) / 12
     scores = (VALUES[:, :1].mean() - VALUES[:, :1]) * np.array([[1.0, 1.0]]) / 12
-    found = sandwich(Scores(scores, np.tile(flat, (12, 1, 1)), runs_of([None] * 12), np.zeros(2)))
+    hessians = np.tile(flat, (12, 1, 1))
+    found = sandwich(Scores(scores, hessians, runs_of([None] * 12), np.zeros(2), hessians))
     difference = np.array([1.0, -1.0])
     assert difference @ found.covariance @ difference == pytest.approx(0.0, abs=1e-15)
     total = np.array([1.0, 1.0])
@@ -110,21 +110,75 @@ def test_commands_repeated_unequally_have_the_degrees_of_freedom_of_welch_and_sa
 
 def test_a_line_with_one_far_point_has_the_degrees_of_freedom_of_bell_and_mccaffrey() -> None:
     """From the residual maker I - X (X'X)^-1 X' of a line through five points, as Imbens and Kolesar write it."""
-    columns = np.column_stack([np.ones(5), [0.0, 1.0, 2.0, 3.0, 14.0]])
+    columns = np.column_stack([np.ones(5), [0.0, 1.0, 2.0, 3.0, 9.0]])
     inverse = np.linalg.inv(columns.T @ columns)
     values = np.array([0.3, -0.2, 0.5, 0.1, -0.4])
     maker = np.eye(5) - columns @ inverse @ columns.T
     scores = -columns * (maker @ values)[:, None]
-    found = sandwich(Scores(scores, np.einsum("zi,zj->zij", columns, columns), runs_of([None] * 5), np.zeros(2)))
-    corrected = (maker @ values) / np.sqrt(np.maximum(np.diag(maker), 0.05))
+    hessians = np.einsum("zi,zj->zij", columns, columns)
+    found = sandwich(Scores(scores, hessians, runs_of([None] * 5), np.zeros(2), hessians))
+    corrected = (maker @ values) / np.sqrt(np.diag(maker))
     weights = inverse @ columns.T
     np.testing.assert_allclose(np.diag(found.covariance), np.square(weights) @ np.square(corrected), rtol=1e-9)
     for number in range(2):
-        shares = weights[number] / np.sqrt(np.maximum(np.diag(maker), 0.05))
+        shares = weights[number] / np.sqrt(np.diag(maker))
         spread = np.outer(shares, shares) * maker
         freedom = np.trace(spread) ** 2 / np.square(spread).sum()
         assert found.effective_freedom[number] == pytest.approx(max(freedom, 1.0))
-    assert found.effective_freedom.max() < 3 < found.degrees_of_freedom + 1
+    assert found.effective_freedom.max() < 3
+
+
+def fitted(columns: Sequence[Array], values: Sequence[Array], commands: Sequence[str | None]) -> tuple[Array, Scores]:
+    """The least-squares estimate (n,) of runs with columns (k, n) and values (k,), and its scores."""
+    hessians = np.array([of_run.T @ of_run for of_run in columns])
+    answer = np.linalg.solve(hessians.sum(axis=0), sum(a.T @ b for a, b in zip(columns, values, strict=True)))
+    scores = np.array([a.T @ (a @ answer - b) for a, b in zip(columns, values, strict=True)])
+    return answer, Scores(scores, hessians, runs_of(commands), np.zeros(len(answer)), hessians)
+
+
+@pytest.mark.parametrize("commands", [[None] * 8, ["turn", *"aabbccd"]])
+@pytest.mark.parametrize("weak", [0.0, 0.05])
+def test_a_direction_that_one_run_alone_determines_has_the_variance_of_the_noise(
+    commands: Sequence[str | None], weak: float
+) -> None:
+    """Unit noise: the mean of the stated variances is that of least squares, with and without a bounded correction."""
+    rng = np.random.default_rng(7)
+    columns = [np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])] + [np.array([[1.0, 0.0], [1.0, weak]])] * 7
+    stated, hits = [], []
+    for _ in range(600):
+        answer, scores = fitted(columns, [rng.standard_normal(len(of_run)) for of_run in columns], commands)
+        found = sandwich(scores)
+        stated.append(np.diag(found.covariance))
+        hits.append(np.abs(answer) < EstimatedCovariance(found.covariance, found.effective_freedom).reach)
+    truth = np.diag(np.linalg.inv(scores.hessians.sum(axis=0)))
+    np.testing.assert_allclose(np.mean(stated, axis=0), truth, rtol=0.08)
+    assert (np.mean(hits, axis=0) > 0.93).all()
+    assert found.effective_freedom.max() <= 7.0
+    assert "directions that one run alone determines" in found.words
+
+
+def test_runs_that_each_determine_a_direction_alone_do_not_scatter() -> None:
+    _, scores = fitted([np.eye(2)[:1], np.eye(2)[1:]], [np.ones(1), np.ones(1)], [None, None])
+    with pytest.raises(DataError, match="every direction is determined by one run alone"):
+        sandwich(scores)
+
+
+def test_commands_scatter_more_than_repetitions_that_agree_exactly() -> None:
+    values = np.repeat([-30.0, -7.0, 2.0, 5.0, 11.0, 19.0], 2)[:, None]
+    found = sandwich(scores_of_a_mean(values, runs_of([name for name in "abcdef" for _ in range(2)])))
+    np.testing.assert_allclose(found.covariance, [[values[::2].var(ddof=1) / 6]], rtol=1e-9)
+    assert "6 commands, more than the repetitions, which agree exactly" in found.words
+    assert found.lack_of_fit
+
+
+def test_repetitions_of_few_commands_that_agree_exactly_do_not_scatter() -> None:
+    with pytest.raises(DataError, match="the repetitions agree exactly"):
+        sandwich(scores_of_a_mean(np.repeat([1.0, 2.0, 6.0], 2)[:, None], runs_of([*"aabbcc"])))
+
+
+def test_too_few_commands_to_tell_whether_they_scatter_are_named() -> None:
+    found = sandwich(scores_of_a_mean(VALUES, runs_of(["a"] * 4 + ["b"] * 4 + ["c"] * 4)))
+    assert found.words.endswith("; 3 commands are too few to tell whether they scatter more")
 
 
 def test_as_many_numbers_as_the_runs_can_hold_have_no_scatter() -> None:
@@ -137,7 +191,7 @@ def scores_of_norms(cost: str, errors: Array, jacobian: Array) -> Scores:
     runs = runs_of([None] * len(errors))
     odometry = OdometryBatch([run.final_log for run in runs], "arc")
     objective = costs.create(cost)
-    return scores_of_runs(objective, odometry, errors, jacobian, runs)
+    return scores_of_runs(objective, odometry, errors, jacobian, runs, Noise(pose_position=0.1, pose_heading=0.1))
 
 
 def test_the_scores_are_the_gradient_and_the_hessians_the_curvature_of_the_norms() -> None:
@@ -183,7 +237,9 @@ def test_commands_that_scatter_as_their_repetitions_do_are_seldom_taken_for_a_la
         values = rng.standard_normal(15)
         left = values - columns @ np.linalg.lstsq(columns, values)[0]
         hessians = np.einsum("zi,zj->zij", columns, columns)
-        misfits += sandwich(Scores(-columns * left[:, None], hessians, runs_of(commands), np.zeros(3))).lack_of_fit
+        misfits += sandwich(
+            Scores(-columns * left[:, None], hessians, runs_of(commands), np.zeros(3), hessians)
+        ).lack_of_fit
     assert misfits <= 4
 
 
