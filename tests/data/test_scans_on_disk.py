@@ -338,7 +338,6 @@ _LONG = """
 import resource, sys
 from dataclasses import replace
 import numpy as np
-from timing import PATIENCE
 from omnibench.data.scans import Scanner, Scans, TrajectoryScans
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.testing.synthetic import synthetic_dataset

@@ -175,8 +175,15 @@ def test_a_searched_geometry_cannot_keep_it_and_says_so() -> None:
 
 def test_progress_is_shown(dataset: Dataset) -> None:
     shown: list[Progress] = []
-    calibrate(dataset, "crs", budget=Budget(evaluations=500), watch=shown.append)
-    assert {event.task for event in shown} == {"crs"}
+
+    def enough(event: Progress) -> None:
+        shown.append(event)
+        if len(shown) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        calibrate(dataset, "random_search", budget=Budget(evaluations=10**9), watch=enough)
+    assert {event.task for event in shown} == {"random_search"}
     assert [event.done for event in shown] == sorted(event.done for event in shown)
 
 
