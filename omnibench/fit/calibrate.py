@@ -65,7 +65,8 @@ def calibrate(
 ) -> CalibrationRun:
     """Fit the odometry model of a data set's training split.
 
-    intervals: also draw bootstrap intervals about the optimum (closed_form only).
+    intervals: also draw bootstrap intervals about the optimum (closed_form only), unless runs are too few for a
+    covariance, of which a warning tells.
     unidentified: for motions that the data drive so little that slip alone may explain them, ``keep`` the design values
     or ``fit`` them (see make_parameterisation). The run's warnings name them.
     watch: told the evaluations and the best cost so far, at most every 0.1 s.
@@ -127,7 +128,7 @@ def calibrate(
             reason=result.reason,
         ),
     )
-    drawn = bootstrap_intervals(problem, result.vector, rng=problem.rng) if intervals else None
+    drawn = bootstrap_intervals(problem, result.vector, rng=problem.rng) if intervals and uncertainty else None
     geometry = problem.parameterisation.name == "geometry"
     parameters = fitted_parameters(dataset.robot, result.vector) if geometry else None
     return CalibrationRun(calibration, result, drawn, parameters, uncertainty, (*warnings, *doubts))

@@ -91,6 +91,7 @@ def run_jobs(jobs: Iterable[Job[T]], store: ResultStore[T], backend: Backend, wa
     system, which lacked memory; a person) may be gone by then. A job that raised, was over its time or memory limit, or
     crashed would do so again. Whatever ``watch`` raises ends the work.
     """
+    store = replace(store, folder=store.folder.absolute())  # a job may change its working folder
     waiting = _not_stored(jobs, store, watch)
     for tried in range(1, _TRIES + 1):
         killed: list[tuple[int, Job[T]]] = []

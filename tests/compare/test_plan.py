@@ -112,6 +112,10 @@ COMPARISONS = [path for path in sorted(CONFIGS.glob("*.yaml")) if "calibrators:"
             ["box: lower bound 1 of m11 is above its upper bound -1"],
         ),
         ({"calibrators": ["crs", "crs"]}, ["two entries are called 'crs'; give one a label of its own"]),
+        (
+            {"calibrators": [{"name": "crs", "label": "a\u00a0b"}]},
+            ["calibrators.0.label: contains characters that cannot"],
+        ),
         ({"calibrators": [{"name": "crs", "label": "x" * 61}]}, ["calibrators.0.label: String should have at most 60"]),
         ({"bootstrap": {"resamples": 10**9}}, ["bootstrap.resamples: Input should be less than or equal to 100000"]),
         ({"datasets": {"flower": {"path": "nowhere"}}}, ["nowhere: no such folder; a data set is a folder with"]),

@@ -151,6 +151,13 @@ def test_a_search_that_stops_far_from_the_minimum_has_no_covariance_and_says_why
     assert run.warnings[0].endswith(" standard deviations away); search longer or take another calibrator")
 
 
+def test_runs_that_are_fitted_exactly_have_no_intervals(dataset: Dataset) -> None:
+    few = make_dataset("few", dataset.robot, dataset.sample_period, dataset.split("train")[:2])
+    run = calibrate(few, intervals=True)
+    assert run.uncertainty is None
+    assert run.intervals is None
+
+
 @pytest.mark.parametrize("calibrator", ["closed_form", "crs"])
 def test_what_the_data_do_not_identify_is_kept_and_told(calibrator: str) -> None:
     runs = driven(RING, slip=0.02)

@@ -103,6 +103,11 @@ def killed(order: tuple[Path, signal.Signals], _: Reporter) -> Answer:
     raise AssertionError
 
 
+def elsewhere(folder: Path, _: Reporter) -> Answer:
+    os.chdir(folder)
+    return Answer(3)
+
+
 def out_of_its_own_time(_: Any, __: Reporter) -> Answer:
     raise TimeoutError("the map's server does not answer")
 
@@ -243,6 +248,12 @@ class TestEveryBackend:
         run(tmp_path, jobs_of(squared, range(3)), backend)
         assert os.environ["OMP_NUM_THREADS"] == "7"
         assert "OPENBLAS_NUM_THREADS" not in os.environ
+
+
+def test_a_job_may_change_its_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "other").mkdir()
+    assert run(Path("results"), jobs_of(elsewhere, [tmp_path / "other"]), Processes(1)).answers() == {0: 3}
 
 
 def test_every_job_has_a_process_of_one_thread(tmp_path: Path) -> None:
