@@ -22,13 +22,12 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
-def _printable(text: str) -> str:
+def printable(text: str) -> str:
+    """The text. ValueError: it holds characters that no terminal shows."""
     if not text.isprintable():
         raise ValueError("contains characters that cannot be printed, such as tabs or no-break spaces")
     return text
 
-
-Printable = Annotated[str, AfterValidator(_printable)]
 
 CHOSEN = "@"  # marks a union member's tag in a pydantic location; what follows it is no key of the document
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field, field_validator
 
-from omnibench.config import Model, Positive, Printable, RelativePath
+from omnibench.config import Model, Positive, RelativePath, printable
 from omnibench.data.dataset import Split
 from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
 from omnibench.fit.problem import Budget
@@ -28,7 +28,7 @@ class CalibratorEntry(Model):
     """One entry of the comparison: a calibrator with its options."""
 
     name: str = Field(description="a calibrator, see omnibench list")
-    label: Annotated[Printable, Field(min_length=1, max_length=60)] | None = Field(
+    label: Annotated[str, Field(min_length=1, max_length=60), AfterValidator(printable)] | None = Field(
         None, description="what tables call it; default: the name and, if it differs, the box"
     )
     options: dict[str, Any] = {}

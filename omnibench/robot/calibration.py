@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import AfterValidator, Field, FiniteFloat, model_validator
 
-from omnibench.config import Model, NonNegative, Positive, Printable, parse_yaml, read_yaml, to_yaml, validate
+from omnibench.config import Model, NonNegative, Positive, parse_yaml, printable, read_yaml, to_yaml, validate
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import write_text
 from omnibench.robot.effects.term import make_term
@@ -64,7 +64,7 @@ class Calibration(Model):
     """The content of a calibration file."""
 
     format: Literal["omnibench-calibration/1"] = FORMAT
-    name: Printable
+    name: Annotated[str, AfterValidator(printable)]
     created: datetime = Field(default_factory=lambda: datetime.now(UTC).replace(microsecond=0))
     robot: Robot
     sample_period: Positive = Field(description="s")
