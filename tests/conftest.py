@@ -11,6 +11,10 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+
+# Before numpy is loaded. On small matrices threads of BLAS only wait for each other when several tests run at once.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import real_recordings
 import shared_results
 from commands import Command, Prepared, commands_of_this_process, prepare, registries_restored

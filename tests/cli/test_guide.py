@@ -138,5 +138,5 @@ def test_the_readme_is_short_and_holds_the_test_command_that_ci_looks_for() -> N
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     assert len(lines) <= 120
     assert [line for line in lines if re.match(r"^    pip install .*\[test\]", line)] == [
-        '    pip install -e ".[test]" && pytest -n 2'
+        '    pip install -e ".[test]" && pytest -n 4'
     ]

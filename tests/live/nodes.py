@@ -15,7 +15,7 @@ import yaml
 import zenoh
 from commands import COMMAND, ENVIRONMENT
 from drives import calibration
-from sessions import free_port, raw_session
+from sessions import free_port, raw_session, until
 from timing import PATIENCE
 
 from omnibench.config import to_yaml
@@ -100,8 +100,18 @@ class Command:
 
 
 def asked(session: zenoh.Session, selector: str, payload: str | bytes | None = None) -> Any:
-    """The one answer to a query: its JSON, with ``error`` in it when it was refused."""
-    (reply,) = list(session.get(selector, payload=payload, timeout=PATIENCE))
+    """The one answer to a query: its JSON, with ``error`` in it when it was refused.
+
+    Asked again as long as nobody is there to answer: a node's port is open a little before it is ready.
+    """
+    replies: list[zenoh.Reply] = []
+
+    def answered() -> bool:
+        replies.extend(session.get(selector, payload=payload, timeout=PATIENCE))
+        return bool(replies)
+
+    until(answered, f"an answer to {selector}")
+    (reply,) = replies
     answer = reply.ok if reply.ok is not None else reply.err
     assert answer is not None
     return json.loads(answer.payload.to_bytes())
