@@ -1,91 +1,24 @@
-"""Many independent jobs: results as files, limits, workers that die, and clear ends."""
+"""Many independent jobs: what every backend promises, limits, workers that die, and clear ends."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from timing import PATIENCE
+from job_samples import Answer, Notes, jobs_of, run, squared, tried
 
 from omnibench.errors import DataError
-from omnibench.jobs.job import Backend, Failure, Job, JobWatch, run_jobs
+from omnibench.jobs.job import Backend, Failure, Job, run_jobs
 from omnibench.jobs.local_backends import InPlace, Processes, local_backend
-from omnibench.jobs.result_store import ResultStore, content_key
+from omnibench.jobs.result_store import ResultStore
 from omnibench.progress import Progress, Reporter
-from omnibench.robot.kinematics import JsonArray
-
-
-@dataclass(frozen=True)
-class Answer:
-    """Result of the jobs here."""
-
-    number: int
-    process: int = 0
-    threads: str | None = None
-
-
-class Notes(JobWatch[Answer]):
-    """Notes what a backend says."""
-
-    def __init__(self) -> None:
-        self.began_numbers: list[int] = []
-        self.moves: list[tuple[int, Progress]] = []
-        self.endings: dict[int, Answer | Failure] = {}
-        self.reused: set[int] = set()
-
-    def began(self, number: int) -> None:
-        self.began_numbers.append(number)
-
-    def moved(self, number: int, event: Progress) -> None:
-        self.moves.append((number, event))
-
-    def ended(self, number: int, ending: Answer | Failure, reused: bool) -> None:
-        assert number not in self.endings
-        self.endings[number] = ending
-        self.reused |= {number} if reused else set()
-
-    def answers(self) -> dict[int, int]:
-        """The numbers of the answers; a failure shows itself."""
-        return {number: getattr(ending, "number", ending) for number, ending in sorted(self.endings.items())}  # type: ignore[misc]
-
-    def reason(self, number: int = 0) -> str:
-        failure = self.endings[number]
-        assert isinstance(failure, Failure)
-        return failure.reason
-
-
-def run(folder: Path, jobs: Iterable[Job[Answer]], backend: Backend) -> Notes:
-    """Run jobs with the store ``folder``. No process is left behind."""
-    notes = Notes()
-    run_jobs(jobs, ResultStore(folder, Answer), backend, notes)
-    assert not multiprocessing.active_children()
-    return notes
-
-
-def jobs_of(function: Any, arguments: Iterable[Any], **limits: float) -> list[Job[Answer]]:
-    return [Job(f"job-{number}", function, argument, **limits) for number, argument in enumerate(arguments)]
-
-
-def tried(folder: Path, name: str) -> int:
-    """Note that the job ``name`` is tried; how many times it has been, this one included."""
-    with (folder / name).open("a") as file:
-        file.write(".")
-    return (folder / name).stat().st_size
-
-
-def squared(number: int, report: Reporter) -> Answer:
-    report(Progress("squaring", number))
-    return Answer(number * number, os.getpid(), os.environ.get("OPENBLAS_NUM_THREADS"))
 
 
 def two_is_wrong(number: int, _: Reporter) -> Answer:
@@ -178,8 +111,6 @@ def with_jobs_of_its_own(folder: Path, _: Reporter) -> Answer:
     return Answer(len(notes.endings), process, str(os.getpid()))
 
 
-# For programs that import this file.
-IMPORTING_THIS = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
 BACKENDS = [InPlace(), Processes(1), Processes(3)]
 
 
@@ -334,133 +265,3 @@ def test_whatever_the_watch_raises_ends_the_workers(tmp_path: Path) -> None:
         run_jobs([*jobs_of(asleep, [None]), Job("quick", squared, 3)], store, Processes(2), notes)
     assert not multiprocessing.active_children()
     assert notes.endings[1] == store.get("quick")
-
-
-OUT_OF_MEMORY = """
-import os, sys
-from pathlib import Path
-from test_jobs import *
-Path(sys.argv[2], "cgroup.procs").write_text(str(os.getpid()))
-jobs = [*jobs_of(fills_memory, [None]), Job("other", squared, 3)]
-print(run(Path(sys.argv[1]), jobs, Processes(1)).reason(), flush=True)
-"""
-
-
-def fills_memory(_: object, __: Reporter) -> Answer:
-    return Answer(sum(len(block) for block in [b"x" * 10**7 for _ in range(1000)]))
-
-
-@pytest.fixture
-def little_memory_group() -> Iterator[Path]:
-    """A control group of 500 MB for processes."""
-    group, limit = Path("/sys/fs/cgroup/memory/omnibench-test"), "memory.limit_in_bytes"
-    try:
-        group.mkdir(exist_ok=True)
-        (group / limit).write_text(str(500 * 10**6))
-    except OSError:
-        pytest.skip("needs the right to make a control group (version 1)")
-    yield group
-    wait_for(lambda: not (group / "cgroup.procs").read_text())
-    group.rmdir()
-
-
-def test_a_job_that_the_system_kills_for_lack_of_memory_says_so(tmp_path: Path, little_memory_group: Path) -> None:
-    command = [sys.executable, "-c", OUT_OF_MEMORY, str(tmp_path), str(little_memory_group)]
-    done = subprocess.run(command, env=IMPORTING_THIS, capture_output=True, text=True, check=True)
-    how = "killed by SIGKILL: the system was out of memory"
-    assert done.stdout == f"the process died without an answer ({how}) in each of 3 tries\n"
-    assert (tmp_path / "other.json").exists()
-
-
-PROGRAM = """
-import sys
-from pathlib import Path
-from test_jobs import *
-folder = Path(sys.argv[1])
-jobs = [Job("first", squared, 2), Job("second", squared, 3), Job("waits", until_told, folder), Job("third", squared, 4)]
-print(run(folder / "results", jobs, Processes(2)).answers(), flush=True)
-"""
-
-
-def until_told(folder: Path, _: Reporter) -> Answer:
-    count = tried(folder, "waits")
-    while not (folder / "go_on").exists():
-        time.sleep(0.05)
-    return Answer(count)
-
-
-def wait_for(happened: Any) -> None:
-    """Wait for an event."""
-    deadline = time.monotonic() + PATIENCE
-    while not happened():
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.05)
-
-
-def alive(session: int) -> list[str]:
-    """Commands of the processes of a session that have not ended."""
-    listed = subprocess.run(
-        ["ps", "-o", "stat=,args=", "-s", str(session)], capture_output=True, text=True, check=False
-    )
-    return [line for line in listed.stdout.splitlines() if not line.startswith("Z")]
-
-
-def test_when_the_parent_is_killed_no_worker_is_left_and_nothing_that_ended_is_run_again(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
-    parent = subprocess.Popen(command, env=IMPORTING_THIS, start_new_session=True)
-    results = tmp_path / "results"
-    wait_for(lambda: len(list(results.glob("*.json"))) == 3 and (tmp_path / "waits").exists())
-    parent.kill()
-    parent.wait()
-    wait_for(lambda: not alive(parent.pid))
-    before = {file.name: file.stat().st_mtime_ns for file in results.iterdir()}
-    assert set(before) == {"first.json", "second.json", "third.json"}
-    (tmp_path / "go_on").touch()
-    again = subprocess.run(command, env=IMPORTING_THIS, capture_output=True, text=True, check=True)
-    assert again.stdout == "{0: 4, 1: 9, 2: 2, 3: 16}\n"  # the job that waited is in its second try
-    assert before.items() <= {file.name: file.stat().st_mtime_ns for file in results.iterdir()}.items()
-
-
-@dataclass(frozen=True, eq=False)
-class Table:
-    """A result with arrays."""
-
-    values: JsonArray
-    empty: JsonArray | None = None
-
-
-class TestStore:
-    def test_gives_arrays_back_to_the_last_bit(self, tmp_path: Path) -> None:
-        values = np.random.default_rng(5).normal(size=(4, 3, 3)) * 10.0 ** np.arange(-150, 150, 100)
-        values[0, 0] = [np.nan, np.inf, -0.0]
-        store = ResultStore(tmp_path, Table)
-        store.put("key", Table(values))
-        table = store.get("key")
-        assert table is not None
-        assert table.values.tobytes() == values.tobytes()
-        assert table.empty is None
-
-    def test_refuses_what_it_could_not_give_back(self, tmp_path: Path) -> None:
-        store = ResultStore(tmp_path, Answer)
-        with pytest.raises(ValueError, match="number"):
-            store.put("key", Answer("three"))  # type: ignore[arg-type]
-        assert list(tmp_path.iterdir()) == []
-
-    def test_removes_its_files_and_no_others(self, tmp_path: Path) -> None:
-        store = ResultStore(tmp_path / "results", Answer)
-        store.put("key", Answer(1))
-        (tmp_path / "results" / "notes.txt").touch()
-        store.remove()
-        assert [file.name for file in (tmp_path / "results").iterdir()] == ["notes.txt"]
-
-    def test_a_key_changes_with_every_bit_of_what_it_is_made_of(self) -> None:
-        values = np.arange(6.0)
-        keys = [
-            content_key({"table": Table(values), "number": 1}),
-            content_key({"table": Table(np.nextafter(values, 9.0)), "number": 1}),
-            content_key({"table": Table(values.reshape(2, 3)), "number": 1}),
-            content_key({"table": Table(values, values), "number": 1}),
-            content_key({"table": Table(values), "number": 2}),
-        ]
-        assert len(set(keys)) == len(keys)
-        assert keys[0] == content_key({"number": 1, "table": Table(values.copy())})

@@ -1,0 +1,96 @@
+"""Jobs, and a watch that notes what becomes of them."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from timing import PATIENCE
+
+from omnibench.jobs.job import Backend, Failure, Job, JobWatch, run_jobs
+from omnibench.jobs.result_store import ResultStore
+from omnibench.progress import Progress, Reporter
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Result of the jobs here."""
+
+    number: int
+    process: int = 0
+    threads: str | None = None
+
+
+class Notes(JobWatch[Answer]):
+    """Notes what a backend says."""
+
+    def __init__(self) -> None:
+        self.began_numbers: list[int] = []
+        self.moves: list[tuple[int, Progress]] = []
+        self.endings: dict[int, Answer | Failure] = {}
+        self.reused: set[int] = set()
+
+    def began(self, number: int) -> None:
+        self.began_numbers.append(number)
+
+    def moved(self, number: int, event: Progress) -> None:
+        self.moves.append((number, event))
+
+    def ended(self, number: int, ending: Answer | Failure, reused: bool) -> None:
+        assert number not in self.endings
+        self.endings[number] = ending
+        self.reused |= {number} if reused else set()
+
+    def answers(self) -> dict[int, int | Failure]:
+        """The numbers of the answers; a failure shows itself."""
+        return {
+            number: ending.number if isinstance(ending, Answer) else ending
+            for number, ending in sorted(self.endings.items())
+        }
+
+    def reason(self, number: int = 0) -> str:
+        failure = self.endings[number]
+        assert isinstance(failure, Failure)
+        return failure.reason
+
+
+def run(folder: Path, jobs: Iterable[Job[Answer]], backend: Backend) -> Notes:
+    """Run jobs with the store ``folder``. No process is left behind."""
+    notes = Notes()
+    run_jobs(jobs, ResultStore(folder, Answer), backend, notes)
+    assert not multiprocessing.active_children()
+    return notes
+
+
+def jobs_of(function: Any, arguments: Iterable[Any], **limits: float) -> list[Job[Answer]]:
+    return [Job(f"job-{number}", function, argument, **limits) for number, argument in enumerate(arguments)]
+
+
+def tried(folder: Path, name: str) -> int:
+    """Note that the job ``name`` is tried; how many times it has been, this one included."""
+    with (folder / name).open("a") as file:
+        file.write(".")
+    return (folder / name).stat().st_size
+
+
+def squared(number: int, report: Reporter) -> Answer:
+    report(Progress("squaring", number))
+    return Answer(number * number, os.getpid(), os.environ.get("OPENBLAS_NUM_THREADS"))
+
+
+def wait_for(happened: Callable[[], object]) -> None:
+    """Wait for an event."""
+    deadline = time.monotonic() + PATIENCE
+    while not happened():
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.05)
+
+
+# For programs that import the modules here.
+IMPORTING_THIS = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
