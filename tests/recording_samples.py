@@ -7,22 +7,16 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from sample_robots import APR_02
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.scans import ScansInMemory
 from omnibench.data.true_poses import TruePath
-from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
+from omnibench.robot.kinematics import Array, wheel_equations
 from omnibench.robot.path import Path
 from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.chain.lidar import Lidar, measure_scans, scan_stamps
 
-ROBOT = Robot(
-    name="APR-02",
-    wheels=tuple(
-        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(degrees))
-        for name, degrees in zip("abc", (60, 180, 300), strict=True)
-    ),
-)
 COMMANDS = {"straight": (0.2, 0.0), "left": (0.2, 0.35), "right": (0.2, -0.35), "spot": (0.0, 0.35)}
 TICK = 0.2  # rad/s, of the measured rates
 PERIOD = 0.01
@@ -58,10 +52,10 @@ def sample(repetitions: int = 2, duration: float = 3.0, rays: int = 90) -> Sampl
         for repetition in range(repetitions):
             name = f"{command}-{repetition}"
             twist = np.array([speed * math.cos(0.5), speed * math.sin(0.5), turn]) * slower
-            target = np.tile(wheel_equations(ROBOT.wheels) @ twist, (len(times), 1))
+            target = np.tile(wheel_equations(APR_02.wheels) @ twist, (len(times), 1))
             true = 1.02 * target
             ticks = np.floor(np.cumsum(true, axis=0) / TICK)
-            path = Path(times, np.zeros(3), true @ ROBOT.inverse_kinematic_matrix.T * PERIOD, "arc")
+            path = Path(times, np.zeros(3), true @ APR_02.inverse_kinematic_matrix.T * PERIOD, "arc")
             dense = np.append(0.0, times)
             truth[name] = TruePath(dense, path.poses(dense))
             starts[name] = plan.start + np.array([0.05, -0.03, 0.04]) * rng.standard_normal(3)
@@ -88,7 +82,7 @@ def sample(repetitions: int = 2, duration: float = 3.0, rays: int = 90) -> Sampl
                     pose_covariances=np.tile(np.diag(NOISE**2), (len(stamps), 1, 1)),
                 )
             )
-    dataset = make_dataset("in a room", ROBOT, PERIOD, runs, simulated=True, scans=ScansInMemory(lidar.scanner, scans))
+    dataset = make_dataset("in a room", APR_02, PERIOD, runs, simulated=True, scans=ScansInMemory(lidar.scanner, scans))
     return Sample(dataset, truth, plan, starts)
 
 

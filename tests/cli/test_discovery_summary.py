@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -22,8 +23,8 @@ def printed(found: Discovery, width: int = 80) -> str:
 
 
 @pytest.mark.parametrize("make", [named, nothing, nameless, incomplete])
-def test_eighty_columns_are_enough_and_nothing_is_cut(make: object) -> None:
-    told = printed(make())  # type: ignore[operator]
+def test_eighty_columns_are_enough_and_nothing_is_cut(make: Callable[[], Discovery]) -> None:
+    told = printed(make())
     assert max(len(line.rstrip()) for line in told.splitlines()) <= 80
     assert "…" not in told
 

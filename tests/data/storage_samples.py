@@ -11,30 +11,24 @@ from typing import Any, Literal
 import numpy as np
 import polars as pl
 import yaml
+from sample_robots import APR_02
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.robot.kinematics import Robot, Wheel, wheel_equations
+from omnibench.robot.kinematics import wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
 Format = Literal["parquet", "csv"]
 FORMATS: tuple[Format, ...] = ("parquet", "csv")
-ROBOT = Robot(
-    name="APR-02",
-    wheels=tuple(
-        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle))
-        for name, angle in zip("abc", (60, 180, 300), strict=True)
-    ),
-)
 
 
 def a_trajectory(identity: str, turn: float, **known: Any) -> Trajectory:
     """Four samples of 0.1 s as the design drives them; poses at 0, 0.2 and 0.4 s."""
     times = 0.1 * np.arange(1, 5)
-    rates = np.tile(wheel_equations(ROBOT.wheels) @ [0.2, 0.1, turn], (4, 1))
+    rates = np.tile(wheel_equations(APR_02.wheels) @ [0.2, 0.1, turn], (4, 1))
     stamps = np.array([0.0, 0.2, 0.4])
     start = np.array([1 / 3, -0.2, 1.0])
-    (poses,) = OdometryModel.of_design(ROBOT, "arc").poses([WheelLog(times, rates, start, stamps)])
+    (poses,) = OdometryModel.of_design(APR_02, "arc").poses([WheelLog(times, rates, start, stamps)])
     defaults: dict[str, Any] = {"split": "train"}
     return Trajectory(identity, times=times, rates=rates, pose_times=stamps, poses=poses, **(defaults | known))
 
@@ -65,7 +59,7 @@ def everything_known() -> Dataset:
         )
     return make_dataset(
         "two runs",
-        ROBOT,
+        APR_02,
         0.1,
         runs,
         description="as designed; with commas, 'quotes' and ü",

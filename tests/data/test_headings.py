@@ -9,32 +9,26 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sample_robots import APR_02
 
 from omnibench.data.dataset import Trajectory, make_dataset
 from omnibench.data.headings import unwrap
-from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
+from omnibench.robot.kinematics import Array, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
 TURN = 2 * math.pi
-ROBOT = Robot(
-    name="APR-02",
-    wheels=tuple(
-        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle))
-        for name, angle in zip("abc", (60, 180, 300), strict=True)
-    ),
-)
 
 
 def driven(turn_rates: Array, stamps: Array, start: float = 0.3) -> WheelLog:
     """A run at 0.2 m/s that turns at each rate for 0.1 s."""
     twists = np.column_stack([np.full(len(turn_rates), 0.2), np.zeros(len(turn_rates)), turn_rates])
     times = 0.1 * np.arange(1, len(turn_rates) + 1)
-    return WheelLog(times, twists @ wheel_equations(ROBOT.wheels).T, np.array([0.0, 0.0, start]), stamps)
+    return WheelLog(times, twists @ wheel_equations(APR_02.wheels).T, np.array([0.0, 0.0, start]), stamps)
 
 
 def true_headings(log: WheelLog) -> Array:
-    return OdometryModel.of_design(ROBOT, "arc").poses([log])[0][:, 2]
+    return OdometryModel.of_design(APR_02, "arc").poses([log])[0][:, 2]
 
 
 def wrapped(headings: Array) -> Array:
@@ -42,7 +36,7 @@ def wrapped(headings: Array) -> Array:
 
 
 def unwrapped(log: WheelLog, headings: Array) -> Array:
-    (found,), _ = unwrap(ROBOT, [log], [headings])
+    (found,), _ = unwrap(APR_02, [log], [headings])
     return found
 
 
@@ -102,17 +96,17 @@ def test_the_start_heading_stays_as_recorded() -> None:
 def test_headings_that_odometry_does_not_confirm_are_doubtful() -> None:
     sound = driven(np.full(100, 1.5), np.array([0.0, 10.0]))
     off = true_headings(sound) * [1.0, 1.12]  # 1.8 rad more than the odometry
-    _, doubtful = unwrap(ROBOT, [sound, sound], [true_headings(sound), wrapped(off)])
+    _, doubtful = unwrap(APR_02, [sound, sound], [true_headings(sound), wrapped(off)])
     assert doubtful == [1]
 
 
 def test_a_data_set_holds_unwrapped_headings_and_warns_of_doubtful_ones() -> None:
     stamps = np.array([0.0, 10.0])
     log = driven(np.full(100, 1.5), stamps)
-    poses = OdometryModel.of_design(ROBOT, "arc").poses([log])[0]
+    poses = OdometryModel.of_design(APR_02, "arc").poses([log])[0]
     truth = poses[:, 2]
     sound = Trajectory("sound", "train", log.times, log.rates, stamps, np.column_stack([poses[:, :2], wrapped(truth)]))
     odd = replace(sound, id="odd", poses=np.column_stack([poses[:, :2], wrapped(truth * [1.0, 1.12])]))
-    dataset = make_dataset("turns", ROBOT, 0.1, [sound, odd])
+    dataset = make_dataset("turns", APR_02, 0.1, [sound, odd])
     np.testing.assert_allclose(dataset.trajectories[0].poses[:, 2], truth, atol=1e-9)
     assert dataset.warnings == ("headings of 1 trajectory may be unwrapped wrongly (reference too sparse): odd",)

@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 import shutil
 from dataclasses import fields, replace
+from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from sample_robots import APR_02
 from storage_samples import (
     FORMATS,
-    ROBOT,
     Format,
     a_trajectory,
     everything_known,
@@ -46,7 +47,7 @@ def test_parquet_and_csv_have_the_hash_of_what_was_written(good: dict[Format, Pa
 @pytest.mark.parametrize("fmt", FORMATS)
 def test_names_made_of_digits_stay_as_they_are(tmp_path: Path, fmt: Format) -> None:
     run = a_trajectory("007", 0.4, command="0010", session="20221220")
-    save_dataset(make_dataset("digits", ROBOT, 0.1, [run]), tmp_path / "d", fmt)
+    save_dataset(make_dataset("digits", APR_02, 0.1, [run]), tmp_path / "d", fmt)
     (found,) = load_dataset(tmp_path / "d").trajectories
     assert (found.id, found.command, found.session) == ("007", "0010", "20221220")
 
@@ -54,12 +55,12 @@ def test_names_made_of_digits_stay_as_they_are(tmp_path: Path, fmt: Format) -> N
 @pytest.mark.parametrize("fmt", FORMATS)
 def test_headings_of_many_turns_come_back_to_the_bit(tmp_path: Path, fmt: Format) -> None:
     times = 0.1 * np.arange(1, 400)
-    rates = np.tile(wheel_equations(ROBOT.wheels) @ [0.2, 0.1, 1.7], (len(times), 1))
+    rates = np.tile(wheel_equations(APR_02.wheels) @ [0.2, 0.1, 1.7], (len(times), 1))
     stamps = np.arange(0.0, 39.0, 0.3)
-    (poses,) = OdometryModel.of_design(ROBOT, "arc").poses([WheelLog(times, rates, np.array([0, 0, 0.1]), stamps)])
+    (poses,) = OdometryModel.of_design(APR_02, "arc").poses([WheelLog(times, rates, np.array([0, 0, 0.1]), stamps)])
     wrapped = poses.copy()
     wrapped[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
-    dataset = make_dataset("turns", ROBOT, 0.1, [Trajectory("a", "train", times, rates, stamps, wrapped)])
+    dataset = make_dataset("turns", APR_02, 0.1, [Trajectory("a", "train", times, rates, stamps, wrapped)])
     save_dataset(dataset, tmp_path / "d", fmt)
     assert load_dataset(tmp_path / "d").hash == dataset.hash
 
@@ -87,7 +88,7 @@ def test_only_trajectory_and_split_are_needed(good: dict[Format, Path], tmp_path
         ("wheels", ["trajectory", "t", "omega_a", "omega_b", "omega_c"]),
         ("poses", ["trajectory", "t", "x", "y", "theta"]),
     ):
-        with_frame(name, lambda frame, kept=kept: frame.select(kept))(folder)  # type: ignore[misc]
+        with_frame(name, methodcaller("select", kept))(folder)
     run = load_dataset(folder).trajectories[0]
     unknown = {item.name for item in fields(run) if getattr(run, item.name) is None}
     assert unknown == {
@@ -132,7 +133,7 @@ def test_numbers_of_a_csv_may_have_spaces_and_integers(good: dict[Format, Path],
 def test_arrays_that_only_some_runs_have_are_left_out(tmp_path: Path, fmt: Format) -> None:
     first, second = everything_known().trajectories
     poorer = replace(second, angles=None, pose_covariances=None)
-    save_dataset(make_dataset("mixed", ROBOT, 0.1, [first, poorer]), tmp_path / "d", fmt)
+    save_dataset(make_dataset("mixed", APR_02, 0.1, [first, poorer]), tmp_path / "d", fmt)
     found = load_dataset(tmp_path / "d").trajectories
     assert [(run.angles is None, run.targets is None, run.pose_covariances is None) for run in found] == [
         (True, False, True)
@@ -144,7 +145,7 @@ def test_a_data_set_is_replaced_by_one_in_either_format(good: dict[Format, Path]
     folder = tmp_path / "dataset"
     shutil.copytree(good[fmt], folder)
     other: Format = "csv" if fmt == "parquet" else "parquet"
-    save_dataset(make_dataset("new", ROBOT, 0.1, [a_trajectory("new", 0.1)]), folder, other)
+    save_dataset(make_dataset("new", APR_02, 0.1, [a_trajectory("new", 0.1)]), folder, other)
     assert [run.id for run in load_dataset(folder).trajectories] == ["new"]
     assert {file.suffix for file in folder.iterdir()} == {f".{other}", ".yaml"}
 
@@ -199,23 +200,23 @@ def test_a_full_disk_is_told_in_one_line_and_leaves_the_old_data_set(
     name = "dataset.yaml" if file == "dataset" else f"{file}.{new}"
     (folder / f".{name}.{os.getpid()}.partial").symlink_to("/dev/full")
     with pytest.raises(DataError, match=f"{name}: cannot be written: No space left on device"):
-        save_dataset(make_dataset("new", ROBOT, 0.1, [a_trajectory("new", 0.1)]), folder, new)
+        save_dataset(make_dataset("new", APR_02, 0.1, [a_trajectory("new", 0.1)]), folder, new)
     assert load_dataset(folder).hash == everything_known().hash
     assert sorted(folder.iterdir()) == sorted(folder / source.name for source in good[old].iterdir())
 
 
 def test_two_runs_with_one_id_are_refused_in_memory_too() -> None:
     with pytest.raises(DataError, match="data set twice: trajectory a is there twice"):
-        make_dataset("twice", ROBOT, 0.1, [a_trajectory("a", 0.1), a_trajectory("a", 0.2)])
+        make_dataset("twice", APR_02, 0.1, [a_trajectory("a", 0.1), a_trajectory("a", 0.2)])
 
 
 def test_a_data_set_without_runs_is_refused_in_memory_too() -> None:
     with pytest.raises(DataError, match="data set none: it has no trajectory"):
-        make_dataset("none", ROBOT, 0.1, [])
+        make_dataset("none", APR_02, 0.1, [])
 
 
 def test_poses_after_the_last_wheel_sample_are_warned_of() -> None:
     run = a_trajectory("late", 0.3)
     late = replace(run, pose_times=np.array([0.0, 0.2, 1.0]))
-    (warning,) = make_dataset("late", ROBOT, 0.1, [run, late][1:]).warnings[-1:]
+    (warning,) = make_dataset("late", APR_02, 0.1, [run, late][1:]).warnings[-1:]
     assert warning == "1 trajectory has reference poses after its last wheel sample, e.g. late"

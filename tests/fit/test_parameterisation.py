@@ -10,21 +10,15 @@ import pytest
 from fit_samples import box_between, make_problem
 from hypothesis import given
 from hypothesis import strategies as st
+from sample_robots import APR_02
 
 from omnibench.config import validate
 from omnibench.errors import ConfigError
 from omnibench.fit.parameterisation import Box, GeometryLimits, MatrixElements, WheelGeometry, make_bounds
-from omnibench.robot.kinematics import Array, Robot, Wheel, inverse_kinematic_matrix
+from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrix
 from omnibench.robot.published_matrices import published_matrix
 from omnibench.testing.synthetic import synthetic_robot
 
-APR_02 = Robot(
-    name="APR-02",
-    wheels=tuple(
-        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle))
-        for name, angle in zip("abc", (60, 180, 300), strict=True)
-    ),
-)
 DESIGN = APR_02.inverse_kinematic_matrix
 NO_NULL = np.zeros((0, 3))
 

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from sample_robots import APR_02
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import Effect, MotionEffect, ReferenceEffect
@@ -16,13 +17,6 @@ from omnibench.robot.odometry import Integration, OdometryStream, WheelLog
 
 PERIOD = 0.02
 SESSIONS = ("morning", "evening")
-APR_02 = Robot(
-    name="APR-02",
-    wheels=tuple(
-        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle))
-        for name, angle in zip("abc", (60, 180, 300), strict=True)
-    ),
-)
 MECANUM = Robot(
     name="youBot",
     wheels=tuple(

@@ -14,6 +14,7 @@ import yaml
 from effect_samples import a_drive
 from hypothesis import given
 from hypothesis import strategies as st
+from sample_robots import APR_02
 
 from omnibench.config import validate
 from omnibench.errors import ConfigError, DataError, OmnibenchError
@@ -28,17 +29,10 @@ from omnibench.robot.calibration import (
     write_calibration,
 )
 from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
-from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.robot.kinematics import Array
 from omnibench.robot.published_matrices import published_matrix
 from omnibench.robot.signals import Signals
 
-ROBOT = Robot(
-    name="APR-02",
-    wheels=tuple(
-        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle))
-        for name, angle in zip("abc", (60, 180, 300), strict=True)
-    ),
-)
 PROVENANCE = Provenance(
     dataset="flower",
     dataset_hash="0123abcd",
@@ -59,7 +53,7 @@ PROVENANCE = Provenance(
 def a_calibration(**changes: Any) -> Calibration:
     given_values: dict[str, Any] = {
         "name": "flower closed_form",
-        "robot": ROBOT,
+        "robot": APR_02,
         "sample_period": 0.01,
         "matrix": matrix_rows(published_matrix("palacin2023_eq8")),
         "integration": "euler",

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from effect_samples import APR_02, MOTION, ROBOTS, a_drive, a_term, at_every_sample, mixture, model, streamed, term
+from effect_samples import MOTION, ROBOTS, a_drive, a_term, at_every_sample, mixture, model, streamed, term
 from hypothesis import given
 from hypothesis import strategies as st
+from sample_robots import APR_02
 
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryStream, WheelLog, advance

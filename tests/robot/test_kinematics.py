@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from sample_robots import APR_02
 
 from omnibench.config import validate
 from omnibench.errors import ConfigError
@@ -21,11 +22,6 @@ from omnibench.robot.kinematics import (
     wheel_equations,
 )
 from omnibench.robot.published_matrices import published_matrix
-
-APR_02 = tuple(
-    Wheel(name=n, radius=0.148, distance=0.195, angle=math.radians(a))
-    for n, a in zip("abc", (60, 180, 300), strict=True)
-)
 
 # Eq. (7) of the article, as printed.
 EQ_7 = np.array(
@@ -71,11 +67,11 @@ def condition(equations: Array) -> float:
 @pytest.mark.parametrize("row", [0, 1, 2])
 @pytest.mark.parametrize("column", [0, 1, 2])
 def test_the_design_values_give_every_element_of_eq_7(row: int, column: int) -> None:
-    assert abs(inverse_kinematic_matrix(APR_02)[row, column] - EQ_7[row, column]) <= 1e-15
+    assert abs(inverse_kinematic_matrix(APR_02.wheels)[row, column] - EQ_7[row, column]) <= 1e-15
 
 
 def test_m12_of_the_design_is_exactly_zero_so_that_the_papers_box_freezes_it() -> None:
-    assert inverse_kinematic_matrix(APR_02)[0, 1] == 0.0
+    assert inverse_kinematic_matrix(APR_02.wheels)[0, 1] == 0.0
 
 
 @given(wheels=three_omni_wheels)

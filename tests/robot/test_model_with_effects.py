@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from effect_samples import APR_02, MOTION, PERIOD, REFERENCE, a_drive, a_term, mixture, model, term
+from effect_samples import MOTION, PERIOD, REFERENCE, a_drive, a_term, mixture, model, term
 from hypothesis import given
 from hypothesis import strategies as st
+from sample_robots import APR_02
 from timing import processor_time
 
 from omnibench.errors import DataError, PluginError
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import MotionEffect, Values
+from omnibench.robot.effects.effect import MotionEffect, Stage, Values
 from omnibench.robot.effects.term import make_term
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
@@ -171,7 +173,8 @@ MISSING = {
 @pytest.mark.parametrize("name", MISSING)
 def test_a_recording_that_lacks_what_an_effect_needs_is_refused_in_one_line(name: str) -> None:
     field, words = MISSING[name]
-    chosen, log = model(a_term(name, APR_02)), replace(a_drive(1), **{field: None})  # type: ignore[arg-type]
+    unknown: dict[str, Any] = {field: None}
+    chosen, log = model(a_term(name, APR_02)), replace(a_drive(1), **unknown)
     for method in (chosen.poses, chosen.reported):
         with pytest.raises(DataError) as refusal:
             method([log])
@@ -199,7 +202,7 @@ def test_a_model_with_effects_needs_the_sample_period() -> None:
 
 @pytest.mark.usefixtures("registries_as_before")
 @pytest.mark.parametrize(("stage", "shape"), [("wheel", (40, 1)), ("body", (40, 1)), ("world", (40, 3))])
-def test_a_correction_of_another_shape_is_not_spread_over_wheels(stage: str, shape: tuple[int, int]) -> None:
+def test_a_correction_of_another_shape_is_not_spread_over_wheels(stage: Stage, shape: tuple[int, int]) -> None:
     @effects.register("careless")
     class Careless(MotionEffect):
         """Gives one column."""
@@ -209,7 +212,7 @@ def test_a_correction_of_another_shape_is_not_spread_over_wheels(stage: str, sha
         def correction(self, signals: Signals, values: Values) -> Array:  # noqa: ARG002
             return np.zeros((len(signals.rates), shape[1]))
 
-    Careless.stage = stage  # type: ignore[assignment]
+    Careless.stage = stage
     with pytest.raises(PluginError, match=r"effect 'careless': its correction has shape \(40, \d\), expected \(40, \d"):
         model(make_term("careless", {}, APR_02)).poses([a_drive(1)])
 

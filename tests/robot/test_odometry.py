@@ -9,20 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sample_robots import APR_02
 
-from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch, OdometryStream, WheelLog
 from omnibench.robot.published_matrices import published_matrix
 
 BOTH: tuple[Integration, ...] = ("euler", "arc")
-ROBOT = Robot(
-    name="APR-02",
-    wheels=tuple(
-        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle))
-        for name, angle in zip("abc", (60, 180, 300), strict=True)
-    ),
-)
 MATRIX = published_matrix("palacin2023_eq8")
 
 
@@ -274,13 +268,13 @@ def test_positions_are_linear_in_rows_1_and_2_once_the_headings_are_known() -> N
 
 def test_a_model_gives_the_poses_of_each_log_by_itself() -> None:
     logs = [a_log(1, stamps=4), a_log(2, stamps=9)]
-    model = OdometryModel(ROBOT, MATRIX, "arc")
+    model = OdometryModel(APR_02, MATRIX, "arc")
     for log, poses in zip(logs, model.poses(logs), strict=True):
         np.testing.assert_allclose(poses, streamed(log, MATRIX, "arc"), rtol=0, atol=1e-12)
 
 
 def test_a_models_stream_starts_at_the_origin_unless_told() -> None:
-    model = OdometryModel.of_design(ROBOT, "arc")
+    model = OdometryModel.of_design(APR_02, "arc")
     np.testing.assert_array_equal(model.stream().pose, np.zeros(3))
     np.testing.assert_array_equal(model.stream(np.array([1.0, 2.0, 3.0])).pose, [1.0, 2.0, 3.0])
 

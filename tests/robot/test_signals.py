@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from effect_samples import APR_02, PERIOD, ROBOTS, a_drive
+from effect_samples import PERIOD, ROBOTS, a_drive
 from hypothesis import given
 from hypothesis import strategies as st
+from sample_robots import APR_02
 
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.signals import Signals, SignalStream, signals_of, smoothing_share

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from effect_samples import APR_02, ROBOTS
+from effect_samples import ROBOTS
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from sample_robots import APR_02
 
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.training_domain import (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,7 +46,8 @@ class AcceptsAnything(GoodImporter):
         try:
             return load_dataset(source)
         except DataError:
-            return Dataset("nothing", None, 0.1, ())  # type: ignore[arg-type]
+            robot: Any = None  # on purpose: an importer that knows no robot
+            return Dataset("nothing", robot, 0.1, ())
 
 
 class Altered(GoodImporter):

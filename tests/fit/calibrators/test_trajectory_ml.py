@@ -13,6 +13,7 @@ from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
 from omnibench.fit.calibrators.trajectory_ml import TrajectoryML, TrajectoryMLOptions
 from omnibench.fit.least_squares.nuisances import TURN
+from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Array
@@ -213,7 +214,8 @@ def test_directions_that_are_not_driven_keep_the_design() -> None:
     problem = make_problem(noisy_trajectories(4), wheels=4)
     result = solved(problem)
     assert result.matrix is not None
-    (null,) = problem.parameterisation.null  # type: ignore[attr-defined]
+    assert isinstance(problem.parameterisation, MatrixElements)
+    (null,) = problem.parameterisation.null
     assert np.abs((result.matrix - problem.robot.inverse_kinematic_matrix) @ null).max() < 1e-9
 
 

@@ -30,10 +30,10 @@ from omnibench.live.node import LiveNode
 from omnibench.live.replay.arrivals import ReplayConfig
 from omnibench.live.replay.concatenated_drive import concatenate_recording, concatenate_runs, concatenated_truth
 from omnibench.live.replay.replay_player import events
-from omnibench.live.wire.messages import JOINT_STATE
+from omnibench.live.wire.messages import JOINT_STATE, JointState
 from omnibench.robot.calibration import Calibration, EffectTerm, covariance_rows, matrix_rows, write_calibration
 from omnibench.robot.kinematics import Array
-from omnibench.robot.odometry import WheelLog
+from omnibench.robot.odometry import Integration, WheelLog
 from omnibench.robot.planar import relative
 from omnibench.testing import synthetic_robot
 from omnibench.testing.synthetic import true_robot
@@ -90,16 +90,16 @@ class TestAgreesWithTheBatch:
         np.testing.assert_allclose(odometry(updates)[1:], batch(path, using), atol=1e-9)
 
     @pytest.mark.parametrize("integration", ["euler", "arc"])
-    def test_a_replayed_recording_gives_the_batch_odometry(self, integration: str) -> None:
-        using = with_effects(*every_effect(), plain=calibration(integration=integration))  # type: ignore[arg-type]
+    def test_a_replayed_recording_gives_the_batch_odometry(self, integration: Integration) -> None:
+        using = with_effects(*every_effect(), plain=calibration(integration=integration))
         dataset = random_dataset(3)
         drive = concatenate_runs(dataset)
         robot = RobotTracker("apr", using.model_copy(update={"robot": dataset.robot}))
         updates = [
             update
             for event in events(drive, ReplayConfig(), origin=ORIGIN)
-            if event.topic == "joint_states"
-            for update in robot.take_wheels(JOINT_STATE.encode(event.message), event.arrival)  # type: ignore[arg-type]
+            if isinstance(event.message, JointState)
+            for update in robot.take_wheels(JOINT_STATE.encode(event.message), event.arrival)
         ]
         log = replace(drive.log(session="evening"), start=np.zeros(3))
         np.testing.assert_allclose(odometry(updates), using.model.poses([log])[0], atol=1e-9)

@@ -81,8 +81,8 @@ def test_the_twist_is_the_matrix_times_the_rates_in_the_robots_frame() -> None:
     assert np.linalg.eigvalsh(live.twist_covariance)[0] > 0
 
 
-def step(duration: float, angles: list[float], **more: float) -> WheelStep:
-    return WheelStep(0, duration, np.array(angles), np.array(angles) / duration, **more)  # type: ignore[arg-type]
+def step(duration: float, angles: list[float], blind: float = 0.0) -> WheelStep:
+    return WheelStep(0, duration, np.array(angles), np.array(angles) / duration, blind)
 
 
 def live_matrix(of: Calibration) -> np.ndarray:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,8 +26,8 @@ from omnibench.robot.calibration import EffectTerm, matrix_rows
 from omnibench.robot.odometry import Integration
 
 
-def tracker(**options: object) -> RobotTracker:
-    return RobotTracker("apr", calibration(), **{"fusion": FusionSettings(), **options})  # type: ignore[arg-type]
+def tracker(**options: Any) -> RobotTracker:
+    return RobotTracker("apr", calibration(), **{"fusion": FusionSettings(), **options})
 
 
 def fed(robot: RobotTracker, payloads: list[bytes], begin: float = 0.0) -> list[Update]:
@@ -167,8 +168,9 @@ def test_a_pose_without_covariance_takes_that_of_the_calibrations_noise() -> Non
     robot = tracker()
     fed(robot, path.payloads())
     assert robot.take_pose(slam(path.stamps[-1], [1, 2, 3], np.zeros((3, 3))), 0.1) == "located"
-    assert robot.pose_at().in_map is not None
-    assert robot.pose_at().in_map[1][0, 0] == pytest.approx(NOISE.pose_position**2)  # type: ignore[index]
+    in_map = robot.pose_at().in_map
+    assert in_map is not None
+    assert in_map[1][0, 0] == pytest.approx(NOISE.pose_position**2)
 
 
 def test_a_calibration_of_another_robot_is_refused_and_the_old_one_runs_on() -> None:

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.live.estimation.counts import Counts
+from omnibench.live.estimation.live_odometry import Motion
 from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings
 from omnibench.live.fusion.timeline import Entry, PoseMeasurement, Timeline
 from omnibench.robot.odometry import advance
@@ -34,9 +35,9 @@ class Robot:
             self._append(motion(ORIGIN + len(self.truth) * 10_000_000 - 10_000_000, moved))
         return self
 
-    def _append(self, moved: object) -> None:
-        pose, covariance = self.fusion.predict(moved)  # type: ignore[arg-type]
-        self.timeline.append(Entry(moved.stamp, moved, self.truth[-1], pose, covariance))  # type: ignore[attr-defined, arg-type]
+    def _append(self, moved: Motion) -> None:
+        pose, covariance = self.fusion.predict(moved)
+        self.timeline.append(Entry(moved.stamp, moved, self.truth[-1], pose, covariance))
         self.fusion.take_waiting()
 
     def at(self, time: float) -> np.ndarray:

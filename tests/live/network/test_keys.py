@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from omnibench.errors import ConfigError
@@ -158,5 +159,7 @@ def expire(folder: Path, name: str, start: datetime) -> None:
         .not_valid_before(start)
         .not_valid_after(start + timedelta(days=1))
     )
-    signed = builder.sign(read_key(folder / "ca.key"), hashes.SHA256())  # type: ignore[arg-type]
+    key = read_key(folder / "ca.key")
+    assert isinstance(key, EllipticCurvePrivateKey)
+    signed = builder.sign(key, hashes.SHA256())
     (folder / f"{name}.pem").write_bytes(signed.public_bytes(Encoding.PEM))

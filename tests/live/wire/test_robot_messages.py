@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -32,7 +34,7 @@ def square() -> st.SearchStrategy[np.ndarray]:
 
 
 @given(FRAMES, FRAMES, st.lists(st.tuples(STAMPS, vector(), square(), vector(), square()), min_size=1, max_size=3))
-def test_odometry_of_fixed_frames_is_encoded_as_rosbags_does(frame: str, child: str, contents: list) -> None:  # type: ignore[type-arg]
+def test_odometry_of_fixed_frames_is_encoded_as_rosbags_does(frame: str, child: str, contents: list[Any]) -> None:
     encoder = OdometryEncoder(frame, child)
     for stamp, *numbers in contents:
         message = Odometry(stamp, frame, child, *numbers)
@@ -40,7 +42,7 @@ def test_odometry_of_fixed_frames_is_encoded_as_rosbags_does(frame: str, child: 
 
 
 @given(st.lists(st.tuples(FRAMES, FRAMES), min_size=1, max_size=3), st.data())
-def test_transforms_of_fixed_frames_are_encoded_as_rosbags_does(frames: list, data: st.DataObject) -> None:  # type: ignore[type-arg]
+def test_transforms_of_fixed_frames_are_encoded_as_rosbags_does(frames: list[Any], data: st.DataObject) -> None:
     encoder = TransformsEncoder(frames)
     for _ in range(2):
         transforms = [Transform(data.draw(STAMPS), *pair, data.draw(vector())) for pair in frames]
@@ -75,8 +77,7 @@ def test_wheel_messages_are_decoded_as_rosbags_does_whoever_sends_in_between(mes
         for decoded in (decoder.decode(payload), JOINT_STATE.decode(payload)):
             assert (decoded.stamp, decoded.names, decoded.frame) == (message.stamp, message.names, message.frame)
             for found, sent in ((decoded.positions, message.positions), (decoded.velocities, message.velocities)):
-                assert (found is None) == (sent is None)
-                assert sent is None or found.tolist() == sent.tolist()  # type: ignore[union-attr]
+                assert (None if found is None else found.tolist()) == (None if sent is None else sent.tolist())
 
 
 @given(joint_states(), st.data())

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
-from effect_samples import APR_02, MOTION, REFERENCE, ROBOTS, SESSIONS, a_drive, a_term, built_in
+from effect_samples import MOTION, REFERENCE, ROBOTS, SESSIONS, a_drive, a_term, built_in
 from hypothesis import given
 from hypothesis import strategies as st
+from sample_robots import APR_02
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect, Effect, MotionEffect, Need, ReferenceEffect, Values
@@ -47,9 +48,9 @@ PHI = np.array([[0.5, 1.2, -2.0]])
 SPEED, R = math.hypot(VX, VY), 0.148
 
 
-def signals(**changes: object) -> Signals:
+def signals(**changes: Any) -> Signals:
     """One sample with numbers that are easy to put into a formula."""
-    chosen: dict[str, object] = {
+    chosen: dict[str, Any] = {
         "robot": APR_02,
         "durations": np.array([0.01]),
         "rates": RATES,
@@ -61,7 +62,7 @@ def signals(**changes: object) -> Signals:
         "session_time": np.array([1000.0]),
         "session": "evening",
     }
-    return Signals(**(chosen | changes))  # type: ignore[arg-type]
+    return Signals(**(chosen | changes))
 
 
 def towards(angle: float) -> float:

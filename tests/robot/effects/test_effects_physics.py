@@ -8,9 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from effect_samples import APR_02, ROBOTS, a_drive, a_term, model, term
+from effect_samples import ROBOTS, a_drive, a_term, model, term
 from hypothesis import given
 from hypothesis import strategies as st
+from sample_robots import APR_02
 
 from omnibench.robot.effects.effect import Values
 from omnibench.robot.effects.term import Term

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from effect_samples import APR_02, PERIOD, ROBOTS, SESSIONS, a_drive, a_term, at_every_sample, model, streamed
+from effect_samples import PERIOD, ROBOTS, SESSIONS, a_drive, a_term, at_every_sample, model, streamed
 from hypothesis import given
 from hypothesis import strategies as st
+from sample_robots import APR_02
 
 from omnibench.registry import effects
 from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows, read_calibration, write_calibration

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pytest
-from effect_samples import APR_02, MECANUM, built_in
+from effect_samples import MECANUM, built_in
+from sample_robots import APR_02
 
 from omnibench.errors import DataError, OmnibenchError, UnknownNameError
 from omnibench.registry import effects
@@ -41,7 +43,7 @@ def test_every_effect_takes_its_own_parameters(name: str) -> None:
         assert dict(make_term(name, given, robot, sessions=("x", "y")).values) == given
 
 
-REFUSED: dict[str, tuple[str, Mapping[str, object], str]] = {
+REFUSED: dict[str, tuple[str, Mapping[str, Any], str]] = {  # wrong types among them
     "an unknown effect": (
         "heading_drif",
         {},
@@ -97,7 +99,7 @@ REFUSED: dict[str, tuple[str, Mapping[str, object], str]] = {
 def test_what_is_wrong_is_told_in_one_line(case: str) -> None:
     name, parameters, words = REFUSED[case]
     with pytest.raises(OmnibenchError) as refusal:
-        make_term(name, parameters, APR_02, "cal.yaml")  # type: ignore[arg-type]
+        make_term(name, parameters, APR_02, "cal.yaml")
     assert str(refusal.value).startswith(words)
     assert isinstance(refusal.value, UnknownNameError if "unknown" in words else DataError)
 

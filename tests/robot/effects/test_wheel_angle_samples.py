@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from effect_samples import APR_02, PERIOD, ROBOTS, a_drive, a_term
+from effect_samples import PERIOD, ROBOTS, a_drive, a_term
 from hypothesis import given
 from hypothesis import strategies as st
+from sample_robots import APR_02
 
 from omnibench.robot.effects.effect import MotionEffect
 from omnibench.robot.kinematics import Array

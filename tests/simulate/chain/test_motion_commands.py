@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sample_robots import APR_02
 
 from omnibench.config import validate
 from omnibench.errors import ConfigError
-from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.robot.kinematics import Array
 from omnibench.simulate.chain.motion_commands import (
     CommandedMotion,
     CommandLink,
@@ -25,13 +26,6 @@ from omnibench.simulate.flower import Command
 
 PERIOD, SETTLE, TURN = 0.01, 0.5, 6.0
 PETAL, WAY = Command(0.2, math.radians(30), 0.35), 1.116
-APR_02 = Robot(
-    name="APR-02",
-    wheels=tuple(
-        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle))
-        for name, angle in (("a", 60), ("b", 180), ("c", 300))
-    ),
-)
 
 turn_rates = st.one_of(st.just(0.0), st.floats(0.05, 2), st.floats(-2, -0.05))
 travels = st.builds(Command, st.floats(0.02, 2), st.floats(-math.pi, math.pi), turn_rates)

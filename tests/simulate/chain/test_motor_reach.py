@@ -9,21 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sample_robots import APR_02
 
 from omnibench.config import validate
 from omnibench.errors import ConfigError
-from omnibench.robot.kinematics import Robot, Wheel
 from omnibench.simulate.chain.motors import Controller, Encoder, Motor, check_reach
 from omnibench.simulate.chain.wheel_drive import drive_session
 from omnibench.simulate.flower import Command
-
-APR_02 = Robot(
-    name="APR-02",
-    wheels=tuple(
-        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle))
-        for name, angle in (("a", 60), ("b", 180), ("c", 300))
-    ),
-)
 
 
 @given(st.floats(0.05, 4), st.floats(-math.pi, math.pi), st.floats(-5, 5))
@@ -34,7 +26,8 @@ def test_the_speed_that_is_proposed_fits_and_little_more_does_not(
     try:
         check_reach(APR_02, [command], Motor())
     except ConfigError as error:
-        proposed = float(re.search(r"give it a speed of at most ([\d.]+) m/s", str(error)).group(1))  # type: ignore[union-attr]
+        (proposal,) = re.findall(r"give it a speed of at most ([\d.]+) m/s", str(error))
+        proposed = float(proposal)
         check_reach(APR_02, [Command(proposed, direction, turn_rate)], Motor())
         with pytest.raises(ConfigError):
             check_reach(APR_02, [Command(proposed * 1.02, direction, turn_rate)], Motor())

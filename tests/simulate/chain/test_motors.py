@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from sample_robots import APR_02
 from scipy.integrate import solve_ivp
 
-from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
+from omnibench.robot.kinematics import Array, wheel_equations
 from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
 from omnibench.simulate.chain.motors import Controller, Encoder, Motor
 from omnibench.simulate.chain.wheel_drive import DrivenRun, drive_session
@@ -20,13 +21,6 @@ from omnibench.simulate.flower import Command
 PERIOD, STEP = 0.01, 0.001
 TICK = Encoder().tick
 FULL = 1e6  # rad/s; a target that asks for the full voltage
-APR_02 = Robot(
-    name="APR-02",
-    wheels=tuple(
-        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle))
-        for name, angle in (("a", 60), ("b", 180), ("c", 300))
-    ),
-)
 
 rates = st.one_of(st.floats(0.2, 3), st.floats(-3, -0.2))
 starts = st.floats(-100, 100)
@@ -116,11 +110,15 @@ def test_friction_acts_as_an_independent_integration_says() -> None:
         back = supply - motor.resistance * current - constant * rate
         return [back / motor.inductance, torque / motor.inertia, rate]
 
-    def breaks_away(_: float, state: Array) -> float:
-        return constant * state[0] - motor.static_friction
+    class BreaksAway:
+        """Event of solve_ivp: zero as the torque of the current reaches the static friction, where it ends."""
 
-    breaks_away.terminal = True  # type: ignore[attr-defined]
-    first = solve_ivp(standing, (0, 1), [0, 0, 0], events=breaks_away, method="LSODA", rtol=1e-10, atol=1e-12)
+        terminal = True
+
+        def __call__(self, _: float, state: Array) -> float:
+            return constant * state[0] - motor.static_friction
+
+    first = solve_ivp(standing, (0, 1), [0, 0, 0], events=BreaksAway(), method="LSODA", rtol=1e-10, atol=1e-12)
     then = solve_ivp(
         moving, (first.t[-1], 0.3), first.y[:, -1], method="LSODA", rtol=1e-10, atol=1e-12, dense_output=True
     )
