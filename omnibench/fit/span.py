@@ -17,8 +17,8 @@ from omnibench.robot.planar import interpolated
 Unidentified = Literal["keep", "fit"]
 State = Literal["driven", "weak", "undriven"]
 
-# Share of the strongest direction below which a direction holds noise and no motion. Half of it changes nothing; twice
-# of it counts slip of 2 % as no motion in the place of a weak one, and both keep the design
+# Share of the strongest direction below which a direction holds noise and no motion. Half of it changes nothing; with
+# twice, slip of 2 % counts as no motion in the place of a weak one, and both keep the design
 # (tests/benchmarks/constants_fit.py).
 _NULL_SHARE = 1e-2
 

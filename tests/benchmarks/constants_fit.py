@@ -1,36 +1,29 @@
-"""Study of the constants of fit, slam, design and data/checks: what would change if each were half or twice as large.
+"""Study of the constants of fit, design and data/checks: what would change if each were half or twice as large.
 
-    python tests/benchmarks/constants_fit.py --out constants_fit.jsonl [--part slam] [--only motion_prior] [--table]
+    python tests/benchmarks/constants_fit.py --out constants_fit.jsonl [--part fit] [--only sandwich] [--table]
 
-Every number that a module names in capitals is varied by itself on small data. A line of JSON for each, added as it
-comes: run again with the same file, and it goes on where it was. Of each the table says
-
-- estimates: largest change of an estimate (matrix, pose, choice of a design), in its standard deviations,
-- stated: largest change of a stated standard deviation, as a share of it,
-- words: whether outcomes, warnings or verdicts change,
-- work: largest change of the work (parts of a box, evaluations), as a share of it.
+Small simulated recordings; constant_study.py says what the table holds.
 """
 
 from __future__ import annotations
 
-import argparse
-import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from named_constants import Constant, constants_of
-from slam_study import Run, drive, flower_command
+from constant_study import Answer, Part, Value, carry_out, estimates, stated, words, work
+from interval_coverage import simulated, wheel_equations
 
-from omnibench.config import Model
 from omnibench.data.checks import implausible
 from omnibench.data.dataset import Dataset
-from omnibench.data.scans import TrajectoryScans
+from omnibench.design.candidates import candidates_of_dataset
 from omnibench.design.design import design_experiment
+from omnibench.design.report.design_figures import path_figures
+from omnibench.design.report.tables import effort_table
+from omnibench.design.result import Chosen
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.certify import certify_optimum
 from omnibench.fit.least_squares.nuisances import Nuisances, deviations_of
@@ -38,23 +31,17 @@ from omnibench.fit.least_squares.repetitions import differences_between_repetiti
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.fit.uncertainty.identifiability import identifiability
-from omnibench.processes import one_thread
 from omnibench.registry import costs
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
-from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
-from omnibench.simulate.chain.lidar import Lidar
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.flower import Command
 from omnibench.simulate.simulate import simulate_dataset
-from omnibench.slam.slam_options import SlamOptions
-from omnibench.slam.slam_run import run_slam
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "fit"))
 from motions import RING, driven
 
-FACTORS = (0.5, 2.0)
+FEW_SETS = 60  # sets of few runs
 ANGLES = (1.0471975511965976, 3.141592653589793, 5.235987755982989)
 THREE: dict[str, Any] = {
     "robot": {
@@ -91,54 +78,6 @@ FOUR = {
     },
     "truth": {"tolerances": {"radius": 0.02, "distance": 0.03, "angle_deg": 0.5, "seed": 7}},
 }
-
-
-class Value(Model):
-    """A figure of an answer. kind: see above. scale: the unit of its change; 0 where only equality counts."""
-
-    kind: str
-    values: tuple[float, ...] = ()
-    scale: tuple[float, ...] = ()
-    words: str = ""
-
-    def change(self, other: Value) -> float:
-        """How far another value is from this one: a multiple of the scale, or 1 for other words."""
-        if self.kind == "words":
-            return float(self.words != other.words)
-        if len(self.values) != len(other.values):
-            return np.inf
-        apart, scale = np.abs(np.subtract(self.values, other.values)), np.array(self.scale)
-        return float(np.max(apart[scale > 0] / scale[scale > 0], initial=0.0))
-
-
-Answer = dict[str, Value]
-
-
-class Result(Model):
-    """The answers with one constant at another value; constant "" for those as they are."""
-
-    part: str
-    constant: str
-    factor: float
-    value: str
-    answer: dict[str, Value]
-    failure: str = ""
-
-
-def estimates(values: Array, deviations: Array) -> Value:
-    return Value(kind="estimates", values=tuple(np.ravel(values)), scale=tuple(np.ravel(deviations)))
-
-
-def stated(deviations: Array) -> Value:
-    return Value(kind="stated", values=tuple(np.ravel(deviations)), scale=tuple(np.ravel(deviations)))
-
-
-def work(*amounts: float) -> Value:
-    return Value(kind="work", values=amounts, scale=amounts)
-
-
-def words(*texts: object) -> Value:
-    return Value(kind="words", words=" | ".join(map(str, texts)))
 
 
 @cache
@@ -260,73 +199,8 @@ def answers_of_evaluator() -> Answer:
     return answer
 
 
-@cache
-def scanned(room: str) -> tuple[Run, ...]:
-    """Two runs in a room."""
-    plan = make_plan(RoomPlan(plan=room), room)
-    return tuple(drive(plan, Lidar(), flower_command(n), np.random.default_rng([5, n])) for n in (1, 3))
-
-
-def of_path(run: Run, start: Literal["odometry", "last_pose"], lidar: Lidar) -> Answer:
-    """The figures of one run."""
-    path = run_slam(run.scans, lidar.scanner, SlamOptions(start=start), np.zeros(3), run.odometry)
-    errors = (path.poses - run.true)[1:]
-    deviations = np.sqrt(np.diagonal(path.covariances[1:], axis1=1, axis2=2))
-    nees = (errors * np.linalg.solve(path.covariances[1:], errors[:, :, None])[:, :, 0]).sum(axis=1)
-    return {
-        "poses": estimates(path.poses[1:], deviations),
-        "deviations": stated(deviations),
-        "words": words(*path.warnings),
-        "error mm": Value(kind="error", values=(1e3 * float(np.hypot(*errors[:, :2].T).mean()),)),
-        "nees": Value(kind="nees", values=(float(nees.mean()),)),
-    }
-
-
-def answers_of_slam() -> Answer:
-    """Poses in three rooms from both starts, their errors and how honest their covariances are."""
-    starts: tuple[Literal["odometry", "last_pose"], ...] = ("odometry", "last_pose")
-    found = {
-        f"{room}, {start}, {index}": of_path(run, start, Lidar())
-        for room in ("furnished_room", "hall", "corridor")
-        for start in starts
-        for index, run in enumerate(scanned(room))
-    }
-    return {f"{name}: {figure}": value for name, of in found.items() for figure, value in of.items()}
-
-
-@cache
-def hard_runs() -> dict[str, tuple[Run, Lidar]]:
-    """Runs in rooms that hide the heading, of a quick robot, and of a scanner that is mounted upside down."""
-    runs = {}
-    few = Lidar(rays=361)
-    for corners, radius, lidar in ((72, 3.0, Lidar()), (400, 8.0, Lidar()), (400, 3.0, few)):
-        angles = 2 * np.pi * np.arange(corners) / corners
-        boundary = tuple((radius * math.cos(angle), radius * math.sin(angle)) for angle in angles)
-        plan = make_plan(RoomPlan(boundary=boundary, start=(0.0, 0.0, 0.0)), "round")
-        run = drive(plan, lidar, flower_command(2), np.random.default_rng([5, 2]), distance=0.9)
-        runs[f"{corners} corners of {radius:g} m, {lidar.rays} rays"] = run, lidar
-    furnished = make_plan(RoomPlan(plan="furnished_room"), "furnished")
-    for turn in (-1.2, 1.2):
-        run = drive(furnished, Lidar(), Command(0.5, 1.0, turn), np.random.default_rng(7))
-        runs[f"quickly, {turn} rad/s"] = run, Lidar()
-    right = scanned("furnished_room")[0]
-    mirrored = TrajectoryScans(right.scans.times, np.ascontiguousarray(right.scans.ranges[:, ::-1]))
-    return runs | {"mirrored": (replace(right, scans=mirrored), Lidar())}
-
-
-def answers_of_hard_slam() -> Answer:
-    """Poses where scans mislead or tell little."""
-    found = {
-        name: of_path(run, "last_pose" if name.startswith("quickly") else "odometry", lidar)
-        for name, (run, lidar) in hard_runs().items()
-    }
-    return {f"{name}: {figure}": value for name, of in found.items() for figure, value in of.items()}
-
-
 def answers_of_design() -> Answer:
     """A design from recordings: the continuous optimum, the choice and its precision."""
-    from omnibench.design.candidates import candidates_of_dataset
-
     design = design_experiment(candidates_of_dataset(recorded(3)), per="second")
     (of_set,) = design.sets
     step = of_set.step
@@ -339,6 +213,44 @@ def answers_of_design() -> Answer:
         "choice": words(*of_set.chosen),
         "steps": work(len(of_set.steps)),
     }
+
+
+def answers_of_design_report() -> Answer:
+    """The report of a design from recordings of which a third are straight, as if every command were chosen.
+
+    lines: of the table against the number of runs. straight: how many commands are drawn so.
+    """
+    commands: dict[str, Any] = THREE["commands"]
+    config = FlowerConfig.model_validate(THREE | {"commands": commands | {"turn_rates": [-0.35, 0, 0.35]}})
+    design = design_experiment(candidates_of_dataset(simulate_dataset(config, "with straight runs").dataset))
+    (of_set,) = design.sets
+    everything = of_set.model_copy(update={"chosen": tuple(Chosen(command=name, runs=1) for name in of_set.commands)})
+    (figure,) = path_figures(design.model_copy(update={"sets": (everything,)})).figures
+    straight = [trace for trace in figure.plot.data if trace.legendgroup == "straight" and trace.mode == "lines"]
+    return {
+        "lines": Value(kind="lines", values=(len(effort_table(design, of_set).rows),)),
+        "straight": Value(kind="straight", values=(len(straight),)),
+    }
+
+
+def answers_of_few_runs() -> Answer:
+    """Intervals of closed_form, which its matrix's elements fit nearly: from four and five runs without repetition."""
+    answer = {}
+    for runs in (4, 5):
+        covered, deviations = [], []
+        for seed in range(FEW_SETS):
+            dataset, geometry = simulated("bias", runs, seed)
+            once = replace(dataset, trajectories=tuple(run for run in dataset.trajectories if run.repetition == 0))
+            said = calibrate(once, "closed_form", cost="trajectory", seed=seed).uncertainty
+            if said is not None:
+                truth = np.linalg.inv(wheel_equations(geometry))
+                covered.append((said.intervals.low <= truth) & (truth <= said.intervals.high))
+                deviations.append(said.standard_deviations)
+        answer |= {
+            f"{runs} runs: deviations": stated(np.array(deviations)),
+            f"{runs} runs: covered": Value(kind="covered", values=(100 * float(np.mean(covered)),)),
+        }
+    return answer
 
 
 def answers_of_checks() -> Answer:
@@ -364,93 +276,15 @@ def answers_of_checks() -> Answer:
     return answer
 
 
-# The package or module whose constants a part varies, what is left out of it, and its answers.
-PARTS: dict[str, tuple[str, tuple[str, ...], Callable[[], Answer]]] = {
-    "fit": ("omnibench.fit", ("omnibench.fit.bounds", "omnibench.fit.evaluator"), answers_of_fit),
-    "bounds": ("omnibench.fit.bounds", (), answers_of_bounds),
-    "evaluator": ("omnibench.fit.evaluator", (), answers_of_evaluator),
-    "slam": ("omnibench.slam", (), answers_of_slam),
-    "hard_slam": ("omnibench.slam", (), answers_of_hard_slam),
-    "design": ("omnibench.design", ("omnibench.design.report",), answers_of_design),
-    "checks": ("omnibench.data.checks", (), answers_of_checks),
+PARTS = {
+    "fit": Part("omnibench.fit", answers_of_fit, ("omnibench.fit.bounds", "omnibench.fit.evaluator")),
+    "bounds": Part("omnibench.fit.bounds", answers_of_bounds),
+    "evaluator": Part("omnibench.fit.evaluator", answers_of_evaluator),
+    "design": Part("omnibench.design", answers_of_design, ("omnibench.design.report",)),
+    "design_report": Part("omnibench.design.report", answers_of_design_report),
+    "few_runs": Part("omnibench.fit.uncertainty.uncertainty", answers_of_few_runs),
+    "checks": Part("omnibench.data.checks", answers_of_checks),
 }
 
-
-def study(part: str, only: Sequence[str], done: set[tuple[str, str, float]]) -> Iterator[Result]:
-    """The answers of a part as they are, then with each constant varied, if they are not known already."""
-    package, elsewhere, answers = PARTS[part]
-    varied = [each for each in constants_of(package, elsewhere) if _is_wanted(each, only)]
-    wanted = [(each, factor) for each in varied for factor in FACTORS if (part, each.title, factor) not in done]
-    with one_thread():
-        if (part, "", 1.0) not in done:
-            yield Result(part=part, constant="", factor=1.0, value="", answer=answers())
-        for constant, factor in wanted:
-            answer, failure = {}, ""
-            with constant.varied(factor):
-                try:
-                    answer = answers()
-                except Exception as error:  # the study goes on, and the table says so
-                    failure = f"{type(error).__name__}: {error}"
-            value = str(constant.times(factor)).replace("\n", "")
-            yield Result(part=part, constant=constant.title, factor=factor, value=value, answer=answer, failure=failure)
-
-
-def _is_wanted(constant: Constant, only: Sequence[str]) -> bool:
-    return not only or any(part in constant.title for part in only)
-
-
-def print_table(results: Sequence[Result]) -> None:
-    """A line for each constant and factor: the largest change of each kind, and where."""
-    usual = {each.part: each.answer for each in results if not each.constant}
-    for part, answer in usual.items():
-        for kind in ("error", "nees"):
-            figures = [value.values[0] for value in answer.values() if value.kind == kind]
-            if figures:
-                print(f"{part}: median {kind} {np.median(figures):.3f}{' mm' if kind == 'error' else ''}")
-    for result in results:
-        if result.constant:
-            print(f"{result.part} {result.constant:45} {result.value:>12}  {_changes(result, usual[result.part])}")
-
-
-def _changes(result: Result, usual: Answer) -> str:
-    if result.failure:
-        return result.failure
-    texts = []
-    for kind in ("estimates", "stated", "words", "work"):
-        changes = {name: value.change(result.answer[name]) for name, value in usual.items() if value.kind == kind}
-        worst = max(changes, key=lambda name: changes[name], default="")
-        if worst and changes[worst] > 1e-6:
-            texts.append(f"{kind} {changes[worst]:.2g} ({worst})" if kind != "words" else f"words ({worst})")
-    for kind in ("error", "nees"):
-        figures = [
-            [answer[name].values[0] for name, value in usual.items() if value.kind == kind]
-            for answer in (usual, result.answer)
-        ]
-        if figures[0] and figures[0] != figures[1]:
-            texts.append(f"{kind} {np.median(figures[0]):.3f} -> {np.median(figures[1]):.3f}")
-    return "; ".join(texts) or "nothing"
-
-
-def main() -> None:
-    """Carry out what is missing, then print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="file of answers, one line of JSON each")
-    parser.add_argument("--part", nargs="+", choices=tuple(PARTS), default=tuple(PARTS))
-    parser.add_argument("--only", action="append", default=[], metavar="PART", help="of a constant's name")
-    parser.add_argument("--table", action="store_true", help="print the table of what is there")
-    arguments = parser.parse_args()
-    lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
-    results = [Result.model_validate_json(line) for line in lines]
-    if not arguments.table:
-        done = {(each.part, each.constant, each.factor) for each in results}
-        with arguments.out.open("a") as file:
-            for part in arguments.part:
-                for result in study(part, arguments.only, done):
-                    file.write(result.model_dump_json() + "\n")
-                    file.flush()
-                    results.append(result)
-    print_table([each for each in results if each.part in arguments.part])
-
-
 if __name__ == "__main__":
-    main()
+    carry_out(PARTS, __doc__)

@@ -21,7 +21,7 @@ _SMALL: Final = "dim"  # style of small print
 _NO_BREAK: Final = "\u00a0"
 # Spaces within a number: after a sign or relation, before a power of ten, and before a unit.
 _WITHIN_NUMBERS: Final = re.compile(r"(?<=[×≤≥<>=±]) (?=[\d.])|(?<=\d) (?=×|[%°µ]|[a-zA-Z]{1,3}(?:/\w+)?(?!\w))")
-Place = Literal["beside", "below"]  # of a cell's note
+Place = Literal["beside", "below"]  # where a cell's note stands
 
 
 def print_table(console: Console, table: Table) -> None:

@@ -25,7 +25,10 @@ _STRAIGHT = LegendItem("straight", "straight", "#5b6772")
 _RIGHT = LegendItem("right", "turning right", PALETTE[1], "dash")
 _UNUSED = LegendItem("unused", "candidates not chosen", "#d4d9df")
 _BASELINE = LegendItem("", "baseline", QUIET, symbol="diamond")
-_STRAIGHT_BELOW = math.radians(2)  # rad: a run that turns by less is drawn as straight (chosen)
+# rad: a run that turns by less is drawn as straight; nothing else hangs on it. Before calibration the simulated APR-02
+# seems to turn by 0.1 to 2.7 degrees in six straight runs: five are drawn as straight, three with half of it and six
+# with twice (tests/benchmarks/constants_fit.py).
+_STRAIGHT_BELOW = math.radians(2)
 _ROW_DASHES: tuple[Dash, ...] = ("solid", "dash", "dot")
 
 

@@ -25,8 +25,9 @@ from scipy.optimize import lsq_linear
 
 from omnibench.robot.kinematics import Array
 
-# These numbers change how tight a bound is, not whether it holds. In tests/benchmarks/constants_fit.py half and twice
-# of _SMOOTHING and _SETTLED move it by 4 % and 0.3 % of the gap that is asked for, of the others not at all.
+# These numbers change how tight a bound is, not whether it holds. In tests/benchmarks/constants_fit.py each is halved
+# and doubled: _SMOOTHING and _SETTLED then move the bound by 4 % and 0.3 % of the gap that is asked for, the others not
+# at all.
 _STEPS = 25  # steps of the reweighted least squares
 _SMOOTHING = 3.0  # digits: eps falls to this negative power of ten of the mean norm
 # The reweighting ends when no deviation changes by more, in units in which the normal equations' diagonal is 1.

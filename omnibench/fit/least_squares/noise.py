@@ -28,8 +28,9 @@ from omnibench.robot.kinematics import Array
 # White noise, m or rad, that keeps the covariance regular where there is neither white noise nor walk: a millionth of
 # the millimetre that poses are known to. Half of it and twice change nothing (tests/benchmarks/constants_fit.py).
 LEAST_WHITE = 1e-9
-# Range of the search: logarithms of the components as shares of the residuals' RMS. Half and twice as wide, it moves
-# estimates by 4e-5 of their standard deviations, and these by 0.1 % (tests/benchmarks/constants_fit.py).
+# Range of the search: logarithms of the components as shares of the residuals' RMS. Half as wide, it moves estimates by
+# 1e-4 of their standard deviations at most, twice as wide by 2e-3; either moves these deviations by 0.1 %
+# (tests/benchmarks/constants_fit.py).
 _LOGARITHMS = (np.log(1e-4), np.log(1e2))
 # Change of twice the log-likelihood below which a component is set to zero: nothing beside 2.7, a test at 5 % (Self
 # and Liang 1987). Half of it and twice change nothing (tests/benchmarks/constants_fit.py).

@@ -6,8 +6,8 @@ import numpy as np
 
 from omnibench.robot.kinematics import Array
 
-# Share of the largest of some eigenvalues or variances below which another one is rounding: far above that of products
-# of columns (1e-15), and far below a direction of wheel rates that are a hundredth of the strongest (1e-4).
+# Share of the largest eigenvalue or variance below which another one is rounding: far above the rounding of products
+# between columns (1e-15), and far below a direction of wheel rates that are a hundredth of the strongest (1e-4).
 ROUNDING = 1e-12
 
 

@@ -25,7 +25,7 @@ class Counts:
     late: int = _anomaly("wheel sample", "out of order")  # a newer one had been taken
     gaps: int = _anomaly("gap", "longer than max_gap")
     clock_jumps: int = _anomaly("jump", "of the wheel samples' clock")  # the stamps went on somewhere else
-    bad_stamps: int = _anomaly("wheel sample", "with an unlikely stamp")  # which the next ones did not confirm
+    bad_stamps: int = _anomaly("wheel sample", "with an unlikely stamp")  # the next stamps did not confirm it
     wraps: int = 0  # angles that started again after a turn of the counter
     counter_restarts: int = _anomaly("restart", "of a wheel's counter")  # elsewhere, or it moved faster than max_rate
     not_finite: int = _anomaly("wheel sample", "not finite")  # NaN or infinity among angles and rates

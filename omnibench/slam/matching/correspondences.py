@@ -10,7 +10,7 @@ from omnibench.robot.planar import rotation
 from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints
 
-# The study tests/benchmarks/constants_fit.py varies these numbers by 0.5 and 2. In three rooms the median error stays
+# The study tests/benchmarks/constants_slam.py varies these numbers by 0.5 and 2. In three rooms the median error stays
 # between 1.04 and 1.14 mm (1.07 mm as they are) and the median NEES between 2.3 and 2.7 (3 for an honest covariance).
 _OUTLIER = 4.0  # standard deviations: a point farther from a surface does not match it
 _PARALLEL = 0.9  # least cosine between the normals of a point and of its surface

@@ -12,7 +12,7 @@ from omnibench.slam.matching.map import ScanMap
 from omnibench.slam.matching.points import ScanPoints
 from omnibench.slam.slam_options import SlamOptions
 
-# The study tests/benchmarks/constants_fit.py varies these numbers by 0.5 and 2. In three rooms poses change by a
+# The study tests/benchmarks/constants_slam.py varies these numbers by 0.5 and 2. In three rooms poses change by a
 # hundredth of their deviations at most. Where scans mislead (round rooms, a quick robot, a mirrored scanner) they stay
 # the same but for three: with LOST = 0.1 a scan at a wrong pose counts (NEES 5.2 for 3.6); _CONVINCING = 0.3 moves a
 # quick robot by 0.7 deviations; and with _FALSE = 1 or _TRUE = 0.4, which exclude each other, a round room seems to
