@@ -82,16 +82,16 @@ def _run(command: Any) -> None:
     except Interrupted as error:
         _fail(str(error), 130)
     except OmnibenchError as error:
-        _fail(f"error: {error}")
+        _fail(_with_notes(f"error: {error}", error))
     except typer.Abort:
         _fail("interrupted", 130)
     except BrokenPipeError:
         sys.stderr.close()  # the program that read our output has ended
         sys.exit(1)
-    except MemoryError:
-        _fail("error: out of memory; make the data or the budget smaller")
+    except MemoryError as error:
+        _fail(_with_notes("error: out of memory; make the data or the budget smaller", error))
     except OSError as error:  # a disk or a terminal that failed unexpectedly
-        _fail(f"error: {error.filename or 'output'}: {error.strerror or error}")
+        _fail(_with_notes(f"error: {error.filename or 'output'}: {error.strerror or error}", error))
     else:
         if code == 130:  # newer versions of Typer return this after Ctrl-C
             _fail("interrupted", 130)
@@ -111,6 +111,11 @@ def _usage(error: Any) -> str:
     context = error.ctx
     command = context.command_path if context else "omnibench"
     return f"error: {message} (see {command} --help)"
+
+
+def _with_notes(message: str, error: Exception) -> str:
+    """The message and what was noted with the error, such as the place of results that are kept."""
+    return "; ".join([message, *getattr(error, "__notes__", ())])
 
 
 def _fail(message: str, code: int = 2) -> NoReturn:

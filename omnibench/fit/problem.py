@@ -133,11 +133,6 @@ class CalibrationProblem:
         return self.budget.evaluations - self.evaluations
 
     @property
-    def is_fast(self) -> bool:
-        """True once ``cost`` uses the fast evaluator."""
-        return self._evaluator is not None
-
-    @property
     def seconds(self) -> float:
         """Wall time since the problem was made."""
         return time.perf_counter() - self._began

@@ -63,7 +63,7 @@ class SlamRequest:
         """Find the poses and write the data set. DataError in one line, before the work where that can be.
 
         Until the data set is written, the paths found so far are kept in a folder beside it, with which the command
-        goes on when it is run again. Interrupted: Ctrl-C; the message names that folder.
+        goes on when it is run again. Interrupted: Ctrl-C; the message names that folder, as a note of any error does.
         """
         recorded = load_dataset(self.dataset)
         truth = self._truth_of(recorded)
@@ -115,15 +115,21 @@ def _paths_beside(output: Path) -> Path:
 
 @contextmanager
 def _kept(folder: Path | None) -> Iterator[None]:
-    """Remove the folder of paths when the block ends well. Interrupted says after Ctrl-C how to go on with them."""
+    """Remove the folder of paths when the block ends well; else the error says where they are.
+
+    Interrupted: after Ctrl-C. Other errors get a note.
+    """
     if folder is None:
         yield
         return
     try:
         yield
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Exception) as error:
         if not any(folder.glob("*.json")):
             raise
-        message = f"interrupted; the paths found so far are kept in {folder}: run the command again"
-        raise Interrupted(message) from None
+        kept = f"the paths found so far are kept in {folder}"
+        if isinstance(error, KeyboardInterrupt):
+            raise Interrupted(f"interrupted; {kept}: run the command again") from None
+        error.add_note(kept)
+        raise
     ResultStore(folder, SlamPath).remove()

@@ -15,6 +15,7 @@ wheel equations (Eq. 3) stand here. Kinds of noise, beside white noise of 5 mm a
 - bias: an error of the whole run of 1 cm and 0.01 rad.
 - commands: the path of every command is pulled by 1 cm / s and 0.01 rad / s, alike in all its repetitions, so that no
   matrix fits.
+- slight: that of commands, an eighth as strong, which about half of the tests for it do not notice.
 - turn: that of bias, in straight runs without repetition beside a single run that turns on the spot.
 - sessions: the reference of every session has a scale that is off by 2 %, as with a wheel or a map that changes by day.
 
@@ -51,7 +52,7 @@ from omnibench.registry import effects
 from omnibench.robot.kinematics import Array, Robot, Wheel
 
 METHODS = ("closed_form", "trajectory_ml", "discover")
-KINDS = ("white", "start", "walk", "bias", "turn", "commands", "sessions")
+KINDS = ("white", "start", "walk", "bias", "turn", "slight", "commands", "sessions")
 CLUSTERS = (5, 8, 12)
 SPEED, TURNS = 0.25, (0.5, -0.5, 0.0)  # m/s, rad/s
 TIMES = 0.2 * np.arange(1, 21)  # s, wheel samples
@@ -59,6 +60,7 @@ STAMPS = np.append(0.0, TIMES[1::2])  # s, reference poses
 DRIFT = 0.003  # rad/s, of the heading, where an effect is hidden
 UNITS = np.array([0.01, 0.01, 0.01])  # m, m, rad: what sizes of noise are given in
 WHITE = 0.5  # of these
+PULLED = {"commands": 1.0, "slight": 0.125}  # of these a second
 ANGLES = np.radians([60.0, 180.0, 300.0])
 ROBOT = Robot(
     name="APR-02",
@@ -116,7 +118,7 @@ def simulated(kind: str, clusters: int, seed: int, drift: float = 0.0) -> tuple[
     ]
     if kind == "turn":
         twists.append(np.array([0.0, 0.0, TURNS[0]]))
-    pulls = UNITS * rng.standard_normal((len(twists), 3)) * (kind == "commands")
+    pulls = PULLED.get(kind, 0.0) * UNITS * rng.standard_normal((len(twists), 3))
     scales = 1 + 0.02 * rng.standard_normal(sessions) * by_session
     runs = []
     for session, command, repetition in product(range(sessions), range(len(twists)), range(repetitions)):

@@ -319,6 +319,28 @@ def test_after_ctrl_c_the_command_goes_on(
     assert len(poses) == 1  # of one run, whoever found its path
 
 
+def test_an_error_says_where_the_paths_found_before_it_are_kept(
+    command: Command, driven: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = load_dataset(driven.data)
+    assert data.scans is not None
+    (first,) = data.trajectories[:1]
+    scans = data.scans.of(first.id)
+    empty = replace(scans, ranges=np.zeros_like(scans.ranges))
+    content = dict.fromkeys(("1", "2", "3"), scans) | {"4": empty}  # two at a time: others end before the last begins
+    runs = tuple(replace(first, id=name) for name in content)
+    save_dataset(replace(data, trajectories=runs, scans=ScansInMemory(data.scans.scanner, content)), tmp_path / "four")
+    monkeypatch.chdir(tmp_path)
+    run = command("slam", "four", "-o", "found")
+    kept = "the paths found so far are kept in found.slam-paths"
+    assert (run.returncode, run.stdout) == (2, "")
+    assert run.stderr.splitlines()[-1] == (
+        "error: four/scans.parquet, row 49: the scan of trajectory 4 at 0 s is empty: "
+        f"no range from 0.1 to 30 m; remove the row; {kept}"
+    )
+    assert {file.name for file in tmp_path.iterdir()} == {"four", "found.slam-paths"}
+
+
 def test_ctrl_c_before_the_first_path_leaves_nothing(driven: Driven, tmp_path: Path) -> None:
     program = "import os, signal, sys, threading; sys.argv[0] = 'omnibench'; "
     program += "from omnibench.__main__ import main; import omnibench.cli.app, omnibench.slam.slam_request; "

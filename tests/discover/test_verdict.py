@@ -42,20 +42,7 @@ ONE_OF_TWO = effect(weight=0.5, confusable=("floor_drift",))
         ((effect(), effect("floor_drift", 0.6)), (SEEN,), (), "incomplete"),
         ((ONE_OF_TWO,), (SEEN,), (), "class"),
         ((effect("floor_drift"), ONE_OF_TWO), (SEEN,), (SEEN,), "class"),
-    ],
-)
-def test_the_verdict_follows_from_names_and_from_what_is_left(
-    effects: tuple[NamedEffect, ...],
-    where: tuple[CovariateDependence, ...],
-    left: tuple[CovariateDependence, ...],
-    verdict: Verdict,
-) -> None:
-    assert verdict_of(effects, where, left) == verdict
-
-
-@pytest.mark.parametrize(
-    ("effects", "where", "left", "verdict"),
-    [
+        # Motors are judged by themselves, and the odometry first.
         ((), (MOTORS,), (MOTORS,), "none"),  # what a controller does without a name is nothing that the odometry lacks
         ((LAG,), (MOTORS,), (), "named"),
         ((LAG,), (MOTORS,), (MOTORS,), "named"),
@@ -63,7 +50,7 @@ def test_the_verdict_follows_from_names_and_from_what_is_left(
         ((effect(), LAG), (SEEN, MOTORS), (MOTORS,), "named"),
     ],
 )
-def test_motors_are_judged_by_themselves_and_the_odometry_first(
+def test_the_verdict_follows_from_names_and_from_what_is_left(
     effects: tuple[NamedEffect, ...],
     where: tuple[CovariateDependence, ...],
     left: tuple[CovariateDependence, ...],

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import AfterValidator, Field, SecretStr, field_validator, model_validator
 
-from omnibench.config import Model, RelativePath, read_model
+from omnibench.config import Model, RelativePath
 
 Mode = Literal["router", "peer", "client"]
 
@@ -216,8 +215,3 @@ class SessionConfig(Model):
     @property
     def _protocol(self) -> str:
         return "tls" if self.tls else "tcp"
-
-
-def read_session_config(path: Path) -> SessionConfig:
-    """Read a session's config from a file; its paths are relative to the file. ConfigError in one line."""
-    return read_model(SessionConfig, path)

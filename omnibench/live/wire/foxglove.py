@@ -66,10 +66,6 @@ class FoxgloveServer(Closing):
             self._channels[name] = foxglove.Channel(name, schema=schema, message_encoding="cdr", context=self._context)
         self._listeners.append(listener)
 
-    def subscribed(self, name: str) -> bool:
-        """True if a client subscribes to the topic, as /apr02/odom, now."""
-        return name in self._channels and self._channels[name].has_sinks()
-
     def close(self) -> None:
         """Stop serving, and return when another server can have the port."""
         for listener in self._listeners:

@@ -16,6 +16,7 @@ from omnibench.fit.evaluator.evaluator import PoseEvaluator, make_evaluator
 from omnibench.fit.evaluator.expansion import Basis, degree_for
 from omnibench.fit.evaluator.impulses import cut, impulses, make_path, quadrature
 from omnibench.fit.parameterisation import GeometryLimits
+from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
@@ -127,12 +128,18 @@ def test_outside_the_box_direct_integration_answers() -> None:
     assert np.abs(problem.cost(candidates) - problem.values(candidates)).max() <= 1e-11
 
 
-def test_a_search_builds_the_evaluator_and_few_evaluations_do_not() -> None:
+def test_a_search_builds_the_evaluator_and_few_evaluations_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    build, built_for = CalibrationProblem.build_evaluator, []
+
+    def noted(problem: CalibrationProblem) -> PoseEvaluator | None:
+        built_for.append(problem)
+        return build(problem)
+
+    monkeypatch.setattr(CalibrationProblem, "build_evaluator", noted)
     few, many = make_problem(long_runs()), make_problem(long_runs())
     calibrators.create("closed_form").calibrate(few)
     calibrators.create("random_search", {"candidates": 300}).calibrate(many)
-    assert not few.is_fast
-    assert many.is_fast
+    assert built_for == [many]
 
 
 def test_recordings_that_moments_would_slow_down_are_integrated_directly() -> None:

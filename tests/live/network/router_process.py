@@ -13,9 +13,10 @@ from pathlib import Path
 
 import zenoh
 
+from omnibench.config import read_model
 from omnibench.live.network.access_log import log_refused_access
 from omnibench.live.network.session import open_session
-from omnibench.live.network.session_config import read_session_config
+from omnibench.live.network.session_config import SessionConfig
 
 
 def say(line: str) -> None:
@@ -25,7 +26,7 @@ def say(line: str) -> None:
 
 def main(path: Path) -> None:
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    config = read_session_config(path)
+    config = read_model(SessionConfig, path)
     ended = threading.Event()
     threading.Thread(target=lambda: (sys.stdin.read(), ended.set()), daemon=True).start()
 

@@ -151,10 +151,11 @@ class TestLog:
 _PROGRAM = """
 import os, subprocess, sys
 from pathlib import Path
+from omnibench.config import read_model
 from omnibench.live.network.access_log import log_refused_access
 from omnibench.live.network.session import open_session
-from omnibench.live.network.session_config import read_session_config
-config = read_session_config(Path(sys.argv[1]))
+from omnibench.live.network.session_config import SessionConfig
+config = read_model(SessionConfig, Path(sys.argv[1]))
 print("before")
 with log_refused_access(config), open_session(config, "router"):
     print("printed")

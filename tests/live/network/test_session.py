@@ -17,10 +17,10 @@ import pytest
 import zenoh
 from sessions import free_port, until
 
-from omnibench.config import to_yaml, validate
+from omnibench.config import read_model, to_yaml, validate
 from omnibench.errors import ConfigError
 from omnibench.live.network.session import open_session, zenoh_config
-from omnibench.live.network.session_config import SessionConfig, User, read_session_config
+from omnibench.live.network.session_config import SessionConfig, User
 
 
 @pytest.fixture
@@ -328,7 +328,7 @@ def test_paths_start_from_the_config_files_folder(tmp_path: Path) -> None:
     files = {"ca": "keys/ca.pem", "certificate": "/etc/node.pem", "key": "keys/node.key"}
     given = {"tls": files, "users_file": "users.txt", "user": {"name": "me", "password_file": "me.password"}}
     (tmp_path / "session.yaml").write_text(json.dumps(given))
-    there = read_session_config(tmp_path / "session.yaml")
+    there = read_model(SessionConfig, tmp_path / "session.yaml")
     assert there.tls is not None
     assert there.user is not None
     assert there.tls.ca == tmp_path / "keys/ca.pem"
