@@ -16,12 +16,13 @@ wheel equations (Eq. 3) stand here. Kinds of noise, beside white noise of 5 mm a
 - commands: the path of every command is pulled by 1 cm / s and 0.01 rad / s, alike in all its repetitions, so that no
   matrix fits.
 - slight: that of commands, an eighth as strong, which about half of the tests for it do not notice.
+- once: that of walk, in runs without repetition.
 - turn: that of bias, in straight runs without repetition beside a single run that turns on the spot.
 - sessions: the reference of every session has a scale that is off by 2 %, as with a wheel or a map that changes by day.
 
-Clusters are commands, each driven three times in one session; for ``sessions`` they are sessions of four commands that
-are driven twice. ``discover`` stands for the intervals of a model that discover has extended, by the effect that is
-there: a drift of the heading.
+Clusters are commands, each driven three times in one session, but once where there are no repetitions; for ``sessions``
+they are sessions of four commands that are driven twice. ``discover`` stands for the intervals of a model that discover
+has extended, by the effect that is there: a drift of the heading.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ from omnibench.registry import effects
 from omnibench.robot.kinematics import Array, Robot, Wheel
 
 METHODS = ("closed_form", "trajectory_ml", "discover")
-KINDS = ("white", "start", "walk", "bias", "turn", "slight", "commands", "sessions")
+KINDS = ("white", "start", "walk", "bias", "once", "turn", "slight", "commands", "sessions")
 CLUSTERS = (5, 8, 12)
 SPEED, TURNS = 0.25, (0.5, -0.5, 0.0)  # m/s, rad/s
 TIMES = 0.2 * np.arange(1, 21)  # s, wheel samples
@@ -87,6 +88,7 @@ class Row:
     """Intervals of one set: of the nine elements of the matrix, then of the wheels' geometry, or of the effect.
 
     errors: about the truth, in the standard deviations that are stated. reach: half-widths of the intervals, likewise.
+    Both are empty where no interval is stated, with the reason in source.
     """
 
     case: str
@@ -110,7 +112,8 @@ def simulated(kind: str, clusters: int, seed: int, drift: float = 0.0) -> tuple[
     design = np.concatenate([np.full(3, 0.148), np.full(3, 0.195), ANGLES])
     truth = design + np.repeat([0.002, 0.004, math.radians(1)], 3) * rng.standard_normal(9)
     by_session = kind == "sessions"
-    commands, sessions, repetitions = (4, clusters, 2) if by_session else (clusters, 1, 1 if kind == "turn" else 3)
+    alone = kind in ("once", "turn")
+    commands, sessions, repetitions = (4, clusters, 2) if by_session else (clusters, 1, 1 if alone else 3)
     first = rng.uniform(0, 2 * math.pi)
     twists = [
         np.array([SPEED * math.cos(angle), SPEED * math.sin(angle), 0.0 if kind == "turn" else TURNS[number % 3]])
@@ -169,7 +172,7 @@ def noise_of(kind: str, rng: np.random.Generator) -> Array:
     extra = rng.standard_normal((later, 3))
     if kind == "start":
         errors[0] = extra[0] * [1.0, 1.0, 1.75]
-    elif kind == "walk":
+    elif kind in ("walk", "once"):
         errors[1:] += 0.5 * np.cumsum(np.sqrt(np.diff(STAMPS))[:, None] * extra, axis=0)
     elif kind in ("bias", "turn"):
         errors[1:] += extra[0]
@@ -185,6 +188,8 @@ def covered(case: Case, seed: int) -> Row:
         found, truth = extended_by_drift(dataset), np.append(elements, drift)
     else:
         found, truth = calibrated(dataset, case.method, seed), np.append(elements, geometry)
+    if isinstance(found, str):
+        return Row(str(case), seed, (), (), found)
     errors, reach = (found.values - truth) / found.deviations, found.reach / found.deviations
     return Row(str(case), seed, tuple(errors.round(4).tolist()), tuple(reach.round(4).tolist()), found.source)
 
@@ -199,11 +204,12 @@ class Found:
     source: str
 
 
-def calibrated(dataset: Dataset, calibrator: str, seed: int) -> Found:
-    """The elements of the matrix and the wheels' geometry, by ``calibrate``."""
+def calibrated(dataset: Dataset, calibrator: str, seed: int) -> Found | str:
+    """The elements of the matrix and the wheels' geometry, by ``calibrate``, or why there are no intervals."""
     run = calibrate(dataset, calibrator, seed=seed, budget=Budget(seconds=math.inf))
     uncertainty = run.uncertainty
-    assert uncertainty is not None, run.warnings
+    if uncertainty is None:
+        return "; ".join(run.warnings)
     assert uncertainty.parameters is not None
     wheels = np.array([(each.value, each.standard_deviation, each.high) for each in uncertainty.parameters])
     matrix, intervals = run.calibration.matrix_array, uncertainty.intervals
@@ -252,17 +258,21 @@ def carry_out(missing: Sequence[tuple[Case, int]], path: Path, jobs: int, doubt:
 
 
 def table(rows: Iterable[Row], chosen: Iterable[Case]) -> Iterator[str]:
-    """A line for every cell: coverage with its 95 % interval (Wilson), each set counted as one trial."""
+    """A line for every cell: coverage with its 95 % interval (Wilson), each set counted as one trial.
+
+    without: number of sets for which no interval is stated.
+    """
     rows = list(rows)
-    yield f"{'':28s} sets   elements, %              geometry or effect, %    least   stated / seen"
+    yield f"{'':28s} sets   elements, %              geometry or effect, %    least   stated / seen   without"
     for case in chosen:
-        own = [row for row in rows if row.case == str(case)]
+        every = [row for row in rows if row.case == str(case)]
+        own = [row for row in every if row.errors]
         if own:
             hits = np.array([row.covered for row in own])
             seen = np.sqrt(np.mean(np.square([row.errors for row in own]), axis=0))
             yield (
                 f"{case!s:28s} {len(own):4d}   {share(hits[:, :9])}    {share(hits[:, 9:])}    "
-                f"{100 * hits.mean(axis=0).min():4.1f}    {np.mean(1 / seen):.2f}"
+                f"{100 * hits.mean(axis=0).min():4.1f}    {np.mean(1 / seen):.2f}            {len(every) - len(own):4d}"
             )
 
 

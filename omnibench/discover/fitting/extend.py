@@ -139,4 +139,4 @@ def _covariance(fit: Fit, data: Whitened) -> EstimatedCovariance:
     """Covariance (p, p) of the fitted numbers: by the noise model, or by the runs where they scatter more."""
     unit = 1 / np.sqrt(np.maximum(np.diag(data.information), 1e-300))
     covariance = FitCovariance(data, fit.runs, fit.noise, unit)
-    return covariance.chosen(covariance.scatter_is_wider)[0]
+    return covariance.chosen(covariance.scatter_stands)[0]

@@ -13,7 +13,7 @@ statistically efficient as long as the model is right. Nuisances of each run:
 Where the runs scatter more than their noise explains, no matrix is right, and the best one depends on its purpose: the
 squared pose errors at the stamps of the problem's cost are then minimised, with starts and clocks kept as the
 likelihood found them. The covariance is that of the noise model, or the sandwich of the scatter
-(uncertainty/sandwich.py).
+(uncertainty/sandwich.py), also where no repetition shows the noise.
 """
 
 from __future__ import annotations
@@ -59,7 +59,9 @@ class TrajectoryMLOptions(Options):
         "auto", description="of the noise, of the problem's cost, or the latter only where the model misfits"
     )
     covariance: Literal["auto", "model", "robust"] = Field(
-        "auto", description="from the noise, from the scatter of the runs, or the latter only where the model misfits"
+        "auto",
+        description="from the noise, from the scatter of the runs, or the latter only where the model misfits or no "
+        "command is repeated",
     )
     tolerance: float = Field(1e-3, gt=0, description="largest last step, standard errors")
 
@@ -142,7 +144,7 @@ class TrajectoryML(Calibrator):
             weightings = cost_weightings(problem.objective, fit.runs, fit.residuals)
             now = descend(now.fit.with_nuisances(fit.nuisances.held()), weightings, options.tolerance)
             covariance = self._covariance(now, noise)
-        robust = options.covariance == "robust" or (options.covariance == "auto" and covariance.scatter_is_wider)
+        robust = options.covariance == "robust" or (options.covariance == "auto" and covariance.scatter_stands)
         chosen, words = covariance.chosen(by_cost or robust)
         return TrajectoryEstimate(
             vector=now.fit.vector,

@@ -20,6 +20,14 @@ position has two coordinates of the same variance. The variances of positions ha
 degrees of freedom, more where white noise dominates. Those of headings have one coordinate, and D. (3) is taken for
 all numbers: with such a shared part, of the elements of the heading's row 99 % of the intervals hold the truth with
 D = 4, and 97 % with D = 6.
+
+Without repetitions the residuals of D runs stand in for differences. A fit of n numbers leaves 3 D - n of the D shared
+parts, and the variances have at least two thirds as many degrees of freedom,
+
+    2 D - 2 n / 3,                                                                                        (4)
+
+but one. They are too small then, since likelihood does not know what the fit has taken, and the scatter of the runs,
+which is corrected for that, stands for the noise model wherever the runs are enough for it.
 """
 
 from __future__ import annotations
@@ -61,7 +69,9 @@ class FitCovariance:
         scores, information = data.scores * unit, data.information_of_runs * np.outer(unit, unit)
         roots = roots_of(information.sum(axis=0))
         self._noise, self._roots = noise, unit[:, None] * roots
-        self.by_model = EstimatedCovariance(self._roots @ self._roots.T, 2 * noise.degrees_of_freedom)  # Eq. (3)
+        taken = 0 if noise.source == "repetitions" else roots.shape[1]
+        freedom = max(2 * noise.degrees_of_freedom - 2 * taken / 3, 1)  # Eq. (3), (4)
+        self.by_model = EstimatedCovariance(self._roots @ self._roots.T, freedom)
         self._chance_of_misfit = _chance_of_misfit(scores @ roots, roots.T @ information @ roots, runs)
         if not roots.size:
             return
@@ -90,13 +100,15 @@ class FitCovariance:
         return self.scatter is not None and self.scatter.lack_of_fit and self._chance_of_misfit < CHANCE
 
     @property
-    def scatter_is_wider(self) -> bool:
-        """True if the runs scatter significantly more than the noise model predicts.
+    def scatter_stands(self) -> bool:
+        """True if the runs scatter significantly more than the noise model predicts, or no repetition shows the noise.
 
         Scatter between commands counts only if the likelihood's test confirms it, at the level of the sandwich's.
         """
         if self.scatter is None:
             return False
+        if self._noise.source == "within runs":
+            return True
         if self.scatter.clustered:
             return self._chance_of_misfit < DOUBT
         back = np.linalg.pinv(self._roots)

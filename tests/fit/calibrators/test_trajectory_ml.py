@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fit_samples import make_problem, noisy_trajectories
+from numpy.testing import assert_array_equal
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import ConfigError
@@ -187,6 +188,23 @@ def test_intervals_of_the_scatter_can_be_asked_for() -> None:
     # The same variances but for chance; each is known from 24 differences.
     ratios = np.diag(scatter.covariance) / np.diag(model.covariance)
     assert np.exp(np.abs(np.log(ratios)).max()) < 3
+
+
+def test_without_repetitions_the_scatter_of_the_runs_states_the_intervals() -> None:
+    problem = flower()
+    once = changed(problem, [run for run in problem.trajectories if run.repetition == 1])
+    asked, by_itself = solved(once, covariance="robust"), solved(once)
+    assert by_itself.covariance is not None
+    assert asked.covariance is not None
+    assert_array_equal(by_itself.covariance, asked.covariance)
+    assert "the scatter between 12 runs: no command is repeated" in by_itself.reason
+
+
+def test_intervals_of_as_few_runs_as_the_numbers_take_are_wide() -> None:
+    problem = flower()
+    result = solved(changed(problem, [problem.trajectories[index] for index in (0, 15, 30)]))
+    assert result.degrees_of_freedom is not None
+    assert_array_equal(result.degrees_of_freedom, 1.0)
 
 
 def test_a_covariance_of_the_noise_does_not_go_with_weights_of_the_cost() -> None:
