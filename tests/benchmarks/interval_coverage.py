@@ -15,7 +15,7 @@ wheel equations (Eq. 3) stand here. Kinds of noise, beside white noise of 5 mm a
 - bias: an error of the whole run of 1 cm and 0.01 rad.
 - commands: the path of every command is pulled by 1 cm / s and 0.01 rad / s, alike in all its repetitions, so that no
   matrix fits.
-- slight: that of commands, an eighth as strong, which about half of the tests for it do not notice.
+- slight: that of commands, an eighth as strong: the test for it misses it in most sets of five commands.
 - once: that of walk, in runs without repetition.
 - turn: that of bias, in straight runs without repetition beside a single run that turns on the spot.
 - sessions: the reference of every session has a scale that is off by 2 %, as with a wheel or a map that changes by day.
