@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 from omnibench.compare.effective_config import load_calibrators
 from omnibench.compare.plan import PlannedRun, RunTask
-from omnibench.compare.run_progress import RunProgress
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error, run_calibrator
 from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
@@ -15,6 +14,7 @@ from omnibench.jobs.local_backends import Processes
 from omnibench.jobs.result_store import ResultStore
 from omnibench.progress import Progress, Reporter
 from omnibench.registry import calibrators
+from omnibench.words import plural
 
 _GRACE = 10.0  # s after the budget's time: a run that has not stopped by then is killed (chosen)
 # Modules that the processes share, so that they need not be imported for every run.
@@ -57,28 +57,47 @@ def _without_answer(outcome: Outcome, reason: str, evaluations: int = 0, seconds
 
 
 class _Runs(JobWatch[RunResult]):
-    """The results of runs so far, by their numbers in the plan."""
+    """The results of runs so far, by their numbers in the plan.
+
+    In the progress that is reported each run is a task of its own, with a line about its outcome as result.
+    """
 
     def __init__(self, plan: Sequence[PlannedRun], store: ResultStore[RunResult], report: Reporter) -> None:
         self.results: dict[int, RunResult] = {}
-        self._plan, self._store = plan, store
-        self._progress = RunProgress(report, len(plan))
+        self._plan, self._store, self._report = plan, store, report
         self._began: dict[int, float] = {}
         self._evaluations: dict[int, int] = {}
+        self._report_all()
 
     def began(self, number: int) -> None:
         if number not in self._began:
             self._began[number] = time.monotonic()
-            self._progress.began(self._plan[number])
+            self._report_run(number)
 
     def moved(self, number: int, event: Progress) -> None:
         self._evaluations[number] = event.done
-        self._progress.moved(self._plan[number], event)
+        self._report_run(number, event.done, event.best)
 
     def ended(self, number: int, ending: RunResult | Failure, reused: bool) -> None:
         result = self._result(number, ending) if isinstance(ending, Failure) else ending
         self.results[number] = result
-        self._progress.ended(self._plan[number], result, reused=reused)
+        cost = "no answer" if result.cost is None else f"cost {result.cost:.6f}"
+        kept = ", kept from an earlier run" if reused else ""
+        figures = f"{cost}, {plural(result.evaluations, 'evaluation')}, {result.seconds:.1f} s{kept}"
+        words = f"{self._plan[number].title}: {result.outcome}, {figures} ({result.reason})"
+        line = f"[{len(self.results)}/{len(self._plan)}] {words}"
+        self._report_run(number, result.evaluations, result.cost, line)
+        self._report_all()
+
+    def _report_all(self) -> None:
+        self._report(Progress("comparing", len(self.results), len(self._plan), "run"))
+
+    def _report_run(
+        self, number: int, evaluations: int = 0, best: float | None = None, result: str | None = None
+    ) -> None:
+        run = self._plan[number]
+        budget = run.config.budget.evaluations
+        self._report(Progress(run.title, evaluations, budget, "evaluation", best, result=result))
 
     def _result(self, number: int, failure: Failure) -> RunResult:
         """The result of a run that left none. DataError: the disk refused it."""

@@ -85,6 +85,11 @@ class PlannedRun:
     seed: int
 
     @property
+    def title(self) -> str:
+        """Data set, entry and seed."""
+        return f"{self.dataset_name} {self.label} seed {self.seed}"
+
+    @property
     def element_box(self) -> Box | None:
         """The box of matrix elements that is searched; None for a geometry, or an answer without a box."""
         return None if self.parameterisation == "geometry" or self.box_name == UNBOUNDED else self.box

@@ -33,7 +33,7 @@ CHANCE = 0.002  # probability that an effect is named where none is missing: in 
 # Share of its signature that an effect must keep beyond the matrix to be told from it: less is less than noise of an
 # effect that alone makes a chi-square of 10,000. At twice as much quadratic_rotation_slip would be absorbed, too.
 ABSORBED = 1e-4
-_MOST = 3  # effects that are named, at most: one more than any pair that the studies hide
+_MOST = 3  # effects that are named, at most: one more than the studies hide in a robot
 _CLEARLY = 3.0  # standard deviations by which generic bases must find something for a larger set to explain it
 _MOSTLY = 0.3  # share of it that the larger set may leave
 # Probability below which what is missing gets no name, and no model holds it: above that of even odds, Eq. (10).

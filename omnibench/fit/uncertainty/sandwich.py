@@ -47,11 +47,9 @@ number of directions in which the scatter was seen,
 
     tr E^2 / tr Q  (tr S)^2 / tr S^2.                                                                     (9)
 
-Repetitions that agree exactly are exceeded by whatever scatter there is.
-
-The test misses clusters that differ little, and intervals then rest on repetitions and are too narrow: where 4 to 12
-clusters differ by half to once the noise of a run, 84 to 92 % of the 95 % intervals of a linear model hold the truth,
-and 92 % of closed_form's from five commands (tests/benchmarks/interval_coverage.py --only slight, 60 sets).
+Repetitions that agree exactly are exceeded by whatever scatter there is. Clusters that differ little, by half to once
+the noise of a run, are often missed: then 84 to 92 % of the 95 % intervals of a linear model hold the truth, with 4 to
+12 clusters, and 92 % of closed_form's with 5 (tests/benchmarks/interval_coverage.py --only slight, 60 sets).
 """
 
 from __future__ import annotations
