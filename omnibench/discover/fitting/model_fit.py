@@ -10,11 +10,11 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.outliers import without_jumps
-from omnibench.discover.fitting.start_frames import in_start_frames
 from omnibench.discover.regressors.paths import Paths, make_paths
 from omnibench.fit.least_squares.noise import FIRST_NOISE, NoiseEstimate, Whitener, estimate_noise, is_near, whiteners
 from omnibench.fit.least_squares.nuisances import Nuisances, deviations_of, nuisance_columns
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions
+from omnibench.fit.least_squares.start_frames import in_start_frames
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
 from omnibench.fit.least_squares.whitened import Whitened, given
 from omnibench.robot.effects.term import Term

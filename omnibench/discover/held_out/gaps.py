@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit, at_runs
-from omnibench.discover.fitting.start_frames import in_start_frames
 from omnibench.discover.held_out.cross_validation import STANDARD_ERRORS, held_out_residuals, held_out_squares
 from omnibench.discover.held_out.validation_runs import ValidationRuns
 from omnibench.discover.result import Gap, HeldOut
 from omnibench.fit.least_squares.noise import whiteners
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions
+from omnibench.fit.least_squares.start_frames import in_start_frames
 from omnibench.fit.least_squares.whitened import whitened
 from omnibench.robot.kinematics import Array
 

@@ -29,8 +29,8 @@ from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.cost_weights import cost_weightings
 from omnibench.fit.least_squares.gauss_newton import BoxedFit, Descent, descend, first_fit
 from omnibench.fit.least_squares.noise import FIRST_NOISE, NoiseEstimate, estimate_noise, is_near, whiteners
+from omnibench.fit.least_squares.nuisance_noise import separate_start_noise
 from omnibench.fit.least_squares.nuisances import TURN, Nuisances
-from omnibench.fit.least_squares.start_noise import separate_start_noise
 from omnibench.fit.least_squares.trajectory_covariance import FitCovariance
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
 from omnibench.fit.problem import CalibrationProblem

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.least_squares.start_noise import separate_start_noise
+from omnibench.fit.least_squares.nuisance_noise import separate_start_noise
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
