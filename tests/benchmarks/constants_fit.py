@@ -26,13 +26,12 @@ from omnibench.design.report.tables import effort_table
 from omnibench.design.result import Chosen
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.certify import certify_optimum
-from omnibench.fit.least_squares.nuisances import Nuisances, deviations_of
-from omnibench.fit.least_squares.repetitions import differences_between_repetitions
+from omnibench.fit.least_squares.nuisance_noise import noise_of_fit
+from omnibench.fit.least_squares.nuisances import Nuisances
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.fit.uncertainty.identifiability import identifiability
 from omnibench.registry import costs
-from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.config import FlowerConfig
@@ -116,8 +115,7 @@ def nuisances_of(dataset: Dataset) -> Array:
     model = OdometryModel(dataset.robot, dataset.robot.inverse_kinematic_matrix, "arc")
     runs = dataset.split("train")
     fit = TrajectoryFit(model, runs, Nuisances(np.zeros((len(runs), 3)), np.zeros(3)))
-    noise = Noise(pose_position=0.005, pose_heading=0.005, walk_position=0.003, walk_heading=0.003)
-    return deviations_of(differences_between_repetitions(runs, fit.residuals, fit.slopes), noise)
+    return noise_of_fit(fit, range(3)).deviations
 
 
 def of_calibration(run: CalibrationRun, usual: Array | None = None) -> Answer:

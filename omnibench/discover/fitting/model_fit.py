@@ -4,15 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.outliers import without_jumps
 from omnibench.discover.regressors.paths import Paths, make_paths
-from omnibench.fit.least_squares.noise import FIRST_NOISE, NoiseEstimate, Whitener, estimate_noise, is_near, whiteners
-from omnibench.fit.least_squares.nuisances import Nuisances, deviations_of, nuisance_columns
+from omnibench.fit.least_squares.noise import (
+    FIRST_NOISE,
+    NoiseEstimate,
+    Whitener,
+    estimate_noise,
+    is_near,
+    whiteners,
+)
+from omnibench.fit.least_squares.nuisance_noise import noise_of_fit
+from omnibench.fit.least_squares.nuisances import Nuisances
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions
 from omnibench.fit.least_squares.start_frames import in_start_frames
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
@@ -37,13 +44,13 @@ class Fit(TrajectoryFit):
     noise: NoiseEstimate
     jumps: int = 0
 
-    @cached_property
-    def slopes(self) -> list[Array]:
-        """Derivatives (K, 3, 3) of the model's poses by the nuisances.
+    @property
+    def velocities(self) -> list[Array]:
+        """Velocities (K, 3) between the poses, m/s, m/s, rad/s.
 
-        Velocities are those between the poses, which takes no further evaluation of a model with effects.
+        They take no further evaluation of a model with effects, and are smoother than those of single samples.
         """
-        return [_nuisance_columns(log, poses) for log, poses in zip(self.logs, self.poses, strict=True)]
+        return [_velocities(log, poses) for log, poses in zip(self.logs, self.poses, strict=True)]
 
     @property
     def weightings(self) -> list[Whitener]:
@@ -64,10 +71,10 @@ class Fit(TrajectoryFit):
         return replace(self, nuisances=replace(self.nuisances, values=self.likeliest_nuisances(self.weightings)))
 
 
-def _nuisance_columns(log: WheelLog, poses: Array) -> Array:
+def _velocities(log: WheelLog, poses: Array) -> Array:
     stamps = np.append(min(0.0, log.stamps[0] - 1e-3), log.stamps)
-    velocity = np.gradient(np.vstack([log.start, poses]), stamps, axis=0)[1:]
-    return nuisance_columns(poses - log.start, velocity, log.stamps)
+    velocities: Array = np.gradient(np.vstack([log.start, poses]), stamps, axis=0)[1:]
+    return velocities
 
 
 def fit_matrix(runs: Sequence[Trajectory], robot: Robot, sample_period: float, start: Array) -> Fit:
@@ -81,9 +88,7 @@ def fit_matrix(runs: Sequence[Trajectory], robot: Robot, sample_period: float, s
         fit = _matrix_step(fit)
     for _ in range(_ROUNDS):
         before = fit.noise.noise
-        fit = with_noise(fit)
-        for _ in range(2 if fit.nuisances.deviations.any() else 1):
-            fit = _matrix_step(fit)
+        fit = _matrix_step(with_noise(fit))
         if is_near(before.model_dump(), fit.noise.noise.model_dump(), _NEAR):
             break
     return fit
@@ -93,15 +98,13 @@ def with_noise(fit: Fit) -> Fit:
     """The fit with noise, nuisances and jumping poses estimated anew from its residuals."""
     near = fit.noise.noise if fit.noise is not _UNKNOWN_NOISE else None
     turned = in_start_frames(fit.runs, fit.residuals)
-    noise = estimate_noise(fit.runs, turned, near)
+    noise = estimate_noise(differences_between_repetitions(fit.runs, turned), near)
     runs, jumps = without_jumps(fit.runs, turned, noise.noise)
-    if jumps:
-        fit = replace(fit, runs=runs, noise=noise, jumps=fit.jumps + jumps)
-        noise = estimate_noise(fit.runs, in_start_frames(fit.runs, fit.residuals), noise.noise)
-    residuals, slopes = (in_start_frames(fit.runs, values) for values in (fit.nuisance_free_residuals, fit.slopes))
-    deviations = deviations_of(differences_between_repetitions(fit.runs, residuals, slopes), noise.noise)
-    values = np.where(deviations > 0, fit.nuisances.values, 0.0)
-    return replace(fit, nuisances=Nuisances(values, deviations), noise=noise)
+    fit = replace(fit, runs=runs, jumps=fit.jumps + jumps)
+    found = noise_of_fit(fit, range(3), noise.noise)
+    values = np.where(found.deviations > 0, fit.nuisances.values, 0.0)
+    fit = replace(fit, nuisances=Nuisances(values, found.deviations), noise=found.estimate)
+    return fit.with_likeliest_nuisances()
 
 
 def paths_of(fit: Fit, coarse: float = 0.0) -> Paths:

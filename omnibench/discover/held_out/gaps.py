@@ -24,8 +24,7 @@ from omnibench.discover.held_out.cross_validation import STANDARD_ERRORS, held_o
 from omnibench.discover.held_out.validation_runs import ValidationRuns
 from omnibench.discover.result import Gap, HeldOut
 from omnibench.fit.least_squares.noise import whiteners
-from omnibench.fit.least_squares.repetitions import differences_between_repetitions
-from omnibench.fit.least_squares.start_frames import in_start_frames
+from omnibench.fit.least_squares.nuisance_noise import differences_without_nuisances
 from omnibench.fit.least_squares.whitened import whitened
 from omnibench.robot.kinematics import Array
 
@@ -86,11 +85,11 @@ class Floor:
 
 def floor_of(fit: Fit) -> Floor | None:
     """The floor of a fit's runs; None where no command is repeated."""
-    residuals, slopes = (in_start_frames(fit.runs, values) for values in (fit.nuisance_free_residuals, fit.slopes))
-    differences = differences_between_repetitions(fit.runs, residuals, slopes)
+    known = np.flatnonzero(fit.nuisances.estimated)
+    differences = differences_without_nuisances(fit, list(known))
     if differences.source != "repetitions":
         return None
-    each, known = differences.each, fit.nuisances.estimated
+    each = differences.each
     white = whitened(
         [difference.values for difference in each],
         [np.zeros((*difference.values.shape, 0)) for difference in each],

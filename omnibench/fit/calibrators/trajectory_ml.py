@@ -28,8 +28,8 @@ from omnibench.config import Positive
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.cost_weights import cost_weightings
 from omnibench.fit.least_squares.gauss_newton import BoxedFit, Descent, descend, first_fit
-from omnibench.fit.least_squares.noise import FIRST_NOISE, NoiseEstimate, estimate_noise, is_near, whiteners
-from omnibench.fit.least_squares.nuisance_noise import separate_start_noise
+from omnibench.fit.least_squares.noise import FIRST_NOISE, NoiseEstimate, is_near, whiteners
+from omnibench.fit.least_squares.nuisance_noise import FitNoise, noise_of_fit
 from omnibench.fit.least_squares.nuisances import TURN, Nuisances
 from omnibench.fit.least_squares.trajectory_covariance import FitCovariance
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
@@ -118,12 +118,12 @@ class TrajectoryML(Calibrator):
         fit = first_fit(problem)
         stamps = fit.trajectories.stamps
         now = descend(self._with_deviations(fit, 0.0), whiteners(FIRST_NOISE, stamps), _STILL)
-        noise: _Noise | None = None
+        noise: FitNoise | None = None
         rounds, settled = 0, False
         while not settled and rounds < _MOST_ROUNDS:
             before, earlier = now.fit, noise
             noise = self._noise(before.trajectories, earlier)
-            fit = self._with_deviations(before, noise.start_heading)
+            fit = self._with_deviations(before, noise.deviations[TURN])
             now = descend(fit, whiteners(noise.estimate.noise, stamps), self.options.tolerance)
             moved = now.fit.vector - before.vector
             still = float(moved @ now.data.information @ moved) < _STILL**2
@@ -171,28 +171,10 @@ class TrajectoryML(Calibrator):
         values = np.where(deviations > 0, fit.trajectories.nuisances.values, 0.0)
         return fit.with_nuisances(Nuisances(values, deviations))
 
-    def _noise(self, fit: TrajectoryFit, earlier: _Noise | None) -> _Noise:
+    def _noise(self, fit: TrajectoryFit, earlier: FitNoise | None) -> FitNoise:
         """The noise and the deviation of the start headings, from the residuals of a fit."""
-        values = fit.nuisances.values.copy()
-        values[:, TURN] = 0.0
-        straight = replace(fit, nuisances=replace(fit.nuisances, values=values))
-        noise = estimate_noise(fit.runs, straight.residuals, None if earlier is None else earlier.estimate.noise)
-        if self.options.start == "exact":
-            return _Noise(noise, 0.0)
-        turning = [slopes[..., TURN] for slopes in straight.slopes]
-        apart = separate_start_noise(fit.runs, straight.residuals, turning, noise.noise)
-        least = apart.noise.pose_heading if self.options.start == "noisy" else 0.0
-        return _Noise(replace(noise, noise=apart.noise), max(apart.start_heading, least))
-
-
-@dataclass(frozen=True)
-class _Noise:
-    """The noise of the reference, and the standard deviation of the start headings, rad."""
-
-    estimate: NoiseEstimate
-    start_heading: float
-
-    @property
-    def sizes(self) -> dict[str, float]:
-        """All standard deviations, by their names."""
-        return {**self.estimate.noise.model_dump(), "start_heading": self.start_heading}
+        start = self.options.start
+        near = None if earlier is None else earlier.estimate.noise
+        found = noise_of_fit(fit, [] if start == "exact" else [TURN], near)
+        least = found.estimate.noise.pose_heading if start == "noisy" else 0.0
+        return replace(found, deviations=np.maximum(found.deviations, [least, 0.0, 0.0]))

@@ -19,9 +19,8 @@ import numpy as np
 from scipy.linalg.lapack import dpbtrf, dtbtrs
 from scipy.optimize import minimize
 
-from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
-from omnibench.fit.least_squares.repetitions import Differences, differences_between_repetitions
+from omnibench.fit.least_squares.repetitions import Differences
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
@@ -52,9 +51,9 @@ class Whitener:
 
     def __init__(self, noise: Noise, stamps: Array) -> None:
         stamps = np.asarray(stamps, dtype=float)
-        if stamps.ndim != 1 or len(stamps) == 0 or not (np.diff(stamps, prepend=0.0) > 0).all():
-            raise ValueError("stamps must be increasing and > 0")
         steps = np.diff(stamps, prepend=0.0)
+        if stamps.ndim != 1 or len(stamps) == 0 or not (steps > 0).all():
+            raise ValueError("stamps must be increasing and > 0")
         self._position = _Factor(noise.pose_position, noise.walk_position, noise.bias_position, steps)
         self._heading = _Factor(noise.pose_heading, noise.walk_heading, noise.bias_heading, steps)
         self.log_determinant = 2 * self._position.log_determinant + self._heading.log_determinant
@@ -126,19 +125,13 @@ class NoiseEstimate:
     description: str
 
 
-def estimate_noise(
-    trajectories: Sequence[Trajectory], residuals: Sequence[Array], near: Noise | None = None
-) -> NoiseEstimate:
+def estimate_noise(differences: Differences, near: Noise | None = None) -> NoiseEstimate:
     """Variance components by restricted maximum likelihood from the differences between repetitions of a command.
 
-    residuals: for every trajectory (K, 3) at its pose_times[1:], odometry minus reference, m, m, rad, of any decent
-    fit, since errors of the model are the same in all repetitions and cancel. Repetitions are runs of one command
-    within a session (within a split if no session repeats a command). Runs with different stamps are compared at the
-    nearest ones; interpolation would reduce white noise. Without repetitions the residuals themselves count as noise,
-    and the estimate says so. near: an earlier estimate, where the search starts; without one it starts from several
-    points. DataError without trajectories.
+    The residuals are those of any decent fit, since errors of the model are the same in all repetitions and cancel.
+    Without repetitions the residuals themselves count as noise, and the estimate says so. near: an earlier estimate,
+    where the search starts; without one it starts from several points. DataError without differences.
     """
-    differences = differences_between_repetitions(trajectories, residuals)
     if not differences.each:
         raise DataError("no trajectory has a reference pose after its start; the noise cannot be estimated")
     return NoiseEstimate(

@@ -5,13 +5,7 @@ is a bias of the run, which the noise model contains. Nuisances eta of a run are
 deviations S (a diagonal matrix). With r the whitened residuals of a run and N the whitened derivatives of its poses by
 eta, the likeliest values for the residuals that a model would leave without nuisances are
 
-    eta = (N'N + S^-2)^-1 N'r,                                                                            (1)
-
-and marginalised, up to a constant,
-
-    -2 ln L = ln |1 + S N'N S| - (S N'r)' (1 + S N'N S)^-1 (S N'r) + r'r + ln |C|,                        (2)
-
-C being the covariance of the noise.
+    eta = (N'N + S^-2)^-1 N'r.                                                                            (1)
 """
 
 from __future__ import annotations
@@ -21,23 +15,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.least_squares.noise import Whitener
-from omnibench.fit.least_squares.repetitions import Differences
-from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import WheelLog
 
 NUISANCES = ("start heading", "clock offset", "clock slope")
 TURN, OFFSET, SLOPE = range(3)  # their columns
-# Twice the gain in log-likelihood that a variance of zero exceeds by chance once in 200 times: under the null half of
-# it is chi-square with one degree of freedom, half is 0 (Self and Liang 1987).
-_LEAST_GAIN = 6.6
-# rad, s, s per s: largest deviations that are searched, several times those of clocks that are synchronised by hand
-# (0.2 s, 0.003). Half and twice as wide, the search finds the same to 1e-5 (tests/benchmarks/constants_fit.py).
-_LARGEST = np.array([0.3, 0.5, 0.02])
 # A function from a run's residuals (K, 3), or their derivatives (K, 3, n), to weighted ones (k, 3) or (k, 3, n).
 Weighting = Callable[[Array], Array]
 
@@ -105,66 +89,3 @@ def likeliest_nuisances(
         inner = flat[:, 1:]
         values[row, known] = np.linalg.solve(inner.T @ inner + prior, inner.T @ flat[:, 0])
     return values
-
-
-class NuisanceLikelihood:
-    """Eq. (2) for differences between repetitions, by the standard deviations (m,) of m nuisances.
-
-    noise_part: the terms r'r + ln |C|, which ``__call__`` leaves out.
-    """
-
-    def __init__(self, differences: Differences, noise: Noise) -> None:
-        self.noise_part = 0.0
-        self._products, self._scores = [], []
-        for stamps, values, slopes in differences.by_stamps:
-            whitener, count = Whitener(noise, stamps), values.shape[2]
-            white = whitener(values).reshape(-1, count)
-            columns = whitener(slopes.reshape(*values.shape[:2], -1)).reshape(len(white), count, -1)
-            self.noise_part += count * whitener.log_determinant + float(np.square(white).sum())
-            self._products.append(np.einsum("rnk,rnl->nkl", columns, columns))
-            self._scores.append(np.einsum("rnk,rn->nk", columns, white))
-
-    def __call__(self, deviations: Array) -> float:
-        total = 0.0
-        for products, scores in zip(self._products, self._scores, strict=True):
-            inner = np.eye(len(deviations)) + products * np.outer(deviations, deviations)
-            scaled = scores * deviations
-            total += float(np.linalg.slogdet(inner)[1].sum())
-            total -= float(np.einsum("nk,nk->", scaled, np.linalg.solve(inner, scaled[..., None])[..., 0]))
-        return total
-
-    def along(self, deviations: Array, kind: int) -> tuple[float, float]:
-        """The best deviation of one kind, the others held, and the value that it reaches."""
-
-        def with_deviation(value: float) -> float:
-            return self(np.where(np.arange(len(deviations)) == kind, value, deviations))
-
-        answer = minimize_scalar(
-            with_deviation,
-            bounds=(0.0, float(_LARGEST[kind])),
-            method="bounded",
-            options={"xatol": 1e-5 * _LARGEST[kind]},
-        )
-        return float(answer.x), float(answer.fun)
-
-
-def deviations_of(differences: Differences, noise: Noise) -> Array:
-    """Standard deviations (3,) of the nuisances, by maximum likelihood from differences between repetitions.
-
-    0 for a nuisance that does not show. The three resemble each other: the likeliest comes in first, a further one only
-    for what those before it leave unexplained.
-    """
-    likelihood = NuisanceLikelihood(differences, noise)
-    deviations: Array = np.zeros(3)
-    chosen: list[int] = []
-    while len(chosen) < len(NUISANCES):
-        now = likelihood(deviations)
-        trials = {kind: likelihood.along(deviations, kind) for kind in range(3) if kind not in chosen}
-        best = min(trials, key=lambda kind: trials[kind][1])
-        if now - trials[best][1] < _LEAST_GAIN:
-            return deviations
-        chosen.append(best)
-        deviations[best] = trials[best][0]
-        for kind in (*chosen, *chosen):  # earlier kinds may have stood in for later ones: fit all again
-            deviations[kind] = likelihood.along(deviations, kind)[0]
-    return deviations

@@ -53,10 +53,12 @@ class Differences:
 def differences_between_repetitions(
     trajectories: Sequence[Trajectory], residuals: Sequence[Array], slopes: Sequence[Array] | None = None
 ) -> Differences:
-    """Independent differences of residuals (K, 3), given at every trajectory's pose_times[1:].
+    """Independent differences of residuals (K, 3), odometry minus reference or the reverse, at all pose_times[1:].
 
-    slopes (K, 3, m): derivatives of every trajectory's poses by its nuisances, averaged alongside; default none.
-    Without repeated commands the residuals themselves stand in for the differences.
+    Repetitions are runs of one command within a session (within a split if no session repeats a command). Runs with
+    different stamps are compared at the nearest ones; interpolation would reduce white noise. Without repeated commands
+    the residuals themselves stand in for the differences. slopes (K, 3, m): derivatives of every trajectory's poses by
+    its nuisances, averaged alongside; default none.
     """
     slopes = [np.zeros((*residual.shape, 0)) for residual in residuals] if slopes is None else slopes
     runs = [

@@ -62,9 +62,15 @@ class TrajectoryFit:
 
     @cached_property
     def slopes(self) -> list[Array]:
-        """Derivatives (K, 3, 3) of the model's poses by the nuisances.
+        """Derivatives (K, 3, 3) of the model's poses by the nuisances."""
+        paths = [poses - log.start for poses, log in zip(self.poses, self.logs, strict=True)]
+        return [nuisance_columns(*of_run) for of_run in zip(paths, self.velocities, self.stamps, strict=True)]
 
-        Velocities are differences over two samples: the rate of a single one has its full encoder noise.
+    @property
+    def velocities(self) -> list[Array]:
+        """Velocities (K, 3) at the poses, m/s, m/s, rad/s.
+
+        They are differences over two samples: the rate of a single one has its full encoder noise.
         """
         period = float(np.median(np.concatenate([np.diff(run.times, prepend=0.0) for run in self.runs])))
         later = np.array([0.0, -period, 0.0])
@@ -72,9 +78,7 @@ class TrajectoryFit:
             self.model.reported([log_of(run, values) for run, values in zip(self.runs, moved, strict=True)])
             for moved in (self.nuisances.values + later, self.nuisances.values - later)
         )
-        velocities = [(late - early) / (2 * period) for late, early in zip(after, before, strict=True)]
-        paths = [poses - log.start for poses, log in zip(self.poses, self.logs, strict=True)]
-        return [nuisance_columns(*of_run) for of_run in zip(paths, velocities, self.stamps, strict=True)]
+        return [(late - early) / (2 * period) for late, early in zip(after, before, strict=True)]
 
     @property
     def estimated_slopes(self) -> list[Array]:

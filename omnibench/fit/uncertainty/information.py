@@ -9,6 +9,7 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.least_squares.noise import NoiseEstimate, Whitener, estimate_noise
+from omnibench.fit.least_squares.repetitions import differences_between_repetitions
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
@@ -19,13 +20,11 @@ Stamps = Literal["reference", "final"]
 def noise_of_matrix(runs: Sequence[Trajectory], matrix: Array, integration: Integration) -> NoiseEstimate:
     """Noise of the reference poses, estimated from the residuals that ``matrix`` (3, N) leaves in some runs."""
     logs = [run.reference_log for run in runs]
-    return estimate_noise(
-        runs,
-        [
-            OdometryBatch([log], integration).poses(matrix[None])[0] - run.poses[1:]
-            for log, run in zip(logs, runs, strict=True)
-        ],
-    )
+    residuals = [
+        OdometryBatch([log], integration).poses(matrix[None])[0] - run.poses[1:]
+        for log, run in zip(logs, runs, strict=True)
+    ]
+    return estimate_noise(differences_between_repetitions(runs, residuals))
 
 
 def information_of_run(

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.least_squares.noise import Whitener, estimate_noise
+from omnibench.fit.least_squares.repetitions import differences_between_repetitions
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.config import FlowerConfig
@@ -100,7 +101,7 @@ def recorded(repetitions: int, seed: int = 0) -> tuple[list[Trajectory], list[Ar
 
 def test_the_variances_are_found_from_the_repetitions() -> None:
     runs, residuals = recorded(20)
-    estimate = estimate_noise(runs, residuals)
+    estimate = estimate_noise(differences_between_repetitions(runs, residuals))
     assert estimate.source == "repetitions"
     for name, value in NOISE.items():
         assert getattr(estimate.noise, name) == pytest.approx(value, rel=0.15), name
@@ -110,13 +111,14 @@ def test_what_the_model_gets_wrong_of_a_command_is_no_noise() -> None:
     runs, residuals = recorded(20)
     wrong = {run.command: 0.1 * np.random.default_rng(index).standard_normal(3) for index, run in enumerate(runs)}
     bent = [part + wrong[run.command] for run, part in zip(runs, residuals, strict=True)]
-    plain, found = estimate_noise(runs, residuals).noise, estimate_noise(runs, bent).noise
+    plain, found = (estimate_noise(differences_between_repetitions(runs, values)).noise for values in (residuals, bent))
     assert found.bias_position == pytest.approx(plain.bias_position, rel=0.01)
 
 
 def test_without_repetitions_the_residuals_are_taken_and_that_is_said() -> None:
     runs, residuals = recorded(1)
-    estimate = estimate_noise([replace(run, command=None) for run in runs], residuals)
+    alone = [replace(run, command=None) for run in runs]
+    estimate = estimate_noise(differences_between_repetitions(alone, residuals))
     assert estimate.source == "within runs"
     assert "no command is repeated" in estimate.description
     assert estimate.noise.pose_position == pytest.approx(NOISE["pose_position"], rel=0.2)
@@ -124,4 +126,4 @@ def test_without_repetitions_the_residuals_are_taken_and_that_is_said() -> None:
 
 def test_no_trajectories_have_no_noise() -> None:
     with pytest.raises(DataError, match="no trajectory has a reference pose"):
-        estimate_noise([], [])
+        estimate_noise(differences_between_repetitions([], []))
