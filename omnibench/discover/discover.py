@@ -17,8 +17,8 @@ from omnibench.data.dataset import Dataset
 from omnibench.discover.calibrations import Request
 from omnibench.discover.conclude import Findings, conclude
 from omnibench.discover.covariate_dependence import covariate_dependences
-from omnibench.discover.fitting.extend import Extended, extend, without_effects
-from omnibench.discover.fitting.model_fit import Fit, fit_matrix
+from omnibench.discover.fitting.extend import Extended, extend, fit_matrix, without_effects
+from omnibench.discover.fitting.model_fit import Fit
 from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.discover.held_out.cross_validation import random_folds_of_repetitions
 from omnibench.discover.held_out.gaps import compare_held_out

@@ -23,8 +23,7 @@ from hidden.pairs import PAIRS
 from hidden.sets import LEVELS, Kind, make_set
 
 from omnibench.config import Model
-from omnibench.discover.fitting.extend import extend
-from omnibench.discover.fitting.model_fit import fit_matrix
+from omnibench.discover.fitting.extend import extend, fit_matrix
 from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.significance import significance_of

@@ -41,8 +41,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.discover.fitting.extend import extend
-from omnibench.discover.fitting.model_fit import fit_matrix
+from omnibench.discover.fitting.extend import extend, fit_matrix
 from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.discover.regressors.column_group import Group
 from omnibench.fit.calibrate import calibrate

@@ -1,4 +1,4 @@
-"""The model extended by effects: matrix and parameters fitted together, noise and nuisances estimated anew.
+"""The plain matrix, and matrix and effects, fitted in turn with the noise and the nuisances that they leave.
 
 The covariance of matrix elements and parameters is that of every trajectory fit
 (fit/least_squares/trajectory_covariance.py).
@@ -16,22 +16,26 @@ from omnibench.discover.fitting.model_fit import (
     Fit,
     at_model,
     at_runs,
+    first_fit,
     model_with,
     paths_of,
     with_noise,
 )
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.paths import Paths
+from omnibench.fit.least_squares.noise import is_near
 from omnibench.fit.least_squares.trajectory_covariance import FitCovariance
 from omnibench.fit.least_squares.trajectory_fit import split_runs
 from omnibench.fit.least_squares.whitened import Whitened, given
 from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.term import Term
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, Robot
 
-# tests/benchmarks/constants.py varies both by 0.5 and 2: on a small set with heading drift no verdict and no name
-# changes.
+# tests/benchmarks/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
+# name changes.
+_ROUNDS = 4  # rounds that fit noise and plain matrix by turns, at most; fewer where the noise stays within 2 %
+_NEAR = 0.02  # share of the largest component of the noise by which two noises may differ, see is_near
 _STEPS = 4  # Gauss-Newton steps, at most
 _STILL = 0.05  # standard errors: a smaller step, which no interval shows, ends the fit
 
@@ -62,17 +66,26 @@ class Extended:
         ]
 
 
+def fit_matrix(runs: Sequence[Trajectory], robot: Robot, sample_period: float, start: Array) -> Fit:
+    """Fit the plain matrix from a start (3, N), and with it noise, nuisances and the poses that jump."""
+    return _in_turn(first_fit(runs, robot, sample_period, start), (), _ROUNDS)[0]
+
+
 def extend(plain: Fit, groups: Sequence[Group]) -> Extended:
     """Fit matrix and effects together, from the plain matrix and effects of 0."""
-    fit = plain
-    values: Array = np.zeros(sum(len(group.parameters) for group in groups))
-    for round_ in range(2):
-        fit, values, data, columns = _descend(fit, groups, values)
-        if round_ == 0 and groups:
-            fit = with_noise(fit)
-        else:
-            break
+    fit, values, data, columns = _in_turn(plain, groups, 1 if groups else 0)
     return Extended(fit, tuple(groups), data, columns, values, _covariance(fit, data))
+
+
+def _in_turn(fit: Fit, groups: Sequence[Group], rounds: int) -> tuple[Fit, Array, Whitened, tuple[Array, ...]]:
+    """Matrix and effects fitted, then noise and these by turns until the noise stays, so many rounds at most."""
+    fit, values, data, columns = _descend(fit, groups, np.zeros(sum(len(group.parameters) for group in groups)))
+    for _ in range(rounds):
+        before = fit.noise.noise
+        fit, values, data, columns = _descend(with_noise(fit), groups, values)
+        if is_near(before.model_dump(), fit.noise.noise.model_dump(), _NEAR):
+            break
+    return fit, values, data, columns
 
 
 def without_effects(plain: Fit, extended: Extended) -> Extended:

@@ -10,31 +10,19 @@ import numpy as np
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.outliers import without_jumps
 from omnibench.discover.regressors.paths import Paths, make_paths
-from omnibench.fit.least_squares.noise import (
-    FIRST_NOISE,
-    NoiseEstimate,
-    Whitener,
-    estimate_noise,
-    is_near,
-    whiteners,
-)
+from omnibench.fit.least_squares.noise import FIRST_NOISE, NoiseEstimate, Whitener, estimate_noise, whiteners
 from omnibench.fit.least_squares.nuisance_noise import noise_of_fit
 from omnibench.fit.least_squares.nuisances import Nuisances
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions
 from omnibench.fit.least_squares.start_frames import in_start_frames
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
-from omnibench.fit.least_squares.whitened import Whitened, given
+from omnibench.fit.least_squares.whitened import Whitened
 from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
 _UNKNOWN_NOISE = NoiseEstimate(FIRST_NOISE, "within runs", 1, "")
-# tests/benchmarks/constants.py varies each number by 0.5 and 2: on a small set with heading drift no verdict and no
-# name changes.
-_FIRST_STEPS = 3  # Gauss-Newton steps from the design values on, before anything is known of the noise
-_ROUNDS = 4  # rounds that fit noise and matrix by turns, at most; fewer where the noise stays within 2 %
-_NEAR = 0.02  # share of the largest component of the noise by which two noises may differ, see is_near
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,21 +65,13 @@ def _velocities(log: WheelLog, poses: Array) -> Array:
     return velocities
 
 
-def fit_matrix(runs: Sequence[Trajectory], robot: Robot, sample_period: float, start: Array) -> Fit:
-    """Fit the plain matrix from a start (3, N), and with it noise, nuisances and the poses that jump.
+def first_fit(runs: Sequence[Trajectory], robot: Robot, sample_period: float, start: Array) -> Fit:
+    """The plain matrix (3, N) to start from, whose noise is not known yet.
 
     The model drives exact arcs: Euler steps would leave what looks like centripetal slip.
     """
     model = OdometryModel(robot, start, "arc", (), sample_period)
-    fit = Fit(model, tuple(runs), Nuisances(np.zeros((len(runs), 3)), np.zeros(3)), _UNKNOWN_NOISE)
-    for _ in range(_FIRST_STEPS):
-        fit = _matrix_step(fit)
-    for _ in range(_ROUNDS):
-        before = fit.noise.noise
-        fit = _matrix_step(with_noise(fit))
-        if is_near(before.model_dump(), fit.noise.noise.model_dump(), _NEAR):
-            break
-    return fit
+    return Fit(model, tuple(runs), Nuisances(np.zeros((len(runs), 3)), np.zeros(3)), _UNKNOWN_NOISE)
 
 
 def with_noise(fit: Fit) -> Fit:
@@ -136,13 +116,6 @@ def at_runs(fit: Fit, runs: Sequence[Trajectory]) -> Fit:
     """The fit's model at other runs, their nuisances 0: only the sizes of these are known."""
     nothing_known = Nuisances(np.zeros((len(runs), 3)), fit.nuisances.deviations)
     return replace(fit, runs=tuple(runs), nuisances=nothing_known, jumps=0)
-
-
-def _matrix_step(fit: Fit) -> Fit:
-    """One Gauss-Newton step of the matrix, nuisances refitted after it."""
-    data = given(fit.whitened(fit.matrix_jacobian()), [])
-    step, _ = data.estimate(range(fit.model.matrix.size))
-    return at_model(fit, replace(fit.model, matrix=fit.model.matrix + step.reshape(3, -1)))
 
 
 def model_with(model: OdometryModel, matrix: Array, terms: Sequence[Term]) -> OdometryModel:

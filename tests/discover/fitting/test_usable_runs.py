@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from discovery_samples import simulated
 
-from omnibench.discover.fitting.model_fit import fit_matrix
+from omnibench.discover.fitting.extend import fit_matrix
 from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.errors import DataError
 from omnibench.fit.least_squares.nuisances import log_of

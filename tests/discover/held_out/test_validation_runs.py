@@ -7,7 +7,7 @@ from dataclasses import replace
 from discovery_samples import simulated
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.fitting.model_fit import fit_matrix
+from omnibench.discover.fitting.extend import fit_matrix
 from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.discover.held_out.validation_runs import validation_runs
 

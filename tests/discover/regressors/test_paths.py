@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from discovery_samples import simulated
 
-from omnibench.discover.fitting.model_fit import fit_matrix, paths_of
+from omnibench.discover.fitting.extend import fit_matrix
+from omnibench.discover.fitting.model_fit import paths_of
 from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from discovery_samples import COUPLING, simulated
 
-from omnibench.discover.fitting.extend import extend
-from omnibench.discover.fitting.model_fit import Fit, fit_matrix
+from omnibench.discover.fitting.extend import extend, fit_matrix
+from omnibench.discover.fitting.model_fit import Fit
 from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.selection.competing_models import CompetingModels, competing_models

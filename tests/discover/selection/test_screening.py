@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from discovery_samples import shorn, simulated
 
-from omnibench.discover.fitting.extend import Extended, extend
-from omnibench.discover.fitting.model_fit import Fit, fit_matrix
+from omnibench.discover.fitting.extend import Extended, extend, fit_matrix
+from omnibench.discover.fitting.model_fit import Fit
 from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.discover.selection.candidate_groups import Missing
 from omnibench.discover.selection.detectability import detectability_of

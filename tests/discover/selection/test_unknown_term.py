@@ -12,8 +12,7 @@ from hidden.experiment import ROBOT
 from hidden.sets import Truth, make_set
 
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.fitting.extend import Extended, extend
-from omnibench.discover.fitting.model_fit import fit_matrix
+from omnibench.discover.fitting.extend import Extended, extend, fit_matrix
 from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.discover.held_out.waterfall import group_counts, step_name
 from omnibench.discover.regressors.column_group import Group
