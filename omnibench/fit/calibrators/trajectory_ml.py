@@ -136,7 +136,7 @@ class TrajectoryML(Calibrator):
         """The maximum likelihood estimate, or the one weighted by the cost if the model misfits; its covariance."""
         options, problem, fit = self.options, now.fit.problem, now.fit.trajectories
         covariance = self._covariance(now, noise)
-        misfit = covariance.scatter.words if covariance.lack_of_fit and covariance.scatter else ""
+        misfit = covariance.scatter.words if covariance.scatter and covariance.scatter.lack_of_fit else ""
         by_cost = options.weights == "cost" or (
             options.weights == "auto" and bool(misfit) and options.covariance != "model"
         )

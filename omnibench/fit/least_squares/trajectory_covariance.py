@@ -1,30 +1,25 @@
 """Covariance of a trajectory fit, from its noise model or from the scatter of the runs.
 
-Scores s_z and information L_z of the runs z are said in coordinates in which the information of all runs is the unit
-matrix, as in uncertainty/sandwich.py. If one vector of n numbers fits all commands g, and q_g = rank L_g, then
+In coordinates in which the information of all runs is the unit matrix, the scatter of d directions, S, has the unit
+matrix for its expectation under the noise model. Where commands and sessions scatter no more than their repetitions
+explain, which the sandwich tests, it is wider than that at the level a if
 
-    F = [sum_g s_g' L_g^+ s_g / (sum_g q_g - n)]
-        / [(sum_z s_z' L_z^+ s_z - sum_g s_g' L_g^+ s_g) / sum_g (n_g - 1) q_g]                           (1)
-
-has the F distribution whatever the size of the noise. Where no lack of fit shows, the scatter S of d directions, whose
-expectation under the noise model is the unit matrix, is wider than that at the level a if
-
-    tr S / d > chi2(1 - a; v) / v,                                                                        (2)
+    tr S / d > chi2(1 - a; v) / v,                                                                        (1)
 
 v being the degrees of freedom of the sandwich's trace, its Eq. (9). The noise model itself is known from D differences
 between runs. The part of the noise that all poses of a run share is one number a difference and coordinate, and a
 position has two coordinates of the same variance. The variances of positions have at least
 
-    2 D                                                                                                   (3)
+    2 D                                                                                                   (2)
 
-degrees of freedom, more where white noise dominates. Those of headings have one coordinate, and D. (3) is taken for
+degrees of freedom, more where white noise dominates. Those of headings have one coordinate, and D. (2) is taken for
 all numbers: with such a shared part, of the elements of the heading's row 99 % of the intervals hold the truth with
 D = 4, and 97 % with D = 6.
 
 Without repetitions the residuals of D runs stand in for differences. A fit of n numbers leaves 3 D - n of the D shared
 parts, and the variances have at least two thirds as many degrees of freedom,
 
-    2 D - 2 n / 3,                                                                                        (4)
+    2 D - 2 n / 3,                                                                                        (3)
 
 but one. They are too small then, since likelihood does not know what the fit has taken, and the scatter of the runs,
 which is corrected for that, stands for the noise model wherever the runs are enough for it.
@@ -37,22 +32,20 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtri, fdtrc
+from scipy.special import chdtri
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.least_squares.noise import NoiseEstimate
-from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.fit.least_squares.roots import roots_of
 from omnibench.fit.least_squares.whitened import Whitened
 from omnibench.fit.uncertainty.intervals import EstimatedCovariance
-from omnibench.fit.uncertainty.sandwich import CHANCE, DOUBT, Sandwich, Scores, sandwich, times_the
+from omnibench.fit.uncertainty.sandwich import CHANCE, Sandwich, Scores, sandwich
 from omnibench.robot.kinematics import Array
 
-# Share of the largest eigenvalue of a command's information below which a direction has information from encoder noise
-# alone: wheel rates that are 3 % of the strongest. Five calibrations of tests/benchmarks/constants_fit.py are the same
-# with half of it and with twice.
-_DETERMINED = 1e-3
+# Share of the noise model's variance below which the scatter is rounding. The noise is 1e-9 m or rad at least; exact
+# models of exact poses leave 1e-14 of its variance, Euler steps in flowers 1e10 times it.
+_ROUNDING = 1e-6
 
 
 class FitCovariance:
@@ -70,14 +63,19 @@ class FitCovariance:
         roots = roots_of(information.sum(axis=0))
         self._noise, self._roots = noise, unit[:, None] * roots
         taken = 0 if noise.source == "repetitions" else roots.shape[1]
-        freedom = max(2 * noise.degrees_of_freedom - 2 * taken / 3, 1)  # Eq. (3), (4)
+        freedom = max(2 * noise.degrees_of_freedom - 2 * taken / 3, 1)  # Eq. (2), (3)
         self.by_model = EstimatedCovariance(self._roots @ self._roots.T, freedom)
-        self._chance_of_misfit = _chance_of_misfit(scores @ roots, roots.T @ information @ roots, runs)
         if not roots.size:
             return
         with suppress(DataError):
             found = sandwich(Scores(scores, information, runs, np.zeros(len(unit)), information))
-            self.scatter = replace(found, covariance=found.covariance * np.outer(unit, unit))
+            real = float(np.square(scores @ roots).sum()) > _ROUNDING * roots.shape[1]
+            self.scatter = replace(
+                found,
+                covariance=found.covariance * np.outer(unit, unit),
+                clustered=found.clustered and real,
+                lack_of_fit=found.lack_of_fit and real,
+            )
 
     def chosen(self, robust: bool) -> tuple[EstimatedCovariance, str]:
         """The covariance of the noise model or, if ``robust``, of the scatter, and its source in words.
@@ -91,53 +89,16 @@ class FitCovariance:
         return EstimatedCovariance(self.scatter.covariance, self.scatter.effective_freedom), self.scatter.words
 
     @property
-    def lack_of_fit(self) -> bool:
-        """True if commands scatter more than their repetitions explain, by the likelihood and by the sandwich.
-
-        The likelihood's test is an F test between and within commands on the vectors that single commands would give,
-        each direction in units of its noise, so that the size of the noise does not matter.
-        """
-        return self.scatter is not None and self.scatter.lack_of_fit and self._chance_of_misfit < CHANCE
-
-    @property
     def scatter_stands(self) -> bool:
-        """True if the runs scatter significantly more than the noise model predicts, or no repetition shows the noise.
+        """True if the runs scatter significantly more than the noise model, or than their repetitions explain.
 
-        Scatter between commands counts only if the likelihood's test confirms it, at the level of the sandwich's.
+        The scatter stands, too, where no repetition shows the noise.
         """
         if self.scatter is None:
             return False
-        if self._noise.source == "within runs":
+        if self._noise.source == "within runs" or self.scatter.clustered:
             return True
-        if self.scatter.clustered:
-            return self._chance_of_misfit < DOUBT
         back = np.linalg.pinv(self._roots)
         values = np.linalg.eigvalsh(back @ self.scatter.covariance @ back.T)
         freedom = self.scatter.freedom_of_trace
-        return float(values.mean()) > float(chdtri(freedom, CHANCE)) / freedom  # Eq. (2)
-
-
-def _chance_of_misfit(scores: Array, information: Array, trajectories: Sequence[Trajectory]) -> float:
-    """p-value of the F test that one vector fits all commands; 1 where no repetitions show the noise.
-
-    scores (Z, k) and information (Z, k, k) of the runs, whose sums are 0 and the unit matrix. Repetitions that agree
-    exactly are exceeded by whatever is above the noise.
-    """
-    groups = grouped([(run.session, run.command, run.id if run.command is None else None) for run in trajectories])
-    between, within, between_freedom, within_freedom = 0.0, 0.0, -scores.shape[1], 0
-    for members in map(list, groups):
-        values, vectors = np.linalg.eigh(information[members].sum(axis=0))
-        determined = values > _DETERMINED * values.max(initial=0.0)
-        turned, rank = scores[members] @ vectors[:, determined], int(determined.sum())
-        common = float((turned.sum(axis=0) ** 2 / values[determined]).sum())
-        between, between_freedom = between + common, between_freedom + rank
-        if len(members) > 1:
-            of_runs = vectors[:, determined].T @ information[members] @ vectors[:, determined]
-            within += sum(float(s @ np.linalg.lstsq(m, s)[0]) for s, m in zip(turned, of_runs, strict=True)) - common
-            within_freedom += (len(members) - 1) * rank
-    if between_freedom <= 0 or within_freedom <= 0:
-        return 1.0
-    ratio = times_the(within / within_freedom, between / between_freedom)  # Eq. (1)
-    if np.isinf(ratio) and between < between_freedom:
-        return 1.0
-    return float(fdtrc(between_freedom, within_freedom, ratio))
+        return float(values.mean()) > float(chdtri(freedom, CHANCE)) / freedom  # Eq. (1)

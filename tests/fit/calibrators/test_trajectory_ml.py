@@ -178,6 +178,10 @@ def test_where_a_matrix_fits_the_noise_weighs() -> None:
     assert "the noise model" in solved(flower()).reason
 
 
+def test_poses_without_noise_that_the_model_explains_show_no_lack_of_fit() -> None:
+    assert "the noise model" in solved(flower(pose_position=0.0)).reason
+
+
 def test_intervals_of_the_scatter_can_be_asked_for() -> None:
     problem = flower()
     scatter, model = solved(problem, covariance="robust"), solved(problem)
