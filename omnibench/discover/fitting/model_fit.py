@@ -36,7 +36,8 @@ class Fit(TrajectoryFit):
     def velocities(self) -> list[Array]:
         """Velocities (K, 3) between the poses, m/s, m/s, rad/s.
 
-        They take no further evaluation of a model with effects, and are smoother than those of single samples.
+        They take no further evaluation of a model with effects, and have less encoder noise than differences over two
+        samples, with which the class of the effect that omni3 lacks has a weight of 0.62 instead of 0.998.
         """
         return [_velocities(log, poses) for log, poses in zip(self.logs, self.poses, strict=True)]
 
