@@ -23,6 +23,11 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
 _UNKNOWN_NOISE = NoiseEstimate(FIRST_NOISE, "within runs", 1, "")
+# Level of the tests for nuisances. It is strict, since other noise resembles them and what they explain is lost for
+# effects: ticks of encoders make start headings of twice a log-likelihood of 10, with which an effect was named that
+# the simulated robot has not (tests/discover/test_robot_recordings.py). Clocks of omni3 and of a hidden set gain 31 to
+# 230; the level asks for 16.
+_CHANCE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +87,7 @@ def with_noise(fit: Fit) -> Fit:
     noise = estimate_noise(differences_between_repetitions(fit.runs, turned), near)
     runs, jumps = without_jumps(fit.runs, turned, noise.noise)
     fit = replace(fit, runs=runs, jumps=fit.jumps + jumps)
-    found = noise_of_fit(fit, range(3), noise.noise)
+    found = noise_of_fit(fit, range(3), noise.noise, _CHANCE)
     values = np.where(found.deviations > 0, fit.nuisances.values, 0.0)
     fit = replace(fit, nuisances=Nuisances(values, found.deviations), noise=found.estimate)
     return fit.with_likeliest_nuisances()

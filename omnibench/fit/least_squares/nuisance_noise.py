@@ -32,7 +32,7 @@ from omnibench.robot.kinematics import Array
 _NAMES = ("pose_position", "walk_position", "bias_position", "pose_heading", "walk_heading", "bias_heading")
 # Level of the tests, shared by the nuisances that are asked about (Bonferroni): noise alone shows any of them in one
 # set of twenty.
-_CHANCE = 0.05
+CHANCE = 0.05
 # Share of the critical value that a nuisance alone must gain before all components are fitted with it: the others do
 # not add four times as much. Half of this and twice give the same estimates from right and wrong starts
 # (tests/benchmarks/constants_fit.py).
@@ -56,14 +56,17 @@ class FitNoise:
         return {**self.estimate.noise.model_dump(), "start_heading": float(self.deviations[TURN])}
 
 
-def noise_of_fit(fit: TrajectoryFit, kinds: Sequence[int], near: Noise | None = None) -> FitNoise:
+def noise_of_fit(
+    fit: TrajectoryFit, kinds: Sequence[int], near: Noise | None = None, chance: float = CHANCE
+) -> FitNoise:
     """The noise that the residuals of a fit show beside nuisances of some kinds, and the deviations of these.
 
-    Nuisances of other kinds keep their values; their deviations are 0. near: an earlier estimate of the noise.
+    Nuisances of other kinds keep their values; their deviations are 0. near: an earlier estimate of the noise. chance:
+    level of the tests.
     """
     differences = differences_without_nuisances(fit, kinds)
     estimate = estimate_noise(differences, near)
-    separate = separate_nuisances(differences, estimate.noise, kinds)
+    separate = separate_nuisances(differences, estimate.noise, kinds, chance)
     return FitNoise(replace(estimate, noise=separate.noise), separate.deviations)
 
 
@@ -105,7 +108,9 @@ class SeparateNoise:
         return cls(noise, deviations, of_noise + of_nuisances)
 
 
-def separate_nuisances(differences: Differences, noise: Noise, kinds: Sequence[int]) -> SeparateNoise:
+def separate_nuisances(
+    differences: Differences, noise: Noise, kinds: Sequence[int], chance: float = CHANCE
+) -> SeparateNoise:
     """Maximum likelihood estimate of the noise and of the deviations of nuisances of some kinds.
 
     noise: the estimate without nuisances, where the search begins. The likeliest nuisance comes in first, a further one
@@ -113,7 +118,7 @@ def separate_nuisances(differences: Differences, noise: Noise, kinds: Sequence[i
     """
     # Under the null half of the statistic of one variance that may be zero is chi-square with one degree of freedom,
     # half is 0 (Self and Liang 1987).
-    critical = chdtri(1, 2 * _CHANCE / max(len(kinds), 1))
+    critical = chdtri(1, 2 * chance / max(len(kinds), 1))
     now = SeparateNoise.of(differences, noise, np.zeros(3))
 
     def gain(then: SeparateNoise) -> float:
