@@ -119,7 +119,7 @@ def test_the_others_run(comparison: Compared) -> None:
         ("gives_odd_reasons", "converged", "{'two': 'lines"),
         ("spoils_the_history", "failed", "Expected `Improvement`"),
         ("dies", "failed", "the process died without an answer (exit code 3)"),
-        ("is_killed", "failed", "the process died without an answer (killed by SIGKILL)"),
+        ("is_killed", "failed", "the process died without an answer (killed by SIGKILL"),
         ("closes_everything", "failed", "the process died without an answer"),
         ("leaves_a_thread", "converged", "here"),
         ("wants_memory", "failed", "out of memory (limit 1000 MB)"),

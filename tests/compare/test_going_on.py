@@ -241,7 +241,9 @@ def test_a_killed_comparison_of_runs_that_are_killed_hang_or_want_memory_goes_on
     assert before.items() <= after.items()
     rows = {run["label"]: run for run in summary(tmp_path / "out")["runs"]}
     assert rows.pop("theoretical")["outcome"] == "converged"
-    assert {label: (row["outcome"], row["reason"]) for label, row in rows.items()} == {
+    # Of other tests' processes some are killed for lack of memory, which the system counts for all.
+    reasons = {label: row["reason"].replace(": the system was out of memory", "") for label, row in rows.items()}
+    assert {label: (row["outcome"], reasons[label]) for label, row in rows.items()} == {
         "is_killed": ("failed", "the process died without an answer (killed by SIGKILL) in each of 3 tries"),
         "wants_memory": ("failed", "out of memory (limit 1000 MB)"),
         "hangs": ("time", "ended by force: 0.5 s spent without an answer"),

@@ -206,7 +206,9 @@ class TestWorkersThatDie:
     def test_a_job_that_is_killed_is_tried_three_times(self, by: signal.Signals, tmp_path: Path) -> None:
         jobs = [*jobs_of(killed, [(tmp_path, by)]), Job("other", squared, 3)]
         notes = run(tmp_path / "results", jobs, Processes(2))
-        assert notes.reason() == f"the process died without an answer (killed by {by.name}) in each of 3 tries"
+        # Of other tests' processes some are killed for lack of memory, which the system counts for all.
+        reason = notes.reason().replace(": the system was out of memory", "")
+        assert reason == f"the process died without an answer (killed by {by.name}) in each of 3 tries"
         assert (tmp_path / "killed").stat().st_size == 3
         assert notes.endings[1] == ResultStore(tmp_path / "results", Answer).get("other")
 
