@@ -73,6 +73,23 @@ def whiteners(noise: Noise, stamps: Sequence[Array]) -> list[Whitener]:
     return [whitener_of[times.tobytes()] for times in stamps]
 
 
+def covariance_of_sums(noise: Noise, stamps: Array, weights: Array, coordinates: Sequence[int]) -> Array:
+    """Covariance (n, n) of n weighted sums of a run's errors, in O(K).
+
+    weights (K, c, n): of the errors of c coordinates (0 and 1 position, 2 heading) at stamps (K,), s, increasing. A
+    step of the walk is in the errors of its stamp and of all later ones.
+    """
+    total = np.zeros((weights.shape[2],) * 2)
+    steps = np.sqrt(np.diff(stamps, prepend=0.0))[:, None]
+    for coordinate, columns in zip(coordinates, weights.swapaxes(0, 1), strict=True):
+        kind = "heading" if coordinate == 2 else "position"
+        white, walk, bias = (getattr(noise, f"{part}_{kind}") for part in ("pose", "walk", "bias"))
+        later = columns[::-1].cumsum(axis=0)[::-1]
+        independent = np.vstack([max(white, LEAST_WHITE) * columns, walk * steps * later, bias * later[:1]])
+        total += independent.T @ independent
+    return total
+
+
 def is_near(first: Mapping[str, float], second: Mapping[str, float], share: float) -> bool:
     """True if no standard deviation differs by more than a share of the largest one."""
     ours, theirs = np.array(list(first.values())), np.array(list(second.values()))

@@ -64,7 +64,7 @@ from scipy.special import fdtrc
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.cost import SumOfNorms
-from omnibench.fit.least_squares.noise import LEAST_WHITE
+from omnibench.fit.least_squares.noise import covariance_of_sums
 from omnibench.fit.least_squares.repetitions import grouped, repetitions_of_commands
 from omnibench.fit.least_squares.roots import ROUNDING, roots_of
 from omnibench.robot.calibration import Noise
@@ -183,25 +183,10 @@ def scores_of_runs(
         hessians.append(squares - rays.T @ rays)
         curved = slopes[own] - errors[own][:, :, None] * (along[own] / length[:, None] ** 2)[:, None]
         by_errors = curved * (share / length)[:, None, None] * weights[used][:, None]
-        working.append(_covariance_of_score(by_errors, stamps[run], used.tolist(), noise))
+        working.append(covariance_of_sums(noise, stamps[run], by_errors, used.tolist()))  # D'C D
     roots = roots_of(curvature)
     step = -roots @ roots.T @ np.sum(scores, axis=0)
     return Scores(np.array(scores), np.array(hessians), trajectories, step, np.array(working))
-
-
-def _covariance_of_score(by_errors: Array, stamps: Array, used: Sequence[int], noise: Noise) -> Array:
-    """Covariance D'C D (n, n) of a run's score by a noise model.
-
-    by_errors (K, c, n): D, for the errors of the c coordinates ``used`` at stamps (K,).
-    """
-    total = np.zeros((by_errors.shape[2],) * 2)
-    for coordinate, columns in zip(used, by_errors.swapaxes(0, 1), strict=True):
-        kind = "heading" if coordinate == 2 else "position"
-        white, walk, bias = (getattr(noise, f"{each}_{kind}") for each in ("pose", "walk", "bias"))
-        covariance = walk**2 * np.minimum(stamps[:, None], stamps) + bias**2
-        covariance += max(white, LEAST_WHITE) ** 2 * np.eye(len(stamps))
-        total += columns.T @ covariance @ columns
-    return total
 
 
 def sandwich(scores: Scores) -> Sandwich:

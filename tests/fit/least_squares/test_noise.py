@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
-from omnibench.fit.least_squares.noise import Whitener, estimate_noise
+from omnibench.fit.least_squares.noise import Whitener, covariance_of_sums, estimate_noise
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
@@ -57,6 +58,23 @@ def test_whitened_residuals_have_the_chi_square_and_the_determinant_of_the_dense
     assert np.square(whitener(residuals)).sum() == pytest.approx(squares, rel=1e-6)
     determinant = 2 * np.linalg.slogdet(position)[1] + np.linalg.slogdet(heading)[1]
     assert whitener.log_determinant == pytest.approx(determinant, rel=1e-6, abs=1e-6)
+
+
+@given(
+    values=st.lists(DEVIATIONS, min_size=6, max_size=6),
+    steps=st.lists(st.floats(0.01, 2.0), min_size=1, max_size=12),
+    seed=st.integers(0, 2**31),
+)
+def test_sums_of_errors_have_the_covariance_that_the_dense_one_gives(
+    values: list[float], steps: list[float], seed: int
+) -> None:
+    noise = Noise(**dict(zip(NOISE, values, strict=True)))
+    stamps = np.cumsum(steps)
+    weights = np.random.default_rng(seed).standard_normal((len(stamps), 2, 4))
+    left = dense(noise.pose_position, noise.walk_position, noise.bias_position, stamps)
+    heading = dense(noise.pose_heading, noise.walk_heading, noise.bias_heading, stamps)
+    expected = weights[:, 0].T @ left @ weights[:, 0] + weights[:, 1].T @ heading @ weights[:, 1]
+    assert_allclose(covariance_of_sums(noise, stamps, weights, [1, 2]), expected, rtol=1e-9, atol=1e-9)
 
 
 def test_derivatives_are_whitened_column_by_column() -> None:
