@@ -20,7 +20,7 @@ from commands import COMMAND, ENVIRONMENT, Command, Printed, assert_refused, run
 from timing import PATIENCE
 
 from omnibench.data.dataset import make_dataset
-from omnibench.data.scans import ScansInMemory
+from omnibench.data.scans import ScansInMemory, TrajectoryScans
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.data.true_poses import TruePath, write_true_poses
 from omnibench.robot.kinematics import Array
@@ -278,19 +278,26 @@ def _places(folder: Path, driven: Driven) -> dict[str, Path]:
     return places | {"DATA": driven.data, "FOUR": folder / "four.yaml"}
 
 
+def first_scans(driven: Driven) -> TrajectoryScans:
+    """The scans of the first run that was driven."""
+    data = load_dataset(driven.data)
+    assert data.scans is not None
+    return data.scans.of(data.trajectories[0].id)
+
+
+def save_runs(driven: Driven, folder: Path, scans: dict[str, TrajectoryScans]) -> None:
+    """Save the first run that was driven once under each name, with these scans."""
+    data = load_dataset(driven.data)
+    assert data.scans is not None
+    runs = tuple(replace(data.trajectories[0], id=name) for name in scans)
+    save_dataset(replace(data, trajectories=runs, scans=ScansInMemory(data.scans.scanner, scans)), folder)
+
+
 def test_after_ctrl_c_the_command_goes_on(
     command: Command, driven: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    data = load_dataset(driven.data)
-    assert data.scans is not None
-    (first,) = data.trajectories[:1]
-    names = [f"{number:04d}" for number in range(16)]
-    many = replace(
-        data,
-        trajectories=tuple(replace(first, id=name) for name in names),
-        scans=ScansInMemory(data.scans.scanner, dict.fromkeys(names, data.scans.of(first.id))),
-    )
-    save_dataset(many, tmp_path / "many")
+    scans = first_scans(driven)
+    save_runs(driven, tmp_path / "many", {f"{number:04d}": scans for number in range(16)})
     process = subprocess.Popen(
         [*COMMAND, "slam", "many", "-o", "found"],
         cwd=tmp_path,
@@ -322,14 +329,10 @@ def test_after_ctrl_c_the_command_goes_on(
 def test_an_error_says_where_the_paths_found_before_it_are_kept(
     command: Command, driven: Driven, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    data = load_dataset(driven.data)
-    assert data.scans is not None
-    (first,) = data.trajectories[:1]
-    scans = data.scans.of(first.id)
+    scans = first_scans(driven)
     empty = replace(scans, ranges=np.zeros_like(scans.ranges))
-    content = dict.fromkeys(("1", "2", "3"), scans) | {"4": empty}  # two at a time: others end before the last begins
-    runs = tuple(replace(first, id=name) for name in content)
-    save_dataset(replace(data, trajectories=runs, scans=ScansInMemory(data.scans.scanner, content)), tmp_path / "four")
+    # Two are worked on at a time: others end before the last begins.
+    save_runs(driven, tmp_path / "four", {"1": scans, "2": scans, "3": scans, "4": empty})
     monkeypatch.chdir(tmp_path)
     run = command("slam", "four", "-o", "found")
     kept = "the paths found so far are kept in found.slam-paths"
