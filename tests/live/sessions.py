@@ -23,8 +23,9 @@ def free_port() -> int:
     """
     for port in count(20_000 + crc32(str(shared_folder()).encode()) % 10_000):  # another run begins elsewhere
         with suppress(OSError), socket.socket() as probe:
-            probe.bind(("127.0.0.1", port))
+            # Before the probe: to bind a port that was given out could be just when its listener does.
             (shared_folder() / f"port-{port}").touch(exist_ok=False)
+            probe.bind(("127.0.0.1", port))
             return port
     raise AssertionError
 
