@@ -19,7 +19,6 @@ from omnibench.robot.kinematics import Array
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
-DEVIATIONS = st.floats(1e-3, 1.0)
 NOISE = {
     "pose_position": 0.006,
     "pose_heading": 0.004,
@@ -28,6 +27,8 @@ NOISE = {
     "bias_position": 0.009,
     "bias_heading": 0.007,
 }
+NOISES = st.builds(Noise, **dict.fromkeys(NOISE, st.floats(1e-3, 1.0)))
+STAMPS = st.lists(st.floats(0.01, 2.0), min_size=1, max_size=12).map(np.cumsum)
 
 
 def dense(white: float, walk: float, bias: float, stamps: Array) -> Array:
@@ -37,16 +38,10 @@ def dense(white: float, walk: float, bias: float, stamps: Array) -> Array:
     return covariance
 
 
-@given(
-    values=st.lists(DEVIATIONS, min_size=6, max_size=6),
-    steps=st.lists(st.floats(0.01, 2.0), min_size=1, max_size=12),
-    seed=st.integers(0, 2**31),
-)
+@given(noise=NOISES, stamps=STAMPS, seed=st.integers(0, 2**31))
 def test_whitened_residuals_have_the_chi_square_and_the_determinant_of_the_dense_covariance(
-    values: list[float], steps: list[float], seed: int
+    noise: Noise, stamps: Array, seed: int
 ) -> None:
-    noise = Noise(**dict(zip(NOISE, values, strict=True)))
-    stamps = np.cumsum(steps)
     residuals = np.random.default_rng(seed).standard_normal((len(stamps), 3))
     whitener = Whitener(noise, stamps)
     position = dense(noise.pose_position, noise.walk_position, noise.bias_position, stamps)
@@ -60,16 +55,8 @@ def test_whitened_residuals_have_the_chi_square_and_the_determinant_of_the_dense
     assert whitener.log_determinant == pytest.approx(determinant, rel=1e-6, abs=1e-6)
 
 
-@given(
-    values=st.lists(DEVIATIONS, min_size=6, max_size=6),
-    steps=st.lists(st.floats(0.01, 2.0), min_size=1, max_size=12),
-    seed=st.integers(0, 2**31),
-)
-def test_sums_of_errors_have_the_covariance_that_the_dense_one_gives(
-    values: list[float], steps: list[float], seed: int
-) -> None:
-    noise = Noise(**dict(zip(NOISE, values, strict=True)))
-    stamps = np.cumsum(steps)
+@given(noise=NOISES, stamps=STAMPS, seed=st.integers(0, 2**31))
+def test_sums_of_errors_have_the_covariance_that_the_dense_one_gives(noise: Noise, stamps: Array, seed: int) -> None:
     weights = np.random.default_rng(seed).standard_normal((len(stamps), 2, 4))
     left = dense(noise.pose_position, noise.walk_position, noise.bias_position, stamps)
     heading = dense(noise.pose_heading, noise.walk_heading, noise.bias_heading, stamps)
