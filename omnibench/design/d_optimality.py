@@ -50,6 +50,16 @@ _ROUNDING = 1e-9  # runs: a number of runs that is whole up to rounding
 _BEGIN = 0.9  # share of the least cost at which the search for an equal design begins; a lower one takes longer
 
 
+def scale_of(information: Array) -> Array:
+    """Factors (p,) of parameters by which an information (p, p) has a unit diagonal: m and rad may lie orders apart.
+
+    A parameter that is known by rounding alone keeps next to no information.
+    """
+    own = np.diagonal(information)
+    scale: Array = 1 / np.sqrt(np.maximum(own, max(_UNDETERMINED**2 * own.max(), np.finfo(float).tiny)))
+    return scale
+
+
 class Candidates:
     """Runs that a design may choose from, in standard coordinates: their mean information per cost is the identity.
 
@@ -62,8 +72,7 @@ class Candidates:
         self.costs = np.ones(len(information)) if costs is None else np.asarray(costs, dtype=float)
         self.most = most
         mean = (information / self.costs[:, None, None]).mean(axis=0)
-        # Scaled to a unit diagonal first: metres and radians may lie orders apart.
-        scale = 1 / np.sqrt(np.maximum(np.diagonal(mean), np.finfo(float).tiny))
+        scale = scale_of(mean)
         values, vectors = np.linalg.eigh(mean * scale * scale[:, None])
         if not (np.isfinite(values).all() and values[0] > _UNDETERMINED * values[-1]):
             raise ValueError("the candidates together leave a direction of the parameters undetermined")

@@ -9,7 +9,7 @@ import numpy as np
 
 from omnibench.design.candidates import CandidatePool, CandidateRun
 from omnibench.design.config import Per, Use
-from omnibench.design.d_optimality import Candidates, Counts
+from omnibench.design.d_optimality import Candidates, Counts, scale_of
 from omnibench.design.result import Candidate, Chosen, Effort, PhysicalSpread, Precision, Step
 from omnibench.errors import ConfigError
 from omnibench.fit.parameterisation import WheelGeometry
@@ -69,8 +69,9 @@ class DesignProblem:
             raise ConfigError(self._open(information, use, name)) from None
 
     def _open(self, information: Array, use: Use, name: str | None) -> str:
-        scale = 1 / np.sqrt(np.maximum(np.diagonal(information.mean(axis=0)), np.finfo(float).tiny))
-        weakest = np.linalg.eigh(information.mean(axis=0) * scale * scale[:, None])[1][:, 0] * scale
+        mean = information.mean(axis=0)
+        scale = scale_of(mean)
+        weakest = np.linalg.eigh(mean * scale * scale[:, None])[1][:, 0] * scale
         elements = (self.basis @ weakest).reshape(3, -1)
         direction = np.linalg.svd(elements)[2][0]
         row = int(np.argmax(np.linalg.norm(elements, axis=1))) + 1

@@ -20,6 +20,7 @@ from omnibench.data.storage import save_dataset
 from omnibench.design.candidates import candidates_of_dataset, read_candidates
 from omnibench.design.config import DesignConfig
 from omnibench.design.design import design_experiment
+from omnibench.design.report.design_wording import equal_in_words
 from omnibench.design.result import Design, SetDesign
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.fit.uncertainty.information import information_of_runs
@@ -286,6 +287,21 @@ def test_a_config_that_cannot_be_is_refused_in_a_line(
         design_experiment(written(tmp_path, **changes))
     for part in (str(tmp_path / "small.yaml"), *parts):
         assert part in str(refused.value)
+
+
+def test_final_poses_of_full_turns_are_said_to_leave_the_matrix_undetermined(tmp_path: Path) -> None:
+    turn = {"turn_rate": math.tau / 6, "duration": 6}
+    turns = [
+        {"speed": 0.2, "direction_deg": 0, **turn},
+        {"speed": 0.2, "direction_deg": 90, **turn},
+        {"speed": 0, **turn},
+    ]
+    path = written(tmp_path, sets={"star": turns})
+    with pytest.raises(ConfigError, match="the final poses of star leave row 1 of the matrix undetermined along"):
+        design_experiment(path, use="final")
+    design = design_experiment(path, use="trajectory")
+    assert equal_in_words(design, set_of(design, "star"), "final").startswith("none: they leave part")
+    assert set_of(design, "star").reached
 
 
 def test_recordings_that_never_turn_are_refused_and_the_motion_is_named() -> None:
