@@ -16,6 +16,7 @@ from omnibench.robot.kinematics import Array
 BEFORE, AFTER, FLOOR = "#d97706", "#0072b2", "#8a8f98"
 BAND = "rgba(102,114,127,0.20)"
 _NOISE = "#c3c9d0"
+_VAGUE = 3.0  # usual half-widths of the band: a value within a wider one says nothing; only the drawing hangs on it
 # A line across the plot at y = 0, as part of the layout: adding it to a figure is much slower.
 ZERO = {"type": "line", "xref": "x domain", "x0": 0, "x1": 1, "y0": 0, "y1": 0, "line": {"color": QUIET, "width": 1}}
 
@@ -80,10 +81,14 @@ def drawn(panels: Sequence[Panel]) -> list[go.Figure]:
 
 
 def _reach(panel: Panel) -> float:
-    widest = np.nanmax(np.concatenate([np.abs(curve.values) for curve in panel.curves]), initial=0.0)
-    # The wide band of a bin with few samples must not flatten all curves.
-    usual = [np.nanquantile(curve.half_width, 0.75) for curve in panel.curves if np.isfinite(curve.half_width).any()]
-    return float(max(widest, 1.3 * max(usual, default=0.0)))
+    """The largest value to be shown: a bin with few samples, with its wide band, must not flatten all curves."""
+    reach = [0.0]
+    for curve in panel.curves:
+        if np.isfinite(curve.half_width).any():
+            usual, size = np.nanquantile(curve.half_width, 0.75), np.abs(curve.values)
+            vague = (curve.half_width > _VAGUE * usual) & (size <= curve.half_width)
+            reach += [float(1.3 * usual), float(np.nanmax(size[~vague], initial=0.0))]
+    return max(reach)
 
 
 def _plot(panel: Panel, reach: float) -> go.Figure:
