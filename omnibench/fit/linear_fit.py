@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
 from omnibench.robot.kinematics import Array
@@ -27,12 +28,19 @@ def linear_fit(
     directions (r, N): orthonormal directions of wheel rates that are fitted; along the others it keeps ``design``.
     """
     basis = directions.T
-    moved = reference - np.array([run.start for run in runs])[odometry.trajectory]
-    headings = [np.interp(np.append(0.0, run.times[:-1]), run.pose_times, run.poses[:, 2]) for run in runs]
+    moved, columns = linear_system(odometry, runs, reference)
     turned = moved[:, 2] - odometry.driven @ design[2]
     row_3 = basis @ np.linalg.lstsq(odometry.driven @ basis, turned, rcond=None)[0]  # Eq. (L1)
-    columns = odometry.position_design(headings)
     missing = moved[:, 0] + 1j * moved[:, 1] - columns @ (design[0] + 1j * design[1])
     rows_12 = basis @ np.linalg.lstsq(columns @ basis, missing, rcond=None)[0]  # Eq. (L2)
     matrix: Array = design + np.stack([rows_12.real, rows_12.imag, row_3])
     return matrix
+
+
+def linear_system(
+    odometry: OdometryBatch, runs: Sequence[Trajectory], reference: Array
+) -> tuple[Array, NDArray[np.complex128]]:
+    """The left side of Eq. (L1) and (L2): motions (S, 3) since the start; and the factor of m1 + i m2, (S, N)."""
+    moved = reference - np.array([run.start for run in runs])[odometry.trajectory]
+    headings = [np.interp(np.append(0.0, run.times[:-1]), run.pose_times, run.poses[:, 2]) for run in runs]
+    return moved, odometry.position_design(headings)

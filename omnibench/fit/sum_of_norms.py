@@ -48,11 +48,12 @@ class SumOfNormsProgram:
         """The best step (n,) for shares (S,) >= 0. Raises SolverError."""
         self._shares.value = shares / shares.sum()
         # A program that cvxpy prepares for changing shares takes memory that grows with the square of their number.
-        _solve(self._program, ignore_dpp=len(shares) > _MOST_PREPARED)
+        solve_program(self._program, ignore_dpp=len(shares) > _MOST_PREPARED)
         return np.clip(self._step.value * self._unit, self._lower, self._upper)
 
 
-def _solve(problem: Any, ignore_dpp: bool = False) -> None:
+def solve_program(problem: Any, ignore_dpp: bool = False) -> None:
+    """Solve a cvxpy problem with Clarabel. Raises SolverError."""
     try:
         with warnings.catch_warnings():  # the status is checked below, and only steps that lower the cost are taken
             warnings.simplefilter("ignore", UserWarning)

@@ -13,7 +13,15 @@ from omnibench.testing.synthetic import ObservedProblem
 
 # The share of the start's cost at which a claim of convergence is believed. Those that are not named here are
 # baselines: they need only not be worse than the start.
-SOLVED = {"closed_form": 1e-6, "trajectory_ml": 1e-6, "crs": 1e-5, "isres": 1e-3, "genetic": 1e-1, "parametric": 1e-5}
+SOLVED = {
+    "closed_form": 1e-6,
+    "least_squares": 1e-2,  # its headings are interpolated between the few poses of the synthetic reference
+    "trajectory_ml": 1e-6,
+    "crs": 1e-5,
+    "isres": 1e-3,
+    "genetic": 1e-1,
+    "parametric": 1e-5,
+}
 
 
 def cases(registry: Registry[Any], base: type[Conformance]) -> list[Any]:
