@@ -59,8 +59,13 @@ class PublishedResult(Model):
     source: str
     theoretical_train_cost: Positive
     train_cost: Positive
+    train_improvement: float | None = Field(None, lt=1, description="as printed, 0.826 for 82.6 %; default: by costs")
     theoretical_validation_cost: Positive | None = None
     validation_cost: Positive | None = None
+    validation_improvement: float | None = Field(None, lt=1, description="as printed; default: by costs")
+    seconds: Positive | None = Field(None, description="time of the published calibration, s")
+    entry: str | None = Field(None, description="label of the entry that is the same method")
+    remarks: tuple[str, ...] = Field((), description="what a reader of these figures must know")
 
     def costs(self, split: Split) -> tuple[float, float] | None:
         """Costs of the design values and of the calibration on a split; None where one of them was not published."""
@@ -69,6 +74,12 @@ class PublishedResult(Model):
         if self.theoretical_validation_cost is None or self.validation_cost is None:
             return None
         return self.theoretical_validation_cost, self.validation_cost
+
+    def improvement(self, split: Split) -> float | None:
+        """Share of the cost of the design values that was saved: as printed, or else from the costs as printed."""
+        printed = self.train_improvement if split == "train" else self.validation_improvement
+        costs = self.costs(split)
+        return printed if printed is not None or costs is None else 1 - costs[1] / costs[0]
 
 
 class CompareConfig(Model):

@@ -65,7 +65,7 @@ def _published_rows(view: DatasetView, split: Split) -> list[Row]:
         if published is None:
             continue
         before, after = published
-        costs = (fixed(before, 4), fixed(after, 4), percent(1 - after / before, 2))
+        costs = (fixed(before, 4), fixed(after, 4), percent(result.improvement(split), 2))
         rows.append(Row.of(Cell(result.label, result.source), *costs, role="muted"))
     if rows:
         rows.insert(0, Row.of("Published, on other data: not comparable row by row", role="group"))

@@ -1,4 +1,4 @@
-"""Published results as rows beside ours: which figures agree, and the circumstances in which they may differ."""
+"""Published results as rows beside ours: figures, effort of the searches, and the circumstances of both."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from omnibench.compare.report.wording import cost_decimals
 from omnibench.compare.result import EntryStatistics, Interval
 from omnibench.data.dataset import SPLITS, Split, Trajectory
 from omnibench.report.blocks import Block, Callout, Cell, Column, Row, Table
-from omnibench.report.numbers import NOTHING, fixed, listing, percent, span
+from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, seconds, span
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
@@ -28,17 +28,23 @@ def published_blocks(view: DatasetView) -> tuple[Block, ...]:
     if view.config.cost.name != _PUBLISHED_COST:
         remark = f"They are of the cost {_PUBLISHED_COST}, Eq. (6); this comparison's is {view.config.cost.name}."
         return (Callout("The published costs cannot be set beside these", (remark,), "warning"),)
-    return (_figure_table(view), _circumstance_table(view))
+    remarks = tuple(dict.fromkeys(remark for result in view.config.published_results for remark in result.remarks))
+    about = (Callout("About the published figures", remarks),) if remarks else ()
+    return (_figure_table(view), _circumstance_table(view), *_effort_tables(view), *about)
 
 
 @dataclass(frozen=True)
 class ComparedFigure:
-    """One of our figures with its 95 % interval, and the published ones: costs, or shares where ``is_share``."""
+    """One of our figures with its 95 % interval, and the published ones: costs, or shares where ``is_share``.
+
+    decimals: of the published figures, as printed (shares in per cent).
+    """
 
     name: str
     ours: Interval
     published: tuple[float, ...]
     is_share: bool
+    decimals: int
 
     @property
     def alike(self) -> bool:
@@ -63,20 +69,20 @@ def compared_figures(view: DatasetView) -> list[ComparedFigure]:
 
 
 def _of_split(view: DatasetView, split: Split, best: EntryStatistics | None) -> Iterator[ComparedFigure]:
-    published = _published(view, split)
+    published = [result for result in view.config.published_results if result.costs(split)]
     if not published:
         return
-    before, after = zip(*published, strict=True)
+    before, after = zip(*_published(view, split), strict=True)
     name = SPLIT_NAMES[split]
     if split in view.design_costs:
-        yield ComparedFigure(f"Theoretical cost, {name}", view.design_costs[split], before, False)
+        yield ComparedFigure(f"Theoretical cost, {name}", view.design_costs[split], before, False, 4)
     if best is None:
         return
     if (reached := best.cost(split)) is not None:
-        yield ComparedFigure(f"Calibrated cost, {name} ({best.label})", reached, after, False)
+        yield ComparedFigure(f"Calibrated cost, {name} ({best.label})", reached, after, False, 4)
     if (fell := best.improvement(split)) is not None:
-        shares = tuple(1 - low / high for high, low in published)
-        yield ComparedFigure(f"Improvement, {name} ({best.label})", fell, shares, True)
+        shares = tuple(share for result in published if (share := result.improvement(split)) is not None)
+        yield ComparedFigure(f"Improvement, {name} ({best.label})", fell, shares, True, 2)
 
 
 def _over_time(view: DatasetView, best: EntryStatistics | None) -> Iterator[ComparedFigure]:
@@ -95,7 +101,7 @@ def _over_time(view: DatasetView, best: EntryStatistics | None) -> Iterator[Comp
         spread = math.hypot(*((cost.high - cost.low) / 2 / cost.value for cost in (train, validation)))
         changes = tuple(later[kind] / earlier[kind] - 1 for earlier, later in published)
         ours = Interval(value=change, low=change - spread, high=change + spread)
-        yield ComparedFigure(f"Change of the {name} cost to validation", ours, changes, True)
+        yield ComparedFigure(f"Change of the {name} cost to validation", ours, changes, True, 1)
 
 
 def _published(view: DatasetView, split: Split) -> list[tuple[float, float]]:
@@ -105,34 +111,95 @@ def _published(view: DatasetView, split: Split) -> list[tuple[float, float]]:
 
 
 def _figure_table(view: DatasetView) -> Table:
+    columns: tuple[Column, ...] = (
+        Column("Figure", numeric=False),
+        Column("Here"),
+        Column("Published"),
+        Column("From the nearest"),
+        Column("Verdict", numeric=False),
+    )
+    note = "As published: the 95 % interval (small print) contains a published figure."
+    if view.dataset.simulated:  # whoever simulates chooses wheels, floor and noise, so agreement would prove nothing
+        columns = columns[:-1]
+        note = (
+            "No verdict: the recordings here are simulated, and what was chosen so that they give the published "
+            "figures agrees with them by construction. Small print: 95 % intervals."
+        )
     rows = []
     for figure in compared_figures(view):
         ours, decimals = figure.ours, 1 if figure.is_share else cost_decimals(view)
         factor, unit = (100.0, " %") if figure.is_share else (1.0, "")
         interval = f"{span(factor * ours.low, factor * ours.high, decimals)}{unit}"
-        theirs = (f"{fixed(factor * value, 1 if figure.is_share else 4)}{unit}" for value in figure.published)
-        rows.append(
-            Row.of(
-                figure.name,
-                Cell(f"{fixed(factor * ours.value, decimals)}{unit}", interval),
-                listing(list(dict.fromkeys(theirs))),
-                figure.difference,
-                "as published" if figure.alike else "not as published",
-            )
+        theirs = (f"{fixed(factor * value, figure.decimals)}{unit}" for value in figure.published)
+        cells = (
+            Cell(figure.name),
+            Cell(f"{fixed(factor * ours.value, decimals)}{unit}", interval),
+            Cell(listing(list(dict.fromkeys(theirs)))),
+            Cell(figure.difference),
+            Cell("as published" if figure.alike else "not as published"),
         )
+        rows.append(Row(cells[: len(columns)]))
     sources = listing(list(dict.fromkeys(result.source for result in view.config.published_results)))
     return Table(
         f"Beside the published figures ({sources})",
-        (
-            Column("Figure", numeric=False),
-            Column("Here"),
-            Column("Published"),
-            Column("From the nearest"),
-            Column("Verdict", numeric=False),
-        ),
+        columns,
         tuple(rows),
-        "As published: the 95 % interval (small print) contains a published figure.",
+        note,
     )
+
+
+def _effort_tables(view: DatasetView) -> tuple[Table, ...]:
+    """Published computing times beside the evaluations and times of the entries that are the same methods."""
+    entries = {entry.label: entry for entry in view.statistics if entry.evaluations_median is not None}
+    pairs = [
+        (result, entries[result.entry], result.seconds)
+        for result in view.config.published_results
+        if result.seconds is not None and result.entry in entries
+    ]
+    if not pairs:
+        return ()
+    rows = [
+        Row.of(
+            Cell(result.label, f"here {entry.label}", view.styles[entry.label].colour),
+            seconds(published),
+            count(entry.evaluations_median),
+            seconds(entry.seconds_median),
+            fixed(entry.train_median, cost_decimals(view)),
+        )
+        for result, entry, published in pairs
+    ]
+    slowest, base, longest = max(pairs, key=lambda pair: pair[2])
+    rows += [
+        Row.of(
+            f"{result.label} against {slowest.label}",
+            percent(published / longest - 1, 0, signed=True),
+            _change(entry.evaluations_median, base.evaluations_median),
+            _change(entry.seconds_median, base.seconds_median),
+            _change(entry.train_median, base.train_median),
+        )
+        for result, entry, published in pairs
+        if result is not slowest
+    ]
+    return (
+        Table(
+            "Effort of the searches",
+            (
+                Column("Method", numeric=False),
+                Column("Time, published"),
+                Column("Evaluations here", "median"),
+                Column("Time here", "median"),
+                Column("CF training here", "median"),
+            ),
+            tuple(rows),
+            "Hardware and program differ, so times compare within a column only; the publication gives no numbers of "
+            "evaluations. A search that evaluates less has converged faster only if its cost is not higher.",
+        ),
+    )
+
+
+def _change(value: float | None, base: float | None) -> str:
+    """Relative change in per cent; a dash where one of the values is not known."""
+    return percent(value / base - 1, 1, signed=True) if value is not None and base else NOTHING
 
 
 def _circumstance_table(view: DatasetView) -> Table:

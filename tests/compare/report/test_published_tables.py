@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from report_samples import config, flower, run, statistics
 
+from omnibench.compare.report.cost_tables import cost_table
 from omnibench.compare.report.published_tables import ComparedFigure, compared_figures, published_blocks
 from omnibench.compare.report.view import DatasetView, views
 from omnibench.compare.result import ComparisonResult
@@ -26,6 +28,11 @@ def with_published(result: ComparisonResult, *published: dict[str, Any], **chang
     wanted = config(calibrators=["theoretical", "closed_form"], published_results=given, **changes)
     (view,) = views(ComparisonResult(**{**vars(result), "config": wanted}))
     return view
+
+
+def recorded(view: DatasetView) -> DatasetView:
+    """The view with its data set called a recording."""
+    return replace(view, dataset=replace(view.dataset, simulated=False))
 
 
 def scaled(result: ComparisonResult, before: float, after: float) -> dict[str, float]:
@@ -64,10 +71,51 @@ def test_figures_equal_to_ours_are_alike(result: ComparisonResult) -> None:
     view = with_published(result, scaled(result, 1.0, 1.0))
     assert not figures(view, alike=False)
     assert len(compared_figures(view)) == 8
-    table, _ = published_blocks(view)
+    table, _ = published_blocks(recorded(view))
     assert isinstance(table, Table)
     assert [row.cells[-1].text for row in table.rows] == ["as published"] * 8
     assert table.rows[0].cells[3].text == "0.0 %"
+
+
+def test_simulated_recordings_are_given_no_verdict_as_they_were_chosen(result: ComparisonResult) -> None:
+    table, _ = published_blocks(with_published(result, scaled(result, 1.0, 1.0)))
+    assert isinstance(table, Table)
+    assert [column.title for column in table.columns] == ["Figure", "Here", "Published", "From the nearest"]
+    assert {len(row.cells) for row in table.rows} == {4}
+    assert "agrees with them by construction" in table.note
+
+
+def test_improvements_are_shown_as_printed_and_not_from_rounded_costs(result: ComparisonResult) -> None:
+    printed = {"theoretical_train_cost": 0.1234, "train_cost": 0.0215, "train_improvement": 0.8261}
+    view = with_published(result, printed)
+    assert cost_table(view, "train").rows[-1].cells[-1].text == "82.61 %"
+    (improvement,) = (figure for figure in compared_figures(view) if figure.name.startswith("Improvement"))
+    assert improvement.published == (0.8261,)
+    del printed["train_improvement"]
+    assert cost_table(with_published(result, printed), "train").rows[-1].cells[-1].text == "82.58 %"
+
+
+def test_published_times_stand_beside_evaluations_of_the_same_methods(result: ComparisonResult) -> None:
+    both = [
+        {**scaled(result, 1, 1), "label": "slow", "seconds": 903, "entry": "theoretical"},
+        {**scaled(result, 1, 1), "label": "fast", "seconds": 637, "entry": "closed_form"},
+    ]
+    _, _, table = published_blocks(with_published(result, *both))
+    assert isinstance(table, Table)
+    slow, fast, change = ([cell.text for cell in row.cells] for row in table.rows)
+    evaluations = statistics(result, "closed_form").evaluations_median
+    assert slow[:3] == ["slow", "903 s", "1"]
+    assert fast[:3] == ["fast", "637 s", f"{evaluations:.0f}"]
+    assert change[:2] == ["fast against slow", "−29 %"]
+    assert change[2] == f"+{100 * (evaluations - 1):.1f} %"
+    assert "Hardware and program differ" in table.note
+
+
+def test_remarks_on_published_figures_are_shown_once(result: ComparisonResult) -> None:
+    remarked = {**scaled(result, 1, 1), "remarks": ["A misprint."]}
+    *_, remarks = published_blocks(with_published(result, remarked, remarked))
+    assert isinstance(remarks, Callout)
+    assert remarks.items == ("A misprint.",)
 
 
 def test_a_published_floor_twice_as_high_is_not_as_ours(result: ComparisonResult) -> None:

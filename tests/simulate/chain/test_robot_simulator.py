@@ -15,9 +15,11 @@ from commands import CONFIGS, Command, assert_refused, flower
 from omnibench.config import validate
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.data.true_poses import read_true_poses
+from omnibench.fit.calibrate import calibrate
 from omnibench.robot.kinematics import wheel_equations
 from omnibench.robot.odometry import OdometryBatch
 from omnibench.simulate.chain.robot_config import RobotConfig
+from omnibench.simulate.config import MotionGrid, Truth
 from omnibench.simulate.flower import grid_of
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.simulation import Simulation
@@ -275,6 +277,23 @@ def test_the_papers_experiment_is_36_commands_5_times_in_two_sessions() -> None:
     assert len(grid_of(config.commands)) == 36
     assert config.repetitions == 5
     assert config.validation is not None
+
+
+def test_floor_and_slip_of_the_shipped_config_leave_about_the_papers_calibrated_cost() -> None:
+    config = read_simulation(CONFIGS / "apr02_floor.yaml").config
+    assert isinstance(config, RobotConfig)
+    few = MotionGrid(directions_deg=(0, 60, 120, 180, 240, 300), turn_rates=(-0.35, 0.35))
+    small = {"commands": few, "repetitions": 1, "validation": None}
+
+    def calibrated(truth: Truth) -> float:
+        effects = tuple(term for term in truth.effects if term.name != "tyre_wear")  # one session
+        changes = {**small, "truth": truth.model_copy(update={"effects": effects})}
+        result = calibrate(simulate_dataset(config.model_copy(update=changes), "robot").dataset).result
+        assert result.cost is not None
+        return result.cost
+
+    assert calibrated(config.truth) == pytest.approx(0.0215, rel=0.2)
+    assert calibrated(config.truth.model_copy(update={"effects": ()})) < 0.002
 
 
 def test_the_schema_for_editors_knows_a_robot(command: Command) -> None:
