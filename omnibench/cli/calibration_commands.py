@@ -16,7 +16,7 @@ from omnibench.cli.options import (
     load_given_plugins,
     output_option,
 )
-from omnibench.cli.terminal.console import make_console, print_json, warn
+from omnibench.cli.terminal.console import make_console, print_json, print_verdict, warn
 from omnibench.errors import ConfigError
 
 calibration_app = typer.Typer()
@@ -102,6 +102,8 @@ def calibrate(
         return print_json(calibration)
     print_calibration(make_console(), run)
     typer.echo(f"calibration: {output}")
+    if calibration.provenance is not None and calibration.provenance.held_out is not None:
+        print_verdict(calibration.provenance.held_out)
     return None
 
 
@@ -128,7 +130,8 @@ def evaluate(
     warn(warnings)
     if as_json:
         return print_json(evaluation.model_dump() | {"warnings": warnings})
-    return print_evaluation(make_console(), evaluation)
+    print_evaluation(make_console(), evaluation)
+    return print_verdict(evaluation.held_out)
 
 
 @calibration_app.command()

@@ -11,6 +11,7 @@ from omnibench.environment import package_versions
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, RunResult, run_calibrator
 from omnibench.fit.cost import Cost
+from omnibench.fit.evaluate import verdict_on
 from omnibench.fit.parameterisation import (
     Box,
     FittedParameter,
@@ -126,6 +127,7 @@ def calibrate(
             validation_cost=objective.of_model(model, validation) if validation else None,
             outcome=result.outcome,
             reason=result.reason,
+            held_out=verdict_on(model, validation),
         ),
     )
     drawn = bootstrap_intervals(problem, result.vector, rng=problem.rng) if intervals and uncertainty else None

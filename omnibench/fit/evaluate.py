@@ -10,8 +10,9 @@ from pydantic import Field
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory
 from omnibench.data.domain_check import extrapolation_warning
+from omnibench.fit.held_out import judge, nothing_held_out
 from omnibench.registry import costs
-from omnibench.robot.calibration import Calibration
+from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 
@@ -30,8 +31,9 @@ class SplitErrors(Model):
 class Evaluation(Model):
     """Errors of a calibration and of the design values, by split; the split ``all`` is every trajectory.
 
-    warnings: one sentence if runs lie outside the training domain of the calibration's effects. What is not excluded is
-    the document of ``omnibench evaluate --json``.
+    held_out: the verdict by the runs that the calibration was not fitted to. warnings: one sentence if runs lie outside
+    the training domain of the calibration's effects. What is not excluded is the document of ``omnibench evaluate
+    --json``.
     """
 
     dataset: str
@@ -39,6 +41,7 @@ class Evaluation(Model):
     trajectories: int
     splits: dict[str, SplitErrors]
     design: dict[str, SplitErrors] = Field(exclude=True)
+    held_out: HeldOutVerdict
     warnings: tuple[str, ...] = ()
 
 
@@ -59,8 +62,31 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
         trajectories=len(dataset.trajectories),
         splits={name: split_errors(model, group) for name, group in groups.items()},
         design={name: split_errors(design, group) for name, group in groups.items()},
+        held_out=held_out_verdict(calibration, dataset),
         warnings=() if warning is None else (warning,),
     )
+
+
+def held_out_verdict(calibration: Calibration, dataset: Dataset) -> HeldOutVerdict:
+    """The verdict on a calibration by the runs of a data set that it was not fitted to, beside the design values.
+
+    These are the validation split; of another data set without one, all runs. A data set that has the name of the one
+    that was fitted but not its content may hold the same runs, so that nothing of it counts as held out.
+    """
+    runs, provenance = dataset.split("validation"), calibration.provenance
+    if not runs and (provenance is None or provenance.dataset_hash != dataset.hash):
+        if provenance is None or provenance.dataset == dataset.name:
+            return nothing_held_out("which runs the calibration was fitted to is not known, and none is for validation")
+        runs = dataset.trajectories
+    return verdict_on(calibration.model, runs)
+
+
+def verdict_on(model: OdometryModel, held_out: Sequence[Trajectory]) -> HeldOutVerdict:
+    """The verdict on a model by runs that it was not fitted to, beside the design values of its robot."""
+    if not held_out:
+        return nothing_held_out()
+    design = OdometryModel.of_design(model.robot, model.integration)
+    return judge(final_errors(design, held_out), final_errors(model, held_out), held_out)
 
 
 def final_errors(model: OdometryModel, trajectories: Sequence[Trajectory]) -> Array:

@@ -42,8 +42,38 @@ class Noise(Model):
     bias_heading: Deviation = Field(0.0, description="constant over a run, rad")
 
 
+class HeldOutVerdict(Model):
+    """What held-out runs say of a calibration, beside the design values.
+
+    verdict: of the errors of the final pose, Eq. (6). Better or worse: the 95 % interval of the improvement leaves out
+    0; undecided: it does not, or the units are too few for one; unknown: nothing was held out. Positions (m) and
+    headings (rad) are means over the runs. improvement: share of the design values' Eq. (6) that is gone. unit, units,
+    method: what the interval rests on. sentence and detail: all of this in words.
+    """
+
+    verdict: Literal["better", "worse", "undecided", "unknown"]
+    runs: tuple[str, ...] = ()
+    design_position_m: float | None = None
+    position_m: float | None = None
+    design_heading_rad: float | None = None
+    heading_rad: float | None = None
+    improvement: float | None = None
+    low: float | None = None
+    high: float | None = None
+    unit: Literal["command", "run"] | None = None
+    units: int = 0
+    method: Literal["bootstrap", "Student's t", "none"] = "none"
+    sentence: str
+    detail: str
+
+    @property
+    def lines(self) -> tuple[str, str]:
+        """The sentence and its detail, as commands print them."""
+        return self.sentence, self.detail
+
+
 class Provenance(Model):
-    """Origin of a calibration: data set, calibrator with options, versions, costs and outcome."""
+    """Origin of a calibration: data set, calibrator with options, versions, costs, outcome, what held-out runs say."""
 
     dataset: str
     dataset_hash: str
@@ -58,6 +88,7 @@ class Provenance(Model):
     validation_cost: float | None = None
     outcome: str
     reason: str = ""
+    held_out: HeldOutVerdict | None = None
 
 
 class Calibration(Model):

@@ -51,7 +51,7 @@ def test_help_is_shown_on_standard_output(arguments: list[str], command: Command
 
 def test_evaluate_prints_the_documented_document(command: Command, prepared: Prepared) -> None:
     found = document(command("evaluate", prepared.calibration, prepared.data, "--json"))
-    assert [*found] == ["dataset", "trajectories", "splits", "warnings"]
+    assert [*found] == ["dataset", "trajectories", "splits", "held_out", "warnings"]
     assert found["warnings"] == []
     assert (found["dataset"], found["trajectories"]) == ("flower", 12)
     assert [*found["splits"]] == ["train", "validation", "all"]
@@ -65,7 +65,7 @@ def test_evaluate_prints_the_documented_document(command: Command, prepared: Pre
 
 def test_evaluate_shows_the_design_values_beside_the_calibration(command: Command, prepared: Prepared) -> None:
     shown = command("evaluate", prepared.calibration, prepared.data).stdout
-    assert shown.count("calibration") == shown.count("design") == 3
+    assert shown.count("\ncalibration") == shown.count("\ndesign") == 3
     assert "(simulated data)" in shown
 
 
@@ -74,6 +74,18 @@ def test_calibrate_prints_what_it_would_write(command: Command, prepared: Prepar
     assert found == json.loads(read_calibration(tmp_path / "c.yaml").model_dump_json())
     assert found["format"] == "omnibench-calibration/1"
     assert np.shape(found["matrix"]) == (3, 3)
+
+
+def test_calibrate_and_evaluate_end_with_what_held_out_runs_say(command: Command, prepared: Prepared) -> None:
+    calibrated = command("calibrate", prepared.data, "-o", "c.yaml").stdout.splitlines()
+    evaluated = command("evaluate", "c.yaml", prepared.data).stdout.splitlines()
+    assert calibrated[-2:] == evaluated[-2:]
+    assert calibrated[-2].startswith("held out (6 runs): ")
+    assert calibrated[-2].endswith(", better than the design")
+    assert "; runs: validation-001, validation-002, " in calibrated[-1]
+    found = document(command("evaluate", "c.yaml", prepared.data, "--json"))["held_out"]
+    assert (found["verdict"], found["unit"], found["units"], len(found["runs"])) == ("better", "run", 6, 6)
+    assert calibrated[-2:] == [found["sentence"], found["detail"]]
 
 
 def test_a_calibration_comes_close_to_the_truth_and_says_where_it_is_from(prepared: Prepared) -> None:

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
     from rich.console import Console
 
+    from omnibench.robot.calibration import HeldOutVerdict
+
 _PIPED_WIDTH = 160  # columns of a table in a pipe or a file, where nobody's window is too narrow
 
 
@@ -35,3 +37,9 @@ def print_json(document: Mapping[str, Any] | BaseModel) -> None:
     from omnibench.config import to_json
 
     typer.echo(to_json(document))
+
+
+def print_verdict(verdict: HeldOutVerdict) -> None:
+    """The last lines of ``calibrate``, ``evaluate`` and ``compare``: what held-out runs say, and which these are."""
+    for line in verdict.lines:
+        typer.echo(line)
