@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -25,6 +26,7 @@ class Environment(Model):
     processors: int
 
 
+@cache
 def package_versions() -> dict[str, str]:
     """Versions of the packages that results depend on; those that are installed."""
     versions = {}

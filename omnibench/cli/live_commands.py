@@ -186,21 +186,26 @@ def record(
 def keys(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write to.")],
     names: Annotated[list[str] | None, typer.Argument(help="Who gets a certificate. Default: node and client.")] = None,
+    router: Annotated[
+        str | None,
+        typer.Option(help="Who of these runs the node that the others connect to. Default: node.", metavar="NAME"),
+    ] = None,
     hosts: Annotated[
         list[str] | None,
-        typer.Option("--host", help="Name or address of the computer that the node runs on; may be repeated."),
+        typer.Option("--host", help="Name or address of the computer that this node runs on; may be repeated."),
     ] = None,
     days: Annotated[int, typer.Option(min=1, help="Validity, in days.")] = 365,
     users: Annotated[bool, typer.Option("--users", help="Also make passwords, and a users.txt for the node.")] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace files that exist, the authority (CA) too.")
+    force: Annotated[
+        bool, typer.Option("--force", "--overwrite", help="Replace files that exist, the authority (CA) too.")
     ] = False,
 ) -> None:
     """Make a test authority (CA) and certificates for mutual TLS."""
     from omnibench.live.network.keys import make_keys
 
     chosen = names or ["node", "client"]
-    for file in make_keys(folder, chosen, hosts=hosts or (), days=days, users=users, overwrite=overwrite):
+    made = make_keys(folder, chosen, router=router, hosts=hosts or (), days=days, users=users, overwrite=force)
+    for file in made:
         typer.echo(f"written: {file}")
 
 

@@ -30,15 +30,23 @@ Settings = Annotated[
 TableFormat = Annotated[Literal["parquet", "csv"], typer.Option("--format", help="Format of the data set's tables.")]
 Plugins = Annotated[
     list[Path] | None,
-    typer.Option("--plugins", metavar="DIR", help="Folder of plug-ins; may be repeated. Default: ./plugins, if any."),
+    typer.Option(
+        "--plugins",
+        metavar="DIR",
+        envvar="OMNIBENCH_PLUGINS",
+        help="Folder of plug-ins; may be repeated. Default: ./plugins, if any; none: load none.",
+    ),
 ]
 
 
 def plugin_folders(given: Sequence[Path] | None) -> list[Path]:
-    """The folders that were given; by default ./plugins, if it exists."""
+    """The folders that were given; by default ./plugins, if it holds plug-ins, which standard error then says."""
     if given:
-        return list(given)
-    return [Path("plugins")] if given is None and Path("plugins").is_dir() else []
+        return [folder for folder in given if folder != Path("none")]
+    if given is not None or not any(Path("plugins").glob("*.py")):
+        return []
+    typer.echo("plug-ins of ./plugins are loaded; --plugins none loads none", err=True)
+    return [Path("plugins")]
 
 
 def load_given_plugins(given: Sequence[Path] | None) -> list[PluginFailure]:

@@ -14,6 +14,7 @@ import zenoh
 
 from omnibench.errors import DataError
 from omnibench.live.closing import Closing
+from omnibench.live.control.request_queue import source_of
 from omnibench.live.estimation.counts import Counts
 from omnibench.live.network.callbacks import direct
 from omnibench.live.network.presence import Presence, checked_robot, nothing_received
@@ -105,7 +106,8 @@ class RobotMonitor(Closing):
 
     def _query_health(self) -> None:
         key = f"omnibench/{self._robot or '*'}/health"
-        self._session.get(key, direct(self._take_answer), target=zenoh.QueryTarget.ALL, timeout=_QUERY_PERIOD)
+        take, everyone = direct(self._take_answer), zenoh.QueryTarget.ALL
+        self._session.get(key, take, target=everyone, timeout=_QUERY_PERIOD, source_info=source_of(self._session))
 
     def _take_answer(self, reply: zenoh.Reply) -> None:
         if reply.ok is None:

@@ -203,7 +203,21 @@ def test_list_names_everything_that_a_config_can_name(command: Command) -> None:
 
 def test_list_takes_the_plugins_of_the_folder_one_is_in(command: Command, tmp_path: Path) -> None:
     write_plugin(tmp_path / "plugins", "chatty", CHATTY)
-    assert "chatty" in command("list").stdout
+    printed = command("list")
+    assert "chatty" in printed.stdout
+    assert "plug-ins of ./plugins are loaded; --plugins none loads none\n" in printed.stderr
+
+
+@pytest.mark.parametrize("by_variable", [False, True])
+def test_no_plugins_are_loaded_where_none_are_wanted(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by_variable: bool
+) -> None:
+    write_plugin(tmp_path / "plugins", "unwanted", "raise SystemExit('it ran')\n")
+    if by_variable:
+        monkeypatch.setenv("OMNIBENCH_PLUGINS", "none")
+    printed = command("list", *([] if by_variable else ["--plugins", "none"]))
+    assert "closed_form" in printed.stdout
+    assert printed.stderr == ""
 
 
 def test_list_goes_on_past_a_plugin_that_cannot_be_imported(command: Command, tmp_path: Path) -> None:

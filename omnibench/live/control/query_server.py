@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 import math
-import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from typing import Any, Final, cast
 
 import numpy as np
@@ -16,7 +15,8 @@ import zenoh
 
 from omnibench.config import Model, to_json
 from omnibench.errors import ConfigError, DataError, OmnibenchError, one_line
-from omnibench.live.control.orders import read_pose, read_sent_calibration, read_time
+from omnibench.live.control.orders import LONGEST, read_pose, read_sent_calibration, read_time
+from omnibench.live.control.request_queue import MOST_WAITING, Request, RequestQueue, client_of
 from omnibench.live.estimation.saved_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.network.callbacks import direct
@@ -27,17 +27,17 @@ from omnibench.robot.kinematics import Array
 LOG = logging.getLogger("omnibench.live")
 _READING: Final = ("info", "calibration", "health", "pose")
 _ORDERS: Final = ("set_pose", "reset", "swap")
-_LONGEST: Final = 1 << 16  # bytes of a request; chosen
-_LONGEST_QUEUE: Final = 64  # requests that wait; chosen
 _CLOSE_TIMEOUT: Final = 6.0  # s to wait for a request under way: longer than Zenoh waits for a client, 5 s
 
 
 class QueryServer:
     """Answers queries and accepts calibrations, one request after another, in a thread of its own.
 
-    Requests that are too long or too many are refused on arrival, so that they do not delay the wheel samples. Zenoh
-    gives a reply its query's congestion control: for a client that queried with BLOCK and does not read, Zenoh waits up
-    to 5 s and then disconnects it. Until then this thread waits; the wheel samples are not delayed.
+    Requests that are too long or too many are refused on arrival, so that they do not delay the wheel samples. Clients
+    are served in turn. Zenoh tells who asks only if the client says so (``source_info``, as omnibench's own commands
+    do); requests without it share a turn for each robot and service. What waits for the same answer gets one that is
+    made once. Zenoh gives a reply its query's congestion control: for a client that queried with BLOCK and does not
+    read, Zenoh waits up to 5 s and then disconnects it. Until then this thread waits; wheel samples are not delayed.
 
     info: makes the answer to ``info`` for a robot. memories: robot -> its saved state, for nodes that keep one.
     """
@@ -54,7 +54,8 @@ class QueryServer:
         self._memories = memories
         self._rate_limiter = RateLimiter()
         self._refused = 0
-        self._work: queue.Queue[Callable[[], None] | None] = queue.Queue(_LONGEST_QUEUE)
+        self._requests = RequestQueue()
+        self._answers: dict[tuple[str, str], bytes] = {}  # robot, service -> answer, for the requests taken together
         self._thread = threading.Thread(target=self._run, name="query server", daemon=True)
         self._declarations: list[Any] = []
         for name in trackers:
@@ -65,8 +66,7 @@ class QueryServer:
         """Answer the requests that wait, and accept no more."""
         for declaration in self._declarations:
             declaration.undeclare()
-        with suppress(queue.Full):  # a client that does not read may block the thread for a while
-            self._work.put(None, timeout=_CLOSE_TIMEOUT)
+        self._requests.close()
         self._thread.join(_CLOSE_TIMEOUT)
 
     def _declare(self, session: zenoh.Session, name: str) -> list[Any]:
@@ -85,42 +85,47 @@ class QueryServer:
         if service in _ORDERS and str(query.key_expr) != f"omnibench/{name}/{service}":
             return  # an order must name its robot: wildcards are ignored
         size = _size(query.payload) + _size(query.attachment) + len(str(query.parameters))
-        reason = self._queued(lambda: self._answer(name, service, query), size)
-        if reason is not None:
-            _refuse(query, name, f"omnibench/{name}/{service}: {reason}")
+        self._queue(
+            client_of(query, f"{name}/{service}"),
+            size,
+            lambda: self._answer(name, service, query),
+            lambda reason: _refuse(query, name, f"omnibench/{name}/{service}: {reason}"),
+        )
 
     def _take_sample(self, name: str, sample: zenoh.Sample) -> None:
         """Take a calibration that was put: it has no reply, unlike ``swap``, so health and log report a refusal."""
         if sample.kind != zenoh.SampleKind.PUT:
             return
-        size = _size(sample.payload) + _size(sample.attachment)
-        reason = self._queued(lambda: self._take_calibration(name, sample), size)
-        if reason is not None:
-            self._trackers[name].refuse_swap(f"omnibench/{name}/calibration: {reason}")
+        self._queue(
+            client_of(sample, f"{name}/put"),
+            _size(sample.payload) + _size(sample.attachment),
+            lambda: self._take_calibration(name, sample),
+            lambda reason: self._trackers[name].refuse_swap(f"omnibench/{name}/calibration: {reason}"),
+        )
 
-    def _queued(self, work: Callable[[], None], size: int) -> str | None:
-        """Queue a request of ``size`` bytes; None, or the reason why it is refused."""
-        reason = None
-        if size > _LONGEST:
-            reason = f"{size} bytes are more than a request may have, {_LONGEST}"
+    def _queue(self, client: str, size: int, answer: Callable[[], None], refuse: Callable[[str], None]) -> None:
+        """Queue a request of ``size`` bytes, or refuse it or the one that gives way to it."""
+        request = Request(client, answer, refuse)
+        refused: Request | None = request
+        if size > LONGEST:
+            reason = f"{size} bytes are more than a request may have, {LONGEST}"
         else:
-            try:
-                self._work.put_nowait(work)
-            except queue.Full:
-                reason = f"{_LONGEST_QUEUE} requests are waiting; ask again later"
-        if reason is not None:
+            reason = f"{MOST_WAITING} requests are waiting; ask again later"
+            refused = self._requests.put(request)
+        if refused is not None:
             self._refused += 1
             if self._rate_limiter.allows("refused"):
                 LOG.warning("requests refused so far: %d; the last: %s", self._refused, reason)
-        return reason
+            refused.refuse(reason)
 
     def _run(self) -> None:
-        while (work := self._work.get()) is not None:
-            try:
-                work()
-            except Exception as error:  # whatever it was, the next request is answered
-                self._failed(error)
-            del work  # a query ends when the last reference to it is gone
+        while batch := deque(self._requests.take()):
+            self._answers.clear()
+            while batch:
+                try:
+                    batch.popleft().answer()  # a query ends when the last reference to it is gone
+                except Exception as error:  # whatever it was, the next request is answered
+                    self._failed(error)
 
     def _failed(self, error: Exception) -> None:
         if self._rate_limiter.allows(type(error).__name__):
@@ -129,7 +134,7 @@ class QueryServer:
     def _answer(self, name: str, service: str, query: zenoh.Query) -> None:
         with query:
             try:
-                answer = to_json(self._serve(name, service, query)).encode()
+                answer = self._made(name, service, query)
             except OmnibenchError as error:
                 _refuse(query, name, str(error))
             except Exception as error:
@@ -137,6 +142,18 @@ class QueryServer:
                 self._failed(error)
             else:
                 query.reply(f"omnibench/{name}/{service}", answer, encoding=zenoh.Encoding.APPLICATION_JSON)
+
+    def _made(self, name: str, service: str, query: zenoh.Query) -> bytes:
+        """The answer in JSON. One without parameters is made once for all that wait for it; an order changes them."""
+        plain = service in _READING and not str(query.parameters) and query.payload is None
+        answer = self._answers.get((name, service)) if plain else None
+        if answer is None:
+            answer = to_json(self._serve(name, service, query)).encode()
+        if plain:
+            self._answers[name, service] = answer
+        elif service in _ORDERS:
+            self._answers.clear()
+        return answer
 
     def _serve(self, name: str, service: str, query: zenoh.Query) -> Mapping[str, Any] | Model:
         tracker = self._trackers[name]
@@ -165,6 +182,7 @@ class QueryServer:
         return {"robot": name, "done": "reset"}
 
     def _take_calibration(self, name: str, sample: zenoh.Sample) -> None:
+        self._answers.clear()
         try:
             self._swap(name, sample.payload.to_bytes())
         except OmnibenchError:

@@ -8,6 +8,8 @@ import zenoh
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from omnibench.errors import DataError
+from omnibench.live.control.orders import LONGEST
+from omnibench.live.control.request_queue import source_of
 from omnibench.live.network.presence import alive_robots, checked_robot, nothing_received
 from omnibench.robot.calibration import read_calibration
 
@@ -34,9 +36,10 @@ def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: fl
 
     DataError: the file is no calibration, no node answers (the message names the robots alive), or the node refuses.
     """
+    _check_size(file)
     read_calibration(file)
-    payload = file.read_bytes()
-    for reply in session.get(f"omnibench/{checked_robot(robot)}/swap", payload=payload, timeout=timeout):
+    payload, key = file.read_bytes(), f"omnibench/{checked_robot(robot)}/swap"
+    for reply in session.get(key, payload=payload, timeout=timeout, source_info=source_of(session)):
         try:
             if reply.ok is not None:
                 return SwapReply.model_validate_json(reply.ok.payload.to_bytes())
@@ -44,4 +47,20 @@ def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: fl
                 raise DataError(f"robot {robot!r} refuses {file}: {_Refusal.model_validate_json(refusal).error}")
         except ValidationError:
             raise DataError(f"robot {robot!r}: cannot read its node's answer; is it an omnibench node?") from None
-    raise DataError(nothing_received(robot, timeout, alive_robots(session)))
+    alive = alive_robots(session)
+    if robot in alive:
+        raise DataError(
+            f"robot {robot!r} is alive, but its node did not answer in {timeout:.0f} s; the `access` of its router may "
+            "not let us swap, which only operators may, or the node is too busy"
+        )
+    raise DataError(nothing_received(robot, timeout, alive))
+
+
+def _check_size(file: Path) -> None:
+    """DataError at once for a file that every node would refuse; to parse it could take minutes."""
+    try:
+        size = file.stat().st_size
+    except OSError:
+        return  # whoever reads it says what is wrong
+    if size > LONGEST:
+        raise DataError(f"{file}: {size} bytes are more than a node takes, {LONGEST}; is it a calibration file?")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import zenoh
 
@@ -16,44 +16,57 @@ from omnibench.errors import ConfigError
 from omnibench.live.network.session_config import Access
 from omnibench.live.wire.topics import INPUTS, TOPICS, topic_name
 
-_WRITE: Final = ("put", "delete", "declare_queryable", "reply", "liveliness_token")
-_READ: Final = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
+Right = Literal["write", "read", "ask", "put", "subscribe", "serve"]
+_MESSAGES: Final[dict[Right, tuple[str, ...]]] = {
+    "write": ("put", "delete", "declare_queryable", "reply", "liveliness_token"),
+    "read": ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"),
+    "ask": ("query",),
+    "put": ("put",),
+    "subscribe": ("declare_subscriber",),
+    "serve": ("declare_queryable", "reply", "liveliness_token"),
+}
+_ALL: Final = _MESSAGES["write"] + _MESSAGES["read"]
 
 _ALIVE: Final = "omnibench/{}/alive"
 _ANSWERS: Final = tuple("omnibench/{}/" + service for service in ("info", "calibration", "health", "pose"))
 _SERVICES: Final = "omnibench/{}/*"
+_CALIBRATION: Final = "omnibench/{}/calibration"
+# ROS 2's keys of a robot, in any domain: domain, name, type and hash. omnibench's services have fewer parts.
+_ROS_KEYS: Final = "*/{}/*/**/*/*"
 _ROS_GRAPH: Final = "@ros2_lv/**"  # rmw_zenoh's liveliness tokens: nodes and their topics, no data
 _ADVANCED: Final = "/@adv/**"  # below a key: messages between Zenoh's advanced publishers and subscribers
 
 _OUTPUTS: Final = tuple(topic for topic in TOPICS if topic not in INPUTS)
 
-Rights = dict[str, dict[str, list[str]]]
-"""Peer's name -> "write" or "read" -> key expressions."""
+Rights = dict[str, dict[Right, list[str]]]
+"""Peer's name -> right -> key expressions."""
 
 
 def rights_of(access: Access) -> Rights:
     """The key expressions that each peer may write and read. ConfigError: a rule's key expression is not valid."""
-    rights: Rights = defaultdict(lambda: {"write": [], "read": []})
+    rights: Rights = defaultdict(lambda: defaultdict(list))
 
-    def grant(who: Iterable[str], *, write: Iterable[str] = (), read: Iterable[str] = ()) -> None:
+    def grant(who: Iterable[str], **keys: Iterable[str]) -> None:
         for name in who:
-            rights[name]["write"] += write
-            rights[name]["read"] += read
+            for right in _MESSAGES:
+                rights[name][right] += keys.get(right, ())
 
+    tokens = [*_services("*", _ALIVE), _ROS_GRAPH]
     for robot, name in access.robots.items():
-        robot_keys = (f"{robot}/**", f"*/{robot}/**", *_topics(robot, ("tf",)), *_services(robot, *_ANSWERS))
-        tokens = _services("*", _ALIVE)
-        grant([name], write=[*_topics(robot, INPUTS), _ROS_GRAPH], read=[*robot_keys, *tokens, _ROS_GRAPH])
-    all_topics = [*_topics("*", TOPICS), _ROS_GRAPH]
-    answers, services = _services("*", *_ANSWERS, _ALIVE), _services("*", _SERVICES)
-    grant(access.nodes, write=[*_topics("*", _OUTPUTS), *services, _ROS_GRAPH])
-    grant(access.nodes, read=[*all_topics, *services])
-    grant(access.viewers, write=[_ROS_GRAPH], read=[*all_topics, *answers])
-    grant(access.operators, write=[_ROS_GRAPH, "omnibench/*/calibration"], read=[*all_topics, *services])
+        own_keys = (f"{robot}/**", *_services(robot, _ROS_KEYS), *_topics(robot, ("tf",)))
+        grant([name], write=[*_topics(robot, INPUTS), _ROS_GRAPH], read=[*own_keys, *tokens])
+        grant([name], ask=_services(robot, *_ANSWERS))
+    everything = [*_topics("*", TOPICS), *tokens]
+    answers, services, calibrations = _services("*", *_ANSWERS), _services("*", _SERVICES), _services("*", _CALIBRATION)
+    # Nodes answer for their robots and take calibrations; to give orders and calibrations is for operators alone.
+    grant(access.nodes, write=[*_topics("*", _OUTPUTS), _ROS_GRAPH], serve=services)
+    grant(access.nodes, read=everything, ask=answers, subscribe=calibrations)
+    grant(access.viewers, write=[_ROS_GRAPH], read=everything, ask=answers)
+    grant(access.operators, write=[_ROS_GRAPH], read=everything, ask=services, put=calibrations)
     for rule in access.rules:
         grant(rule.who, write=rule.write, read=rule.read)
     return {
-        who: {kind: sorted(_with_advanced(_checked(key) for key in keys)) for kind, keys in granted.items()}
+        who: {right: sorted(_with_advanced(_checked(key) for key in keys)) for right, keys in granted.items()}
         for who, granted in rights.items()
     }
 
@@ -67,21 +80,21 @@ def access_control(access: Access, *, by_certificate: bool, own_name: str | None
     property_name = "cert_common_names" if by_certificate else "usernames"
     rights = rights_of(access)
     if own_name is not None:
-        everything = sorted(_with_advanced(["**", _ROS_GRAPH]))
-        rights[own_name] = {"write": everything, "read": everything}
+        all_keys = sorted(_with_advanced(["**", _ROS_GRAPH]))
+        rights[own_name] = {"write": all_keys, "read": all_keys}
     named = {key for granted in rights.values() for keys in granted.values() for key in keys if "@" in key}
     rules = [
         # Peers without a rule are a subject too, or Zenoh would not log that they are refused.
-        _rule("nothing", "deny", "ingress", _WRITE + _READ, ["**"]),
-        _rule("outgoing", "allow", "egress", _WRITE + _READ, sorted({"**", "**" + _ADVANCED, *named})),
+        _rule("nothing", "deny", "ingress", _ALL, ["**"]),
+        _rule("outgoing", "allow", "egress", _ALL, sorted({"**", "**" + _ADVANCED, *named})),
     ]
     policies = [{"id": "anyone", "subjects": ["anyone"], "rules": ["nothing"]}]
     subjects: list[dict[str, Any]] = [{"id": "anyone"}]
     for number, (who, granted) in enumerate(rights.items()):
         peer_rules = [
-            _rule(f"{number} {kind}", "allow", "ingress", messages, granted[kind])
-            for kind, messages in (("write", _WRITE), ("read", _READ))
-            if granted[kind]
+            _rule(f"{number} {right}", "allow", "ingress", _MESSAGES[right], keys)
+            for right, keys in granted.items()
+            if keys
         ]
         rules += peer_rules
         names = [rule["id"] for rule in peer_rules]

@@ -26,6 +26,9 @@ from omnibench.live.network.tls_files import read_certificate, read_key
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _RESERVED: Final = ("ca", "users")
+_ROUTER: Final = "node"  # whose certificate is the router's unless another is named
+_HOST = re.compile(r"{0}(\.{0})*".format(r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"))  # RFC 1123, section 2.1
+_LONGEST_HOST: Final = 253  # characters; RFC 1035, section 2.3.4
 _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
 _CLOCK_TOLERANCE: Final = timedelta(hours=1)  # certificates are valid since so long ago, as clocks differ; chosen
 _KEY_USAGES: Final = (
@@ -45,6 +48,7 @@ def make_keys(
     folder: Path,
     names: Sequence[str],
     *,
+    router: str | None = None,
     hosts: Sequence[str] = (),
     days: int = 365,
     users: bool = False,
@@ -53,21 +57,24 @@ def make_keys(
     """Write a certificate (``<name>.pem``) and its private key (``<name>.key``, for its owner only) for every name.
 
     The authority (``ca.pem``, ``ca.key``) is made if it is missing; else it signs the new certificates, which adds
-    robots to a fleet. hosts: the router's host names and addresses, for which the certificates are valid besides
-    loopback. days: validity. users: write passwords too (``<name>.password``, and ``users.txt`` for the router).
-    overwrite: replace existing files, the authority's too.
+    robots to a fleet. router: whose certificate may serve, the only one that carries host names; by default ``node``,
+    if it is among the names. The others' are for clients, so that none of them can pose as the router. hosts: the
+    router's host names and addresses besides loopback. days: validity. users: write passwords too
+    (``<name>.password``, and ``users.txt`` for the router). overwrite: replace existing files, the authority's too.
 
-    Returns the files written. ConfigError: a name is not valid, or a file exists already; DataError: a file cannot be
-    written.
+    Returns the files written. ConfigError: a name or a host is not valid, hosts are given and no router, or a file
+    exists already; DataError: a file cannot be written.
     """
     _check(names, days)
+    router = _checked_router(router, names, needed=bool(hosts))
+    served = [_general_name(host) for host in dict.fromkeys((*_LOOPBACK, *hosts))]
     until = datetime.now(UTC) + timedelta(days=days)
     made: dict[str, _Pair] = {}
     if overwrite or not (folder / "ca.pem").exists():
         made["ca"] = authority = _new_authority(until)
     else:
         authority = _existing_authority(folder)
-    made |= {name: _member(name, hosts, until, authority) for name in names}
+    made |= {name: _member(name, served if name == router else (), until, authority) for name in names}
     contents: dict[Path, bytes] = {}
     for name, (certificate, key) in made.items():
         contents[folder / f"{name}.pem"] = certificate.public_bytes(Encoding.PEM)
@@ -76,9 +83,7 @@ def make_keys(
         contents |= _passwords(folder, names, keep=not overwrite)
     existing = [path for path in contents if path.exists() and path.name != "users.txt"]
     if existing and not overwrite:
-        raise ConfigError(
-            f"{existing[0]}: is there already; choose other names, or --overwrite to replace all in {folder}"
-        )
+        raise ConfigError(f"{existing[0]}: is there already; choose other names, or --force to replace all in {folder}")
     for path, content in contents.items():
         _write(path, content, private=path.suffix != ".pem")
     return list(contents)
@@ -94,6 +99,18 @@ def _check(names: Sequence[str], days: int) -> None:
         raise ConfigError(f"{days} days: a certificate is valid for 1 to 36500 days")
 
 
+def _checked_router(router: str | None, names: Sequence[str], *, needed: bool) -> str | None:
+    """The name of the router's certificate among ``names``, or None. ConfigError: there is none and one is needed."""
+    chosen = router or _ROUTER
+    if chosen in names:
+        return chosen
+    if router is not None or needed:
+        raise ConfigError(
+            f"{chosen!r}, whose certificate would be the router's, is not among {', '.join(names)}; say --router NAME"
+        )
+    return None
+
+
 def _new_authority(until: datetime) -> _Pair:
     extensions = (
         (x509.BasicConstraints(ca=True, path_length=0), True),
@@ -102,14 +119,17 @@ def _new_authority(until: datetime) -> _Pair:
     return _signed(f"omnibench test CA {secrets.token_hex(4)}", until, extensions)  # the number tells two CAs apart
 
 
-def _member(name: str, hosts: Sequence[str], until: datetime, authority: _Pair) -> _Pair:
-    extensions = (
+def _member(name: str, served: Sequence[x509.GeneralName], until: datetime, authority: _Pair) -> _Pair:
+    """A client's certificate, and a server's too for the hosts ``served``."""
+    server = [ExtendedKeyUsageOID.SERVER_AUTH] if served else []
+    extensions: list[tuple[x509.ExtensionType, bool]] = [
         (x509.BasicConstraints(ca=False, path_length=None), True),
         (_key_usage("digital_signature"), True),
-        (x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]), False),
-        (x509.SubjectAlternativeName([_general_name(host) for host in dict.fromkeys((*_LOOPBACK, *hosts))]), False),
+        (x509.ExtendedKeyUsage([*server, ExtendedKeyUsageOID.CLIENT_AUTH]), False),
         (x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()), False),
-    )
+    ]
+    if served:
+        extensions.append((x509.SubjectAlternativeName(served), False))
     return _signed(name, min(until, authority.certificate.not_valid_after_utc), extensions, authority)
 
 
@@ -143,10 +163,10 @@ def _general_name(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
         pass
-    try:
-        return x509.DNSName(host)
-    except ValueError:
-        raise ConfigError(f"{host!r} is neither a host's name nor an address") from None
+    # A name of digits and points alone is an address that was mistyped.
+    if len(host) > _LONGEST_HOST or not _HOST.fullmatch(host) or host.replace(".", "").isdigit():
+        raise ConfigError(f"--host: {host!r} is neither a host's name nor an address; write base.local or 192.168.0.2")
+    return x509.DNSName(host)
 
 
 def _existing_authority(folder: Path) -> _Pair:

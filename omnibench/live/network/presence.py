@@ -32,10 +32,11 @@ def nothing_received(robot: str, seconds: float, alive: tuple[str, ...]) -> str:
     """One line for a robot from which nothing came in ``seconds``: those that are alive, and the nearest name."""
     if robot in alive:
         return (
-            f"robot {robot!r} is alive, but nothing was received from it in {seconds:.0f} s; either it gets no wheel "
-            f"samples or it has another profile: query omnibench/{robot}/info"
+            f"robot {robot!r} is alive, but nothing was received from it in {seconds:.0f} s; it gets no wheel samples, "
+            f"it has another profile (query omnibench/{robot}/info), or its router's `access` does not let us read it"
         )
-    others = f"alive: {', '.join(alive)}" if alive else "no robot is alive; is its node running, and connected to here?"
+    nobody = "no robot is alive; is its node running, connected to here, and are we named in its router's `access`?"
+    others = f"alive: {', '.join(alive)}" if alive else nobody
     return f"robot {robot!r}: nothing was received from it in {seconds:.1f} s; {nearest(robot, alive)}{others}"
 
 

@@ -97,7 +97,7 @@ def _settings(config: SessionConfig) -> Iterator[tuple[str, Any]]:
         yield "transport/auth/usrpwd/user", config.user.name
         yield "transport/auth/usrpwd/password", _password(config.user)
     if config.tls is not None:
-        check_files(config.tls)
+        check_files(config.tls, listening=bool(config.listening))
         yield "transport/link/tls", _tls_settings(config.tls)
     if config.access is not None:
         yield "access_control", _access_settings(config.access, config)

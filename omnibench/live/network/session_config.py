@@ -137,6 +137,8 @@ class Access(Model):
 
     @model_validator(mode="after")
     def _names_somebody(self) -> Self:
+        if "omnibench" in self.robots:  # its topics would be the services of all robots
+            raise ValueError("robots: omnibench begins the keys of the services; give the robot another name")
         if not any((self.robots, self.nodes, self.viewers, self.operators, self.rules)):
             raise ValueError("it names nobody, so that all would be refused; name robots, or leave access out")
         return self

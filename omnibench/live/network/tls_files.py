@@ -11,7 +11,7 @@ from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
-from cryptography.x509.oid import NameOID
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from omnibench.errors import ConfigError
 from omnibench.live.network.session_config import Tls
@@ -20,8 +20,11 @@ LOG = logging.getLogger("omnibench.live")
 _SOON: Final = timedelta(days=14)  # before a certificate expires, from when on a warning is logged; chosen
 
 
-def check_files(tls: Tls) -> None:
-    """ConfigError in one line: a file is missing, unreadable or expired, or the key is not the certificate's."""
+def check_files(tls: Tls, *, listening: bool = False) -> None:
+    """ConfigError in one line: a file is missing, unreadable or expired, or the key is not the certificate's.
+
+    listening: the certificate must be a server's, or all that connect would refuse us.
+    """
     authority = read_certificate(tls.ca)
     if tls.certificate is None or tls.key is None:
         return
@@ -32,7 +35,21 @@ def check_files(tls: Tls) -> None:
     )
     if key_bytes != certificate_bytes:
         raise ConfigError(f"tls: {tls.key} is not the key of {tls.certificate}; give the two that belong together")
+    if listening and not _may_serve(certificate):
+        raise ConfigError(
+            f"tls: {tls.certificate} is a client's, and all that connect would refuse us; listen with the router's, "
+            "which omnibench keys DIR NAME --router NAME makes"
+        )
     _check_issuer(certificate, authority, tls)
+
+
+def _may_serve(certificate: x509.Certificate) -> bool:
+    """True unless the certificate's extended key usage leaves out that of a server (RFC 5280, section 4.2.1.12)."""
+    try:
+        usages = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+    except (x509.ExtensionNotFound, ValueError):
+        return True
+    return ExtendedKeyUsageOID.SERVER_AUTH in usages or ExtendedKeyUsageOID.ANY_EXTENDED_KEY_USAGE in usages
 
 
 def _check_issuer(certificate: x509.Certificate, authority: x509.Certificate, tls: Tls) -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +13,19 @@ import numpy as np
 import pytest
 import zenoh
 from drives import ORIGIN, SECOND, calibration, drive
-from nodes import as_text, asked, config_of, running, sent
+from nodes import Command, as_text, asked, config_of, running, sent, write_node
 from received_messages import ReceivedMessages
-from sessions import Loopback, until
+from sessions import Loopback, raw_session, until
 from timing import PATIENCE
 
+from omnibench.errors import DataError
 from omnibench.live.control.query_server import QueryServer
+from omnibench.live.control.request_queue import MOST_WAITING, Request, RequestQueue, source_of
+from omnibench.live.control.swap import swap_calibration
 from omnibench.live.estimation.tracker import RobotTracker
+from omnibench.live.network.presence import alive_robots
 from omnibench.live.wire.messages import ODOMETRY
+from omnibench.robot.calibration import write_calibration
 
 EVERY_REPLY = zenoh.QueryConsolidation(zenoh.ConsolidationMode.NONE)
 
@@ -80,6 +88,7 @@ def test_the_pose_at_a_time_is_interpolated(driven: Any, form: str) -> None:
         ("swap", "a: &a [1, 1]\nb: &b [*a, *a]\nc: [*b, *b]", "write out what *a stands for"),
         ("swap", as_text(calibration()).replace("session: null", r'session: "\ud800"'), "text that is not Unicode"),
         ("swap", "#" * 70_000, "70000 bytes are more than a request may have, 65536"),
+        ("swap", "#" * 10_000_000, "10000000 bytes are more than a request may have, 65536"),
         ("health?" + "x" * 70_000, None, "70000 bytes are more than a request may have"),
     ],
 )
@@ -152,6 +161,100 @@ def test_more_requests_than_the_server_holds_are_refused_and_the_stream_goes_on(
     assert len(replies) == 100
     assert 30 <= len(refused) <= 40
     assert set(refused) == {"omnibench/apr/health: 64 requests are waiting; ask again later"}
+
+
+_FLOODER = """
+import sys, zenoh
+from sessions import raw_session
+session, replies = raw_session("client", connect=[sys.argv[1]]), []
+def take(reply):
+    if reply.ok is not None and not replies:
+        replies.append(reply)
+        print("answered", flush=True)
+while True:
+    session.get("omnibench/apr/" + sys.argv[2], zenoh.handlers.Callback(take, indirect=False), timeout=5.0)
+"""
+
+
+@pytest.mark.parametrize("flooded", ["health", "info"])
+def test_a_flood_of_questions_gets_its_share_and_others_get_answers_meanwhile(tmp_path: Path, flooded: str) -> None:
+    with Command("live", write_node(tmp_path, "apr", "bob")) as node:
+        until(lambda: "Ctrl-C ends it" in node.said(), "the node")
+        endpoint = next(word for word in node.said().split() if word.startswith("tcp/")).rstrip(";")
+        flooder = subprocess.Popen(
+            [sys.executable, "-c", _FLOODER, endpoint, flooded],
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        session = raw_session("client", connect=[endpoint])
+        try:
+            assert flooder.stdout is not None
+            assert flooder.stdout.readline() == "answered\n"
+            until(lambda: "requests refused so far" in node.said(), "so many questions that some are refused")
+            for _ in range(30):
+                # one who says who asks has a turn of its own; who does not has it for other robots and services
+                named = list(session.get(f"omnibench/apr/{flooded}", timeout=PATIENCE, source_info=source_of(session)))
+                assert [reply.ok is not None for reply in named] == [True]
+                assert asked(session, "omnibench/bob/health")["status"] == "waiting"
+            assert flooder.poll() is None
+        finally:
+            flooder.kill()
+            flooder.communicate()
+            session.close()
+
+
+def request(client: str, refused: list[str]) -> Request:
+    return Request(client, lambda: None, lambda _: refused.append(client))
+
+
+def test_clients_are_served_in_turn_and_who_has_most_requests_waiting_gives_way() -> None:
+    requests = RequestQueue()
+    flood = [request("flooder", []) for _ in range(MOST_WAITING)]
+    assert [requests.put(each) for each in flood] == [None] * MOST_WAITING
+    assert requests.put(late := request("flooder", [])) is late
+    assert requests.put(other := request("other", [])) is flood[-1]
+    assert requests.put(second := request("other", [])) is flood[-2]
+    taken = requests.take()
+    assert taken[:4] == [flood[0], other, flood[1], second]
+    assert len(taken) == MOST_WAITING
+
+
+def test_strangers_with_a_new_name_each_time_take_nobodys_place() -> None:
+    requests = RequestQueue()
+    honest = request("honest", [])
+    requests.put(honest)
+    refused = [requests.put(request(f"name {number}", [])) for number in range(2 * MOST_WAITING)]
+    assert honest not in refused
+    assert honest in requests.take()
+
+
+def test_a_closed_queue_gives_out_what_waits_and_takes_no_more() -> None:
+    requests = RequestQueue()
+    requests.put(before := request("a", []))
+    requests.close()
+    assert requests.put(late := request("a", [])) is late
+    assert requests.take() == [before]
+    assert requests.take() == []
+
+
+def test_a_file_that_is_no_calibration_by_its_size_is_not_sent(loopback: Loopback, tmp_path: Path) -> None:
+    file = tmp_path / "recording.yaml"
+    file.write_bytes(b"- 1\n" * 2_500_000)
+    with pytest.raises(DataError, match="10000000 bytes are more than a node takes, 65536; is it a calibration file"):
+        swap_calibration(loopback.client(), "apr", file)
+
+
+def test_a_swap_that_nobody_answers_names_access_rights_as_a_possible_cause(loopback: Loopback, tmp_path: Path) -> None:
+    token = loopback.router.liveliness().declare_token("omnibench/apr/alive")
+    queryable = loopback.router.declare_queryable("omnibench/apr/swap", lambda _: None)
+    write_calibration(calibration(), tmp_path / "calibration.yaml")
+    session = loopback.client()
+    until(lambda: alive_robots(session) == ("apr",), "the token")
+    with pytest.raises(DataError, match="the `access` of its router may not let us swap, which only operators may"):
+        swap_calibration(session, "apr", tmp_path / "calibration.yaml", timeout=0.2)
+    queryable.undeclare()
+    token.undeclare()
 
 
 def test_a_calibration_that_is_put_runs_from_the_next_sample_on_and_odom_does_not_jump(tmp_path: Path) -> None:

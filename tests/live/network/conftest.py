@@ -16,7 +16,7 @@ from omnibench.live.network.keys import make_keys
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("keys")
     make_keys(folder, MEMBERS, users=True)
-    make_keys(folder / "other", ["apr02"])
+    make_keys(folder / "other", ["apr02"], router="apr02")
     return folder
 
 

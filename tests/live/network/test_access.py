@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from pydantic import ValidationError
 from routers import RouterProcess, member, works
 from sessions import until
 
-from omnibench.live.network.access import rights_of
+from omnibench.live.network.access import Right, rights_of
 from omnibench.live.network.session import open_session
 from omnibench.live.network.session_config import Access
 
@@ -168,6 +169,23 @@ class TestAccess:
         for key in ("apr03/joint_states", "apr02/odom", "apr02/tf", "omnibench/apr02/calibration", "tf"):
             assert not may_write(key)
             assert not may_write(rmw.format(key))
+
+    @pytest.mark.parametrize("domain", ["0", "232"])
+    def test_a_robots_keys_in_any_domain_are_not_the_keys_of_its_services(self, domain: str) -> None:
+        rights = rights_of(Access.model_validate({"robots": ["apr02"]}))["apr02"]
+
+        def may(right: Right, key: str) -> bool:
+            return any(zenoh.KeyExpr(each).includes(zenoh.KeyExpr(key)) for each in rights[right])
+
+        assert may("read", f"{domain}/apr02/odom/nav_msgs::msg::dds_::Odometry_/*")
+        assert may("read", f"{domain}/apr02/odometry/filtered/nav_msgs::msg::dds_::Odometry_/RIHS01_a13e")
+        for service in ("set_pose", "reset", "swap", "calibration", "*", "**"):
+            assert not may("read", f"omnibench/apr02/{service}")
+            assert may("ask", f"omnibench/apr02/{service}") == (service == "calibration")
+
+    def test_a_robot_cannot_have_the_name_that_begins_the_services(self) -> None:
+        with pytest.raises(ValidationError, match="omnibench begins the keys of the services"):
+            Access.model_validate({"robots": ["omnibench"]})
 
 
 def answers(session: zenoh.Session, key: str) -> list[bytes]:

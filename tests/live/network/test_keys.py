@@ -48,6 +48,49 @@ def test_a_certificate_carries_its_name_and_its_hosts(tmp_path: Path) -> None:
     assert names.get_values_for_type(x509.IPAddress) == addresses
 
 
+def purposes(folder: Path, name: str) -> list[str]:
+    """What OpenSSL lets a certificate be used for."""
+    command = ["openssl", "verify", "-x509_strict", "-CAfile", "ca.pem", "-purpose"]
+    return [
+        purpose
+        for purpose in ("sslserver", "sslclient")
+        if subprocess.run([*command, purpose, f"{name}.pem"], cwd=folder, capture_output=True, check=False).returncode
+        == 0
+    ]
+
+
+@pytest.mark.parametrize(
+    ("names", "router", "server"),
+    [(["node", "apr02"], None, "node"), (["base", "node"], "base", "base"), (["apr02", "screen"], None, None)],
+)
+def test_only_the_routers_certificate_may_serve_and_carries_hosts(
+    tmp_path: Path, names: list[str], router: str | None, server: str | None
+) -> None:
+    make_keys(tmp_path, names, router=router)
+    for name in names:
+        assert purposes(tmp_path, name) == (["sslserver", "sslclient"] if name == server else ["sslclient"])
+        extensions = read_certificate(tmp_path / f"{name}.pem").extensions
+        hosts = [each for each in extensions if isinstance(each.value, x509.SubjectAlternativeName)]
+        assert bool(hosts) == (name == server)
+
+
+@pytest.mark.parametrize("hosts", [["base.local"], []])
+def test_a_router_that_is_not_named_is_refused(tmp_path: Path, hosts: list[str]) -> None:
+    with pytest.raises(ConfigError, match="is not among apr02, apr03; say --router NAME"):
+        make_keys(tmp_path, ["apr02", "apr03"], hosts=hosts, router=None if hosts else "node")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["", "a b", "tls/base.local:7447", "base.local:7447", "-base", "192.168.0.256", "1.2.3", "ä.local", "x" * 64],
+)
+def test_what_is_no_host_is_refused(tmp_path: Path, host: str) -> None:
+    with pytest.raises(ConfigError, match="is neither a host's name nor an address"):
+        make_keys(tmp_path, ["node"], hosts=[host])
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_is_secret_is_for_its_owner_only(tmp_path: Path) -> None:
     for path in make_keys(tmp_path, ["apr02"], users=True):
         mode = stat.S_IMODE(path.stat().st_mode)
@@ -108,6 +151,11 @@ class TestCheckedFiles:
         with pytest.raises(ConfigError) as caught:
             check_files(files)
         return str(caught.value)
+
+    def test_a_clients_certificate_cannot_listen(self, folder: Path) -> None:
+        with pytest.raises(ConfigError, match=r"apr02\.pem is a client's, .* listen with the router's"):
+            check_files(tls(folder, "apr02"), listening=True)
+        check_files(tls(folder, "node"), listening=True)
 
     def test_missing_file(self, folder: Path) -> None:
         (folder / "node.pem").unlink()

@@ -53,6 +53,20 @@ class TestMutualTls:
         text = refusal(elsewhere)
         assert "nothing listens there" in text or "IP address mismatch" in text
 
+    def test_a_member_cannot_pose_as_the_router(self, fleet: RouterProcess, keys: Path) -> None:
+        config = mutual(keys)
+        settings = zenoh_config(SessionConfig.model_validate(config))
+        for side in ("listen", "connect"):  # omnibench itself would not start with a client's certificate
+            settings.insert_json5(f"transport/link/tls/{side}_certificate", json.dumps(str(keys / "apr02.pem")))
+            settings.insert_json5(f"transport/link/tls/{side}_private_key", json.dumps(str(keys / "apr02.key")))
+        victim = member(fleet, keys, "apr03").model_copy(update={"connect": (config["listen"],)})
+        assert victim.tls is not None
+        with zenoh.open(settings):
+            for verify_name in (True, False):
+                tls = victim.tls.model_copy(update={"verify_name": verify_name})
+                text = refusal(victim.model_copy(update={"tls": tls}))
+                assert "we refuse its certificate: unsuitable certificate purpose" in text
+
     def test_a_refused_peer_opens_but_nothing_of_it_passes(self, fleet: RouterProcess, keys: Path) -> None:
         settings = zenoh_config(member(fleet, keys / "other", "apr02", ca=keys / "ca.pem"))
         settings.insert_json5("mode", '"peer"')
