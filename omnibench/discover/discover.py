@@ -19,7 +19,6 @@ from omnibench.discover.conclude import Findings, conclude
 from omnibench.discover.covariate_dependence import covariate_dependences
 from omnibench.discover.fitting.extend import Extended, extend, fit_matrix, without_effects
 from omnibench.discover.fitting.model_fit import Fit
-from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.discover.held_out.cross_validation import random_folds_of_repetitions
 from omnibench.discover.held_out.gaps import compare_held_out
 from omnibench.discover.held_out.validation_runs import validation_runs
@@ -36,6 +35,7 @@ from omnibench.discover.selection.screening import Screening, screen_again, scre
 from omnibench.discover.selection.unknown_term import add_smooth_term
 from omnibench.discover.verdict import lacks_a_name, verdict_of
 from omnibench.errors import DataError
+from omnibench.fit.least_squares.usable_runs import usable_runs
 from omnibench.progress import Reporter, Stages, no_progress
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array

@@ -28,6 +28,7 @@ from omnibench.discover.result import Discovery
 from omnibench.processes import one_thread
 
 PACKAGE = "omnibench.discover"
+RUNS = "omnibench.fit.least_squares.usable_runs"  # what discover begins with
 FACTORS = (0.5, 2.0)
 SURE = 0.95  # weight from which on a name is stated with confidence: the verdict "named" in the design
 # What is the same whatever the constants after the screening are, and what none of those before the end can change.
@@ -35,7 +36,7 @@ FRONT = ("usable_runs", "_start_matrix", "fit_matrix", "screen_plain", "screen_e
          "without_effects")  # fmt: skip
 TAIL = ("validation_runs", "compare_held_out", "waterfall_steps", "extrapolations_of", "calibration_of")
 OF_FRONT = ("fitting", "regressors.covariate_bases", "regressors.paths", "selection.screening",
-            "selection.candidate_groups", "selection.encoder_quantisation", "conclude")  # fmt: skip
+            "selection.candidate_groups", "selection.encoder_quantisation", "conclude", RUNS)  # fmt: skip
 OF_TAIL = ("held_out", "selection.extrapolation")
 
 
@@ -123,7 +124,7 @@ class Result(Model):
 
 def constants() -> list[Constant]:
     """All numbers in capitals of omnibench.discover, without its report: there they shape drawings only."""
-    return constants_of(PACKAGE, (f"{PACKAGE}.report",))
+    return constants_of(PACKAGE, (f"{PACKAGE}.report",)) + constants_of(RUNS)
 
 
 class Memory:

@@ -24,12 +24,12 @@ from hidden.sets import LEVELS, Kind, make_set
 
 from omnibench.config import Model
 from omnibench.discover.fitting.extend import extend, fit_matrix
-from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.significance import significance_of
 from omnibench.discover.selection.evidence import credibility_of, effect_sets, indices_of, joint_share
 from omnibench.discover.selection.model_selection import ABSORBED, SURE
 from omnibench.discover.selection.screening import Screening, screen_again, screen_plain
+from omnibench.fit.least_squares.usable_runs import usable_runs
 from omnibench.fit.least_squares.whitened import Given
 from omnibench.processes import one_thread
 

@@ -11,8 +11,8 @@ from discovery_samples import DELAY, named, repeated, shorn, simulated
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.fitting.extend import fit_matrix
-from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.errors import DataError
+from omnibench.fit.least_squares.usable_runs import usable_runs
 
 
 def with_runs(dataset: Dataset, change) -> Dataset:

@@ -16,8 +16,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.fitting.usable_runs import with_poses
 from omnibench.fit.least_squares.noise import Whitener
+from omnibench.fit.least_squares.usable_runs import with_poses
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 

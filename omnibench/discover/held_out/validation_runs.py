@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.fitting.model_fit import Fit, at_runs
 from omnibench.discover.fitting.outliers import without_jumps
-from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.errors import DataError
 from omnibench.fit.least_squares.start_frames import in_start_frames
+from omnibench.fit.least_squares.usable_runs import usable_runs
 from omnibench.robot.model import OdometryModel
 
 # Times, and s more than, the latest training run, from where on a session's time counts as new. Nothing but a warning

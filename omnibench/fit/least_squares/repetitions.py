@@ -118,14 +118,14 @@ def _contrasts(runs: list[tuple[Array, Array]]) -> Iterator[Difference]:
     """
     runs = sorted(runs, key=lambda run: -run[0][-1])
     for count in range(1, len(runs)):
-        stamps, values = _common(runs[: count + 1])
+        stamps, values = common_poses(runs[: count + 1])
         if len(stamps):
             residuals, slopes = values[..., 0], values[..., 1:]
             contrast = (residuals[:-1].mean(axis=0) - residuals[-1]) * np.sqrt(count / (count + 1))
             yield Difference(stamps, contrast, slopes.mean(axis=0))
 
 
-def _common(runs: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+def common_poses(runs: list[tuple[Array, Array]]) -> tuple[Array, Array]:
     """Stamps (K,) of the run with the fewest, and values (n, K, ...) of all runs at their nearest stamps.
 
     Interpolating would average two poses, which have less white noise than one.

@@ -8,7 +8,7 @@ from discovery_samples import simulated
 
 from omnibench.discover.fitting.extend import fit_matrix
 from omnibench.discover.fitting.model_fit import paths_of
-from omnibench.discover.fitting.usable_runs import usable_runs
+from omnibench.fit.least_squares.usable_runs import usable_runs
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect
 from omnibench.robot.effects.term import make_term

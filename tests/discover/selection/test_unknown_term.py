@@ -13,7 +13,6 @@ from hidden.sets import Truth, make_set
 
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.fitting.extend import Extended, extend, fit_matrix
-from omnibench.discover.fitting.usable_runs import usable_runs
 from omnibench.discover.held_out.waterfall import group_counts, step_name
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.covariate_bases import Basis
@@ -22,6 +21,7 @@ from omnibench.discover.selection.model_selection import Selection, select_effec
 from omnibench.discover.selection.screening import Screening, screen_plain
 from omnibench.discover.selection.unknown_term import add_smooth_term, chosen_functions
 from omnibench.fit.least_squares.noise import Whitener
+from omnibench.fit.least_squares.usable_runs import usable_runs
 from omnibench.registry import effects
 from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
 
