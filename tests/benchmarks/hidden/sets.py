@@ -112,7 +112,7 @@ def make_set(
     for each, each_seed in zip(hidden, seeds, strict=True):
         correction += make_of(kind, each.name, form)(grid, each.values, np.random.default_rng(each_seed))
     clean = _trajectories(grid, grid.poses(correction), _Wheels.of(grid, correction))
-    dataset = make_dataset("recording", ROBOT, SAMPLE, _recorded(grid, correction, disturbance, rng), simulated=True)
+    dataset = make_dataset("recording", ROBOT, SAMPLE, recorded(grid, correction, disturbance, rng), simulated=True)
     covariates = OUTSIDE[names[0]].covariates if kind == "outside" else ()
     return dataset, Truth(kind, hidden, form, design, noise, matrix, disturbance, runs, clean, seeds, covariates)
 
@@ -197,7 +197,7 @@ class _Wheels:
         return _Wheels(rates, asked, np.cumsum(rates * SAMPLE, axis=0))
 
 
-def _recorded(
+def recorded(
     grid: Grid, correction: Correction, disturbance: Disturbance, rng: np.random.Generator
 ) -> tuple[Trajectory, ...]:
     """The recordings of wheels and reference."""

@@ -1,0 +1,1 @@
+"""Comparison of sessions: whether robot or reference changed between them."""

@@ -1,0 +1,105 @@
+"""Sessions that differ, in recordings made without the code that compares them, and those of a real robot."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hidden.session_sets import session_set
+from session_study import answer, cases, print_table
+
+from omnibench.data.dataset import Dataset
+from omnibench.fit.sessions.session_differences import SessionComparison, compare_sessions
+from omnibench.robot.model import OdometryModel
+
+
+def compared(dataset: Dataset, **changes: object) -> SessionComparison:
+    """The comparison by the design's matrix, of runs that are changed."""
+    model = OdometryModel(dataset.robot, dataset.robot.inverse_kinematic_matrix, "arc", (), dataset.sample_period)
+    return compare_sessions(model, [replace(run, **changes) for run in dataset.trajectories])
+
+
+@pytest.mark.parametrize(("wheels", "kind"), [("abc", "all wheels"), ("b", "one wheel")])
+def test_a_session_with_larger_wheels_is_said_to_differ_and_by_how_much(wheels: str, kind: str) -> None:
+    found = compared(session_set("small", 3, change=0.01, wheels=wheels))
+    (difference,) = found.differences
+    assert (difference.session, difference.others, difference.commands) == ("s2", ("s1",), 12)
+    assert difference.kind == kind
+    assert difference.radii[0].low < 0.01 < difference.radii[0].high
+    (sentence,) = found.sentences
+    assert sentence.startswith("The sessions differ: in s2 against s1, 12 commands")
+    assert ("all wheels" if len(wheels) > 1 else "wheel b") in sentence
+    assert "% larger (95 %" in sentence
+
+
+def test_of_several_sessions_the_one_that_differs_is_named() -> None:
+    found = compared(session_set("small_sessions", 5, change=-0.02))
+    (difference,) = found.differences
+    assert (difference.session, difference.others) == ("s4", ("s1", "s2", "s3"))
+    assert "% smaller" in found.sentences[0]
+
+
+@pytest.mark.parametrize(("noise", "seed"), [("plain", 0), ("correlated", 1), ("mixed", 2), ("slip", 3)])
+def test_sessions_that_are_alike_are_not_said_to_differ(noise: str, seed: int) -> None:
+    assert compared(session_set("small", seed, noise=noise)) == SessionComparison()
+
+
+def test_what_the_model_lacks_in_both_sessions_is_no_difference_between_them() -> None:
+    dataset = session_set("small", 4, effect="rotation_translation_coupling")
+    assert compared(dataset) == SessionComparison()
+
+
+def test_of_other_commands_it_is_said_that_sessions_and_commands_cannot_be_told_apart() -> None:
+    found = compared(session_set("small", 1, effect="rotation_translation_coupling", validation="flower"))
+    assert found.differences == ()
+    assert found.other_commands is not None
+    assert "other commands" in found.sentences[0]
+    assert "sessions differ, or" in found.sentences[0]
+
+
+def test_splits_stand_for_sessions_that_were_not_recorded() -> None:
+    found = compared(session_set("small", 3, change=0.01), session=None)
+    assert [(each.session, each.others) for each in found.differences] == [("validation", ("train",))]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [({"session": "s1"}, "one session"), ({"command": None}, "repeats"), ({"poses": None}, "no trajectory")],
+)
+def test_what_cannot_be_compared_is_said_with_the_reason(changes: dict[str, object], reason: str) -> None:
+    dataset = session_set("small", 3, change=0.01)
+    if "poses" in changes:
+        runs = [replace(run, poses=run.poses[:1], pose_times=run.pose_times[:1]) for run in dataset.trajectories]
+        found = compared(replace(dataset, trajectories=tuple(runs)))
+    else:
+        found = compared(dataset, **changes)
+    assert reason in found.untested
+    assert found.sentences == ()
+
+
+def test_repetitions_that_agree_exactly_show_what_differs_and_nothing_else() -> None:
+    dataset = session_set("small", 3, change=0.01)
+    by_command = {(run.session, run.command): run for run in dataset.trajectories}
+    same = {run.command: run for run in dataset.split("train")}
+
+    def of(first: dict[object, object], key: object, run: object) -> object:
+        return replace(run, **{name: getattr(first[key], name) for name in ("times", "rates", "poses", "pose_times")})
+
+    alike = tuple(of(by_command, (run.session, run.command), run) for run in dataset.trajectories)
+    assert [each.session for each in compared(replace(dataset, trajectories=alike)).differences] == ["s2"]
+    none = tuple(of(same, run.command, run) for run in dataset.trajectories)
+    assert compared(replace(dataset, trajectories=none)).differences == ()
+
+
+def test_the_study_marks_its_answers(capsys: pytest.CaptureFixture[str]) -> None:
+    every = {case.name: case for case in cases()}
+    answers = [answer(replace(every[name], designs=("small",)), 0) for name in ("1 % of one radius", "nothing differs")]
+    print_table(answers)
+    assert [each.said for each in answers] == [True, False]
+    assert "1 % of one radius" in capsys.readouterr().out
+
+
+def test_squares_of_a_real_robot_deviate_from_circles_and_are_not_said_to_be_another_session(omni3: Dataset) -> None:
+    found = compared(omni3)
+    assert found.differences == ()
+    assert found.other_commands is not None
