@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -17,6 +17,7 @@ from omnibench.data.delimited import NumberTable, read_numbers
 from omnibench.data.importer import Importer
 from omnibench.data.importers.recording_options import RecordingOptions
 from omnibench.data.importers.robot_option import RobotOption
+from omnibench.data.scans import Scanner, ScansInMemory, TrajectoryScans
 from omnibench.data.splits import complete, divided
 from omnibench.errors import DataError
 from omnibench.registry import importers
@@ -27,6 +28,7 @@ RPM = 2 * math.pi / 60  # rad/s
 _METRES = {"m": 1.0, "mm": 1e-3}
 _COMMAND = ("v", "alpha", "omega", "d")
 _POSE = ("t", "x", "y", "theta")
+_WAY_OUT = "set scanner={rays: 1080, angle_min: -2.356, ..., mount: {x: 0.1, y: 0, yaw: 0}} (m, rad)"
 
 APR_02 = Robot(
     name="APR-02",
@@ -37,12 +39,24 @@ APR_02 = Robot(
 )
 """The design values behind Eq. (7)."""
 
+UTM_30LX = Scanner(
+    name="Hokuyo UTM-30LX",
+    rays=1080,
+    angle_min=math.radians(-135),
+    angle_increment=math.radians(0.25),
+    time_increment=0.025 / 1440,
+    range_min=0.1,
+    range_max=30.0,
+)
+"""The paper's LIDAR by its data sheet (270 degrees, 25 ms a turn), with the 1080 of its 1081 ranges that Table 1 has."""
+
 
 class Table1Options(RecordingOptions):
     """Unit of positions, the robot, and which trajectories train and validate."""
 
     position_unit: Literal["m", "mm"] = Field("m", description="of x and y in slam.csv; Table 1 has m")
     robot: RobotOption = Field(APR_02, description="mapping as in dataset.yaml, or path of a YAML file; default APR-02")
+    scanner: Scanner = Field(UTM_30LX, description="of lidar.csv: mapping as in dataset.yaml; default Hokuyo UTM-30LX")
     name: str = Field("table1", min_length=1, description="name of the data set")
 
 
@@ -55,11 +69,12 @@ class Table1(Importer):
         command.csv  one row: v (m/s), alpha (deg), omega (rad/s), d (m)[, omega_Ma, omega_Mb, omega_Mc (rpm)]
         wheels.csv   t (s), omega_a, omega_b, omega_c (rpm): a row holds the rates up to its t; rows start after 0
         slam.csv     t (s), x, y (m; ``position_unit: mm`` for mm), theta (deg): the ground truth, one row a scan
+        lidar.csv    t (s), d1, d2, ... d1080 (mm), counter-clockwise; 0: nothing was seen. It may be missing.
 
     Columns are separated by commas and named in a header; more columns do no harm. For another ``robot`` than the
-    APR-02 the columns are omega_<wheel> and omega_M<wheel>. Table 1's other two items are not read: the odometry that
-    the robot computed (omnibench computes its own) and the LIDAR scans (lidar.csv, mm), which data sets do not hold
-    yet. A first scan later than the first wheel sample becomes t = 0.
+    APR-02 the columns are omega_<wheel> and omega_M<wheel>; ``scanner`` describes another LIDAR, and where it is
+    mounted. The odometry that the robot computed is not read: omnibench computes its own. A first pose later than the
+    first wheel sample becomes t = 0.
 
     A trajectory is called by its folder, seen from the source; its session is the folder above. Repetitions share
     session and (v, alpha, omega, d). Splits: by ``train`` and ``validation`` (patterns such as ``training/*``); without
@@ -76,14 +91,24 @@ class Table1(Importer):
             raise DataError(
                 f"{source}: no command.csv below it; Table 1 wants one folder a trajectory with command.csv"
             )
-        runs = [self._trajectory(folder, _name(folder, source)) for folder in folders]
+        scans: dict[str, TrajectoryScans] = {}
+        runs = [self._trajectory(folder, _name(folder, source), scans) for folder in folders]
         train, validation = self.options.train, self.options.validation
         by_folder = None if train or validation else _splits_by_folder([run.id for run in runs])
         alike = [(run.session, run.command) for run in runs]
         runs = divided(complete(runs), train, validation, "trajectory", otherwise=by_folder, alike=alike)
-        return self.options.dataset(runs)
+        if not scans:
+            return self.options.dataset(runs)
+        dataset = self.options.dataset(runs, ScansInMemory(self.options.scanner, scans))
+        if self.options.scanner != UTM_30LX:
+            return dataset
+        unknown = (
+            f"{source}: lidar.csv does not say where the LIDAR is mounted; the robot's middle is taken; {_WAY_OUT}"
+        )
+        return replace(dataset, warnings=(*dataset.warnings, unknown))
 
-    def _trajectory(self, folder: Path, name: str) -> Trajectory:
+    def _trajectory(self, folder: Path, name: str, scans: dict[str, TrajectoryScans]) -> Trajectory:
+        """The trajectory of a folder; its scans, if it has some, are added to ``scans``."""
         wheels = self.options.robot.wheel_names
         samples = read_numbers(folder / "wheels.csv", ("t", *(f"omega_{wheel}" for wheel in wheels)))
         slam = read_numbers(folder / "slam.csv", _POSE)
@@ -96,6 +121,8 @@ class Table1(Importer):
             raise DataError(
                 f"{slam.file}: no two poses while the wheels were recorded (wheels end at t = {times[-1]:g})"
             )
+        if (folder / "lidar.csv").exists():
+            scans[name] = _read_scans(folder / "lidar.csv", self.options.scanner, aligned.zero, float(times[-1]))
         times = times[aligned.kept] - aligned.zero
         return Trajectory(
             id=name,
@@ -140,6 +167,24 @@ def _read_command(file: Path, wheels: Sequence[str]) -> _Command:
     v, alpha, omega, distance = (float(value) for value in table.columns(_COMMAND)[0])
     target_rates = table.columns(targets)[0] * RPM if all(name in table for name in targets) else None
     return _Command(v, math.radians(alpha), omega, distance, target_rates)
+
+
+def _read_scans(file: Path, scanner: Scanner, zero: float, end: float) -> TrajectoryScans:
+    """The scans from ``zero`` to ``end``, s of the file's clock; stamps count from ``zero``, ranges in m."""
+    columns = [f"d{ray}" for ray in range(1, scanner.rays + 1)]
+    table = read_numbers(file, ("t", *columns), optional=[f"d{scanner.rays + 1}"])
+    if len(table.names) > scanner.rays + 1:
+        raise DataError(f"{file}: it has more than the {scanner.rays} ranges of the scanner; {_WAY_OUT}")
+    times = _times(table)
+    ranges = (table.columns(columns) * _METRES["mm"]).astype(np.float32)
+    seen = scanner.valid(ranges)
+    for row in np.flatnonzero(~seen.any(axis=1))[:1]:
+        limits = f"{1e3 * scanner.range_min:g} to {1e3 * scanner.range_max:g} mm"
+        raise table.fail(int(row), f"no range is from {limits}; give mm, and remove scans that saw nothing")
+    shown = (times >= zero) & (times <= end)
+    if not shown.any():
+        raise DataError(f"{file}: no scan while poses and wheels were recorded, {zero:g} to {end:g} s")
+    return TrajectoryScans(times[shown] - zero, np.where(seen, ranges, np.float32(np.inf))[shown])
 
 
 def _times(table: NumberTable) -> Array:

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.importers.table1 import APR_02
+from omnibench.data.importers.table1 import APR_02, UTM_30LX
+from omnibench.data.scans import Mount
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import wheel_equations
 from omnibench.robot.model import OdometryModel
+from omnibench.simulate.chain.lidar import Lidar, LidarMount
 from omnibench.slam.import_dataset import import_dataset
 
 RPM = 2 * math.pi / 60
@@ -153,6 +156,59 @@ def test_targets_are_left_out_unless_all_trajectories_have_them(tmp_path: Path) 
     data = import_dataset("table1", tmp_path)
     save_dataset(data, tmp_path / "out")
     assert load_dataset(tmp_path / "out").hash == data.hash
+
+
+def write_scans(folder: Path, stamps: list[float], rays: int = 1080, metre: float = 1000.0) -> np.ndarray:
+    """A lidar.csv of walls between 1 and 4 m, with one ray that saw nothing; its ranges in m."""
+    ranges = np.round(np.random.default_rng(0).uniform(1.0, 4.0, (len(stamps), rays)), 3)
+    ranges[:, 7] = 0.0
+    rows = [
+        f"{t:g}," + ",".join(f"{metre * value:.0f}" for value in row) for t, row in zip(stamps, ranges, strict=True)
+    ]
+    head = "t," + ",".join(f"d{ray}" for ray in range(1, rays + 1))
+    (folder / "lidar.csv").write_text("\n".join([head, *rows]) + "\n")
+    return np.where(ranges > 0, ranges, np.inf)
+
+
+def test_scans_of_lidar_csv_become_scans_of_the_data_set_on_disk(tmp_path: Path) -> None:
+    folder = write_trajectory(tmp_path / "in" / "t01", first_scan=0.25)
+    write_trajectory(tmp_path / "in" / "t02")
+    ranges = write_scans(folder, [0.0, 0.25, 0.5, 0.75, 1.25])
+    save_dataset(import_dataset("table1", tmp_path / "in"), tmp_path / "out")
+    assert (tmp_path / "out" / "scans.parquet").is_file()
+    scans = load_dataset(tmp_path / "out").scans
+    assert scans is not None
+    assert scans.trajectories == ("t01",)
+    assert scans.times("t01").tolist() == [0.0, 0.25, 0.5]  # from the first pose to the last wheel sample
+    np.testing.assert_allclose(scans.of("t01").ranges, ranges[1:4], atol=1e-6)
+    assert scans.scanner == Lidar(mount=LidarMount(x=0)).scanner  # the data sheet's, as the simulated robot has it
+
+
+def test_it_is_said_that_the_mount_of_the_scanner_is_not_known(tmp_path: Path) -> None:
+    write_scans(write_trajectory(tmp_path / "t01"), [0.0, 0.25])
+    (warning,) = import_dataset("table1", tmp_path).warnings
+    assert "does not say where the LIDAR is mounted" in warning
+    mounted = UTM_30LX.model_copy(update={"mount": Mount(x=0.1)}).model_dump()
+    data = import_dataset("table1", tmp_path, {"scanner": mounted})
+    assert data.warnings == ()
+    assert data.scans is not None
+    assert data.scans.scanner.mount.x == 0.1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rays": 1081}, r"lidar\.csv: it has more than the 1080 ranges of the scanner; set scanner="),
+        ({"rays": 1000}, r"lidar\.csv: column 'd1001' is missing"),
+        ({"metre": 1.0}, r"lidar\.csv, row 1 \(line 2\): no range is from 100 to 30000 mm; give mm"),
+        ({"stamps": [2.0, 3.0]}, r"lidar\.csv: no scan while poses and wheels were recorded, 0 to 1 s"),
+        ({"stamps": [0.5, 0.25]}, r"lidar\.csv, row 2 \(line 3\): t goes backwards"),
+    ],
+)
+def test_a_malformed_scan_file_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    write_scans(write_trajectory(tmp_path / "t01"), **{"stamps": [0.0, 0.25], **changes})
+    with pytest.raises(DataError, match=message):
+        import_dataset("table1", tmp_path)
 
 
 def test_a_trajectory_outside_the_split_folders_is_refused(tmp_path: Path) -> None:
