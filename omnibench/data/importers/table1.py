@@ -48,7 +48,7 @@ UTM_30LX = Scanner(
     range_min=0.1,
     range_max=30.0,
 )
-"""The paper's LIDAR by its data sheet (270 degrees, 25 ms a turn), with the 1080 of its 1081 ranges that Table 1 has."""
+"""The paper's LIDAR by its data sheet (270 degrees, 25 ms a turn), with 1080 of its 1081 ranges, as in Table 1."""
 
 
 class Table1Options(RecordingOptions):
