@@ -1,4 +1,13 @@
-"""A planar laser scanner and its scans, one trajectory at a time."""
+"""A planar laser scanner and its scans, one trajectory at a time.
+
+The ray at angle a of a scanner that is tilted by p (nose down) has, with x ahead of the scanner, y to its left and z
+up, the direction
+
+    (cos a cos p, sin a, -cos a sin p).                                                          (1)
+
+Over the floor it points to the bearing atan2(sin a, cos a cos p), the share hypot(cos a cos p, sin a) of its length
+lies along the floor, and from the height h it meets the floor after h/(cos a sin p), if that is positive.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +25,10 @@ from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
 Ranges = NDArray[np.float32]
+_FLOOR_MARGIN = 5.0  # standard deviations of a range: one in two million floor ranges is shorter (normal)
+
+
+MOST_PITCH = math.radians(60)  # rad; beyond that a plane of rays shows the floor and no room (chosen)
 
 
 class Mount(Model):
@@ -24,6 +37,14 @@ class Mount(Model):
     x: FiniteFloat = Field(0.0, description="m, forward")
     y: FiniteFloat = Field(0.0, description="m, left")
     yaw: FiniteFloat = Field(0.0, description="rad, counter-clockwise")
+    pitch: float = Field(0.0, ge=-MOST_PITCH, le=MOST_PITCH, description="rad, tilted down ahead")
+    height: NonNegative = Field(0.0, description="m above the floor, of a tilted scanner")
+
+    @model_validator(mode="after")
+    def _is_above_the_floor_it_is_tilted_to(self) -> Mount:
+        if self.pitch and not self.height:
+            raise ValueError("a tilted scanner (pitch) needs its height above the floor, m")
+        return self
 
     @property
     def pose(self) -> Array:
@@ -62,6 +83,29 @@ class Scanner(Model):
         return self.angle_min + self.angle_increment * np.arange(self.rays)
 
     @property
+    def bearings(self) -> Array:
+        """Directions of the rays (R,) over the floor, in the robot's frame, rad."""
+        pitch = self.mount.pitch
+        if not pitch:
+            return self.angles + self.mount.yaw
+        over_the_floor: Array = np.arctan2(np.sin(self.angles), np.cos(self.angles) * math.cos(pitch))  # Eq. (1)
+        return over_the_floor + self.mount.yaw
+
+    @property
+    def level_shares(self) -> Array:
+        """Share (R,) of each ray's length that lies along the floor: 1 where the scanner is not tilted."""
+        shares: Array = np.hypot(np.cos(self.angles) * math.cos(self.mount.pitch), np.sin(self.angles))  # Eq. (1)
+        return shares if self.mount.pitch else np.ones(self.rays)
+
+    @property
+    def floor_ranges(self) -> Array:
+        """Ranges (R,) at which the rays meet the floor, m; inf for those that do not."""
+        down = np.cos(self.angles) * math.sin(self.mount.pitch)  # Eq. (1)
+        falling = down > 0
+        ranges: Array = np.where(falling, self.mount.height / np.where(falling, down, 1.0), np.inf)
+        return ranges
+
+    @property
     def delays(self) -> Array:
         """Delays (R,) of the rays after the scan's stamp, s."""
         return self.time_increment * np.arange(self.rays)
@@ -69,6 +113,10 @@ class Scanner(Model):
     def valid(self, ranges: Ranges) -> NDArray[np.bool_]:
         """True for ranges, of any shape, that are measurements."""
         return np.isfinite(ranges) & (ranges >= self.range_min) & (ranges <= self.range_max)
+
+    def on_floor(self, ranges: Ranges | Array) -> NDArray[np.bool_]:
+        """True for ranges (..., R) that are the floor's, within five standard deviations."""
+        return np.asarray(ranges >= self.floor_ranges - _FLOOR_MARGIN * self.deviations(ranges))
 
     def deviations(self, ranges: Ranges | Array) -> Array:
         """Standard deviations of ranges of any shape, m."""

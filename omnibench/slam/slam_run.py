@@ -178,10 +178,12 @@ def _check(
         raise DataError(
             f"SLAM: ranges have shape {scans.ranges.shape}, expected {(len(scans.times), scanner.rays)}: scans, rays"
         )
-    for index in np.flatnonzero(~scanner.valid(scans.ranges).any(axis=1))[:1]:
+    walls = scanner.valid(scans.ranges) & ~scanner.on_floor(scans.ranges)
+    for index in np.flatnonzero(~walls.any(axis=1))[:1]:
+        floor = ", but of the floor" if scanner.valid(scans.ranges[index]).any() else ""
         raise DataError(
             f"SLAM: the scan at {scans.times[index]:g} s is empty: no range from {scanner.range_min:g} to "
-            f"{scanner.range_max:g} m; leave it out"
+            f"{scanner.range_max:g} m{floor}; leave it out"
         )
     if options.start == "odometry" and odometry is None:
         raise DataError("SLAM: start is odometry, but there is none; choose start: last_pose")

@@ -275,3 +275,15 @@ class TestImperfectScans:
             run_slam(few, LIDAR.scanner, SlamOptions(), np.zeros(3), run.odometry)
         with pytest.raises(DataError, match="choose start: last_pose"):
             run_slam(run.scans, LIDAR.scanner, SlamOptions(), np.zeros(3))
+
+
+def test_a_scanner_that_is_tilted_to_the_floor_is_located_as_well_as_a_horizontal_one() -> None:
+    lidar = LIDAR.model_copy(update={"mount": LidarMount(pitch_deg=10.0, height=0.4)})
+    run = driven("furnished_room", 4, lidar)
+    walls = ~lidar.scanner.on_floor(run.scans.ranges)
+    assert 0.05 < 1 - walls.mean() < 0.5  # a part of every scan is floor
+    path = located(run, DEFAULT, lidar)
+    assert np.abs(errors(path, run)[:, :2]).max() < 8 * MM
+    assert np.abs(errors(path, run)[:, 2]).max() < 0.3 * DEGREE
+    unaware = run_slam(run.scans, LIDAR.scanner, DEFAULT, np.zeros(3), run.odometry)
+    assert np.abs(errors(unaware, run)[:, :2]).max() > np.abs(errors(path, run)[:, :2]).max()

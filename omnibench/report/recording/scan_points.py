@@ -25,12 +25,14 @@ def poses_at(trajectory: Trajectory, times: Array) -> Array:
 
 
 def scan_points(trajectory: Trajectory, scanner: Scanner, scans: TrajectoryScans, scan: int, stride: int = 1) -> Array:
-    """Points (n, 2) of one scan, m; each ray starts at the reference pose of the time at which it was measured."""
-    ranges = scans.ranges[scan, ::stride].astype(float)
-    seen = scanner.valid(scans.ranges[scan, ::stride])
-    poses = compose(poses_at(trajectory, scans.times[scan] + scanner.delays[::stride][seen]), scanner.mount.pose)
-    directions = poses[:, 2] + scanner.angles[::stride][seen]
-    points: Array = poses[:, :2] + ranges[seen, None] * np.column_stack([np.cos(directions), np.sin(directions)])
+    """Points (n, 2) of one scan's walls, m; each ray starts at the reference pose of the time when it was measured."""
+    ranges = scans.ranges[scan]
+    seen = np.flatnonzero(scanner.valid(ranges) & ~scanner.on_floor(ranges))
+    seen = seen[seen % stride == 0]
+    poses = compose(poses_at(trajectory, scans.times[scan] + scanner.delays[seen]), scanner.mount.pose)
+    directions = poses[:, 2] - scanner.mount.yaw + scanner.bearings[seen]
+    over_the_floor = (ranges[seen] * scanner.level_shares[seen])[:, None]
+    points: Array = poses[:, :2] + over_the_floor * np.column_stack([np.cos(directions), np.sin(directions)])
     return points
 
 

@@ -25,6 +25,15 @@ class LidarMount(Model):
     x: FiniteFloat = Field(0.1, description="m, forward")
     y: FiniteFloat = Field(0.0, description="m, left")
     yaw_deg: FiniteFloat = Field(0.0, description="degrees, counter-clockwise")
+    pitch_deg: float = Field(0.0, ge=-60, le=60, description="degrees, tilted down ahead: rays may meet the floor")
+    height: Positive = Field(0.5, description="m above the floor; without effect on a horizontal scanner")
+
+    @property
+    def in_radians(self) -> Mount:
+        """The mount as data sets describe it; a horizontal scanner's height is left out."""
+        height = self.height if self.pitch_deg else 0.0
+        yaw, pitch = math.radians(self.yaw_deg), math.radians(self.pitch_deg)
+        return Mount(x=self.x, y=self.y, yaw=yaw, pitch=pitch, height=height)
 
 
 class Lidar(Model):
@@ -92,7 +101,7 @@ class Lidar(Model):
             noise=max(self.noise, rounding),
             far_noise=max(self.far_noise, rounding),
             far=self.far,
-            mount=Mount(x=self.mount.x, y=self.mount.y, yaw=math.radians(self.mount.yaw_deg)),
+            mount=self.mount.in_radians,
         )
 
 
@@ -117,15 +126,17 @@ def measure_scans(
 ) -> TrajectoryScans:
     """Scans of a room at stamps (S,), s, which include the latency.
 
-    Each ray starts at the scanner's pose when it is measured. DataError in one line: the scanner is inside a wall, or a
-    scan sees nothing.
+    Each ray starts at the scanner's pose when it is measured. Walls and obstacles are as high as the rays of a tilted
+    scanner reach; its rays end on the floor where that is nearer. DataError in one line: the scanner is inside a wall,
+    or a scan sees nothing.
     """
     from omnibench.simulate.chain.ray_casting import cast_rays  # numba takes half a second to load
 
     scanner = lidar.scanner
     measured = stamps - lidar.latency
     _check_places(plan, scanner.mount, track, measured)
-    true = cast_rays(plan.segments, scanner, track.times, track.poses, measured)
+    to_walls = cast_rays(plan.segments, scanner, track.times, track.poses, measured) / scanner.level_shares
+    true = np.minimum(to_walls, scanner.floor_ranges)
     ranges = true + rng.standard_normal(true.shape) * np.where(true > lidar.far, lidar.far_noise, lidar.noise)
     ranges = lidar.resolution * np.round(ranges / lidar.resolution)
     seen = (true <= lidar.range_max) & (ranges <= lidar.range_max) & (ranges >= lidar.range_min)

@@ -12,7 +12,7 @@ from omnibench.robot.kinematics import Array
 
 
 def cast_rays(segments: Array, scanner: Scanner, track_times: Array, track_poses: Array, times: Array) -> Array:
-    """True distances (S, R), m, from a moving scanner to the nearest wall along each of its rays; inf: there is none.
+    """True distances (S, R) over the floor, m, from a moving scanner to the nearest wall along its rays; inf: none.
 
     segments (W, 4): x, y of both ends of each wall, m. track_poses (M, 3): the robot's poses at track_times
     (M,), interpolated linearly, constant outside. times (S,): times of the scans' first rays, s.
@@ -24,7 +24,7 @@ def cast_rays(segments: Array, scanner: Scanner, track_times: Array, track_poses
         np.ascontiguousarray(track_poses, dtype=float),
         np.ascontiguousarray(times, dtype=float),
         scanner.delays,
-        scanner.angles + mount.yaw,
+        scanner.bearings,
         float(mount.x),
         float(mount.y),
     )

@@ -42,14 +42,15 @@ class ScanPoints:
 
 
 def scan_points(ranges: Ranges, scanner: Scanner, noise_factor: float, within: MotionWithinScan) -> ScanPoints:
-    """Points and lines of a scan (R,).
+    """Points and lines of a scan (R,), over the floor; rays of a tilted scanner that end on the floor are left out.
 
     noise_factor: ratio of the ranges' noise to that of the scanner's description. within: motion during the scan.
     """
-    returned = np.flatnonzero(scanner.valid(ranges))
-    distances, delays = ranges[returned].astype(float), scanner.delays[returned]
-    deviations = noise_factor * scanner.deviations(distances)
-    angles = scanner.angles[returned] + scanner.mount.yaw
+    returned = np.flatnonzero(scanner.valid(ranges) & ~scanner.on_floor(ranges))
+    shares, delays = scanner.level_shares[returned], scanner.delays[returned]
+    distances = ranges[returned].astype(float) * shares
+    deviations = noise_factor * scanner.deviations(ranges[returned]) * shares
+    angles = scanner.bearings[returned]
     directions = np.column_stack([np.cos(angles), np.sin(angles)])
     mount = np.array([scanner.mount.x, scanner.mount.y])
     motions = within.at(delays)

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from shapely.geometry import LineString, Point
 
 from omnibench.config import validate
-from omnibench.data.scans import TrajectoryScans
+from omnibench.data.scans import Mount, TrajectoryScans
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import Array
@@ -132,6 +133,47 @@ def test_each_ray_starts_where_the_robot_then_is(vx: float, vy: float, turn_rate
     assert np.abs(found.ravel() - to_the_walls(4, x, y, directions)).max() < 5e-6
 
 
+def tilted(pitch_deg: float, height: float = 0.5, yaw_deg: float = 0.0) -> Lidar:
+    mount = LidarMount(x=0.0, pitch_deg=pitch_deg, height=height, yaw_deg=yaw_deg)
+    return EXACT.model_copy(update={"mount": mount})
+
+
+@given(
+    pitch=st.floats(-60, 60), height=st.floats(0.1, 2), yaw=st.floats(-180, 180), x=st.floats(-3, 3), y=st.floats(-3, 3)
+)  # fmt: skip
+def test_a_tilted_scanner_meets_walls_and_floor_where_its_rays_do_in_space(
+    pitch: float, height: float, yaw: float, x: float, y: float
+) -> None:
+    lidar = tilted(pitch, height, yaw)
+    found = look(square(4), lidar, standing(x, y, 0.3)).ranges[0].astype(float)
+    flat = np.column_stack([np.cos(lidar.scanner.angles), np.sin(lidar.scanner.angles), np.zeros(lidar.rays)])
+    rays = Rotation.from_euler("ZY", [0.3 + math.radians(yaw), math.radians(pitch)]).apply(flat)
+    with np.errstate(divide="ignore"):
+        to_planes = [(4 - x) / rays[:, 0], (-4 - x) / rays[:, 0], (4 - y) / rays[:, 1], (-4 - y) / rays[:, 1]]
+        to_planes.append(-height / rays[:, 2])
+    expected = np.min([np.where(each > 0, each, np.inf) for each in to_planes], axis=0)
+    seen = (expected > lidar.range_min + FLOAT32) & (expected < lidar.range_max - FLOAT32)
+    np.testing.assert_allclose(found[seen], expected[seen], rtol=1e-6, atol=FLOAT32)
+
+
+def test_ahead_of_a_scanner_that_is_tilted_by_30_degrees_is_the_floor_and_beside_it_the_wall() -> None:
+    lidar = tilted(30.0, height=0.5)
+    angles = lidar.scanner.angles
+    ranges = look(square(3), lidar, standing(0, 0, 0)).ranges[0]
+    ahead, left = int(np.abs(angles).argmin()), int(np.abs(angles - math.pi / 2).argmin())
+    assert ranges[ahead] == pytest.approx(1.0, abs=FLOAT32)  # 0.5 m over the sine of 30 degrees
+    assert ranges[left] == pytest.approx(3.0, rel=1e-3)
+    on_floor = lidar.scanner.on_floor(ranges)
+    assert on_floor[ahead]
+    assert not on_floor[left]
+    assert not EXACT.scanner.on_floor(look(square(3), EXACT, standing(0, 0, 0)).ranges).any()
+
+
+def test_a_tilted_scanner_needs_its_height() -> None:
+    with pytest.raises(ConfigError, match="needs its height above the floor"):
+        validate(Mount, {"pitch": 0.1}, "mount")
+
+
 def test_without_distortion_all_rays_start_where_the_robot_is_at_the_stamp() -> None:
     times = np.arange(0, 1000) * 0.001
     track = TruePath(times, circling(0.5, 0.2, 2.0, times))
@@ -249,6 +291,7 @@ def test_a_scanner_in_a_wall_is_refused(x: float, told: str) -> None:
         ({"rays": 0}, "rays: .*greater than 0"),
         ({"noise": -1}, "noise: .*greater than or equal to 0"),
         ({"mount": {"yaw": 3}}, "did you mean 'yaw_deg'"),
+        ({"mount": {"pitch_deg": 80}}, "mount.pitch_deg: .*less than or equal to 60"),
         ({"latency": float("nan")}, "latency"),
     ],
 )
