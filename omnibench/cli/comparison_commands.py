@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from omnibench.cli.options import output_option
-from omnibench.cli.terminal.console import make_console, warn
+from omnibench.cli.terminal.console import make_console, print_verdict, warn
 from omnibench.errors import ConfigError
 
 comparison_app = typer.Typer()
@@ -47,6 +47,8 @@ def compare(
         result = run_comparison(comparison, output, watch)
     warn(result.warnings)
     print_result(make_console(), result)
+    for name, entry in result.held_out.items():
+        print_verdict(entry.verdict, f"{name}, {entry.label}: ")
     typer.echo(f"report: {result.output / 'report.html'}")
     if all(run.matrix is None for run in result.runs):
         raise typer.Exit(1)

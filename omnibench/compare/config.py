@@ -11,6 +11,7 @@ from omnibench.data.dataset import Split
 from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
 from omnibench.fit.problem import Budget
 from omnibench.fit.span import Unidentified
+from omnibench.fit.uncertainty.ratio_intervals import Bootstrap
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.dataset_source import DatasetSource
 
@@ -35,13 +36,6 @@ class CalibratorEntry(Model):
     parameterisation: ParameterisationName | None = Field(None, description="default: the calibrator's own")
     box: Box | None = Field(None, description="default: the config's box")
     limits: GeometryLimits | None = Field(None, description="limits of the geometry parameterisation; default: its own")
-
-
-class Bootstrap(Model):
-    """Bootstrap over trajectories, from which the intervals come."""
-
-    resamples: int = Field(2000, ge=100, le=100_000)
-    seed: int = Field(0, ge=0)
 
 
 class CertificateChoice(Model):

@@ -12,7 +12,7 @@ from typing import Any, get_type_hints
 import polars as pl
 
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.result import ComparisonResult, EntryStatistics, Interval, RunRecord, ScoredRun
+from omnibench.compare.result import ComparisonResult, EntryStatistics, RunRecord, ScoredRun
 from omnibench.config import read_yaml, to_json, to_yaml
 from omnibench.data.dataset import SPLITS, Dataset
 from omnibench.errors import DataError
@@ -25,6 +25,7 @@ from omnibench.files import (
     write_table,
     write_text,
 )
+from omnibench.fit.uncertainty.ratio_intervals import Interval
 from omnibench.robot.calibration import Calibration, Provenance, Row, covariance_rows, write_calibration
 
 # First line of config.yaml in a folder of results. A folder whose config.yaml lacks it is not written to.
@@ -80,9 +81,23 @@ def summary(result: ComparisonResult) -> dict[str, Any]:
         "budget": result.config.budget.model_dump(),
         "runs": [run.record.model_dump(mode="json") for run in result.runs],
         "statistics": [_statistics_row(entry) for entry in result.statistics],
+        "intervals": _interval_units(result),
+        "held_out": {name: {"label": each.label} | each.verdict.model_dump() for name, each in result.held_out.items()},
         "certificates": [certificate.model_dump() for certificate in result.certificates],
         "warnings": list(result.warnings),
         "environment": result.environment.model_dump(),
+    }
+
+
+def _interval_units(result: ComparisonResult) -> dict[str, dict[str, Any]]:
+    """What the intervals of each data set and split rest on."""
+    designs = {run.record.dataset: run.design for run in result.runs}
+    return {
+        name: {
+            split: {"unit": score.units.name, "units": score.units.count, "method": score.units.method}
+            for split, score in design.items()
+        }
+        for name, design in designs.items()
     }
 
 
@@ -186,7 +201,7 @@ def _statistics_row(entry: EntryStatistics) -> dict[str, Any]:
     return row | {"typical_seed": None if entry.typical is None else entry.typical.record.seed}
 
 
-def _interval_cell(interval: Interval | None) -> dict[str, float] | None:
+def _interval_cell(interval: Interval | None) -> dict[str, float | None] | None:
     return None if interval is None else asdict(interval)
 
 

@@ -17,8 +17,9 @@ from omnibench.environment import Environment
 from omnibench.fit.calibrator import Outcome
 from omnibench.fit.parameterisation import FittedParameter, ParameterisationName
 from omnibench.fit.problem import Improvement
+from omnibench.fit.uncertainty.ratio_intervals import Interval, Units
 from omnibench.fit.uncertainty.uncertainty import Uncertainty
-from omnibench.robot.calibration import Row
+from omnibench.robot.calibration import HeldOutVerdict, Row
 from omnibench.robot.kinematics import Array
 
 
@@ -82,12 +83,13 @@ class SplitScore:
     """Costs and errors of a matrix on one split.
 
     costs (Z,): the cost of each trajectory. errors (Z, 3): odometry minus reference at the last reference pose of each
-    trajectory, m, m, rad.
+    trajectory, m, m, rad. units: what intervals of the costs rest on.
     """
 
     cost: float
     costs: Array
     errors: Array
+    units: Units
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,15 +113,6 @@ class ScoredRun:
 
 
 @dataclass(frozen=True)
-class Interval:
-    """A value with its 95 % bootstrap interval over trajectories."""
-
-    value: float
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
 class SplitStatistics:
     """Statistics of an entry's typical run on one split.
 
@@ -137,6 +130,7 @@ class EntryStatistics:
     typical: the run of median training cost, to which intervals and differences refer. train_spread: interquartile
     range of the training cost over seeds. splits: the typical run by split; empty without an answer. difference: paired
     mean difference in validation cost (training cost where there is no validation split) from the best entry.
+    practically_equal: None where the difference has no interval.
     """
 
     dataset: str
@@ -167,12 +161,20 @@ class EntryStatistics:
         return self.splits[split].improvement if split in self.splits else None
 
 
+@dataclass(frozen=True)
+class EntryVerdict:
+    """What held-out runs say of an entry."""
+
+    label: str
+    verdict: HeldOutVerdict
+
+
 @dataclass(frozen=True, eq=False)
 class ComparisonResult:
     """Everything that the report shows.
 
     design_costs: mean cost of the design values, by data set and split. uncertainties: of the entries' typical runs, by
-    data set and label.
+    data set and label. held_out: the verdict on the best calibration of each data set that has one.
     """
 
     config: CompareConfig
@@ -183,5 +185,6 @@ class ComparisonResult:
     design_costs: Mapping[str, Mapping[Split, Interval]]
     certificates: tuple[BoxCertificate, ...]
     uncertainties: Mapping[tuple[str, str], Uncertainty]
+    held_out: Mapping[str, EntryVerdict]
     environment: Environment
     warnings: tuple[str, ...]

@@ -16,7 +16,7 @@ from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
 from omnibench.compare.report.comparison_report import comparison_document
 from omnibench.compare.result import ComparisonResult, ScoredRun
 from omnibench.compare.scoring import score
-from omnibench.compare.statistics import design_costs, entry_statistics, is_mean
+from omnibench.compare.statistics import design_costs, entry_statistics, held_out_verdicts, is_mean
 from omnibench.compare.uncertainties import typical_uncertainties
 from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
@@ -65,6 +65,7 @@ def run_comparison(
             design_costs=design_costs(runs, config.bootstrap),
             certificates=certificates,
             uncertainties=uncertainties,
+            held_out=held_out_verdicts(statistics, datasets, config.bootstrap),
             environment=environment(),
             warnings=tuple(_warnings(failures, datasets, runs)),
         )

@@ -17,6 +17,7 @@ from omnibench.fit.calibrator import Outcome, RunResult, describe_error
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.fit.parameterisation import FittedParameter, fitted_parameters, make_bounds
+from omnibench.fit.uncertainty.ratio_intervals import UnitName, units_of
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import matrix_rows
 from omnibench.robot.kinematics import Array
@@ -26,8 +27,11 @@ from omnibench.robot.odometry import Integration, OdometryBatch
 class SplitScorer:
     """Scores matrices on one split with one cost."""
 
-    def __init__(self, trajectories: Sequence[Trajectory], cost: Cost, integration: Integration) -> None:
+    def __init__(
+        self, trajectories: Sequence[Trajectory], cost: Cost, integration: Integration, unit: UnitName | None = None
+    ) -> None:
         self._cost = cost
+        self._units = units_of(trajectories, unit)
         self._odometry = cost.batch(trajectories, integration)
         self._reference = cost.reference(trajectories)
         self._ends = OdometryBatch([trajectory.final_log for trajectory in trajectories], integration)
@@ -49,7 +53,7 @@ class SplitScorer:
 
     def score(self, matrix: Array) -> SplitScore:
         """All of these of a matrix (3, N). PluginError when the cost raises or is not a finite number."""
-        return SplitScore(self.cost(matrix), self.costs(matrix), self.final_errors(matrix))
+        return SplitScore(self.cost(matrix), self.costs(matrix), self.final_errors(matrix), self._units)
 
     def _errors(self, matrix: Array) -> Array:
         return self._odometry.poses(matrix[None])[0] - self._reference
@@ -89,7 +93,10 @@ def _scorers(config: CompareConfig, dataset: Dataset) -> dict[Split, SplitScorer
     """A scorer for each split that has trajectories."""
     return {
         split: SplitScorer(
-            dataset.split(split), costs.create(config.cost.name, config.cost.options), config.integration
+            dataset.split(split),
+            costs.create(config.cost.name, config.cost.options),
+            config.integration,
+            config.bootstrap.unit,
         )
         for split in SPLITS
         if dataset.split(split)

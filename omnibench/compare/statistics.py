@@ -1,16 +1,17 @@
-"""Statistics of the entries: medians over seeds, bootstrap intervals over trajectories, paired differences."""
+"""Statistics of the entries: medians over seeds, intervals over commands or runs, paired differences."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
+from operator import itemgetter
 
 import numpy as np
-from numpy.typing import NDArray
 
-from omnibench.compare.config import Bootstrap
-from omnibench.compare.result import EntryStatistics, Interval, ScoredRun, SplitStatistics
-from omnibench.data.dataset import Split
-from omnibench.robot.kinematics import Array
+from omnibench.compare.result import EntryStatistics, EntryVerdict, ScoredRun, SplitScore, SplitStatistics
+from omnibench.data.dataset import Dataset, Split
+from omnibench.fit.held_out import judge, nothing_held_out
+from omnibench.fit.uncertainty.ratio_intervals import Bootstrap, Interval, RatioIntervals
+from omnibench.registry import calibrators
 
 # Share of the standard error of the best cost: a smaller difference is of no practical interest (chosen).
 NEGLIGIBLE_SHARE = 0.1
@@ -21,30 +22,56 @@ def entry_statistics(runs: Sequence[ScoredRun], bootstrap: Bootstrap) -> tuple[E
 
     An entry is practically equal to another when the 95 % interval of the paired difference of their typical runs'
     validation costs (training costs where there is no validation split) contains zero, or the difference is below a
-    tenth of the standard error of the other's cost. The best entry of a data set has the lowest training cost among
-    those that are practically equal to the one of lowest validation cost.
+    tenth of the standard error of the other's cost; where there is no interval, that is undecided. The best entry of a
+    data set has the lowest training cost among those that are not known to differ from the one of lowest validation
+    cost.
     """
     groups: dict[tuple[str, str], list[ScoredRun]] = {}
     for run in runs:
         groups.setdefault((run.record.dataset, run.record.label), []).append(run)
     typical = {key: _typical(group) for key, group in groups.items()}
-    draws = _Draws(bootstrap)
+    intervals = RatioIntervals(bootstrap)
     statistics = []
     for (dataset, label), group in groups.items():
         competing = [run for (name, _), run in typical.items() if name == dataset and run is not None]
-        best = _best(competing, draws)
-        statistics.append(_statistics(group, typical[dataset, label], best, draws))
+        best = _best(competing, intervals)
+        statistics.append(_statistics(group, typical[dataset, label], best, intervals))
     return tuple(statistics)
 
 
 def design_costs(runs: Sequence[ScoredRun], bootstrap: Bootstrap) -> dict[str, dict[Split, Interval]]:
     """The mean cost of the design values, by data set and split."""
     designs = {run.record.dataset: run.design for run in runs}
-    draws = _Draws(bootstrap)
+    intervals = RatioIntervals(bootstrap)
     return {
-        dataset: {split: _mean(score.costs, draws) for split, score in design.items()}
+        dataset: {split: intervals.mean(score.costs, score.units) for split, score in design.items()}
         for dataset, design in designs.items()
     }
+
+
+def held_out_verdicts(
+    statistics: Sequence[EntryStatistics], datasets: Mapping[str, Dataset], bootstrap: Bootstrap
+) -> dict[str, EntryVerdict]:
+    """What the validation runs of each data set say of its best calibration, if a calibrator gave an answer.
+
+    The best calibration is the best entry, or, where that is not fitted, the fitted one of lowest judged cost.
+    """
+    verdicts = {}
+    for name, dataset in datasets.items():
+        fitted = [
+            (not entry.is_best, _judged_cost(entry.typical), entry.label, entry.typical)
+            for entry in statistics
+            if entry.dataset == name and entry.typical is not None and calibrators.entry(entry.calibrator).cls.bounded
+        ]
+        if fitted:
+            _, _, label, run = min(fitted, key=itemgetter(0, 1))
+            held_out = dataset.split("validation")
+            verdict = nothing_held_out()
+            if held_out:
+                design, calibrated = run.design["validation"].errors, run.scores["validation"].errors
+                verdict = judge(design, calibrated, held_out, bootstrap)
+            verdicts[name] = EntryVerdict(label, verdict)
+    return verdicts
 
 
 def is_mean(run: ScoredRun) -> bool:
@@ -53,12 +80,12 @@ def is_mean(run: ScoredRun) -> bool:
     return train is None or bool(np.isclose(train.costs.mean(), train.cost, rtol=1e-6, atol=0.0))
 
 
-def _best(competing: Sequence[ScoredRun], draws: _Draws) -> ScoredRun | None:
+def _best(competing: Sequence[ScoredRun], intervals: RatioIntervals) -> ScoredRun | None:
     """The run of lowest training cost among those practically equal to the one of lowest judged cost."""
     if not competing:
         return None
     lowest = min(competing, key=_judged_cost)
-    level = [run for run in competing if _against_best(run, lowest, draws)[1]]
+    level = [run for run in competing if _against_best(run, lowest, intervals)[1] is not False]
     return min(level, key=lambda run: (run.record.train_cost or 0.0, _judged_cost(run)))
 
 
@@ -66,7 +93,7 @@ def _statistics(
     group: Sequence[ScoredRun],
     typical: ScoredRun | None,
     best: ScoredRun | None,
-    draws: _Draws,
+    intervals: RatioIntervals,
 ) -> EntryStatistics:
     record = group[0].record
     costs = [run.record.train_cost for run in group if run.record.train_cost is not None]
@@ -74,7 +101,7 @@ def _statistics(
     proven = [run.record.proven_gap for run in group if run.record.proven_gap is not None]
     difference, equal = None, None
     if typical is not None and best is not None:
-        difference, equal = _against_best(typical, best, draws)
+        difference, equal = _against_best(typical, best, intervals)
     return EntryStatistics(
         dataset=record.dataset,
         label=record.label,
@@ -86,7 +113,7 @@ def _statistics(
         typical=typical,
         train_median=float(np.median(costs)) if costs else None,
         train_spread=float(np.subtract(*np.percentile(costs, [75, 25]))) if costs else None,
-        splits={} if typical is None else _by_split(typical, draws),
+        splits={} if typical is None else _by_split(typical, intervals),
         difference=difference,
         practically_equal=equal,
         is_best=typical is not None and typical is best,
@@ -97,34 +124,14 @@ def _statistics(
     )
 
 
-def _by_split(run: ScoredRun, draws: _Draws) -> dict[Split, SplitStatistics]:
+def _by_split(run: ScoredRun, intervals: RatioIntervals) -> dict[Split, SplitStatistics]:
     return {
         split: SplitStatistics(
-            cost=_mean(score.costs, draws),
-            improvement=_improvement(score.costs, run.design[split].costs, draws),
+            cost=intervals.mean(score.costs, score.units),
+            improvement=intervals.improvement(score.costs, run.design[split].costs, score.units),
         )
         for split, score in run.scores.items()
     }
-
-
-class _Draws:
-    """Bootstrap resamples of trajectories, shared by all entries, so that differences are paired."""
-
-    def __init__(self, bootstrap: Bootstrap) -> None:
-        self._bootstrap = bootstrap
-        self._by_size: dict[int, NDArray[np.intp]] = {}
-
-    def of(self, count: int) -> NDArray[np.intp]:
-        """Indices (resamples, count) of ``count`` trajectories, drawn with replacement."""
-        if count not in self._by_size:
-            rng = np.random.default_rng(self._bootstrap.seed)
-            self._by_size[count] = rng.integers(count, size=(self._bootstrap.resamples, count))
-        return self._by_size[count]
-
-    def interval(self, count: int, value: float, statistic: Callable[[NDArray[np.intp]], Array]) -> Interval:
-        """``value`` with the 2.5 and 97.5 percentiles of a statistic over the resamples of ``count`` trajectories."""
-        low, high = np.percentile(statistic(self.of(count)), [2.5, 97.5])
-        return Interval(value, float(low), float(high))
 
 
 def _typical(group: Sequence[ScoredRun]) -> ScoredRun | None:
@@ -134,33 +141,26 @@ def _typical(group: Sequence[ScoredRun]) -> ScoredRun | None:
     return ranked[len(ranked) // 2] if ranked else None
 
 
-def _judged(run: ScoredRun) -> Array:
-    """The costs (Z,) that an answer is judged by: validation costs where there are any."""
-    return run.scores["validation" if "validation" in run.scores else "train"].costs
+def _judged(run: ScoredRun) -> SplitScore:
+    """The score that an answer is judged by: on the validation split where there is one."""
+    return run.scores["validation" if "validation" in run.scores else "train"]
 
 
 def _judged_cost(run: ScoredRun) -> float:
-    return float(_judged(run).mean())
+    return float(_judged(run).costs.mean())
 
 
-def _mean(costs: Array, draws: _Draws) -> Interval:
-    return draws.interval(len(costs), float(costs.mean()), lambda chosen: costs[chosen].mean(1))
+def _against_best(run: ScoredRun, best: ScoredRun, intervals: RatioIntervals) -> tuple[Interval, bool | None]:
+    """The paired difference in judged cost from the best run, and whether the two are practically equal, if known."""
+    score, of_best = _judged(run), _judged(best)
+    difference = intervals.mean(score.costs - of_best.costs, score.units)
+    if difference.known is None:
+        return difference, True if run is best else None
+    negligible = NEGLIGIBLE_SHARE * _standard_error(of_best)
+    return difference, bool(difference.holds(0.0) or abs(difference.value) <= negligible)
 
 
-def _improvement(costs: Array, theoretical: Array, draws: _Draws) -> Interval | None:
-    if not theoretical.any():
-        return None
-    return draws.interval(
-        len(costs),
-        float(1 - costs.mean() / theoretical.mean()),
-        lambda chosen: 1 - costs[chosen].mean(1) / theoretical[chosen].mean(1),
-    )
-
-
-def _against_best(run: ScoredRun, best: ScoredRun, draws: _Draws) -> tuple[Interval, bool]:
-    """The paired difference in judged cost from the best run, and whether the two are practically equal."""
-    costs, best_costs = _judged(run), _judged(best)
-    paired = costs - best_costs
-    difference = draws.interval(len(paired), float(paired.mean()), lambda chosen: paired[chosen].mean(1))
-    negligible = NEGLIGIBLE_SHARE * float(best_costs.std(ddof=1)) / np.sqrt(len(costs)) if len(costs) > 1 else 0.0
-    return difference, bool(difference.low <= 0 <= difference.high or abs(difference.value) <= negligible)
+def _standard_error(score: SplitScore) -> float:
+    """The standard error of a mean cost by the sums over its units."""
+    left = score.units.sums(score.costs - score.costs.mean())
+    return float(np.sqrt(len(left) / (len(left) - 1) * np.square(left).sum()) / len(score.costs))

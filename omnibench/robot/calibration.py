@@ -66,11 +66,6 @@ class HeldOutVerdict(Model):
     sentence: str
     detail: str
 
-    @property
-    def lines(self) -> tuple[str, str]:
-        """The sentence and its detail, as commands print them."""
-        return self.sentence, self.detail
-
 
 class Provenance(Model):
     """Origin of a calibration: data set, calibrator with options, versions, costs, outcome, what held-out runs say."""

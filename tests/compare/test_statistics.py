@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 
 from omnibench.compare.config import Bootstrap
 from omnibench.compare.plan import SearchSpace
-from omnibench.compare.result import EntryStatistics, Interval, RunRecord, ScoredRun, SplitScore
+from omnibench.compare.result import EntryStatistics, RunRecord, ScoredRun, SplitScore
 from omnibench.compare.statistics import NEGLIGIBLE_SHARE, entry_statistics, is_mean
 from omnibench.data.dataset import Split
 from omnibench.fit.calibrator import Outcome
+from omnibench.fit.uncertainty.ratio_intervals import Interval, Units
 from omnibench.robot.kinematics import Array
 
 BOOTSTRAP = Bootstrap(resamples=1000, seed=3)
@@ -72,7 +73,7 @@ def scored(
 
 
 def split_score(costs: Array) -> SplitScore:
-    return SplitScore(float(costs.mean()), costs, np.zeros((len(costs), 3)))
+    return SplitScore(float(costs.mean()), costs, np.zeros((len(costs), 3)), Units("run", np.arange(len(costs))))
 
 
 def train_cost(entry: EntryStatistics) -> Interval:
@@ -226,21 +227,28 @@ def test_the_gap_of_an_entry_is_the_median_of_its_runs() -> None:
     assert of(runs)["a"].gap_median == pytest.approx(0.2)
 
 
-def test_a_single_trajectory_has_an_interval_of_no_width() -> None:
-    entry = of([scored("a", np.array([2.0]), theoretical=np.array([4.0]))])["a"]
-    train = train_cost(entry)
-    assert (train.low, train.high) == (2.0, 2.0)
+@pytest.mark.parametrize("number", [1, 2])
+def test_one_or_two_runs_have_no_interval_and_nothing_is_said_to_differ(number: int) -> None:
+    runs = [
+        scored(name, np.full(number, cost), theoretical=np.full(number, 4.0)) for name, cost in (("a", 2), ("b", 3))
+    ]
+    entries = of(runs)
+    improvement, difference = entries["a"].improvement("train"), entries["b"].difference
+    assert (train_cost(entries["a"]).value, train_cost(entries["a"]).known) == (2.0, None)
+    assert improvement is not None
+    assert (improvement.value, improvement.known) == (0.5, None)
+    assert difference is not None
+    assert (difference.known, entries["b"].practically_equal) == (None, None)
 
 
 @settings(max_examples=30)
 @given(st.lists(st.floats(0.01, 100), min_size=2, max_size=30), st.integers(0, 2**32))
-def test_the_value_of_an_interval_is_the_mean_and_lies_between_the_extremes(costs: list[float], seed: int) -> None:
+def test_the_value_of_an_interval_is_the_mean_and_lies_within_it(costs: list[float], seed: int) -> None:
     values = np.array(costs)
     (entry,) = entry_statistics([scored("a", values)], Bootstrap(resamples=100, seed=seed))
     train = train_cost(entry)
     assert train.value == pytest.approx(values.mean())
-    slack = 1e-12 * values.max()
-    assert values.min() - slack <= train.low <= train.high <= values.max() + slack
+    assert train.known is None or train.known[0] <= train.value <= train.known[1]
 
 
 def test_a_cost_that_is_no_mean_over_trajectories_is_noticed() -> None:

@@ -39,7 +39,7 @@ def print_json(document: Mapping[str, Any] | BaseModel) -> None:
     typer.echo(to_json(document))
 
 
-def print_verdict(verdict: HeldOutVerdict) -> None:
+def print_verdict(verdict: HeldOutVerdict, subject: str = "") -> None:
     """The last lines of ``calibrate``, ``evaluate`` and ``compare``: what held-out runs say, and which these are."""
-    for line in verdict.lines:
-        typer.echo(line)
+    typer.echo(f"{subject}{verdict.sentence}")
+    typer.echo(verdict.detail)

@@ -136,7 +136,7 @@ def _overview(datasets: list[DatasetView]) -> Table:
             Column("Improvement"),
         ),
         tuple(rows),
-        f"CF is the cost {cost_in_words(datasets[0])} Small print: 95 % bootstrap intervals. Of several that are "
+        f"CF is the cost {cost_in_words(datasets[0])} Small print: 95 % intervals. Of several that are "
         "level, the entry of lowest training cost is named.",
     )
 
@@ -150,7 +150,12 @@ def _reproduction(result: ComparisonResult) -> Section:
                 f"{plural(config.budget.evaluations, 'evaluation')} or {config.budget.seconds:g} s",
             ),
             Fact("Seeds", listing([str(seed) for seed in config.seeds], 20)),
-            Fact("Intervals", f"{count(config.bootstrap.resamples)} bootstrap resamples, seed {config.bootstrap.seed}"),
+            Fact(
+                "Intervals",
+                f"unit {config.bootstrap.unit or 'command where runs repeat commands, else run'}; from ten units on "
+                f"{count(config.bootstrap.resamples)} bootstrap resamples, seed {config.bootstrap.seed}; from three on "
+                "Student's t",
+            ),
             Fact("Python", environment.python),
             Fact("Platform", environment.platform),
             Fact(

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 from omnibench.compare.report.published_tables import published_blocks
 from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_NAME, DatasetView
-from omnibench.compare.report.wording import cost_decimals, cost_in_words, entry_cell, improvement_in_words
-from omnibench.compare.result import EntryStatistics, Interval
+from omnibench.compare.report.wording import (
+    cost_decimals,
+    cost_in_words,
+    entry_cell,
+    improvement_in_words,
+    interval_basis,
+    interval_in_words,
+)
+from omnibench.compare.result import EntryStatistics
 from omnibench.data.dataset import Split
 from omnibench.report.blocks import Cell, Column, Row, Section, Table
-from omnibench.report.numbers import NOTHING, fixed, percent, span
+from omnibench.report.numbers import NOTHING, fixed, percent
 from omnibench.words import plural
 
 
@@ -23,7 +30,7 @@ def cost_table(view: DatasetView, split: Split) -> Table:
     theoretical = view.theoretical_cost(split)
     decimals = cost_decimals(view)
     before = fixed(theoretical, decimals)
-    design = Cell(before, _span(view.design_costs.get(split), decimals))
+    design = Cell(before, interval_in_words(view.design_costs.get(split), decimals))
     rows = [Row.of(entry_cell(view, None), design, NOTHING, NOTHING)]
     searched = [entry for entry in view.statistics if entry.calibrator != THEORETICAL_NAME]
     rows += [_cost_row(view, entry, split, before) for entry in searched]
@@ -39,7 +46,7 @@ def cost_table(view: DatasetView, split: Split) -> Table:
         ),
         rows=tuple(rows),
         note=f"As Table {2 if split == 'train' else 3} of the paper. CF is the cost {cost_in_words(view)} "
-        "Small print: 95 % bootstrap intervals over trajectories, of the run with the median training cost.",
+        f"Small print: 95 % intervals, {interval_basis(view, split)}, of the run with the median training cost.",
     )
 
 
@@ -52,7 +59,7 @@ def _cost_row(view: DatasetView, entry: EntryStatistics, split: Split, before: s
     return Row.of(
         entry_cell(view, entry),
         before,
-        Cell(fixed(reached.value, cost_decimals(view)), _span(reached, cost_decimals(view))),
+        Cell(fixed(reached.value, cost_decimals(view)), interval_in_words(reached, cost_decimals(view))),
         Cell(*improvement_in_words(entry, split, 2)),
         role="best" if entry.is_best else "plain",
     )
@@ -70,7 +77,3 @@ def _published_rows(view: DatasetView, split: Split) -> list[Row]:
     if rows:
         rows.insert(0, Row.of("Published, on other data: not comparable row by row", role="group"))
     return rows
-
-
-def _span(interval: Interval | None, decimals: int) -> str:
-    return "" if interval is None else span(interval.low, interval.high, decimals)

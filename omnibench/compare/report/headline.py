@@ -8,9 +8,11 @@ import numpy as np
 
 from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_NAME, DatasetView
 from omnibench.compare.report.wording import (
+    NO_INTERVAL,
     cost_decimals,
     difference_in_words,
     improvement_in_words,
+    interval_in_words,
     on_bounds,
     position_unit,
 )
@@ -32,9 +34,19 @@ def result_section(view: DatasetView) -> Section:
 
 def _blocks(view: DatasetView) -> tuple[Block, ...]:
     best = view.best
+    said = _held_out(view)
     if best is None or best.calibrator == THEORETICAL_NAME:
-        return (Paragraph(_no_winner(view, best), "lead"), _remarks(view, best))
-    return (Paragraph(_verdict(view, best), "lead"), Facts(_tiles(view, best), "tiles"), _remarks(view, best))
+        return (Paragraph(_no_winner(view, best), "lead"), *said, _remarks(view, best))
+    return (Paragraph(_verdict(view, best), "lead"), Facts(_tiles(view, best), "tiles"), *said, _remarks(view, best))
+
+
+def _held_out(view: DatasetView) -> tuple[Block, ...]:
+    """What held-out runs say of the best calibration, in the words of ``calibrate`` and ``evaluate``."""
+    if view.held_out is None:
+        return ()
+    verdict = view.held_out.verdict
+    manner: Literal["plain", "warning"] = "plain" if verdict.verdict == "better" else "warning"
+    return (Callout(f"{view.held_out.label}, {verdict.sentence}", (verdict.detail,), manner),)
 
 
 def _no_winner(view: DatasetView, best: EntryStatistics | None) -> str:
@@ -61,8 +73,8 @@ def _verdict(view: DatasetView, best: EntryStatistics) -> str:
         interval = best.improvement(split)
         if interval is not None:
             fell, sure = improvement_in_words(best, split, 1)
-            words += f": the error fell by {fell} (95 % interval {sure})"
-            words += ", which the noise alone could explain" if interval.low <= 0 else ""
+            words += f": the error fell by {fell} ({_with_interval(sure)}), {view.units[split].words}"
+            words += ", which the noise alone could explain" if interval.holds(0.0) else ""
         words += "."
     return words
 
@@ -71,6 +83,11 @@ def _standing(view: DatasetView, best: EntryStatistics) -> str:
     """The best entry, in words; where several are level, the lowest training cost decides."""
     if len(view.calibrated) == 1:
         return f"{best.label} is the only calibrator with an answer"
+    if any(entry.practically_equal is None and entry.answers for entry in view.statistics):
+        return (
+            f"Which entry is best cannot be said ({view.units[view.scored].words}); {best.label} has the lowest "
+            "training cost"
+        )
     level = [entry.label for entry in view.level]
     if len(level) == 1:
         return f"{best.label} is best"
@@ -94,12 +111,12 @@ def _tiles(view: DatasetView, best: EntryStatistics) -> tuple[Fact, ...]:
             Fact(
                 f"Cost, {SPLIT_NAMES[split]}",
                 f"{fixed(before, decimals)} → {fixed(reached.value, decimals)}",
-                f"95 % interval {span(reached.low, reached.high, decimals)}",
+                _with_interval(interval_in_words(reached, decimals)),
             )
         )
     if best.improvement(split) is not None:
         fell, sure = improvement_in_words(best, split, 1)
-        tiles.append(Fact("Improvement", fell, f"95 % interval {sure}"))
+        tiles.append(Fact("Improvement", fell, _with_interval(sure)))
     after = None if best.typical is None else view.errors(best.typical, split)
     if after is not None:
         (p0, h0), (p1, h1) = positions_and_headings(view.design_errors[split]), positions_and_headings(after)
@@ -119,6 +136,10 @@ def _tiles(view: DatasetView, best: EntryStatistics) -> tuple[Fact, ...]:
     return tuple(tiles)
 
 
+def _with_interval(words: str) -> str:
+    return words if words == NO_INTERVAL else f"95 % interval {words}"
+
+
 def _doubts(view: DatasetView, best: EntryStatistics) -> list[str]:
     """Reasons to doubt the first place: seeds that differ, a minimum that was missed, others with a lower cost."""
     doubts = []
@@ -126,7 +147,8 @@ def _doubts(view: DatasetView, best: EntryStatistics) -> list[str]:
     runs = [run for run in view.runs if run.record.label == best.label]
     values = [run.scores[split].cost for run in runs if split in run.scores]
     reached = best.cost(split)
-    width = 0.0 if reached is None else reached.high - reached.low
+    low, high = (None if reached is None else reached.known) or (0.0, 0.0)
+    width = high - low
     if len(values) > 1 and max(values) - min(values) > _SEEDS_DIFFER * width:
         doubts.append(
             f"{best.label} depends on its seed: over {len(values)} seeds its {SPLIT_NAMES[split]} cost goes from "
@@ -208,10 +230,10 @@ def _remarks(view: DatasetView, best: EntryStatistics | None) -> Callout:
     bound = [entry.label for entry, run in view.calibrated if on_bounds(run.record)]
     if bound:
         items.append(f"Held back by the box, with elements on a bound: {listing(bound)}. A wider box may do better.")
-    if _repeats_commands(view):
+    if view.units[split].name == "run" and _repeats_commands(view):
         items.append(
-            "The intervals are over trajectories like these. Runs of one command share what the model misses there, so "
-            "for commands that were not driven here the spread is larger."
+            "The intervals are over runs like these. Runs of one command share what the model misses there, so for "
+            "commands that were not driven here the spread is larger (bootstrap: {unit: command})."
         )
     failed = any(entry.answers < entry.runs for entry in view.statistics)
     return Callout("To be kept in mind", tuple(items), "warning" if doubts or failed else "plain")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from omnibench.compare.report.view import SPLIT_NAMES, DatasetView
-from omnibench.compare.report.wording import difference_in_words, entry_cell, level_in_words, on_bounds
+from omnibench.compare.report.wording import difference_in_words, entry_cell, interval_basis, level_in_words, on_bounds
 from omnibench.compare.result import BoxCertificate, EntryStatistics, RunRecord
 from omnibench.report.blocks import Block, Cell, Column, Details, Row, Section, Table
 from omnibench.report.numbers import (
@@ -62,10 +62,12 @@ def entry_table(view: DatasetView) -> Table:
         rows=tuple(rows),
         note="Spread: interquartile range over seeds. Gap: training cost relative to the exact optimum in the same box "
         f"(closed_form), minus one; {NOTHING} where that is not known. Proven: what share of the "
-        "cost any optimiser could still save in that box, at most. Difference: paired over trajectories, with its "
-        "95 % bootstrap interval. Practically equal: that interval contains zero, or the difference is below a tenth "
-        "of the standard error of the best entry's cost. Best: the lowest training cost of the entries that are "
-        f"practically equal to the one of lowest {SPLIT_NAMES[view.scored]} cost.{_held_in_words(view)}",
+        "cost any optimiser could still save in that box, at most. "
+        f"Difference: paired by {view.units[view.scored].name}, with its 95 % interval, "
+        f"{interval_basis(view, view.scored)}. Practically equal: that interval contains zero, "
+        "or the difference is below a tenth of the standard error of the best entry's cost; undecided: there is no "
+        "interval. Best: the lowest training cost of the entries that are not known to differ from the one of lowest "
+        f"{SPLIT_NAMES[view.scored]} cost.{_held_in_words(view)}",
     )
 
 
@@ -145,7 +147,7 @@ def _verdict(view: DatasetView, entry: EntryStatistics) -> Cell:
     if entry.is_best:
         return Cell("best", level_in_words(view))
     if entry.practically_equal is None or entry.difference is None:
-        return Cell(NOTHING)
+        return Cell("undecided", interval_basis(view, view.scored))
     if entry.practically_equal:
         return Cell("practically equal")
     if entry.difference.value > 0:

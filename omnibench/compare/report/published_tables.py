@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_NAME, DatasetView
-from omnibench.compare.report.wording import cost_decimals
-from omnibench.compare.result import EntryStatistics, Interval
+from omnibench.compare.report.wording import NO_INTERVAL, cost_decimals
+from omnibench.compare.result import EntryStatistics
 from omnibench.data.dataset import SPLITS, Split, Trajectory
+from omnibench.fit.uncertainty.ratio_intervals import Interval
 from omnibench.report.blocks import Block, Callout, Cell, Column, Row, Table
 from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, seconds, span
 from omnibench.robot.kinematics import Array
@@ -49,7 +50,7 @@ class ComparedFigure:
     @property
     def alike(self) -> bool:
         """True if our interval contains a published figure."""
-        return any(self.ours.low <= value <= self.ours.high for value in self.published)
+        return self.ours.known is not None and any(map(self.ours.holds, self.published))
 
     @property
     def difference(self) -> str:
@@ -94,11 +95,12 @@ def _over_time(view: DatasetView, best: EntryStatistics | None) -> Iterator[Comp
         ("calibrated", [None if best is None else best.cost(split) for split in SPLITS], 1),
     )
     for name, (train, validation), kind in kinds:
-        if train is None or validation is None or not published:
+        if train is None or validation is None or not published or train.known is None or validation.known is None:
             continue
         change = validation.value / train.value - 1
+        known = ((train.known, train.value), (validation.known, validation.value))
         # Both splits are samples, so that the interval of the change is about that of the two together.
-        spread = math.hypot(*((cost.high - cost.low) / 2 / cost.value for cost in (train, validation)))
+        spread = math.hypot(*((high - low) / 2 / each for (low, high), each in known))
         changes = tuple(later[kind] / earlier[kind] - 1 for earlier, later in published)
         ours = Interval(value=change, low=change - spread, high=change + spread)
         yield ComparedFigure(f"Change of the {name} cost to validation", ours, changes, True, 1)
@@ -129,7 +131,9 @@ def _figure_table(view: DatasetView) -> Table:
     for figure in compared_figures(view):
         ours, decimals = figure.ours, 1 if figure.is_share else cost_decimals(view)
         factor, unit = (100.0, " %") if figure.is_share else (1.0, "")
-        interval = f"{span(factor * ours.low, factor * ours.high, decimals)}{unit}"
+        interval = NO_INTERVAL
+        if ours.known is not None:
+            interval = f"{span(factor * ours.known[0], factor * ours.known[1], decimals)}{unit}"
         theirs = (f"{fixed(factor * value, figure.decimals)}{unit}" for value in figure.published)
         cells = (
             Cell(figure.name),

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.result import BoxCertificate, ComparisonResult, EntryStatistics, Interval, ScoredRun
+from omnibench.compare.result import BoxCertificate, ComparisonResult, EntryStatistics, EntryVerdict, ScoredRun
 from omnibench.data.dataset import SPLITS, Dataset, Split
 from omnibench.fit.evaluate import final_errors
+from omnibench.fit.uncertainty.ratio_intervals import Interval, Units, units_of
 from omnibench.registry import calibrators
 from omnibench.report.blocks import LegendItem
 from omnibench.report.style import REFERENCE, SYMBOLS, THEORETICAL, colours
@@ -39,7 +40,8 @@ class DatasetView:
 
     warnings: warnings of the whole comparison. styles: styles by label, the same in the whole report. design_costs:
     mean cost of the design values on each split that has trajectories. design_errors: final pose errors (Z, 3) of the
-    design matrix on each such split, m, m, rad.
+    design matrix on each such split, m, m, rad. units: what the intervals of each such split rest on. held_out: what
+    held-out runs say of the best calibration, if there is one.
     """
 
     name: str
@@ -52,6 +54,8 @@ class DatasetView:
     styles: Mapping[str, LegendItem]
     design_costs: Mapping[Split, Interval]
     design_errors: Mapping[Split, Array]
+    units: Mapping[Split, Units]
+    held_out: EntryVerdict | None
 
     @property
     def splits(self) -> tuple[Split, ...]:
@@ -133,6 +137,12 @@ def _view(result: ComparisonResult, name: str, styles: Mapping[str, LegendItem])
         styles=styles,
         design_costs=result.design_costs.get(name, {}),
         design_errors={split: final_errors(design, dataset.split(split)) for split in SPLITS if dataset.split(split)},
+        units={
+            split: units_of(dataset.split(split), result.config.bootstrap.unit)
+            for split in SPLITS
+            if dataset.split(split)
+        },
+        held_out=result.held_out.get(name),
     )
 
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from omnibench.compare.plan import UNBOUNDED
 from omnibench.compare.report.view import THEORETICAL_NAME, THEORETICAL_STYLE, DatasetView
-from omnibench.compare.result import EntryStatistics, Interval, RunRecord
+from omnibench.compare.result import EntryStatistics, RunRecord
 from omnibench.data.dataset import Split
+from omnibench.fit.uncertainty.ratio_intervals import Interval
 from omnibench.registry import costs
 from omnibench.report.blocks import Cell
 from omnibench.report.numbers import NOTHING, decimals_for, fixed, percent, significant, span
+
+NO_INTERVAL = "no interval"
 
 
 def improvement_in_words(entry: EntryStatistics, split: Split, decimals: int) -> tuple[str, str]:
@@ -16,7 +19,21 @@ def improvement_in_words(entry: EntryStatistics, split: Split, decimals: int) ->
     share = entry.improvement(split)
     if share is None:
         return NOTHING, ""
-    return percent(share.value, decimals), f"{span(100 * share.low, 100 * share.high, 1)} %"
+    if share.known is None:
+        return percent(share.value, decimals), NO_INTERVAL
+    return percent(share.value, decimals), f"{span(100 * share.known[0], 100 * share.known[1], 1)} %"
+
+
+def interval_basis(view: DatasetView, split: Split) -> str:
+    """The basis of a split's intervals, in words: ``bootstrap over 36 commands``."""
+    return view.units[split].words
+
+
+def interval_in_words(interval: Interval | None, decimals: int) -> str:
+    """An interval; empty where there is no value."""
+    if interval is None:
+        return ""
+    return NO_INTERVAL if interval.known is None else span(*interval.known, decimals)
 
 
 def level_in_words(view: DatasetView) -> str:
@@ -60,9 +77,12 @@ def position_unit(*errors: float) -> tuple[float, str, int]:
 
 def difference_in_words(difference: Interval) -> tuple[str, str]:
     """A difference and its interval, with decimals that show two digits of the larger end."""
-    largest = max(abs(difference.low), abs(difference.high))
+    low, high = difference.known or (difference.value, difference.value)
+    largest = max(abs(low), abs(high))
     if 0 < largest < 1e-5:
-        value, low, high = (significant(v, 2, signed=True) for v in (difference.value, difference.low, difference.high))
-        return value, f"{low} to {high}"
-    digits = max(4, decimals_for(largest, 2))
-    return fixed(difference.value, digits, signed=True), span(difference.low, difference.high, digits, signed=True)
+        value, *ends = (significant(each, 2, signed=True) for each in (difference.value, low, high))
+        between = " to ".join(ends)
+    else:
+        digits = max(4, decimals_for(largest, 2))
+        value, between = fixed(difference.value, digits, signed=True), span(low, high, digits, signed=True)
+    return value, NO_INTERVAL if difference.known is None else between

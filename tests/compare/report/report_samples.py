@@ -16,7 +16,7 @@ from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
 from omnibench.compare.report.comparison_report import comparison_document
 from omnibench.compare.result import ComparisonResult, EntryStatistics
 from omnibench.compare.scoring import score
-from omnibench.compare.statistics import design_costs, entry_statistics
+from omnibench.compare.statistics import design_costs, entry_statistics, held_out_verdicts
 from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
 from omnibench.fit.calibrator import RunResult, run_calibrator
@@ -68,15 +68,17 @@ def run(chosen: CompareConfig, datasets: Mapping[str, Dataset] | None = None) ->
     loaded = dict(datasets or load_datasets(chosen))
     plan = make_plan(chosen, loaded)
     scored, certificates = certify(plan, score(plan, [solve(planned) for planned in plan], loaded))
+    entries = entry_statistics(scored, chosen.bootstrap)
     return ComparisonResult(
         config=chosen,
         output=Path("results"),
         datasets=loaded,
         runs=scored,
-        statistics=entry_statistics(scored, chosen.bootstrap),
+        statistics=entries,
         design_costs=design_costs(scored, chosen.bootstrap),
         certificates=certificates,
         uncertainties={},
+        held_out=held_out_verdicts(entries, loaded, chosen.bootstrap),
         environment=environment(),
         warnings=(),
     )

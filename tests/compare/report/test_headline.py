@@ -10,7 +10,9 @@ import pytest
 from report_page import Page
 from report_samples import APR02, config, flower, page, run, statistics, usual
 
-from omnibench.compare.result import ComparisonResult, Interval
+from omnibench.compare.result import ComparisonResult
+from omnibench.data.dataset import make_dataset
+from omnibench.fit.uncertainty.ratio_intervals import Interval
 from omnibench.robot.kinematics import Robot
 
 
@@ -105,8 +107,31 @@ def test_no_command_is_listed_where_the_best_is_better_on_all(report: Page) -> N
     assert "worse than the design values" not in report.text
 
 
-def test_repeated_commands_are_said_to_make_the_intervals_too_narrow_for_others(report: Page) -> None:
-    assert report.text.count("for commands that were not driven here the spread is larger") == 1
+def test_intervals_over_runs_are_said_to_be_too_narrow_where_commands_are_repeated(
+    report: Page, tmp_path: Path
+) -> None:
+    told = page(run(config(calibrators=["closed_form"], seeds=[1], bootstrap={"unit": "run"})), tmp_path)
+    assert told.text.count("commands that were not driven here the spread is larger") == 1
+    assert "bootstrap over 16 runs" in told.text
+    assert "the spread is larger" not in report.text
+    assert "Student's t over 8 commands" in report.text
+
+
+def test_one_validation_run_gives_no_interval_and_no_best(tmp_path: Path) -> None:
+    usual_data = usual().datasets["flower"]
+    first = usual_data.split("validation")[0]
+    few = make_dataset("few", usual_data.robot, 0.01, [*usual_data.split("train"), first], simulated=True)
+    told = page(run(config(), {"flower": few}), tmp_path)
+    assert "Which entry is best cannot be said (no interval from 1 run)" in told.text
+    assert "95 % interval" not in told.text.split("Costs")[0]
+    assert "undecided: 1 run cannot show it, hold out 3 or more" in told.text
+    assert told.row("Entries over their seeds", "random_search")[-1] == "undecided | no interval from 1 run"
+    assert told.row("Cost of 1 trajectory, validation", "closed_form")[-1].endswith("no interval")
+
+
+def test_what_held_out_runs_say_stands_under_the_result(report: Page) -> None:
+    assert "closed_form, held out (16 runs): " in report.text
+    assert "better than the design" in report.text
 
 
 def test_commands_driven_once_make_no_such_remark(tmp_path: Path) -> None:
