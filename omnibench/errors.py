@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+_LONGEST = 2000  # characters of a message; a plug-in's may have millions (chosen: a screen of a terminal)
+
 
 def one_line(text: str) -> str:
-    """A text as one line of printable characters, which any terminal and any file can hold."""
+    """A text as one line of printable characters, which any terminal and any file can hold; a long one is cut."""
     line = " ".join(text.split())
+    if len(line) > _LONGEST:
+        line = f"{line[:_LONGEST]} ... ({len(line) - _LONGEST:,} more characters)"
     return line if line.isprintable() else "".join(letter if letter.isprintable() else "?" for letter in line)
 
 

@@ -50,7 +50,8 @@ def compare(
     for name, entry in result.held_out.items():
         print_verdict(entry.verdict, f"{name}, {entry.label}: ")
     typer.echo(f"report: {result.output / 'report.html'}")
-    if all(run.matrix is None for run in result.runs):
+    if result.every_search_failed:
+        typer.echo(f"every search failed, the first: {result.failures[0]}", err=True)
         raise typer.Exit(1)
 
 

@@ -19,6 +19,7 @@ from omnibench.fit.parameterisation import FittedParameter, ParameterisationName
 from omnibench.fit.problem import Improvement
 from omnibench.fit.uncertainty.ratio_intervals import Interval, Units
 from omnibench.fit.uncertainty.uncertainty import Uncertainty
+from omnibench.registry import calibrators
 from omnibench.robot.calibration import HeldOutVerdict, Row
 from omnibench.robot.kinematics import Array
 
@@ -188,3 +189,18 @@ class ComparisonResult:
     held_out: Mapping[str, EntryVerdict]
     environment: Environment
     warnings: tuple[str, ...]
+
+    @property
+    def every_search_failed(self) -> bool:
+        """True if none of the calibrators that fit to data, or none of all if there are no such, gave an answer."""
+        fitted = [run for run in self.runs if calibrators.entry(run.record.calibrator).cls.bounded]
+        return all(run.matrix is None for run in fitted or self.runs)
+
+    @property
+    def failures(self) -> list[str]:
+        """A line for every run without an answer: data set, entry, seed, outcome and reason."""
+        return [
+            f"{record.dataset} {record.label} seed {record.seed}: {record.outcome}: {record.reason}"
+            for record in (run.record for run in self.runs)
+            if record.matrix is None
+        ]

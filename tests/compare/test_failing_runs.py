@@ -173,6 +173,21 @@ def test_when_everything_fails_there_are_results_and_exit_code_1(command: Comman
     assert (tmp_path / "out" / "report.html").is_file()
 
 
+@pytest.mark.usefixtures("registries_as_before")
+def test_when_every_search_fails_beside_the_design_values_the_exit_code_is_1_and_a_long_message_is_cut(
+    command: Command, tmp_path: Path
+) -> None:
+    body = "raise ValueError(5_000_000 * 'x')"
+    plugins = write_plugin(tmp_path / "plugins", "shouts", CALIBRATOR.format(name="shouts", body=body))
+    config = write_config(tmp_path, plugins=[str(plugins)], calibrators=["theoretical", "shouts"])
+    run = command("compare", config, "--output", tmp_path / "out")
+    assert run.returncode == 1
+    assert "every search failed, the first: flower shouts seed 1: failed: ValueError: xxx" in run.stderr
+    assert "more characters)" in rows(tmp_path / "out")["shouts"]["reason"]
+    assert max(map(len, (run.stdout + run.stderr).splitlines())) < 3000
+    assert (tmp_path / "out" / "report.html").stat().st_size < 8_000_000
+
+
 @pytest.mark.parametrize(
     ("changes", "name"),
     [

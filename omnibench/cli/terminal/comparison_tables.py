@@ -23,7 +23,5 @@ def print_result(console: Console, result: ComparisonResult) -> None:
             console.print()
             print_table(console, table)
         console.print()
-    for record in (run.record for run in result.runs):
-        if record.matrix is None:
-            title = f"{record.dataset} {record.label} seed {record.seed}"
-            console.print(f"no answer: {title}: {record.outcome}: {record.reason}", soft_wrap=True)
+    for failure in result.failures:
+        console.print(f"no answer: {failure}", soft_wrap=True)

@@ -55,6 +55,8 @@ class ClosedForm(Calibrator):
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """The optimum in the box. ConfigError for another parameterisation or a cost that is no sum of norms."""
+        from omnibench.fit.sum_of_norms import SolverError
+
         if not isinstance(problem.parameterisation, MatrixElements):
             raise ConfigError("closed_form works on the matrix parameterisation; search the geometry with another")
         if not isinstance(problem.objective, SumOfNorms):
@@ -65,7 +67,10 @@ class ClosedForm(Calibrator):
         for count in range(1, self.options.programs + 1):
             if cost < _NO_ERROR:
                 return Solution(vector, f"no error is left after {count - 1} cone programs")
-            step = cone_program(problem, problem.objective, vector).step(shares)
+            try:
+                step = cone_program(problem, problem.objective, vector).step(shares)
+            except SolverError as error:
+                return Solution(vector, _stopped(problem, problem.objective, cost, error, count), converged=False)
             before = problem.matrix(vector)
             vector, cost, descended = _descend(problem, vector, cost, step)
             if not descended:
@@ -83,6 +88,16 @@ class ClosedForm(Calibrator):
         """The vector of lowest cost."""
         costs = problem.cost(np.array(vectors))
         return vectors[int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))]
+
+
+def _stopped(problem: CalibrationProblem, objective: SumOfNorms, cost: float, error: Exception, count: int) -> str:
+    """The reason of an answer for which the solver finds no better one: usually errors as few as the numbers fitted."""
+    errors = len(problem.reference) * sum(map(bool, objective.weights))
+    fitted = int(problem.free.sum())
+    reason = f"{error} at a cost of {cost:.1e} in cone program {count}"
+    if errors < 2 * fitted:
+        reason += f": {errors} errors for {fitted} numbers are met almost exactly, record more runs"
+    return reason
 
 
 def linear_start(problem: CalibrationProblem) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -231,3 +232,21 @@ def test_a_cost_that_is_no_sum_of_norms_is_refused_in_words() -> None:
     result = closed_form(make_problem(cost="largest"))
     assert (result.outcome, result.vector) == (Outcome.FAILED, None)
     assert result.reason == "closed_form needs a cost that is a sum of norms, which largest is not"
+
+
+def test_five_runs_that_hardly_scatter_have_an_answer_and_say_why_the_solver_stopped() -> None:
+    runs = synthetic_trajectories(synthetic_robot(3), "arc")
+    reasons = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        few = [
+            replace(
+                run, poses=run.poses + np.vstack([np.zeros(3), 1e-5 * rng.standard_normal((len(run.poses) - 1, 3))])
+            )
+            for run in (runs[index] for index in rng.choice(len(runs), 5, replace=False))
+        ]
+        result = closed_form(make_problem(few, cost="final_position"))
+        assert result.matrix is not None
+        reasons += [] if result.outcome is Outcome.CONVERGED else [result.reason]
+    assert all("10 errors for 9 numbers are met almost exactly, record more runs" in reason for reason in reasons)
+    assert reasons, "no seed stops the solver any more: take one that does"
