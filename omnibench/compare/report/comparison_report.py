@@ -11,6 +11,7 @@ from omnibench.compare.report.headline import result_section
 from omnibench.compare.report.matrices import matrix_section
 from omnibench.compare.report.outcome_tables import outcome_section
 from omnibench.compare.report.path_figures import path_section
+from omnibench.compare.report.robot_section import robot_section
 from omnibench.compare.report.search_figures import search_section
 from omnibench.compare.report.view import SPLIT_NAMES, DatasetView, views
 from omnibench.compare.report.wording import cost_decimals, cost_in_words, improvement_in_words, level_in_words
@@ -84,6 +85,7 @@ def _sections(view: DatasetView, prefix: str) -> tuple[Section, ...]:
         result_section(view),
         cost_section(view),
         error_section(view),
+        *robot_section(view),
         path_section(view),
         *_recording(view),
         search_section(view),

@@ -12,6 +12,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from omnibench.compare.plan import SearchSpace
+from omnibench.compare.report.search_diagram import search_diagram
 from omnibench.compare.report.view import THEORETICAL_STYLE, DatasetView
 from omnibench.compare.result import ScoredRun
 from omnibench.fit.problem import Improvement
@@ -66,7 +67,8 @@ def search_section(view: DatasetView) -> Section:
     figures = [figure(searches, axis) for figure in (_costs, _gaps, _targets) for axis in AXES]
     styles = {course.style.key: course.style for course in drawn}.values()
     legend = (*styles, THEORETICAL_STYLE)
-    return Section("searches", "Searches", (FigureGrid(tuple(figures), legend, 2, _caption(drawn)),))
+    curves = FigureGrid(tuple(figures), legend, 2, _caption(drawn))
+    return Section("searches", "Searches", (curves, search_diagram(view)))
 
 
 @dataclass(frozen=True, eq=False)
