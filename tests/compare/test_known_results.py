@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from commands import CONFIGS, RECORDINGS, Command, compared, omnibench, rows, summary
+from commands import CONFIGS, RECORDINGS, ROOT, Command, compared, omnibench, rows, summary
 
 from omnibench.data.storage import load_dataset
 from omnibench.fit.span import driven_span
@@ -62,6 +62,9 @@ def test_a_real_robot_is_calibrated_as_well_as_was_measured(tmp_path: Path) -> N
     compared(config, tmp_path / "out", "--data", recordings)
     assert summary(tmp_path / "out")["simulated"] == {"omni3": False}
     found = rows(tmp_path / "out")
+    assert f"{100 * found['closed_form']['validation_improvement']:.1f} %" in (ROOT / "README.md").read_text(
+        encoding="utf-8"
+    )
     assert found["closed_form"]["train_position_m"] <= 0.045
     assert np.degrees(found["closed_form"]["train_heading_rad"]) <= 3.8
     assert found["closed_form"]["validation_position_m"] <= 0.11
