@@ -13,13 +13,14 @@ from typing import Literal
 
 import polars as pl
 
-from omnibench.errors import DataError
+from omnibench.errors import ConfigError, DataError
 
 RESULTS = Path("results")  # the folder of results, where the user names none
 TableFormat = Literal["parquet", "csv"]
 # The bytes of a file, or a function that writes it to a path and raises OSError when the disk refuses.
 FileContent = bytes | Callable[[Path], None]
 
+_IS_A_FOLDER = "is a folder; name a file"
 _MORE_SPACE = "free space or choose another place"
 _MORE_RIGHTS = "get permission to write there or choose another place"
 _WAYS_OUT = {
@@ -38,7 +39,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
     DataError names the path when its folder cannot be made or the disk refuses (full, read-only, no permission).
     """
-    path = path.resolve()  # a link goes on pointing to the file
+    path = resolved(path)  # a link goes on pointing to the file
     if path.exists() and not path.is_file():  # a device or a pipe is written to, never replaced
         try:
             yield path
@@ -65,9 +66,41 @@ def replacing(path: Path) -> Iterator[Path]:
                 folder.rmdir()
 
 
+def refuse_existing(*paths: Path | None, force: bool, folders: bool = False) -> None:
+    """Check the files (or ``folders``) that a user named for output, before the work; None: none is named.
+
+    ConfigError in one line: one is there with content and is not to be replaced (``force``). DataError: it is a folder
+    where a file is wanted, or a link that leads to itself.
+    """
+    for path in paths:
+        if path is None:
+            continue
+        if resolved(path).is_dir() and not folders:
+            raise DataError(f"{path}: cannot be written: {_IS_A_FOLDER}")
+        if _holds_something(path) and not force:
+            other = "folder" if folders else "file"
+            raise ConfigError(f"{path} is there already; choose another {other}, or --force to replace it")
+
+
+def resolved(path: Path) -> Path:
+    """The path without links. DataError: it is a link that leads to itself."""
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError):
+        raise DataError(f"{path}: cannot be written: it is a link that leads to itself; choose another place") from None
+
+
+def _holds_something(path: Path) -> bool:
+    """True for a file or a folder with content; devices and pipes hold nothing that writing would destroy."""
+    try:
+        return any(path.iterdir()) if path.is_dir() else path.is_file() and path.stat().st_size > 0
+    except OSError:
+        return False  # whoever writes there says what is wrong
+
+
 def _refused(path: Path, error: OSError) -> DataError:
     if error.errno == EISDIR:
-        return DataError(f"{path}: cannot be written: is a folder; name a file")
+        return DataError(f"{path}: cannot be written: {_IS_A_FOLDER}")
     way_out = _WAYS_OUT.get(error.errno or 0, "choose another place")
     return DataError(f"{path}: cannot be written: {error.strerror or error}; {way_out}")
 
@@ -112,21 +145,24 @@ def remove(path: Path) -> None:
         raise DataError(f"{path}: cannot be removed: {error.strerror or error}; remove it by hand") from None
 
 
-def check_results_folder(folder: Path, mark: str, kind: str) -> None:
+def check_results_folder(folder: Path, mark: str, kind: str, *, force: bool = False) -> None:
     """DataError unless ``folder`` is new, empty, or holds earlier results of the same ``kind`` (comparison, discovery).
 
-    mark: first line of the config.yaml in such results, which tells it from somebody else's config.yaml.
+    mark: how the config.yaml in such results begins, which tells it from somebody else's config.yaml. force: write
+    beside other files and replace those of the same names.
     """
-    if folder.is_file():
+    if resolved(folder).is_file():
         raise DataError(f"{folder}: is a file; name a folder for the results")
-    if not folder.is_dir() or not any(folder.iterdir()):
+    if force or not _holds_something(folder):
         return
     try:
         ours = (folder / "config.yaml").read_text(encoding="utf-8").startswith(mark)
     except (OSError, UnicodeDecodeError):
         ours = False
     if not ours:
-        raise DataError(f"{folder}: holds other files; name a new folder, or one of an earlier {kind}")
+        raise DataError(
+            f"{folder}: holds other files; name a new folder, or one of an earlier {kind}, or --force to write there"
+        )
 
 
 def new_results_folder(parent: Path) -> Path:

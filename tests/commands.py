@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CONFIGS = ROOT / "configs"
 RECORDINGS = ROOT.parent / "shared" / "data"
 COMMAND = (sys.executable, "-m", "omnibench")
-ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", "OMNIBENCH_PLUGINS": "none"}
 
 # What every plug-in file of the tests begins with.
 PLUGIN_IMPORTS = """

@@ -10,6 +10,7 @@ import typer
 from omnibench.cli.options import (
     CalibrationFile,
     DatasetFolder,
+    Force,
     Json,
     Plugins,
     Settings,
@@ -53,6 +54,7 @@ def calibrate(
         typer.Option(help="Motions hardly driven in the data: keep their design values, or fit them all the same."),
     ] = "keep",
     settings: Settings = None,
+    force: Force = False,
     plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
@@ -64,6 +66,7 @@ def calibrate(
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings
     from omnibench.data.storage import load_dataset
+    from omnibench.files import refuse_existing
     from omnibench.fit.calibrate import calibrate as fit
     from omnibench.fit.problem import Budget
     from omnibench.registry import calibrators, costs
@@ -74,6 +77,7 @@ def calibrate(
     costs.entry(cost, "--cost")
     if output is None and not as_json:
         raise ConfigError("say where the calibration goes: -o calibration.yaml")
+    refuse_existing(output, force=force)
     recordings = load_dataset(dataset)
     with redirect_stdout(sys.stderr), ProgressDisplay() as watch:
         run = fit(
@@ -183,10 +187,11 @@ def export(
     calibration: CalibrationFile,
     to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="ros2_controllers or c_header.")],
     output: Annotated[Path | None, output_option("File or folder to write to. Default: standard output.")] = None,
+    force: Force = False,
     plugins: Plugins = None,
 ) -> None:
     """Convert a calibration for ROS 2 controllers or C programs."""
-    from omnibench.files import write_text
+    from omnibench.files import refuse_existing, write_text
     from omnibench.robot.calibration import read_calibration
     from omnibench.robot.export.formats import export_calibration
 
@@ -197,5 +202,6 @@ def export(
         typer.echo(exported.text, nl=False)
     else:
         file = output / exported.file_name if output.is_dir() else output
+        refuse_existing(file, force=force)
         write_text(file, exported.text)
         typer.echo(f"{to}: {file}")

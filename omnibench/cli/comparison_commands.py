@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from omnibench.cli.options import output_option
+from omnibench.cli.options import Force, output_option
 from omnibench.cli.terminal.console import make_console, print_verdict, warn
 from omnibench.errors import ConfigError
 
@@ -25,6 +25,7 @@ def compare(
             "--data", metavar="[NAME=]PATH", help="Where the recordings of the config's data set NAME are on this disk."
         ),
     ] = None,
+    force: Force = False,
     plugins: Annotated[
         list[Path] | None,
         typer.Option("--plugins", metavar="DIR", help="Folder of plug-ins besides the config's; may be repeated."),
@@ -44,7 +45,7 @@ def compare(
     folders = [*comparison.plugins, *(folder.resolve() for folder in plugins or [])]
     comparison = comparison.model_copy(update={"plugins": tuple(dict.fromkeys(folders))})
     with ProgressDisplay() as watch:
-        result = run_comparison(comparison, output, watch)
+        result = run_comparison(comparison, output, watch, force=force)
     warn(result.warnings)
     print_result(make_console(), result)
     for name, entry in result.held_out.items():

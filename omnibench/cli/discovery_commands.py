@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from omnibench.cli.options import DatasetFolder, Json, Plugins, load_given_plugins, output_option
+from omnibench.cli.options import DatasetFolder, Force, Json, Plugins, load_given_plugins, output_option
 from omnibench.cli.terminal.console import make_console, print_json, warn
 
 discovery_app = typer.Typer()
@@ -29,6 +29,7 @@ def discover(
         typer.Option("--unknown-term", help="If no known effect fits, close the gap with a smooth function instead."),
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,
+    force: Force = False,
     plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
@@ -50,7 +51,15 @@ def discover(
     load_given_plugins(plugins)
     for name in without or ():
         effects.entry(name, "--without")
-    check_output(output)
+    options = DiscoverOptions(
+        dataset=str(dataset),
+        model=None if model is None else str(model),
+        without=tuple(without or ()),
+        unknown_term=unknown_term,
+        seed=seed,
+        plugins=tuple(map(str, plugins or ())),
+    )
+    check_output(output, options, force=force)
     start = None if model is None else read_calibration(model)
     recordings = load_dataset(dataset)
     with redirect_stdout(sys.stderr), ProgressDisplay() as watch:
@@ -63,15 +72,7 @@ def discover(
             calibration=start,
         )
         watch(Progress("writing the report"))
-        options = DiscoverOptions(
-            dataset=str(dataset),
-            model=None if model is None else str(model),
-            without=tuple(without or ()),
-            unknown_term=unknown_term,
-            seed=seed,
-            plugins=tuple(map(str, plugins or ())),
-        )
-        folder = write_discovery(discovery, options, output)
+        folder = write_discovery(discovery, options, output, force=force)
     warn(recordings.warnings)
     if as_json:
         return print_json(discovery_document(discovery, folder))

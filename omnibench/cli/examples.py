@@ -9,7 +9,7 @@ from pathlib import Path
 
 from omnibench.config import Model, read_model
 from omnibench.errors import ConfigError, UnknownNameError
-from omnibench.files import write_files
+from omnibench.files import refuse_existing, write_files
 
 
 class Example(Model):
@@ -43,25 +43,27 @@ def find_example(name: str) -> Example:
     return known[name]
 
 
-def write_example(example: Example, folder: Path) -> list[Path]:
+def write_example(example: Example, folder: Path, *, force: bool = False) -> list[Path]:
     """Write the example into ``folder`` and return what was written; a file that is there and equal is left as it is.
 
-    ConfigError in one line: a file that differs is there, or all of the example is. DataError: the disk refuses.
+    force: replace what is there. ConfigError in one line: a file that differs is there, or all of the example is.
+    DataError: the disk refuses.
     """
     wanted = {folder / file: content for file, content in _contents(example)}
     for path, content in wanted.items():
-        if path.exists() and (not path.is_file() or path.read_bytes() != content):
-            raise ConfigError(f"{path} is there already and is not overwritten; choose another folder")
-    missing = {path: content for path, content in wanted.items() if not path.exists()}
+        if path.exists() and (not path.is_file() or path.read_bytes() != content) and not force:
+            raise ConfigError(f"{path} is there already; choose another folder, or --force to replace it")
+    missing = {path: content for path, content in wanted.items() if force or not path.exists()}
     recording = folder / example.recording if example.recording else None
-    if recording is not None and recording.exists():
-        raise ConfigError(f"{recording} is there already and is not overwritten; choose another folder")
+    refuse_existing(recording, force=force, folders=True)
     if not missing and recording is None:
-        raise ConfigError(f"{folder}: all of the example {example.name!r} is there already; choose another folder")
+        raise ConfigError(
+            f"{folder}: all of the example {example.name!r} is there already; choose another folder, or --force"
+        )
     write_files(missing)
     if recording is None:
         return list(missing)
-    _simulate(folder / example.files[0], recording)
+    _simulate(folder / example.files[0], recording, force)
     return [*missing, recording]
 
 
@@ -78,7 +80,7 @@ def _contents(example: Example) -> list[tuple[str, bytes]]:
     return [(file.relative_to(bundled).as_posix(), file.read_bytes()) for file in files]
 
 
-def _simulate(config: Path, output: Path) -> None:
+def _simulate(config: Path, output: Path, force: bool) -> None:
     from omnibench.simulate.simulation_request import SimulationRequest
 
-    SimulationRequest(output, config).write("csv")
+    SimulationRequest(output, config, force=force).write("csv")

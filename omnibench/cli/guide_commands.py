@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from omnibench.cli.options import output_option
+from omnibench.cli.options import Force, output_option
 from omnibench.errors import ConfigError
 
 guide_app = typer.Typer()
@@ -34,24 +34,26 @@ def guide(
 def example(
     name: Annotated[str | None, typer.Argument(help="One of the list that is shown without it.")] = None,
     output: Annotated[Path | None, output_option("Folder to write to.", metavar="DIR")] = None,
+    force: Force = False,
 ) -> None:
     """Write an example to begin with, or list the examples.
 
     An example is a config with all that it needs, or a small recording.
     """
     from omnibench.cli.examples import find_example, write_example
+    from omnibench.files import resolved
 
     if name is None:
         return _list_examples()
     chosen = find_example(name)
     if output is None:
         raise ConfigError(f"say where the example goes: omnibench example {name} -o DIR")
-    for path in write_example(chosen, output):
+    for path in write_example(chosen, output, force=force):
         typer.echo(f"written: {path}")
     if chosen.note:
         typer.echo(f"note: {chosen.note}")
     typer.echo("to go on, type:")
-    if output.resolve() != Path.cwd():
+    if resolved(output) != Path.cwd():
         typer.echo(f"  cd {shlex.quote(str(output))}")
     for command in chosen.commands:
         typer.echo(f"  {command}")

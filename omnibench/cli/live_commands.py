@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from omnibench.cli.options import Plugins, load_given_plugins, output_option, plugin_folders
+from omnibench.cli.options import Force, Plugins, load_given_plugins, output_option, plugin_folders
 from omnibench.cli.terminal.console import make_console
 from omnibench.errors import ConfigError
 
@@ -168,17 +168,22 @@ def record(
     topics: Annotated[
         list[str] | None, typer.Option("--topic", help="Record only this topic; may be repeated. Default: all.")
     ] = None,
+    force: Force = False,
 ) -> None:
     """Record live topics into MCAP, for Foxglove and rosbags."""
     from omnibench.cli.terminal.recording_status import record as write
+    from omnibench.files import refuse_existing, remove
     from omnibench.live.config import read_live_config
     from omnibench.live.stopping import stop_on_signals
     from omnibench.live.wire.topics import TOPICS
 
+    refuse_existing(output, force=force)
     if len(robots) == 1 and robots[0].endswith((".yaml", ".yml")):
         config = Path(robots[0]) if config is None else config
         robots = [each.name for each in read_live_config(robots[0]).robots]
     with _client(config, connect, profile, "record") as (session, keys), stop_on_signals() as stop:
+        if force and output.is_file():
+            remove(output)
         write(session, keys, robots, output, make_console(), stop, seconds=seconds, topics=topics or tuple(TOPICS))
 
 

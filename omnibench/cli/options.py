@@ -23,6 +23,7 @@ DatasetFolder = Annotated[Path, typer.Argument(help="Data set folder.")]
 CalibrationFile = Annotated[Path, typer.Argument(help="Calibration file.")]
 WhichDataset = Annotated[str | None, typer.Option(help="Name of the data set, if the config has several.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output, and nothing else.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace what is there already.")]
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Set an option, its value in YAML; may be repeated."),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from omnibench.cli.options import Json, Plugins, load_given_plugins
+from omnibench.cli.options import Force, Json, Plugins, load_given_plugins
 from omnibench.cli.terminal.console import make_console, print_json
 from omnibench.errors import ConfigError
 
@@ -63,13 +63,14 @@ def plugin_new(
     folder: Annotated[
         Path, typer.Option("--folder", "-o", "--output", metavar="DIR", help="Folder to write to.")
     ] = Path("plugins"),
+    force: Force = False,
 ) -> None:
     """Write a working plug-in and its test."""
     from omnibench.testing.plugin_files import new_plugin
 
     if effect and kind not in (None, "effect"):
         raise ConfigError(f"--effect and --kind {kind} contradict each other; leave one out")
-    for file in new_plugin(name, "effect" if effect else kind or "calibrator", folder):
+    for file in new_plugin(name, "effect" if effect else kind or "calibrator", folder, force=force):
         typer.echo(f"written: {file}")
     typer.echo(f"check it: omnibench plugin check {folder / name}.py")
 

@@ -7,6 +7,7 @@ import typer
 
 from omnibench.cli.options import (
     DatasetFolder,
+    Force,
     Json,
     Plugins,
     Settings,
@@ -31,6 +32,7 @@ def import_(
     output: Annotated[Path, output_option("Data set folder to write.")],
     settings: Settings = None,
     table_format: TableFormat = "parquet",
+    force: Force = False,
     plugins: Plugins = None,
 ) -> None:
     """Convert recordings into a data set.
@@ -38,14 +40,17 @@ def import_(
     Recordings with laser scans but without reference poses get these by SLAM.
     """
     from omnibench.config import parse_settings
-    from omnibench.data.storage import save_dataset
+    from omnibench.data.storage import check_dataset_folder, save_dataset
+    from omnibench.files import refuse_existing
     from omnibench.registry import importers
     from omnibench.slam.import_dataset import import_dataset
 
     load_given_plugins(plugins)
     importers.entry(importer, "import")
+    check_dataset_folder(output)
+    refuse_existing(output, force=force, folders=True)
     dataset = import_dataset(importer, source, parse_settings(settings))
-    save_dataset(dataset, output, table_format)
+    save_dataset(dataset, output, table_format, overwrite=force)
     warn(dataset.warnings)
     typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {output}")
 
@@ -88,6 +93,7 @@ def design(
     output: Annotated[
         Path | None, output_option("Folder for report.html and design.json. Default: nothing is written.")
     ] = None,
+    force: Force = False,
     plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
@@ -99,9 +105,11 @@ def design(
     from omnibench.config import to_json
     from omnibench.design.design import design_experiment
     from omnibench.design.report.design_report import design_document
-    from omnibench.files import write_text
+    from omnibench.files import refuse_existing, write_text
     from omnibench.report.render import write_document
 
+    if output is not None:
+        refuse_existing(output / "design.json", output / "report.html", force=force)
     load_given_plugins(plugins)
     chosen = design_experiment(
         source, use=use, per=per, runs=runs, repetitions=repetitions, dataset=dataset, integration=integration
@@ -141,6 +149,7 @@ def slam(
     ] = None,
     settings: Settings = None,
     table_format: TableFormat = "parquet",
+    force: Force = False,
     plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
@@ -151,6 +160,7 @@ def slam(
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.cli.terminal.slam_summary import print_slam
     from omnibench.config import parse_settings, validate
+    from omnibench.files import refuse_existing
     from omnibench.progress import Progress
     from omnibench.report.recording.section import recording_document
     from omnibench.report.render import write_document
@@ -161,8 +171,9 @@ def slam(
     given: dict[str, Any] = {} if start is None else {"start": start}
     given |= {"deskew": False} if no_deskew else {}
     request = SlamRequest(
-        dataset, output, validate(SlamOptions, parse_settings(settings) | given, "slam --set"), model, truth
+        dataset, output, validate(SlamOptions, parse_settings(settings) | given, "slam --set"), model, truth, force
     )
+    refuse_existing(report, force=force)
     if output is None and report is None and not as_json:
         raise ConfigError("say where the poses go: -o DATASET; or ask for figures alone: --json, --report FILE.html")
     with ProgressDisplay() as watch:
@@ -209,6 +220,7 @@ def simulate(
     report: Annotated[
         Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of the recording and the truth.")
     ] = None,
+    force: Force = False,
     plugins: Plugins = None,
 ) -> None:
     """Simulate recordings of a robot whose true model is known.
@@ -217,13 +229,15 @@ def simulate(
     """
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.cli.terminal.slam_summary import print_slam_accuracy
+    from omnibench.files import refuse_existing
     from omnibench.progress import Progress
     from omnibench.report.recording.section import recording_document
     from omnibench.report.render import write_document
     from omnibench.simulate.simulation_request import SimulationRequest
 
     hidden = tuple(effects or ())
-    request = SimulationRequest(output, config, truth, dataset, hidden, like, model, noise, seed)
+    request = SimulationRequest(output, config, truth, dataset, hidden, like, model, noise, seed, force)
+    refuse_existing(report, force=force)
     load_given_plugins([*(plugins or []), *request.plugins] or None)
     with ProgressDisplay() as watch:
         made = request.write(table_format, watch)

@@ -32,15 +32,25 @@ from omnibench.robot.calibration import Calibration, Provenance, Row, covariance
 _MARK = "# The effective config of a comparison; the results beside it were made with it."
 
 
-def prepare_output(config: CompareConfig, folder: Path | None) -> Path:
+def check_output(folder: Path | None, config: CompareConfig, *, force: bool = False) -> None:
+    """Check the folder of results before the work.
+
+    DataError: it is a file, or it holds anything but an earlier comparison of the same name, and not ``force``.
+    """
+    if folder is not None:
+        check_results_folder(folder, _MARK, "comparison", force=force)
+        if not force:
+            _check_name(folder, config)
+
+
+def prepare_output(config: CompareConfig, folder: Path | None, *, force: bool = False) -> Path:
     """The folder to write to, with the effective config in it.
 
-    Default: ``results/<config name>/<time>``, with a link ``latest``. DataError when it cannot be written to, or
-    holds another comparison.
+    Default: ``results/<config name>/<time>``, with a link ``latest``. DataError when it cannot be written to, or as
+    ``check_output`` does.
     """
+    check_output(folder, config, force=force)
     chosen = folder or new_results_folder(RESULTS / config.name)
-    check_results_folder(chosen, _MARK, "comparison")
-    _check_name(chosen, config)
     write_text(chosen / "config.yaml", f"{_MARK}\n{to_yaml(config)}")
     if folder is None:
         link_latest(chosen)
@@ -52,7 +62,7 @@ def _check_name(folder: Path, config: CompareConfig) -> None:
         return
     name = read_yaml(folder / "config.yaml").get("name")
     if name != config.name:
-        raise DataError(f"{folder}: holds the comparison {name!r}; name another folder for {config.name!r}")
+        raise DataError(f"{folder}: holds the comparison {name!r}; name another folder for {config.name!r}, or --force")
 
 
 def write_results(result: ComparisonResult) -> None:

@@ -11,7 +11,7 @@ from omnibench.compare.certificates import certify
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.effective_config import effective_config, load_calibrators
 from omnibench.compare.execute import PRELOAD, execute
-from omnibench.compare.output import prepare_output, write_results
+from omnibench.compare.output import check_output, prepare_output, write_results
 from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
 from omnibench.compare.report.comparison_report import comparison_document
 from omnibench.compare.result import ComparisonResult, ScoredRun
@@ -32,23 +32,24 @@ from omnibench.slam.slam_options import PRELOAD as SLAM_PRELOAD
 
 
 def run_comparison(
-    config: CompareConfig, output: Path | None = None, progress: Reporter = no_progress
+    config: CompareConfig, output: Path | None = None, progress: Reporter = no_progress, *, force: bool = False
 ) -> ComparisonResult:
     """Run every calibrator of the config on every data set, score the answers, and write results and report.
 
     output: the folder of results; runs whose results are there are not repeated. progress: told of the making of data
-    sets and of every run.
+    sets and of every run. force: write into a folder with other files, or of a comparison of another name.
 
     ConfigError or DataError: the config, a data set or the folder is unfit, or the disk refuses. Interrupted: Ctrl-C;
     the results of all runs that had ended are kept.
     """
+    check_output(output, config, force=force)
     failures = load_calibrators(config)
     with _naming_failed_plugins(failures):
         config = effective_config(config)
         with one_thread_processes(_preload(config)):  # processes started for simulation serve the calibrators, too
             datasets = load_datasets(config, progress)
     plan = make_plan(config, datasets)
-    folder = prepare_output(config, output)
+    folder = prepare_output(config, output, force=force)
     store = ResultStore(folder / "runs", RunResult)
     with _resumable(plan, store, folder):
         results = execute(plan, store, progress, config.workers or os.cpu_count() or 1)

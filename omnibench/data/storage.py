@@ -19,7 +19,7 @@ from omnibench.data.scan_files import ScansOnDisk, write_scans
 from omnibench.data.scans import Scanner, Scans
 from omnibench.data.table import Table, read_table, table_file
 from omnibench.errors import ConfigError, DataError, nearest
-from omnibench.files import FileContent, TableFormat, encode_table, remove, write_files
+from omnibench.files import FileContent, TableFormat, encode_table, remove, resolved, write_files
 from omnibench.robot.kinematics import Array, Robot
 
 FORMAT: Final = "omnibench-dataset/1"
@@ -86,10 +86,13 @@ def load_dataset(path: Path | str) -> Dataset:
     )
 
 
-def save_dataset(dataset: Dataset, path: Path | str, table_format: TableFormat = "parquet") -> None:
-    """Write a data set folder.
+def save_dataset(
+    dataset: Dataset, path: Path | str, table_format: TableFormat = "parquet", *, overwrite: bool = False
+) -> None:
+    """Write a data set folder. One that holds an earlier state of the data set is replaced.
 
-    DataError when the poses are placeholders, the folder holds something else, or the disk refuses.
+    overwrite: replace any data set. DataError when the poses are placeholders, the folder holds something else or (not
+    ``overwrite``) another data set, by its name or by being simulated, or the disk refuses.
     """
     folder = Path(path)
     if not dataset.referenced:
@@ -98,6 +101,8 @@ def save_dataset(dataset: Dataset, path: Path | str, table_format: TableFormat =
             "omnibench.import_dataset does"
         )
     check_dataset_folder(folder)
+    if not overwrite:
+        _check_origin(folder, dataset)
     tables = {
         "trajectories": pl.DataFrame(
             [_run_row(trajectory) for trajectory in dataset.trajectories], infer_schema_length=None
@@ -124,6 +129,7 @@ def save_dataset(dataset: Dataset, path: Path | str, table_format: TableFormat =
 
 def check_dataset_folder(folder: Path) -> None:
     """DataError in one line when a data set cannot be written there: something else is there, or nobody may write."""
+    resolved(folder)
     if folder.is_file():
         raise DataError(f"{folder}: is a file; name a folder for the data set")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "dataset.yaml").is_file():
@@ -133,6 +139,16 @@ def check_dataset_folder(folder: Path) -> None:
         raise DataError(f"{folder}: cannot be written: {existing} is not a folder; choose another place")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise DataError(f"{folder}: cannot be written: {existing} is read-only; choose another place")
+
+
+def _check_origin(folder: Path, dataset: Dataset) -> None:
+    """DataError: the folder holds another data set."""
+    if not (folder / "dataset.yaml").is_file():
+        return
+    old = _read_header(folder)
+    if (old.name, old.simulated) != (dataset.name, dataset.simulated):
+        kind = "simulated " if old.simulated else ""
+        raise DataError(f"{folder}: holds the {kind}data set {old.name!r}; name another folder, or overwrite=True")
 
 
 def header_of(dataset: Dataset) -> Header:

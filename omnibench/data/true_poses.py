@@ -17,7 +17,7 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.planar import interpolated
 
 TRUTH_FILE = "truth.yaml"
-_NAME = "poses"
+POSES_FILE = "poses.parquet"
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,15 +41,15 @@ def write_true_poses(folder: Path, paths: Mapping[str, TruePath]) -> None:
         )
         for name, path in paths.items()
     ]
-    write_table(folder / f"{_NAME}.parquet", pl.concat(frames))
+    write_table(folder / POSES_FILE, pl.concat(frames))
 
 
 def read_true_poses(folder: Path | str) -> dict[str, TruePath]:
     """The true poses of every run of a truth folder. DataError in one line: there are none, or they are broken."""
     folder = Path(folder)
-    if not (folder / f"{_NAME}.parquet").is_file():
-        raise DataError(f"{folder}: no {_NAME}.parquet; name the truth of a simulated robot with scans")
-    table = read_table(folder, _NAME, ("trajectory", "t", "x", "y", "theta"))
+    if not (folder / POSES_FILE).is_file():
+        raise DataError(f"{folder}: no {POSES_FILE}; name the truth of a simulated robot with scans")
+    table = read_table(folder, Path(POSES_FILE).stem, ("trajectory", "t", "x", "y", "theta"))
     columns = np.column_stack([table.numbers(name) for name in ("t", "x", "y", "theta")])
     names = table.frame["trajectory"].to_numpy()
     return {

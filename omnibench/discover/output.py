@@ -39,19 +39,24 @@ class DiscoverOptions(Model):
     plugins: tuple[str, ...] = ()
 
 
-def check_output(folder: Path | None) -> None:
-    """Raises DataError if ``folder`` is a file, or holds anything but an earlier discovery. For use before the work."""
+def check_output(folder: Path | None, options: DiscoverOptions, *, force: bool = False) -> None:
+    """Check the folder of results before the work.
+
+    DataError: it is a file, or it holds anything but an earlier discovery with these options, and not ``force``.
+    """
     if folder is not None:
-        check_results_folder(folder, _MARK, "discovery")
+        check_results_folder(folder, _config(options), "discovery with the same options", force=force)
 
 
-def write_discovery(discovery: Discovery, options: DiscoverOptions, folder: Path | None = None) -> Path:
+def write_discovery(
+    discovery: Discovery, options: DiscoverOptions, folder: Path | None = None, *, force: bool = False
+) -> Path:
     """Write all files of a discovery and return their folder.
 
-    Default: ``results/<data set name>/<time>``, with a link ``latest``. Raises DataError if the folder cannot be
-    written to or holds other files; it is then left as it was.
+    Default: ``results/<data set name>/<time>``, with a link ``latest``. Raises DataError as ``check_output`` does, or
+    if the folder cannot be written to; it is then left as it was.
     """
-    check_output(folder)
+    check_output(folder, options, force=force)
     chosen = folder or new_results_folder(RESULTS / _folder_name(discovery.dataset.name))
     try:
         write_files(_contents(discovery, options, chosen))
@@ -68,11 +73,10 @@ def write_discovery(discovery: Discovery, options: DiscoverOptions, folder: Path
 
 
 def _contents(discovery: Discovery, options: DiscoverOptions, folder: Path) -> dict[Path, bytes]:
-    config = to_yaml(options)
     texts = {
-        "config.yaml": f"{_MARK}\n{config}",
+        "config.yaml": _config(options),
         "discovery.json": to_json(discovery_document(discovery, folder)) + "\n",
-        "report.html": render(discovery_report(discovery, config)),
+        "report.html": render(discovery_report(discovery, to_yaml(options))),
         CALIBRATION_FILES["extended"]: to_yaml(discovery.extended),
         CALIBRATION_FILES["plain"]: to_yaml(discovery.plain),
     }
@@ -80,6 +84,11 @@ def _contents(discovery: Discovery, options: DiscoverOptions, folder: Path) -> d
     contents = {folder / name: text.encode("utf-8") for name, text in texts.items()}
     contents[folder / "residuals.parquet"] = encode_table(residual_table(discovery), "parquet")
     return contents
+
+
+def _config(options: DiscoverOptions) -> str:
+    """The content of config.yaml."""
+    return f"{_MARK}\n{to_yaml(options)}"
 
 
 def residual_table(discovery: Discovery) -> pl.DataFrame:

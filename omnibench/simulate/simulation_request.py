@@ -10,9 +10,9 @@ from pathlib import Path
 from omnibench.config import to_json, to_yaml
 from omnibench.data.dataset import Dataset
 from omnibench.data.storage import check_dataset_folder, load_dataset, save_dataset
-from omnibench.data.true_poses import TRUTH_FILE, write_true_poses
+from omnibench.data.true_poses import POSES_FILE, TRUTH_FILE, write_true_poses
 from omnibench.errors import ConfigError
-from omnibench.files import TableFormat, write_text
+from omnibench.files import TableFormat, refuse_existing, remove, resolved, write_text
 from omnibench.progress import Reporter, no_progress
 from omnibench.robot.calibration import read_calibration
 from omnibench.simulate.like import simulate_like
@@ -37,7 +37,8 @@ class SimulationRequest:
     """Arguments of ``omnibench simulate``: either ``config``, or ``like`` with ``model``.
 
     effects: to hide besides those of the config, each as YAML. noise: add the calibration's noise (with ``like``).
-    seed: of that noise; default 0. ConfigError in one line: options that exclude each other.
+    seed: of that noise; default 0. force: replace what is there. ConfigError in one line: options that exclude each
+    other.
     """
 
     output: Path
@@ -49,6 +50,7 @@ class SimulationRequest:
     model: Path | None = None
     noise: bool = False
     seed: int | None = None
+    force: bool = False
 
     def __post_init__(self) -> None:
         if self.like is None and self.model is None:
@@ -64,7 +66,7 @@ class SimulationRequest:
             raise ConfigError(f"--like {self.like}: say with --model CALIBRATION by which model")
         else:
             self._check_like()
-        if self.truth is not None and self.truth.resolve().is_relative_to(self.output.resolve()):
+        if self.truth is not None and resolved(self.truth).is_relative_to(resolved(self.output)):
             raise ConfigError("--truth: must be a folder apart from the data set's")
 
     @cached_property
@@ -81,27 +83,37 @@ class SimulationRequest:
     def write(self, table_format: TableFormat = "parquet", watch: Reporter = no_progress) -> WrittenSimulation:
         """Simulate and write the data set; write the truth to its own folder, if one is named.
 
-        OmnibenchError in one line: the config, the recording or the calibration is wrong, or the disk refuses.
+        OmnibenchError in one line: the config, the recording or the calibration is wrong, files are there already, or
+        the disk refuses.
         """
         check_dataset_folder(self.output)
+        refuse_existing(self.output, force=self.force, folders=True)
+        refuse_existing(*self._truth_files, force=self.force)
         if self.config is None:
             assert self.like is not None
             assert self.model is not None
             calibration = read_calibration(self.model)
             dataset = simulate_like(load_dataset(self.like), calibration, (self.seed or 0) if self.noise else None)
-            save_dataset(dataset, self.output, table_format)
+            save_dataset(dataset, self.output, table_format, overwrite=self.force)
             return WrittenSimulation(dataset)
         check_effect_options(self.effects)
         simulation = self.source.simulate(watch)
-        save_dataset(simulation.dataset, self.output, table_format)
+        save_dataset(simulation.dataset, self.output, table_format, overwrite=self.force)
         accuracy = slam_accuracy(simulation.dataset, simulation.paths) if simulation.paths else None
         if self.truth is not None:
             self._write_truth(self.truth, simulation, accuracy)
         return WrittenSimulation(simulation.dataset, simulation, accuracy)
 
+    @property
+    def _truth_files(self) -> list[Path]:
+        """Files of a truth that would be replaced."""
+        return [] if self.truth is None else [self.truth / name for name in (TRUTH_FILE, POSES_FILE, ACCURACY_FILE)]
+
     def _write_truth(self, folder: Path, simulation: Simulation, accuracy: SlamAccuracy | None) -> None:
         write_text(folder / TRUTH_FILE, to_yaml(simulation.truth))
         if accuracy is None:
+            for name in (POSES_FILE, ACCURACY_FILE):  # an earlier truth's
+                remove(folder / name)
             return
         write_true_poses(folder, simulation.paths)
         write_text(folder / ACCURACY_FILE, to_json(accuracy) + "\n")
@@ -117,7 +129,7 @@ class SimulationRequest:
         _refuse(given, "does not go with --like, which takes all from the recording and the calibration")
         if self.seed is not None and not self.noise:
             raise ConfigError("--seed: is for --noise, which is not asked for; add --noise, or leave --seed out")
-        if self.output.resolve() == self.like.resolve():
+        if resolved(self.output) == resolved(self.like):
             raise ConfigError(f"-o {self.output}: is the recording itself; name another folder")
 
 

@@ -11,7 +11,7 @@ from omnibench.data.dataset import Dataset
 from omnibench.data.storage import check_dataset_folder, load_dataset, save_dataset
 from omnibench.data.true_poses import TruePath, read_true_poses, robot_of_truth
 from omnibench.errors import ConfigError, DataError, Interrupted
-from omnibench.files import TableFormat
+from omnibench.files import TableFormat, refuse_existing, resolved
 from omnibench.jobs.result_store import ResultStore
 from omnibench.progress import Reporter, no_progress
 from omnibench.robot.calibration import read_calibration
@@ -44,7 +44,7 @@ class SlamRequest:
 
     dataset: folder of the recording. output: folder to write with the new poses; None: none. model: a calibration file,
     whose odometry the search starts from; None: the design values. truth: the folder that ``simulate --truth`` wrote.
-    ConfigError in one line: the recording would be written over.
+    force: replace the data set that is in ``output``. ConfigError in one line: the recording would be written over.
     """
 
     dataset: Path
@@ -52,9 +52,10 @@ class SlamRequest:
     options: SlamOptions = field(default_factory=SlamOptions)
     model: Path | None = None
     truth: Path | None = None
+    force: bool = False
 
     def __post_init__(self) -> None:
-        if self.output is not None and self.output.resolve() == self.dataset.resolve():
+        if self.output is not None and resolved(self.output) == resolved(self.dataset):
             raise ConfigError(f"-o {self.output}: is the recording itself; name another folder")
         if self.model is not None and self.options.start != "odometry":
             raise ConfigError(f"--model {self.model}: is for --start odometry; leave one of the two out")
@@ -70,6 +71,8 @@ class SlamRequest:
         model = self._model_of(recorded)
         if self.output is not None:
             check_dataset_folder(self.output)
+            going_on = any(_paths_beside(self.output).glob("*.json"))  # stopped before the data set was complete
+            refuse_existing(self.output, force=self.force or going_on, folders=True)
         local = _has_local_terms(model)
         folder = None if local or self.output is None else _paths_beside(self.output)
         with _kept(folder):
@@ -77,7 +80,7 @@ class SlamRequest:
             paths = slam_paths(recorded, self.options, model=model, workers=workers, folder=folder, watch=watch)
             found = with_paths(recorded, paths)
             if self.output is not None:
-                save_dataset(found, self.output, table_format)
+                save_dataset(found, self.output, table_format, overwrite=self.force)
         accuracy = None if truth is None else slam_accuracy(found, truth)
         return SlamResult(found, summarise(recorded, found, paths, accuracy), truth)
 
@@ -109,7 +112,7 @@ def _has_local_terms(model: OdometryModel | None) -> bool:
 
 
 def _paths_beside(output: Path) -> Path:
-    named = output if output.name not in ("", "..") else output.resolve()
+    named = output if output.name not in ("", "..") else resolved(output)
     return named.with_name(f"{named.name}.slam-paths")
 
 

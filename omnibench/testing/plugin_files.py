@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 
 from omnibench.config import validate
 from omnibench.errors import ConfigError, PluginError, UnknownNameError
-from omnibench.files import write_text
+from omnibench.files import refuse_existing, write_text
 from omnibench.registry import REGISTRIES, Entry, Registry, calibrators, costs, effects, importers, registered_from
 from omnibench.testing.calibrator_cases import CalibratorConformance
 from omnibench.testing.conformance import CaseOutcome, CaseResult, Conformance, load_plugin, run_cases
@@ -50,11 +50,13 @@ class CheckReport:
         return tuple(result for result in self.results if not result.passed)
 
 
-def new_plugin(name: str, kind: str = "calibrator", folder: Path | str = "plugins") -> list[Path]:
+def new_plugin(
+    name: str, kind: str = "calibrator", folder: Path | str = "plugins", *, force: bool = False
+) -> list[Path]:
     """Write a working plug-in ``<name>.py`` and its test ``test_<name>.py`` into ``folder``; return the files written.
 
-    ConfigError: ``kind`` is unknown, ``name`` is no identifier in lower case or is taken, or a file exists already.
-    DataError: a file cannot be written.
+    force: replace files that exist. ConfigError: ``kind`` is unknown, ``name`` is no identifier in lower case or is
+    taken, or a file exists already. DataError: a file cannot be written.
     """
     if kind not in PLUGIN_KINDS:
         raise UnknownNameError("kind of plug-in", kind, PLUGIN_KINDS)
@@ -63,9 +65,7 @@ def new_plugin(name: str, kind: str = "calibrator", folder: Path | str = "plugin
         Path(folder) / f"{name}.py": f"{kind}.py.txt",
         Path(folder) / f"test_{name}.py": f"test_{kind}.py.txt",
     }
-    for path in targets:
-        if path.exists():
-            raise ConfigError(f"{path} is there already; choose another name or folder, or remove it")
+    refuse_existing(*targets, force=force)
     _check_free(name, kind)
     texts = {path: (_TEMPLATES / template).read_text(encoding="utf-8") for path, template in targets.items()}
     title = "".join(part.capitalize() for part in name.split("_"))

@@ -217,7 +217,7 @@ def test_a_data_set_that_does_not_fit_leaves_the_one_that_was_there(
 ) -> None:
     data = shutil.copytree(prepared.data, tmp_path / "data")
     with disk_that_takes(600):
-        run = command("simulate", prepared.config, "-o", data, "--format", "csv")
+        run = command("simulate", prepared.config, "-o", data, "--format", "csv", "--force")
     assert_refused(run, FULL)
     assert load_dataset(data).hash == load_dataset(prepared.data).hash
 

@@ -145,9 +145,21 @@ def test_a_data_set_is_replaced_by_one_in_either_format(good: dict[Format, Path]
     folder = tmp_path / "dataset"
     shutil.copytree(good[fmt], folder)
     other: Format = "csv" if fmt == "parquet" else "parquet"
-    save_dataset(make_dataset("new", APR_02, 0.1, [a_trajectory("new", 0.1)]), folder, other)
+    save_dataset(make_dataset("new", APR_02, 0.1, [a_trajectory("new", 0.1)]), folder, other, overwrite=True)
     assert [run.id for run in load_dataset(folder).trajectories] == ["new"]
     assert {file.suffix for file in folder.iterdir()} == {f".{other}", ".yaml"}
+
+
+def test_another_data_set_is_not_replaced_unless_asked(good: dict[Format, Path], tmp_path: Path) -> None:
+    folder = tmp_path / "dataset"
+    shutil.copytree(good["csv"], folder)
+    known = everything_known()
+    for other in (replace(known, name="other"), replace(known, simulated=not known.simulated)):
+        with pytest.raises(DataError, match=f"holds the .*data set '{known.name}'; name another folder"):
+            save_dataset(other, folder)
+    assert {file.suffix for file in folder.iterdir()} == {".csv", ".yaml"}
+    save_dataset(known, folder)
+    assert {file.suffix for file in folder.iterdir()} == {".parquet", ".yaml"}
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
@@ -200,7 +212,7 @@ def test_a_full_disk_is_told_in_one_line_and_leaves_the_old_data_set(
     name = "dataset.yaml" if file == "dataset" else f"{file}.{new}"
     (folder / f".{name}.{os.getpid()}.partial").symlink_to("/dev/full")
     with pytest.raises(DataError, match=f"{name}: cannot be written: No space left on device"):
-        save_dataset(make_dataset("new", APR_02, 0.1, [a_trajectory("new", 0.1)]), folder, new)
+        save_dataset(make_dataset("new", APR_02, 0.1, [a_trajectory("new", 0.1)]), folder, new, overwrite=True)
     assert load_dataset(folder).hash == everything_known().hash
     assert sorted(folder.iterdir()) == sorted(folder / source.name for source in good[old].iterdir())
 
