@@ -15,17 +15,25 @@ from omnibench.discover.experiments import experiments_for
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit
 from omnibench.discover.held_out.validation_runs import ValidationRuns
-from omnibench.discover.result import Discovery, Extrapolation, HeldOut, NamedEffect, NotLookedFor, Step, Verdict
+from omnibench.discover.result import (
+    Discovery,
+    Extrapolation,
+    HeldOut,
+    NamedEffect,
+    NotLookedFor,
+    Step,
+    Verdict,
+    few_in_words,
+    is_other_session,
+)
 from omnibench.discover.selection.detectability import Detectability
 from omnibench.discover.selection.model_selection import Selection
 from omnibench.discover.selection.named_effects import candidates_of
 from omnibench.discover.selection.screening import Screening
-from omnibench.discover.verdict import headline_of
+from omnibench.discover.verdict import headline_of, sessions_in_words
+from omnibench.fit.sessions.session_differences import SessionComparison
 from omnibench.robot.kinematics import Array
-from omnibench.words import plural
 
-_FEW_RUNS = 10  # with fewer, the signs of runs flip in less than 2^9 ways, and no chance falls below CHANCE, 0.002
-_FEW_COMMANDS = 4  # up to three motions are what some matrix makes of any wheel rates: nothing contradicts it
 _WORSE = 1.05  # times the plain matrix's error; nothing but a warning hangs on it
 
 
@@ -50,6 +58,8 @@ class Findings:
     steps: tuple[Step, ...]
     extrapolations: tuple[Extrapolation, ...]
     detectability: Detectability
+    sessions: SessionComparison
+    eq6_of_sessions: float | None
 
 
 def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: float) -> Discovery:
@@ -57,7 +67,10 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
     baseline, extended, held_out = findings.baseline, findings.extended, findings.held_out
     fit, effects, limits = extended.fit, findings.effects, findings.detectability
     where, left = findings.dependences.where, findings.dependences.left
-    headline = " ".join([headline_of(findings.verdict, effects, where, left), *_warnings(held_out)])
+    of_sessions = sessions_in_words(findings.verdict, findings.sessions, held_out, findings.eq6_of_sessions)
+    few, differ = few_in_words(fit.runs), bool(of_sessions)
+    of_model = headline_of(findings.verdict, effects, where, left, few, differ=differ)
+    headline = " ".join([*of_sessions, of_model, *_warnings(findings)])
     needs_session = any("session" in term.effect.needs for term in fit.model.terms)
     return Discovery(
         dataset=replace(dataset, trajectories=(*fit.runs, *findings.validation.kept)),
@@ -90,6 +103,8 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
         after=tuple(fit.residuals),
         whitened_before=_whitened(fit, baseline.fit.residuals),
         whitened_after=_whitened(fit, fit.residuals),
+        sessions=findings.sessions,
+        eq6_of_sessions=findings.eq6_of_sessions,
         seconds=seconds,
     )
 
@@ -99,10 +114,13 @@ def _whitened(fit: Fit, residuals: Sequence[Array]) -> tuple[Array, ...]:
     return tuple(whiten(of_run) for whiten, of_run in zip(fit.weightings, residuals, strict=True))
 
 
-def _warnings(held_out: Sequence[HeldOut]) -> Iterator[str]:
+def _warnings(findings: Findings) -> Iterator[str]:
     """A warning for each kind of held-out runs that the extended model predicts worse than the plain matrix."""
-    for held in held_out:
-        where = "the held-out session" if held.data == "session" else "repetitions that were held out"
+    session = is_other_session(findings.extended.fit.runs, findings.validation.kept)
+    for held in findings.held_out:
+        where = "repetitions that were held out"
+        if held.data == "session":
+            where = "the held-out session" if session else "the held-out runs"
         sizes: list[tuple[str, float, float, str]] = [
             ("in the cost of Eq. (6)", held.eq6.before, held.eq6.after, ""),
             ("in position", 1e3 * held.position_m[0], 1e3 * held.position_m[1], " mm"),
@@ -120,10 +138,11 @@ def _warnings(held_out: Sequence[HeldOut]) -> Iterator[str]:
 def _notes(findings: Findings) -> Iterator[str]:
     """Notes on the runs, the noise, the encoders, the nuisances, and effects that others could imitate."""
     fit = findings.extended.fit
-    commands = len({run.command for run in fit.runs if run.command is not None})
-    if len(fit.runs) < _FEW_RUNS or 0 < commands < _FEW_COMMANDS:
-        few = f"{plural(len(fit.runs), 'run')}" + (f" of {plural(commands, 'command')}" if commands else "")
-        yield f"These are {few}: so little can show hardly anything, and that nothing was found says little."
+    few = few_in_words(fit.runs)
+    if findings.verdict != "none":  # else the headline says it
+        yield from findings.sessions.of_other_commands
+    if few and findings.verdict != "none":
+        yield f"These are {few}: so little can show hardly anything."
     yield f"Noise: {fit.noise.description}."
     if fit.noise.source != "repetitions":
         yield "Without repetitions of a command nothing says how small the errors could be: no gap is closed."

@@ -1,19 +1,30 @@
-"""Covariate dependence: where the residuals depend on something, before any effect is added and after all are."""
+"""Covariate dependence: where the residuals depend on something, before any effect is added and after all are.
+
+With t bases of its kind, a basis A has the probability ln P(A) = ln B'(A) - ln t + constant, B' of evidence.py, Eq. (2)
+and (3), and a covariate the sum over its bases: the probability that what is missing depends on it rather than on
+another that was tried. As in significance.py, chi-square differences are those without the run that adds most, divided
+by what chance makes of them.                                                                                      (1)
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.regressors.significance import Significance
 from omnibench.discover.result import CovariateDependence
+from omnibench.discover.selection.evidence import log_evidence
 from omnibench.discover.selection.model_selection import Selection
 from omnibench.discover.selection.motor_effects import MotorEffects
 from omnibench.discover.selection.screening import Screening
 
+# delta of the generic bases, which no effect has the form of. With it the likeliest covariate is right in 71 % of 58 blind
+# sets, which is said of it with 77 %, and the second in 16 %, said with 11 %. Half of it says 99 % of 72 %, 1.5 times
+# 48 % of 33 % (tests/benchmarks/place_study.py).
+_DISCREPANCY = 0.2
 _SHOWN = 0.01  # chance up to which a dependence is mentioned; verdicts count those below CHANCE alone
 
 
@@ -37,6 +48,15 @@ def covariate_dependences(screening: Screening, selection: Selection, motors: Mo
     return Dependences(tuple(sorted(where, key=lambda each: (each.p_value, -each.excess))), tuple(left))
 
 
+def without_smooth_term(
+    dependences: Dependences, left: Significance, screening: Screening, selection: Selection
+) -> Dependences:
+    """The dependences with those of the odometry that a smooth term leaves. left: significance beyond it."""
+    of_motors = tuple(each for each in dependences.left if each.stage == "actuator")
+    of_odometry = _significant(left, "still ", lambda group: screening.quantisation_chi_square(group, selection.chosen))
+    return replace(dependences, left=(*of_odometry, *of_motors))
+
+
 def _significant(
     bases: Significance, still: str = "", quantisation: Callable[[Group], float] | None = None
 ) -> list[CovariateDependence]:
@@ -47,7 +67,7 @@ def _significant(
     best: dict[str, int] = {}
     for index in np.argsort(-bases.evidence, kind="stable"):
         best.setdefault(bases.groups[index].name, int(index))
-    dependences = []
+    weights, dependences = weights_of_covariates(bases), []
     for index in sorted(best.values(), key=lambda row: -bases.evidence[row]):
         group, p_value = bases.groups[index], bases.p_value(index)
         assert group.basis is not None
@@ -56,5 +76,22 @@ def _significant(
             excess, rank = float(bases.excess[index]), int(bases.rank[index])
             small = quantisation is not None and excess <= quantisation(group)
             words += ", by no more than rounding to encoder ticks can make it" if small else ""
-            dependences.append(CovariateDependence(group.name, group.basis.stage, p_value, excess, rank, words, small))
+            dependences.append(
+                CovariateDependence(
+                    group.name, group.basis.stage, p_value, excess, rank, words, small, weights[group.name]
+                )
+            )
     return dependences
+
+
+def weights_of_covariates(bases: Significance) -> dict[str, float]:
+    """The probability of each covariate, Eq. (1)."""
+    chi_square = bases.steady / bases.spread
+    energy = float(max((chi_square - bases.rank).max(initial=0.0), 0.0))
+    tries = np.array([group.tries for group in bases.groups], dtype=float)
+    evidence = log_evidence(chi_square, bases.rank, energy, _DISCREPANCY) - np.log(tries)
+    likely = np.exp(evidence - evidence.max(initial=0.0))
+    weights: dict[str, float] = {}
+    for group, weight in zip(bases.groups, likely / max(likely.sum(), 1e-300), strict=True):
+        weights[group.name] = weights.get(group.name, 0.0) + float(weight)
+    return weights

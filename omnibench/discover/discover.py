@@ -16,11 +16,12 @@ import numpy as np
 from omnibench.data.dataset import Dataset
 from omnibench.discover.calibrations import Request
 from omnibench.discover.conclude import Findings, conclude
-from omnibench.discover.covariate_dependence import covariate_dependences
+from omnibench.discover.covariate_dependence import covariate_dependences, without_smooth_term
 from omnibench.discover.fitting.extend import Extended, extend, fit_matrix, without_effects
 from omnibench.discover.fitting.model_fit import Fit
 from omnibench.discover.held_out.cross_validation import random_folds_of_repetitions
 from omnibench.discover.held_out.gaps import compare_held_out
+from omnibench.discover.held_out.sessions import compare_with_validation, eq6_with_changes
 from omnibench.discover.held_out.validation_runs import validation_runs
 from omnibench.discover.held_out.waterfall import waterfall_steps
 from omnibench.discover.result import Discovery
@@ -31,7 +32,13 @@ from omnibench.discover.selection.extrapolation import extrapolations_of
 from omnibench.discover.selection.model_selection import Selection, select_effects
 from omnibench.discover.selection.motor_effects import select_motor_effects
 from omnibench.discover.selection.named_effects import named_effects
-from omnibench.discover.selection.screening import Screening, screen_again, screen_extended, screen_plain
+from omnibench.discover.selection.screening import (
+    Screening,
+    screen_again,
+    screen_extended,
+    screen_plain,
+    significance_left,
+)
 from omnibench.discover.selection.unknown_term import add_smooth_term
 from omnibench.discover.verdict import lacks_a_name, verdict_of
 from omnibench.errors import DataError
@@ -98,6 +105,9 @@ def discover_effects(
     term_notes: tuple[str, ...] = ()
     if unknown_term and lacks_a_name(verdict):
         smooth = add_smooth_term(plain, screening, selection, models, folds)
+        if smooth.models is not models:
+            left = significance_left(smooth.models.used, screening, without, rng)
+            dependences = without_smooth_term(dependences, left, screening, selection)
         models, term_notes = smooth.models, (smooth.note,)
         effects = named_effects(models, motors)
 
@@ -107,6 +117,8 @@ def discover_effects(
     validation = validation_runs(dataset, extended.fit)
     held_out = compare_held_out(baseline, extended, validation, folds)
     steps = waterfall_steps(plain, baseline, extended, validation.kept)
+    sessions = compare_with_validation(extended, validation)
+    eq6_of_sessions = eq6_with_changes(extended, validation.runs, sessions)
     extrapolations = extrapolations_of(validation.kept, baseline, models.weighted)
     detectability = detectability_of(screening, models.selection)
 
@@ -124,6 +136,8 @@ def discover_effects(
         steps=steps,
         extrapolations=extrapolations,
         detectability=detectability,
+        sessions=sessions,
+        eq6_of_sessions=eq6_of_sessions,
     )
     progress.end()
     request = Request(tuple(without), unknown_term, seed)

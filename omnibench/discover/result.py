@@ -5,6 +5,7 @@ It serialises itself as ``discovery.json``, which ``omnibench discover`` writes 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,14 +13,18 @@ from pydantic import ConfigDict, Field, FieldSerializationInfo, field_serializer
 from pydantic.dataclasses import dataclass
 from pydantic_core import to_jsonable_python
 
-from omnibench.data.dataset import Dataset
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.fit.least_squares.noise import NoiseEstimate
+from omnibench.fit.sessions.session_differences import SessionComparison
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.effects.effect import Stage
 from omnibench.robot.kinematics import Array
+from omnibench.words import plural
 
 Verdict = Literal["none", "named", "class", "incomplete", "unknown"]
 CALIBRATION_FILES = {"extended": "model.yaml", "plain": "plain.yaml"}
+_FEW_RUNS = 10  # with fewer, the signs of runs flip in less than 2^9 ways, and no chance falls below CHANCE, 0.002
+_FEW_COMMANDS = 4  # up to three motions are what some matrix makes of any wheel rates: nothing contradicts it
 _NOT_WRITTEN = Field(exclude=True)
 _ChiSquare = Annotated[float, Field(serialization_alias="gain")]
 
@@ -82,7 +87,8 @@ class CovariateDependence:
 
     covariate: command, elapsed time, heading, place, order of runs, wheel rate, wheel angle, acceleration or stamps.
     p_value: corrected for all covariates that were tried. excess: whitened chi-square beyond chance. description: in
-    words. within_ticks: True if rounding to encoder ticks can make as much.
+    words. within_ticks: True if rounding to encoder ticks can make as much. weight: probability that what is missing
+    depends on this covariate rather than on another that was tried.
     """
 
     covariate: str
@@ -92,6 +98,7 @@ class CovariateDependence:
     degrees_of_freedom: int
     description: str
     within_ticks: bool = False
+    weight: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -148,7 +155,8 @@ class Gap:
 class HeldOut:
     """Errors of both models on runs that no fit has seen.
 
-    data: "repetitions" (of the training runs, each fold predicted from the others) or "session" (the validation split).
+    data: "repetitions" (of the training runs, each fold predicted from the others) or "session" (the validation split,
+    which is another session only where sessions were recorded).
     position_m, heading_rad: mean final error before and after.
     """
 
@@ -200,6 +208,21 @@ class Experiment:
     config: str
 
 
+def is_other_session(training: Sequence[Trajectory], held_out: Sequence[Trajectory]) -> bool:
+    """True if held-out runs are known to be of sessions that no training run is of."""
+    known = {run.session for run in training}
+    others = {run.session for run in held_out}
+    return bool(others) and None not in known | others and not known & others
+
+
+def few_in_words(runs: Sequence[Trajectory]) -> str:
+    """Runs and commands in words if they are so few that they show hardly anything, else empty."""
+    commands = len({run.command for run in runs if run.command is not None})
+    if len(runs) >= _FEW_RUNS and (not commands or commands >= _FEW_COMMANDS):
+        return ""
+    return plural(len(runs), "run") + (f" of {plural(commands, 'command')}" if commands else "")
+
+
 def experiment_file(number: int) -> str:
     """The name of the file of the experiment of that number, the first being 1."""
     return f"experiment-{number}.yaml"
@@ -212,9 +235,11 @@ class Discovery:
     where, left: what the residuals depend on before and after the effects that were found. absorbed: names of effects
     that the matrix reproduces; measurements: what would identify them. extended, plain: calibrations with and without
     the effects; their files are written in their place. dataset: the data set without outliers; dataset_hash: that of
-    the whole data set. outliers: number of reference poses that were left out of the fits. trajectories: names of the
-    training runs. before, after: residuals (K, 3) of each of these, reference minus odometry in m, m, rad, at
-    pose_times[1:]. whitened_before, whitened_after: these, independent and of unit variance under the noise.
+    the whole data set. outliers: number of reference poses that were left out of the fits. sessions: comparison of the
+    sessions by the extended model; eq6_of_sessions: Eq. (6) on the validation split, m and rad, once the matrices of
+    those that differ are changed. trajectories: names of the training runs. before, after: residuals (K, 3) of each of
+    these, reference minus odometry in m, m, rad, at pose_times[1:]. whitened_before, whitened_after: these, independent
+    and of unit variance under the noise.
     """
 
     verdict: Verdict
@@ -240,6 +265,8 @@ class Discovery:
     extrapolations: Annotated[tuple[Extrapolation, ...], Field(serialization_alias="novelties")]
     notes: tuple[str, ...]
     noise: NoiseEstimate
+    sessions: SessionComparison
+    eq6_of_sessions: float | None
     trajectories: Annotated[tuple[str, ...], Field(serialization_alias="runs")]
     poses: int
     outliers: int
@@ -248,6 +275,26 @@ class Discovery:
     after: Annotated[tuple[Array, ...], _NOT_WRITTEN]
     whitened_before: Annotated[tuple[Array, ...], _NOT_WRITTEN]
     whitened_after: Annotated[tuple[Array, ...], _NOT_WRITTEN]
+
+    @property
+    def extends(self) -> bool:
+        """True if the extended model holds more than the plain matrix."""
+        return len(self.steps) > 1
+
+    @property
+    def has_other_session(self) -> bool:
+        """True if the validation split is known to be of another session."""
+        names = set(self.trajectories)
+        split: tuple[list[Trajectory], list[Trajectory]] = ([], [])
+        for run in self.dataset.trajectories:
+            split[run.id not in names].append(run)
+        return is_other_session(*split)
+
+    @property
+    def few(self) -> str:
+        """The training runs in words if they are so few that they show hardly anything, else empty."""
+        names = set(self.trajectories)
+        return few_in_words([run for run in self.dataset.trajectories if run.id in names])
 
     @field_serializer("held_out")
     def _by_data(self, held_out: tuple[HeldOut, ...]) -> dict[str, HeldOut]:

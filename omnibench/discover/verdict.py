@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from omnibench.discover.result import CovariateDependence, NamedEffect, Verdict
+from omnibench.discover.result import CovariateDependence, HeldOut, NamedEffect, Verdict
 from omnibench.discover.selection.model_selection import CHANCE, SURE
+from omnibench.fit.sessions.session_differences import SessionComparison
 
 _Dependences = Sequence[CovariateDependence]
+_PLACES = 2  # covariates that a headline names, as what shows in one often shows in another, too (chosen)
 
 
 def verdict_of(effects: Sequence[NamedEffect], where: _Dependences, left: _Dependences) -> Verdict:
@@ -50,23 +52,40 @@ def _counts(dependence: CovariateDependence) -> bool:
     return dependence.p_value < CHANCE and not dependence.within_ticks
 
 
-def headline_of(verdict: Verdict, effects: Sequence[NamedEffect], where: _Dependences, left: _Dependences) -> str:
-    """One or two sentences for the top of a report."""
+def headline_of(
+    verdict: Verdict,
+    effects: Sequence[NamedEffect],
+    where: _Dependences,
+    left: _Dependences,
+    few: str = "",
+    *,
+    differ: bool = False,
+) -> str:
+    """One or two sentences for the top of a report.
+
+    few: the training runs in words if they can show hardly anything. differ: True if sentences on sessions that deviate
+    stand before these.
+    """
     names = "; ".join(" or ".join((effect.name, *effect.confusable_with)) for effect in effects)
     with_weights = " and ".join(f"{effect.name} ({_percent(effect.weight)})" for effect in effects)
     where, left = [each for each in where if _counts(each)], [each for each in left if _counts(each)]
     of_odometry = [each for each in where if each.stage != "actuator"]
-    surest = (of_odometry or where)[0].description if where else ""
+    surest = _places(of_odometry or where)
     if verdict == "none" and where:
         return (
             "Nothing is missing in the odometry that these recordings could show. How the motors follow their targets "
             f"has no name: {surest}."
         )
+    if verdict == "none" and few:
+        found = "Nothing else was found" if differ else "Nothing was found"
+        return f"{found}, but {few} can show hardly anything: that nothing was found says little."
+    if verdict == "none" and differ:
+        return "Nothing else was found: what the matrix leaves of the training runs looks like its noise."
     if verdict == "none":
         return "Nothing is missing that these recordings could show: what the matrix leaves looks like its noise."
-    remains = f" Something else is left: {left[0].description}." if left else ""
+    remains = f" Something else is left: {_places(left)}." if left else ""
     if verdict == "named" and all(effect.stage == "actuator" for effect in effects):
-        more = f" Beyond that, {left[0].description}." if left else ""
+        more = f" Beyond that, {_places(left)}." if left else ""
         return (
             "Nothing is missing in the odometry that these recordings could show. Between targets and measured wheel "
             f"rates: {with_weights}.{more}"
@@ -84,5 +103,39 @@ def headline_of(verdict: Verdict, effects: Sequence[NamedEffect], where: _Depend
     return f"Something is missing that the catalogue has no name for: {surest}."
 
 
+def _places(dependences: _Dependences) -> str:
+    """The likeliest covariate or, where there are several, the likeliest two with their probabilities."""
+    likeliest = sorted(dependences, key=lambda each: -each.weight)[:_PLACES]
+    if len(likeliest) < _PLACES:
+        return likeliest[0].description if likeliest else ""
+    first, second = likeliest
+    other = f"on {second.description.partition('depends on ')[2]} ({_percent(second.weight)})"
+    return f"{first.description} ({_percent(first.weight)}) or {other}"
+
+
+def sessions_in_words(
+    verdict: Verdict, comparison: SessionComparison, held_out: Sequence[HeldOut], eq6_of_sessions: float | None
+) -> list[str]:
+    """Sentences on sessions that differ, and on what their own matrices make of the validation split.
+
+    Where other commands may be the cause, a verdict that something is missing says it already.
+    """
+    sentences = list(comparison.sentences)
+    if verdict != "none":
+        sentences = sentences[: len(comparison.differences)]
+    kinds = {difference.kind for difference in comparison.differences}
+    of_split = [held.eq6 for held in held_out if held.data == "session"]
+    if eq6_of_sessions is not None and of_split:
+        wear = " (tyre_wear, which is an effect of the model if both sessions train)" if "all wheels" in kinds else ""
+        sentences.append(
+            f"With {'these changes' if len(comparison.differences) > 1 else 'this change'}{wear}, fitted to the same "
+            f"runs, Eq. (6) of the held-out runs goes from {of_split[0].after:.3g} to {eq6_of_sessions:.3g} (floor "
+            f"{of_split[0].floor:.3g})."
+        )
+    return sentences
+
+
 def _percent(weight: float) -> str:
+    if weight < 0.001:
+        return "< 0.1 %"
     return "> 99.9 %" if weight > 0.999 else f"{100 * weight:.1f} %"

@@ -16,7 +16,13 @@ from omnibench.discover.report.tables import (
     hidden_table,
     parameter_table,
 )
-from omnibench.discover.report.wording import VERDICTS, chance, data_in_words, extrapolations_in_words, worst_of_each
+from omnibench.discover.report.wording import (
+    chance,
+    data_in_words,
+    extrapolations_in_words,
+    verdict_in_words,
+    worst_of_each,
+)
 from omnibench.discover.result import Discovery, experiment_file
 from omnibench.report.blocks import Table
 from omnibench.report.numbers import listing
@@ -34,7 +40,7 @@ def print_discovery(console: Console, discovery: Discovery, folder: Path) -> Non
     """Print verdict, effects, what the residuals depend on, the gap, what could still hide, and the files' paths."""
     width = min(console.width, _WIDTH)
     console.print(data_in_words(discovery), soft_wrap=True)
-    console.print(f"verdict: {discovery.verdict} ({VERDICTS[discovery.verdict]})", style="bold", width=width)
+    console.print(f"verdict: {discovery.verdict} ({verdict_in_words(discovery)})", style="bold", width=width)
     console.print(discovery.headline, width=width)
     for table in _tables(discovery):
         console.print()
@@ -90,7 +96,10 @@ def _first(lines: Sequence[str], head: str, kind: str) -> Iterator[str]:
 
 
 def _print_files(console: Console, discovery: Discovery, folder: Path) -> None:
-    console.print(f"extended calibration: {folder / 'model.yaml'}", soft_wrap=True)
+    calibration = f"extended calibration: {folder / 'model.yaml'}"
+    if not discovery.extends:
+        calibration = f"plain calibration, as nothing was added: {folder / 'plain.yaml'}"
+    console.print(calibration, soft_wrap=True)
     for number, experiment in enumerate(discovery.experiments, 1):
         file = folder / experiment_file(number)
         console.print(f"to separate {listing(list(experiment.separates))}:\n{file}", soft_wrap=True)

@@ -52,13 +52,15 @@ _MOST_TAKEN = 3  # groups, at most, that are taken out of the residuals that sta
 class Significance:
     """Chi-square differences of G groups and how significant they are.
 
-    chi_square (G,): the differences Q. rank (G,): degrees of freedom d. spread (G,): mean difference v by chance per
-    degree of freedom. evidence (G,): z of Eq. (1), without the run that adds most. chance (B,): the largest evidence of
-    all groups in each random flip, sorted. surplus: Eq. (4). surplus_of: the group that has it.
+    chi_square (G,): the differences Q. steady (G,): these without the run that adds most. rank (G,): degrees of freedom
+    d. spread (G,): mean difference v by chance per degree of freedom. evidence (G,): z of Eq. (1), without the run that
+    adds most. chance (B,): the largest evidence of all groups in each random flip, sorted. surplus: Eq. (4).
+    surplus_of: the group that has it.
     """
 
     groups: tuple[Group, ...]
     chi_square: Array
+    steady: Array
     rank: Array
     spread: Array
     evidence: Array
@@ -127,6 +129,7 @@ def significance_of(
     return Significance(
         groups=tuple(groups),
         chi_square=chi_square,
+        steady=steady,
         rank=rank,
         spread=spread,
         evidence=evidence,

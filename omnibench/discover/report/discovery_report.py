@@ -20,8 +20,6 @@ from omnibench.discover.report.tables import (
 from omnibench.discover.report.where_section import where_section
 from omnibench.discover.report.wording import (
     STAGES,
-    VERDICTS,
-    VERDICTS_AT_LENGTH,
     closed_in_words,
     decisive,
     effect_in_words,
@@ -32,9 +30,11 @@ from omnibench.discover.report.wording import (
     held_out_in_words,
     noise_in_words,
     parameter_in_words,
+    verdict_at_length,
+    verdict_in_words,
     weight_in_words,
 )
-from omnibench.discover.result import Discovery, NamedEffect, experiment_file
+from omnibench.discover.result import Discovery, Gap, NamedEffect, experiment_file
 from omnibench.environment import package_versions
 from omnibench.report.blocks import (
     Block,
@@ -54,7 +54,7 @@ from omnibench.words import plural
 
 def discovery_report(discovery: Discovery, options: str) -> Document:
     """The report as blocks. options: the effective options, in YAML."""
-    dataset = discovery.dataset
+    dataset, better = discovery.dataset, "How much better" if discovery.extends else "How well it predicts"
     return Document(
         title=f"What the odometry model lacks: {dataset.name}",
         subtitle=dataset.description,
@@ -63,7 +63,7 @@ def discovery_report(discovery: Discovery, options: str) -> Document:
             where_section(discovery),
             Section("what", "What", tuple(what_blocks(discovery))),
             Section("sure", "How sure", tuple(sure_blocks(discovery))),
-            Section("better", "How much better", tuple(_how_much_better(discovery))),
+            Section("better", better, tuple(_how_much_better(discovery))),
             Section("basis", "What this rests on", tuple(_basis(discovery, options))),
         ),
         badges=simulated_badge(dataset.simulated),
@@ -81,7 +81,7 @@ def _answer(discovery: Discovery) -> Iterator[Block]:
 
 
 def _tiles(discovery: Discovery) -> Iterator[Fact]:
-    yield Fact("Verdict", discovery.verdict, VERDICTS[discovery.verdict])
+    yield Fact("Verdict", discovery.verdict, verdict_in_words(discovery))
     for effect in discovery.effects:
         values = "; ".join(parameter_in_words(each) for each in effect.parameters[:2])
         more = f" and {len(effect.parameters) - 2} more" if len(effect.parameters) > 2 else ""
@@ -92,19 +92,26 @@ def _tiles(discovery: Discovery) -> Iterator[Fact]:
         )
     held = decisive(discovery)
     if held is None:
-        gap = discovery.gap
-        yield Fact("Gap closed, training runs", closed_in_words(gap), gap_in_words(gap))
+        yield _gap_fact(discovery, discovery.gap, "training runs")
         return
-    position, heading = final_errors_in_words(held)
+    position, heading = final_errors_in_words(discovery, held)
     where = f"{held_out_in_words(discovery, held)}, {plural(held.runs, 'run')}"
     yield Fact("Final position error, mean", position, where)
     yield Fact("Final heading error, mean", heading, where)
-    yield Fact("Gap closed, Eq. (6)", closed_in_words(held.eq6), where)
+    yield _gap_fact(discovery, held.eq6, where)
+
+
+def _gap_fact(discovery: Discovery, gap: Gap, where: str) -> Fact:
+    """The share of the gap that is closed or, where nothing was added, the error beside its floor."""
+    if discovery.extends:
+        return Fact("Gap closed, Eq. (6)", closed_in_words(gap), f"{gap_in_words(gap)}; {where}")
+    decimals = gap_decimals(gap)
+    return Fact("Eq. (6)", fixed(gap.before, decimals), f"floor {fixed(gap.floor, decimals)}; {where}")
 
 
 def what_blocks(discovery: Discovery) -> Iterator[Block]:
     """The effects: those found, with their parameters, and those that a matrix absorbs."""
-    yield Paragraph(VERDICTS_AT_LENGTH[discovery.verdict])
+    yield Paragraph(verdict_at_length(discovery))
     if discovery.effects:
         for effect in discovery.effects:
             yield Callout(_effect_title(effect), tuple(_effect_remarks(effect)))
@@ -209,8 +216,8 @@ def _better_in_words(discovery: Discovery) -> str:
         f"{fixed(1e3 * position, 1)} mm and {fixed(math.degrees(heading), 2)}°"
         for position, heading in zip(held.position_m, held.heading_rad, strict=True)
     )
-    if before == after:
-        return f"{where}the mean final error is {after}, by the plain matrix as by the extended model."
+    if not discovery.extends:
+        return f"{where}the mean final error is {after} by the plain matrix, to which nothing was added."
     closed = "" if held.eq6.closed is None else f": {closed_in_words(held.eq6)} of the gap down to the floor is closed"
     decimals = gap_decimals(held.eq6)
     return (
@@ -253,9 +260,11 @@ def _basis(discovery: Discovery, options: str) -> Iterator[Block]:
     ]
     yield Facts(tuple(fact for fact in facts if fact.value))
     yield Callout("Warnings on reading the data", dataset.warnings, "warning")
+    files = "model.yaml is the extended calibration and plain.yaml the matrix alone, both"
+    if not discovery.extends:
+        files = "plain.yaml is the matrix alone, to which nothing was added, and model.yaml the same,"
     yield Paragraph(
-        "Beside this report: model.yaml is the extended calibration and plain.yaml the matrix alone, both ready for "
-        "omnibench evaluate, simulate and live; discovery.json holds all figures, residuals.parquet every residual "
-        "before and after."
+        f"Beside this report: {files} ready for omnibench evaluate, simulate and live; discovery.json holds all "
+        "figures, residuals.parquet every residual before and after."
     )
     yield Details("Effective options (config.yaml)", (Code(options),))

@@ -189,25 +189,40 @@ def gap_grid(discovery: Discovery) -> FigureGrid:
         gaps.append(("training runs", discovery.gap))
     figures = tuple(
         Figure(
-            f"{METRICS[gap.metric]}, {name}: {closed_in_words(gap)}{'' if gap.closed is None else ' closed'}",
-            _gap_bars(gap),
-            f"{METRICS[gap.metric]} on {name}: before {gap.before:.4g}, after {gap.after:.4g}, floor {gap.floor:.4g}",
-            190,
+            _gap_title(discovery, gap, name),
+            _gap_bars(gap, discovery.extends),
+            f"{METRICS[gap.metric]} on {name}: "
+            + ", ".join(f"{bar} {value:.4g}" for bar, value, _ in _gap_values(gap, discovery.extends)),
+            190 if discovery.extends else 150,
         )
         for name, gap in gaps
     )
     return FigureGrid(
         figures,
-        (PLAIN, EXTENDED, _FLOOR),
+        (PLAIN, EXTENDED, _FLOOR) if discovery.extends else (ALONE, _FLOOR),
         2 if len(figures) > 1 else 1,
         floor_in_words(discovery),
     )
 
 
-def _gap_bars(gap: Gap) -> go.Figure:
+def _gap_title(discovery: Discovery, gap: Gap, name: str) -> str:
+    title = f"{METRICS[gap.metric]}, {name}"
+    if not discovery.extends:
+        return title
+    return f"{title}: {closed_in_words(gap)}{'' if gap.closed is None else ' closed'}"
+
+
+def _gap_values(gap: Gap, extends: bool) -> tuple[tuple[str, float, LegendItem], ...]:
+    """Names, values and legend of the bars: the plain matrix alone and the floor where nothing was added."""
+    floor = ("floor", gap.floor, _FLOOR)
+    if not extends:
+        return ("plain matrix", gap.before, ALONE), floor
+    return ("before", gap.before, PLAIN), ("after", gap.after, EXTENDED), floor
+
+
+def _gap_bars(gap: Gap, extends: bool) -> go.Figure:
     decimals = gap_decimals(gap)
-    values = (("before", gap.before, PLAIN), ("after", gap.after, EXTENDED), ("floor", gap.floor, _FLOOR))
-    bars = [_Bar(name, 0.0, value, fixed(value, decimals), item) for name, value, item in values]
+    bars = [_Bar(name, 0.0, value, fixed(value, decimals), item) for name, value, item in _gap_values(gap, extends)]
     return _bars(bars, METRICS[gap.metric], 1.25)
 
 

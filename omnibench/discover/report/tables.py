@@ -35,6 +35,7 @@ def dependence_table(dependences: Sequence[CovariateDependence], caption: str) -
             Cell(each.covariate, f"{each.stage}: {STAGES[each.stage]}"),
             each.description,
             chance(each.p_value),
+            weight_in_words(each.weight),
             significant(each.excess, 3),
             count(each.degrees_of_freedom),
         )
@@ -46,12 +47,14 @@ def dependence_table(dependences: Sequence[CovariateDependence], caption: str) -
             Column("Residual over", numeric=False),
             Column("In words", numeric=False),
             Column("Chance"),
+            Column("It is this", priority=1),
             Column("Excess", "χ²", priority=1),
             Column("Degrees of freedom", priority=2),
         ),
         rows,
-        "Chance: how often noise alone would give as much in any of the covariates that were tried. Excess: whitened "
-        "χ² beyond the degrees of freedom.",
+        "Chance: how often noise alone would give as much in any of the covariates that were tried. It is this: "
+        "probability that what is missing depends on this covariate rather than on another. Excess: whitened χ² beyond "
+        "the degrees of freedom.",
     )
 
 
@@ -90,41 +93,48 @@ def held_out_table(discovery: Discovery) -> Table:
     rows: list[Row] = []
     for each in discovery.held_out:
         where = f"{held_out_in_words(discovery, each)}: {plural(each.runs, 'run')}"
-        rows += [Row.of(where, role="group"), _gap_row(each.eq6), _gap_row(each.chi2)]
-        position, heading = final_errors_in_words(each)
-        rows += [_plain_row("Final position error, mean", position), _plain_row("Final heading error, mean", heading)]
-    return Table("On held-out runs", _GAP_COLUMNS, tuple(rows), _gap_note(discovery))
+        rows += [Row.of(where, role="group"), *(_gap_row(discovery, gap) for gap in (each.eq6, each.chi2))]
+        position, heading = final_errors_in_words(discovery, each)
+        rows += [
+            _plain_row(discovery, "Final position error, mean", position),
+            _plain_row(discovery, "Final heading error, mean", heading),
+        ]
+    return Table("On held-out runs", _gap_columns(discovery), tuple(rows), _gap_note(discovery))
 
 
 def gap_table(discovery: Discovery) -> Table:
     """The gap on the training runs."""
-    return Table("The gap on the training runs", _GAP_COLUMNS, (_gap_row(discovery.gap),), _gap_note(discovery))
+    title = "The gap on the training runs"
+    return Table(title, _gap_columns(discovery), (_gap_row(discovery, discovery.gap),), _gap_note(discovery))
 
 
-_GAP_COLUMNS = (
-    Column("Measure", numeric=False),
-    Column("Before"),
-    Column("After"),
-    Column("Floor"),
-    Column("Closed"),
-    Column("Std. error of the gap", priority=1),
-)
+def _gap_columns(discovery: Discovery) -> tuple[Column, ...]:
+    """Before and after; of the plain matrix alone where nothing was added."""
+    columns = [Column("Before"), Column("After"), Column("Floor"), Column("Closed")]
+    if not discovery.extends:
+        columns = [Column("Plain matrix"), Column("Floor")]
+    return Column("Measure", numeric=False), *columns, Column("Std. error of the gap", priority=1)
 
 
 def _gap_note(discovery: Discovery) -> str:
+    if not discovery.extends:
+        return f"Nothing was added to the plain matrix. {floor_in_words(discovery)}"
     return (
         f"Before: the plain matrix; after: the extended model. {floor_in_words(discovery)} Closed: the share of "
         "before − floor that is gone, where that is more than two standard errors."
     )
 
 
-def _gap_row(gap: Gap) -> Row:
+def _gap_row(discovery: Discovery, gap: Gap) -> Row:
     decimals = gap_decimals(gap)
-    cells = (fixed(value, decimals) for value in (gap.before, gap.after, gap.floor))
-    return Row.of(METRICS[gap.metric], *cells, closed_in_words(gap), significant(gap.standard_error, 2))
+    before, after, floor = (fixed(value, decimals) for value in (gap.before, gap.after, gap.floor))
+    cells = (before, after, floor, closed_in_words(gap)) if discovery.extends else (before, floor)
+    return Row.of(METRICS[gap.metric], *cells, significant(gap.standard_error, 2))
 
 
-def _plain_row(name: str, words: str) -> Row:
+def _plain_row(discovery: Discovery, name: str, words: str) -> Row:
+    if not discovery.extends:
+        return Row.of(name, words, NOTHING, NOTHING)
     before, _, after = words.partition(" → ")
     unit = " mm" if after.endswith(" mm") else ""
     return Row.of(name, f"{before}{unit}", after, NOTHING, NOTHING, NOTHING)

@@ -37,6 +37,9 @@ VERDICTS_AT_LENGTH: Mapping[Verdict, str] = {
     "incomplete": "What was added is named with a weight of 95 % or more, but the residuals still depend on something.",
     "unknown": "The residuals depend on something, and no effect explains it with a weight of 95 %.",
 }
+_FEW = "nothing was found, but so few runs can show hardly anything"
+_DIFFER = "nothing is missing in the training runs, but the sessions differ"
+_OTHER_COMMANDS = "nothing is missing in the training runs, but the validation runs, of other commands, deviate"
 STAGES: Mapping[Stage, str] = {
     "actuator": "target to wheel rate",
     "wheel": "wheel rate to motion of the wheel",
@@ -114,6 +117,25 @@ def effect_in_words(effect: NamedEffect) -> str:
     return effect.name if not others else f"{effect.name}, or {' or '.join(others)}"
 
 
+def verdict_in_words(discovery: Discovery) -> str:
+    """The verdict; where nothing was found, what speaks against that nothing is missing."""
+    if discovery.verdict != "none":
+        return VERDICTS[discovery.verdict]
+    if discovery.sessions.differences:
+        return _DIFFER
+    if discovery.sessions.other_commands is not None:
+        return _OTHER_COMMANDS
+    return _FEW if discovery.few else VERDICTS["none"]
+
+
+def verdict_at_length(discovery: Discovery) -> str:
+    """The verdict in a sentence."""
+    words = verdict_in_words(discovery)
+    if words == VERDICTS[discovery.verdict]:
+        return VERDICTS_AT_LENGTH[discovery.verdict]
+    return f"{words[0].upper()}{words[1:]}: no effect of the catalogue was added."
+
+
 def added(step: Step) -> str:
     """The name of the effect that a step added."""
     return step.name.removeprefix("+ ")
@@ -167,19 +189,24 @@ def gap_in_words(gap: Gap) -> str:
     return f"{before} → {after} (floor {floor}), {closed_in_words(gap)}"
 
 
-def final_errors_in_words(held: HeldOut) -> tuple[str, str]:
-    """Mean final position and heading error, before and after."""
+def final_errors_in_words(discovery: Discovery, held: HeldOut) -> tuple[str, str]:
+    """Mean final position and heading error, before and after; alone where nothing was added."""
     before, after = held.position_m
-    position = f"{fixed(1e3 * before, 1)} → {fixed(1e3 * after, 1)} mm"
     turned, turned_after = (math.degrees(value) for value in held.heading_rad)
+    if not discovery.extends:
+        return f"{fixed(1e3 * before, 1)} mm", f"{fixed(turned, 2)}°"
+    position = f"{fixed(1e3 * before, 1)} → {fixed(1e3 * after, 1)} mm"
     return position, f"{fixed(turned, 2)}° → {fixed(turned_after, 2)}°"
 
 
 def held_out_in_words(discovery: Discovery, held: HeldOut) -> str:
-    """The kind of held-out runs, such as ``held-out repetitions``."""
+    """The kind of held-out runs, such as ``held-out repetitions``; a session only where sessions are known."""
     if held.data == "session":
-        return "held-out session"
-    return "held-out repetitions" if discovery.noise.source == "repetitions" else "held-out runs"
+        return "held-out session" if discovery.has_other_session else "held-out runs"
+    if discovery.noise.source == "repetitions":
+        return "held-out repetitions"
+    several = len(discovery.held_out) > 1 and not discovery.has_other_session
+    return "training runs, held out in turn" if several else "held-out runs"
 
 
 def floor_in_words(discovery: Discovery) -> str:

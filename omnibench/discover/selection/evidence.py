@@ -98,12 +98,13 @@ def names_of(groups: Sequence[Group]) -> set[str]:
     return {group.name for group in groups}
 
 
-def log_evidence(chi_square: Array, rank: Array, energy: float) -> Array:
+def log_evidence(chi_square: Array, rank: Array, energy: float, discrepancy: float | None = None) -> Array:
     """Logarithms of Bayes factors (n,) of chi-square differences with so many degrees of freedom, Eq. (2) and (3).
 
-    energy: non-centrality N of what is missing.
+    energy: non-centrality N of what is missing. discrepancy: delta, by default that of the catalogue's forms.
     """
-    trusted = chi_square / (1 + DISCREPANCY**2 * energy)  # Eq. (3)
+    delta = DISCREPANCY if discrepancy is None else discrepancy
+    trusted = chi_square / (1 + delta**2 * energy)  # Eq. (3)
     growth = np.log(np.maximum(trusted / np.maximum(rank, 1), 1.0))
     evidence: Array = (trusted - rank - rank * growth) / 2  # Eq. (2)
     return evidence

@@ -12,6 +12,7 @@ from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit, paths_of
 from omnibench.discover.held_out.cross_validation import folds_of_repetitions, is_confirmed
 from omnibench.discover.regressors.column_group import Group
+from omnibench.discover.regressors.significance import Significance, significance_of
 from omnibench.discover.selection.candidate_groups import Groups, make_groups
 from omnibench.discover.selection.encoder_quantisation import EncoderQuantisation
 from omnibench.fit.least_squares.trajectory_fit import split_runs
@@ -66,10 +67,28 @@ def screen_extended(extended: Extended, without: Sequence[str]) -> Screening:
 
 def screen_again(extended: Extended, earlier: Screening, without: Sequence[str]) -> Screening:
     """Screen as ``screen_extended``, with the columns of an earlier screening unless further poses were left out."""
+    groups = _groups_again(extended, earlier, without)
+    return _screened(extended.fit, extended.residuals_without_effects, groups)
+
+
+def significance_left(
+    extended: Extended, screening: Screening, without: Sequence[str], rng: np.random.Generator
+) -> Significance:
+    """Significance of the generic bases beyond all that an extended model holds, smooth terms among it."""
+    fit, groups = extended.fit, _groups_again(extended, screening, without)
+    columns = [
+        np.concatenate([of_bases, fitted], axis=2)
+        for of_bases, fitted in zip(split_runs(groups.columns, fit.runs), extended.columns, strict=True)
+    ]
+    data = fit.whitened(columns)
+    return significance_of(data, range(groups.columns.shape[2], len(data.information)), groups.bases, rng)
+
+
+def _groups_again(extended: Extended, earlier: Screening, without: Sequence[str]) -> Groups:
+    """The groups of an earlier screening unless further poses were left out."""
     fit = extended.fit
     same_poses = len(earlier.groups.columns) == sum(len(residuals) for residuals in fit.residuals)
-    groups = earlier.groups if same_poses else _groups_at(fit, without)
-    return _screened(fit, extended.residuals_without_effects, groups)
+    return earlier.groups if same_poses else _groups_at(fit, without)
 
 
 def _groups_at(fit: Fit, without: Sequence[str]) -> Groups:

@@ -83,15 +83,19 @@ class SessionComparison:
     @property
     def sentences(self) -> tuple[str, ...]:
         """A sentence for each session that differs, or for a validation split that drives other commands."""
-        sentences = [_in_words(each) for each in self.differences]
-        if self.other_commands is not None:
-            sentences.append(
-                "The validation runs deviate from what the training runs fit by more than their repetitions explain "
-                f"(chance {self.other_commands:.1g}), and they drive other commands: whether the sessions differ, or "
-                "the model lacks what these commands show, cannot be told. Drive some of the training's commands in "
-                "that session, too."
-            )
-        return tuple(sentences)
+        return (*(_in_words(each) for each in self.differences), *self.of_other_commands)
+
+    @property
+    def of_other_commands(self) -> tuple[str, ...]:
+        """The sentence on a validation split that drives other commands and deviates, if it does."""
+        if self.other_commands is None:
+            return ()
+        return (
+            "The validation runs deviate from what the training runs fit by more than their repetitions explain "
+            f"(chance {self.other_commands:.1g}), and they drive other commands: whether the sessions differ, or the "
+            "model lacks what these commands show, cannot be told. Drive some of the training's commands in that "
+            "session, too.",
+        )
 
 
 def compare_sessions(model: OdometryModel, trajectories: Sequence[Trajectory]) -> SessionComparison:

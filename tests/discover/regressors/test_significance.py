@@ -69,7 +69,7 @@ def test_what_depends_on_few_runs_is_found_where_these_agree() -> None:
 def by_chance(evidence: float, chance: np.ndarray) -> Significance:
     """One group of so much evidence, where random flips made ``chance``."""
     one = np.ones(1)
-    return Significance(GROUPS[:1], one, one, one, np.array([evidence]), np.sort(chance), 0.0, 0)
+    return Significance(GROUPS[:1], one, one, one, one, np.array([evidence]), np.sort(chance), 0.0, 0)
 
 
 def test_a_chance_that_many_flips_reach_is_their_share_with_the_data_as_one_more() -> None:

@@ -26,7 +26,7 @@ def significance(left: float, rank: int = 1) -> Significance:
     one = np.ones(1)
     surplus = left / np.sqrt(2 * rank)
     basis = Group("covariate", "place", (3,))
-    return Significance((basis,), left * one, rank * one, one, one, np.zeros(499), surplus, 0)
+    return Significance((basis,), left * one, left * one, rank * one, one, one, np.zeros(499), surplus, 0)
 
 
 def test_the_evidence_of_a_difference_is_that_of_the_likeliest_g_prior() -> None:

@@ -1,0 +1,39 @@
+"""Sessions of training and validation runs compared by a discovery's model, and what their changes make of its errors.
+
+Where both sessions are trained on, tyre_wear is an effect of the catalogue as any other. Where one is held out, the
+change that explains its deviation is fitted here, beside the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from omnibench.data.dataset import Trajectory
+from omnibench.discover.fitting.extend import Extended
+from omnibench.discover.fitting.model_fit import at_runs, model_with
+from omnibench.discover.held_out.validation_runs import ValidationRuns
+from omnibench.fit.least_squares.nuisance_noise import FitNoise
+from omnibench.fit.sessions.session_contrast import sessions_of
+from omnibench.fit.sessions.session_differences import SessionComparison, session_comparison
+
+
+def compare_with_validation(extended: Extended, validation: ValidationRuns) -> SessionComparison:
+    """Comparison of all sessions by the extended model, under its noise."""
+    fit = extended.fit
+    runs = [*fit.runs, *validation.kept]
+    return session_comparison(at_runs(fit, runs), FitNoise(fit.noise, fit.nuisances.deviations))
+
+
+def eq6_with_changes(extended: Extended, runs: Sequence[Trajectory], comparison: SessionComparison) -> float | None:
+    """Eq. (6) on validation runs, m and rad, with the matrices of sessions that differ changed; None if none does."""
+    names = sessions_of([*extended.fit.runs, *runs])[len(extended.fit.runs) :]
+    changes = {each.session: np.array(each.matrix) for each in comparison.differences}
+    if not changes.keys() & set(names):
+        return None
+    model, errors = extended.fit.model, []
+    for name, run in zip(names, runs, strict=True):
+        changed = model_with(model, model.matrix + changes.get(name, 0.0), model.terms)
+        errors.append(float(np.linalg.norm(changed.reported([run.reference_log])[0][-1] - run.final_pose)))
+    return float(np.mean(errors))
