@@ -2,9 +2,9 @@
 
     python tests/benchmarks/place_study.py [--levels 150 1000] [--factors 0.5 1 1.5]      # four minutes
 
-Blind sets with one effect each, of the catalogue and outside it, none of which may be named. The right covariate is the
-one in which the catalogue, or the effect's maker, says that it shows. Beside the rates stand the probabilities that were
-said, for the discrepancy of the generic bases and for multiples of it.
+Blind sets with one effect each, of the catalogue and outside it, none of which may be named. The right covariate is
+the one in which the catalogue, or the effect's maker, says that it shows. Beside the rates stand the probabilities that
+were said, for the discrepancy of the generic bases and for multiples of it.
 """
 
 from __future__ import annotations

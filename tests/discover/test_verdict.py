@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from omnibench.discover.result import CovariateDependence, NamedEffect, Verdict
@@ -22,6 +24,8 @@ def dependence(p_value: float = 1e-9, stage: Stage = "body", *, within_ticks: bo
     return CovariateDependence("heading", stage, p_value, 50.0, 3, words, within_ticks)
 
 
+PATCH = replace(dependence(), covariate="place", description="the residual depends on a patch of the floor", weight=0.3)
+LIKELIER = replace(dependence(), weight=0.6)
 SEEN, CHANCE, TICKS = dependence(), dependence(0.005), dependence(within_ticks=True)
 MOTORS = dependence(stage="actuator")
 LAG = effect("motor_lag", stage="actuator")
@@ -59,6 +63,12 @@ def test_the_verdict_follows_from_names_and_from_what_is_left(
     assert verdict_of(effects, where, left) == verdict
 
 
+def test_of_few_runs_the_headline_says_that_they_can_show_hardly_anything() -> None:
+    headline = headline_of("none", (), (), (), "2 runs of 1 command")
+    assert "2 runs of 1 command can show hardly anything" in headline
+    assert "Nothing is missing" not in headline
+
+
 def test_a_name_is_lacking_where_something_is_left_or_nothing_explains_it() -> None:
     assert [name for name in ("none", "named", "class", "incomplete", "unknown") if lacks_a_name(name)] == [
         "incomplete",
@@ -77,6 +87,14 @@ def test_a_name_is_lacking_where_something_is_left_or_nothing_explains_it() -> N
         ("incomplete", (effect(),), (SEEN,), (SEEN,), ["Missing: heading_drift", f"left: {SEEN.description}"]),
         ("class", (ONE_OF_TWO,), (SEEN,), (), ["heading_drift or floor_drift", "cannot tell which"]),
         ("unknown", (), (SEEN,), (SEEN,), ["the catalogue has no name for", SEEN.description]),
+        ("unknown", (), (PATCH, LIKELIER), (), ["on the heading (60.0 %) or on a patch of the floor (30.0 %)"]),
+        (
+            "incomplete",
+            (effect(),),
+            (SEEN,),
+            (PATCH, LIKELIER),
+            ["left: the residual depends on the heading (60.0 %)"],
+        ),
         ("unknown", (effect(weight=0.7),), (SEEN,), (SEEN,), ["no sure name (heading_drift (70.0 %) at best)"]),
         ("unknown", (LAG,), (MOTORS, SEEN), (SEEN,), [SEEN.description, "Of the motors: motor_lag"]),
     ],

@@ -1,0 +1,107 @@
+"""Sessions that differ, and what a discovery and its report say of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+
+from discovery_samples import held_out, nothing, shorn, simulated
+from hidden.session_sets import session_set
+from report_page import Page
+from rich.console import Console
+from shared_results import made_once
+
+from omnibench.cli.terminal.discovery_summary import print_discovery
+from omnibench.data.dataset import Dataset
+from omnibench.discover.discover import discover_effects
+from omnibench.discover.report.discovery_report import discovery_report
+from omnibench.discover.report.wording import VERDICTS, verdict_in_words
+from omnibench.discover.result import Discovery, discovery_document
+from omnibench.report.render import render
+
+
+@made_once
+def worn() -> Discovery:
+    """Wheels that are 2 % larger in the session that is held out."""
+    return discover_effects(session_set("small", 3, change=0.02))
+
+
+def page(found: Discovery) -> Page:
+    return Page(render(discovery_report(found, "seed: 0\n")))
+
+
+def printed(found: Discovery) -> str:
+    output = StringIO()
+    print_discovery(Console(width=80, file=output), found, Path("found"))
+    return output.getvalue()
+
+
+def with_few_runs(dataset: Dataset) -> Dataset:
+    command = dataset.trajectories[0].command
+    runs = [run for run in dataset.split("train") if run.command == command][:2]
+    return replace(dataset, trajectories=tuple(runs))
+
+
+def test_nothing_is_not_said_to_be_missing_where_the_held_out_session_has_other_wheels() -> None:
+    found = worn()
+    assert found.verdict == "none"
+    assert found.headline.startswith("The sessions differ: in s2 against s1")
+    assert "Nothing is missing" not in found.headline
+    assert verdict_in_words(found) != VERDICTS["none"]
+    assert "the sessions differ" in printed(found)
+    assert "residuals of the plain matrix are what the noise leaves" not in page(found).text
+
+
+def test_a_change_of_the_radii_closes_the_gap_to_the_held_out_session() -> None:
+    found = worn()
+    gap = held_out(found, "session").eq6
+    assert found.eq6_of_sessions is not None
+    assert found.eq6_of_sessions < gap.floor + 0.05 * (gap.before - gap.floor)
+    assert "tyre_wear" in found.headline
+    document = discovery_document(found, Path("found"))
+    assert document["sessions"]["differences"][0]["session"] == "s2"
+
+
+def test_sessions_that_both_train_give_tyre_wear_its_name() -> None:
+    dataset = session_set("small", 3, change=0.02)
+    both = tuple(replace(run, split="train") for run in dataset.trajectories)
+    found = discover_effects(replace(dataset, trajectories=both))
+    assert [effect.name for effect in found.effects] == ["tyre_wear"]
+    assert found.verdict == "named"
+    assert found.sessions.differences == ()
+
+
+def test_where_nothing_was_added_the_report_draws_no_two_models_and_offers_none() -> None:
+    found = nothing()
+    report, told = page(found), printed(found)
+    assert "verdict: none" in told
+    assert not found.extends
+    for words in (report.text, told):
+        assert "extended model" not in words
+        assert "extended calibration" not in words
+        assert "After" not in words
+    assert report.tables["On held-out runs"][0][1:3] == ["Plain matrix", "Floor"]
+
+
+def test_held_out_runs_are_a_session_only_where_sessions_are_known() -> None:
+    assert "held-out session" in page(nothing()).text
+    unknown = page(discover_effects(shorn(simulated(()), session=None))).text
+    assert "held-out session" not in unknown
+    assert "held-out runs" in unknown
+
+
+def test_of_two_runs_headline_and_verdict_say_that_they_show_hardly_anything() -> None:
+    found = discover_effects(with_few_runs(session_set("small", 3)))
+    assert "2 runs of 1 command can show hardly anything" in found.headline
+    assert "hardly anything" in verdict_in_words(found)
+
+
+def test_what_is_left_over_is_looked_for_again_once_a_smooth_term_is_added() -> None:
+    dataset = session_set("small", 3, effect="speed_dependent_radius")
+    plain, smooth = (
+        discover_effects(dataset, without=("speed_dependent_radius", "load_transfer"), unknown_term=unknown_term)
+        for unknown_term in (False, True)
+    )
+    assert any("The extended model holds a smooth term" in note for note in smooth.notes)
+    assert sum(each.excess for each in smooth.left) < 0.5 * sum(each.excess for each in plain.left)
