@@ -26,7 +26,14 @@ from omnibench.files import (
     write_text,
 )
 from omnibench.fit.uncertainty.ratio_intervals import Interval
-from omnibench.robot.calibration import Calibration, Provenance, Row, covariance_rows, write_calibration
+from omnibench.robot.calibration import (
+    Calibration,
+    Provenance,
+    Row,
+    covariance_rows,
+    fitted_calibration,
+    write_calibration,
+)
 
 # First line of config.yaml in a folder of results. A folder whose config.yaml lacks it is not written to.
 _MARK = "# The effective config of a comparison; the results beside it were made with it."
@@ -116,7 +123,7 @@ def calibration_of(run: ScoredRun, result: ComparisonResult) -> Calibration:
     dataset: Dataset = result.datasets[run.record.dataset]
     assert run.record.matrix is not None  # only runs with an answer are written
     uncertainty = result.uncertainties.get((run.record.dataset, run.record.label))
-    return Calibration(
+    return fitted_calibration(
         name=f"{run.record.dataset} {run.record.label}",
         robot=dataset.robot,
         sample_period=dataset.sample_period,

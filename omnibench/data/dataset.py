@@ -12,14 +12,16 @@ import numpy as np
 
 from omnibench.data.checks import implausible
 from omnibench.data.headings import unwrap
+from omnibench.data.run_checks import check_sample_period, pose_times_flaw, reach_flaw, values_flaw, wheel_times_flaw
 from omnibench.data.scans import Scans
-from omnibench.errors import DataError
+from omnibench.errors import DataError, nearest
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 from omnibench.words import plural
 
 Split = Literal["train", "validation"]
 SPLITS: tuple[Split, ...] = ("train", "validation")
+_ARRAYS = ("times", "rates", "pose_times", "poses", "angles", "targets", "pose_covariances")
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +131,8 @@ def make_dataset(
 ) -> Dataset:
     """A data set with unwrapped headings and with warnings about values that cannot be right.
 
-    DataError: there is no trajectory, two have the same id, or an array has another shape than Trajectory says.
+    DataError: there is no trajectory, two have the same id, an array has another shape, other times or other values
+    than a data set on disk may have, or the sample period is far from that of the stamps.
     """
     raw = tuple(trajectories)
     if not raw:
@@ -139,7 +142,9 @@ def make_dataset(
         if trajectory.id in seen:
             raise DataError(f"data set {name}: trajectory {trajectory.id} is there twice; give each its own id")
         seen.add(trajectory.id)
-        _check_shapes(name, robot, trajectory)
+        _check_run(f"data set {name}", robot, trajectory)
+    median = _median_period(raw)
+    check_sample_period(f"data set {name}", sample_period, median)
     logs = [trajectory.log(trajectory.pose_times) for trajectory in raw]
     headings, ambiguous = unwrap(robot, logs, [trajectory.poses[:, 2] for trajectory in raw])
     warnings = implausible(robot, logs, [trajectory.poses for trajectory in raw])
@@ -149,7 +154,7 @@ def make_dataset(
             f"headings of {plural(len(ambiguous), 'trajectory')} may be unwrapped wrongly (reference too sparse): "
             f"{shown}"
         ]
-    warnings += _late_references(raw) + _other_periods(raw, sample_period)
+    warnings += _late_references(raw) + _other_periods(median, sample_period)
     unwrapped = (
         replace(trajectory, poses=np.column_stack([trajectory.poses[:, :2], heading]))
         for trajectory, heading in zip(raw, headings, strict=True)
@@ -159,16 +164,38 @@ def make_dataset(
     )
 
 
-def _other_periods(trajectories: Sequence[Trajectory], sample_period: float) -> list[str]:
-    """Warning of a sample period that the stamps contradict; their median is robust to jitter and gaps."""
-    periods = np.concatenate([np.diff(trajectory.times, prepend=0.0) for trajectory in trajectories])
-    median = float(np.median(periods))
+def _median_period(trajectories: Sequence[Trajectory]) -> float:
+    """The median time between wheel samples, s, which is robust to jitter and gaps."""
+    return float(np.median(np.concatenate([np.diff(trajectory.times, prepend=0.0) for trajectory in trajectories])))
+
+
+def _other_periods(median: float, sample_period: float) -> list[str]:
+    """Warning of a sample period that the stamps contradict."""
     if 0.5 < median / sample_period < 2:
         return []
     return [f"sample_period is {sample_period:g} s, but the wheel samples come every {median:g} s (the median)"]
 
 
-def _check_shapes(name: str, robot: Robot, trajectory: Trajectory) -> None:
+def _check_run(place: str, robot: Robot, trajectory: Trajectory) -> None:
+    """DataError in one line that begins with ``place``: a shape, a time, a value or the split of a run is wrong."""
+    where = f"{place}: trajectory {trajectory.id}"
+    if trajectory.split not in SPLITS:
+        hint = nearest(str(trajectory.split), SPLITS)
+        raise DataError(f"{where}: split is {trajectory.split!r}; {hint}it must be train or validation")
+    _check_shapes(where, robot, trajectory)
+    for name, flaw in (
+        *((name, values_flaw(array)) for name in _ARRAYS if (array := getattr(trajectory, name)) is not None),
+        ("times", wheel_times_flaw(trajectory.times, trajectory.id)),
+        ("pose_times", pose_times_flaw(trajectory.pose_times, trajectory.id)),
+    ):
+        if flaw is not None:
+            raise DataError(f"{where}: {name}, row {flaw[0] + 1}: {flaw[1]}")
+    run = trajectory
+    if (flaw := reach_flaw(robot, run.times, run.rates, run.pose_times, run.poses)) is not None:
+        raise DataError(f"{where}: {flaw[1]}")
+
+
+def _check_shapes(where: str, robot: Robot, trajectory: Trajectory) -> None:
     samples, poses = trajectory.times.shape, trajectory.pose_times.shape
     expected: dict[str, tuple[int, ...]] = {"rates": (*samples, len(robot.wheels)), "poses": (*poses, 3)}
     expected |= {"angles": expected["rates"], "targets": expected["rates"], "pose_covariances": (*poses, 3, 3)}
@@ -176,7 +203,9 @@ def _check_shapes(name: str, robot: Robot, trajectory: Trajectory) -> None:
         array = getattr(trajectory, item)
         if len(samples) != 1 or len(poses) != 1 or (array is not None and array.shape != shape):
             given = None if array is None else array.shape
-            raise DataError(f"data set {name}: trajectory {trajectory.id}: {item} has shape {given}, expected {shape}")
+            raise DataError(f"{where}: {item} has shape {given}, expected {shape}")
+    if not samples[0] or not poses[0]:
+        raise DataError(f"{where}: it has no {'reference poses' if samples[0] else 'wheel samples'}")
 
 
 def _late_references(trajectories: Sequence[Trajectory]) -> list[str]:

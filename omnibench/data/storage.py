@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, cast
@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from omnibench.config import Model, Positive, read_yaml, to_yaml, validate
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, make_dataset
-from omnibench.data.delimited import not_increasing
+from omnibench.data.run_checks import Flaw, pose_times_flaw, wheel_times_flaw
 from omnibench.data.scan_files import ScansOnDisk, write_scans
 from omnibench.data.scans import Scanner, Scans
 from omnibench.data.table import Table, read_table, table_file
@@ -65,8 +65,8 @@ def load_dataset(path: Path | str) -> Dataset:
     _check_runs(runs)
     wheel_rows = _rows_by_trajectory(runs, wheels)
     pose_rows = _rows_by_trajectory(runs, poses)
-    _check_wheel_times(wheels, wheel_rows)
-    _check_pose_times(poses, pose_rows)
+    _check_times(wheels, wheel_rows, wheel_times_flaw)
+    _check_times(poses, pose_rows, pose_times_flaw)
     samples = _WheelColumns(wheels, header.wheels)
     reference = _PoseColumns(poses)
     trajectories = [
@@ -256,31 +256,14 @@ def _rows_by_trajectory(runs: Table, table: Table) -> list[np.ndarray[Any, np.dt
     return np.split(order, np.cumsum(counts)[:-1])
 
 
-def _check_wheel_times(wheels: Table, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]) -> None:
-    times = wheels.numbers("t")
-    why = "wheel samples start after t = 0 (a row holds the rate up to its t)"
-    wheels.refuse(times <= 0, lambda row: f"t is {times[row]:g}; {why}")
-    _check_increasing(wheels, times, groups)
-
-
-def _check_pose_times(poses: Table, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]) -> None:
-    times = poses.numbers("t")
-    poses.refuse(times < 0, lambda row: f"t is {times[row]:g}; it must not be negative")
-    _check_increasing(poses, times, groups)
+def _check_times(
+    table: Table, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]], find_flaw: Callable[[Array, str], Flaw | None]
+) -> None:
+    """DataError for the first run whose times in ``table`` have a flaw. groups: the rows of each run."""
+    times = table.numbers("t")
     for rows in groups:
-        first = int(rows[0])
-        identity = poses.frame["trajectory"][first]
-        if times[first] != 0:
-            raise poses.fail(first, f"trajectory {identity} has no reference pose at t = 0, its start pose")
-        if len(rows) < 2:
-            raise poses.fail(first, f"trajectory {identity} has no reference pose after its start")
-
-
-def _check_increasing(table: Table, times: Array, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]]) -> None:
-    for rows in groups:
-        flaw = not_increasing(times[rows])
-        if flaw is not None:
-            raise table.fail(int(rows[flaw[0]]), f"t {flaw[1]}")
+        if (flaw := find_flaw(times[rows], table.frame["trajectory"][int(rows[0])])) is not None:
+            raise table.fail(int(rows[flaw[0]]), flaw[1])
 
 
 def _trajectory(

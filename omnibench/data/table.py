@@ -10,12 +10,12 @@ import polars as pl
 from numpy.typing import NDArray
 
 from omnibench.data.delimited import missing_column
+from omnibench.data.run_checks import LARGEST
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
 # Names may consist of digits: 007 is not 7.
 _TEXTS = dict.fromkeys(("trajectory", "command", "split", "session"), pl.String)
-_LARGEST = 1e9  # a larger number is no measurement in SI units
 
 
 class Table:
@@ -54,7 +54,7 @@ class Table:
             ~np.isfinite(values),
             lambda row: f"{column} is {'missing' if series[row] is None else series[row]}; remove or repair the row",
         )
-        huge = np.abs(values) > _LARGEST
+        huge = np.abs(values) > LARGEST
         self.refuse(huge, lambda row: f"{column} is {values[row]:g}, which no robot can reach; check the units")
         return values
 

@@ -13,7 +13,14 @@ from omnibench.discover.selection.extrapolation import training_domain
 from omnibench.environment import package_versions
 from omnibench.errors import DataError
 from omnibench.fit.evaluate import split_errors
-from omnibench.robot.calibration import Calibration, EffectTerm, Provenance, covariance_rows, matrix_rows
+from omnibench.robot.calibration import (
+    Calibration,
+    EffectTerm,
+    Provenance,
+    covariance_rows,
+    fitted_calibration,
+    matrix_rows,
+)
 from omnibench.robot.kinematics import Array
 
 
@@ -38,7 +45,7 @@ def calibration_of(
         EffectTerm(name=term.name, parameters={key: float(value) for key, value in term.values.items()})
         for term in extended.fit.model.terms
     )
-    return Calibration(
+    return fitted_calibration(
         name=f"{dataset.name} {name}",
         robot=dataset.robot,
         sample_period=dataset.sample_period,

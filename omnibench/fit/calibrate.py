@@ -26,7 +26,7 @@ from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty
 from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
 from omnibench.progress import Reporter, no_progress, renamed
 from omnibench.registry import calibrators, costs
-from omnibench.robot.calibration import Calibration, Provenance, covariance_rows, matrix_rows
+from omnibench.robot.calibration import Calibration, Provenance, covariance_rows, fitted_calibration, matrix_rows
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 
@@ -105,7 +105,7 @@ def calibrate(
     model = OdometryModel(dataset.robot, result.matrix, integration)
     uncertainty, doubts = _uncertainty(problem, result, chosen)
     warnings = warnings_of_calibration(dataset.robot, training, searched.name, unidentified)
-    calibration = Calibration(
+    calibration = fitted_calibration(
         name=f"{dataset.name} {calibrator}",
         robot=dataset.robot,
         sample_period=dataset.sample_period,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, FiniteFloat, model_validator
+from pydantic import AfterValidator, Field, FiniteFloat, ValidationError, model_validator
 
 from omnibench.config import Model, NonNegative, Positive, parse_yaml, printable, read_yaml, to_yaml, validate
 from omnibench.errors import ConfigError, DataError
@@ -156,6 +156,17 @@ def _check_covariance(covariance: Array) -> None:
         raise ValueError("covariance is not symmetric, or its values are impossibly large")
     if np.linalg.eigvalsh(covariance)[0] < -1e-6 * largest:
         raise ValueError("covariance is not positive semi-definite: it has a negative variance in some direction")
+
+
+def fitted_calibration(name: str, **fields: Any) -> Calibration:
+    """The calibration that a fit ends in. DataError: recordings led it to values that no robot has."""
+    try:
+        return Calibration(name=name, **fields)
+    except ValidationError as error:
+        reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+        raise DataError(
+            f"calibration {name!r}: {reason}; check the recordings for poses and rates far from all others"
+        ) from None
 
 
 def matrix_rows(matrix: Array) -> tuple[Row, Row, Row]:

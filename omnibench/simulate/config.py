@@ -15,6 +15,8 @@ from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import Integration
 from omnibench.robot.published_matrices import PUBLISHED
 
+_MOST_NOISE = 1e4  # rad/s, or a factor; chosen: a hundred thousand turns a minute
+_MOST_RUNS = 100_000  # simulated runs; chosen: more take hours and gigabytes
 _MOST_ROWS = 1e8  # wheel samples and poses; more do not fit into memory
 
 
@@ -76,7 +78,7 @@ class RobotSession(Model):
 class Session(RobotSession):
     """One session of recordings: every command, repeated, with noise of the reference."""
 
-    noise_scale: NonNegative = Field(1.0, description="factor on all noise of the reference")
+    noise_scale: float = Field(1.0, ge=0, le=_MOST_NOISE, description="factor on all noise of the reference")
 
 
 class MotionGrid(Model):
@@ -97,7 +99,7 @@ class Commands(MotionGrid):
 class EncoderNoise(Noise):
     """Noise of the encoders, and of the reference poses as in a calibration file."""
 
-    encoder: NonNegative = Field(0.0, description="white noise of each wheel rate, rad/s")
+    encoder: float = Field(0.0, ge=0, le=_MOST_NOISE, description="white noise of each wheel rate, rad/s")
 
 
 S = TypeVar("S", bound=RobotSession)
@@ -160,7 +162,19 @@ class FlowerConfig(Experiment[Session]):
                 f"this is {self._rows():.1g} wheel samples and poses, more than {_MOST_ROWS:.0e}; "
                 "check the periods, distances, speeds and repetitions"
             )
+        if self.runs > _MOST_RUNS:
+            raise ValueError(
+                f"this is {self.runs} runs, more than {_MOST_RUNS}; give fewer speeds, directions, rates of turn or "
+                "repetitions"
+            )
         return self
+
+    @property
+    def runs(self) -> int:
+        """Number of runs of all sessions, at most."""
+        chosen = self.commands
+        commands = len(chosen.speeds) * len(chosen.directions_deg) * len(chosen.turn_rates)
+        return commands * self.repetitions * len(self.sessions)
 
     def _rows(self) -> float:
         """Number of wheel samples and poses of the experiment."""

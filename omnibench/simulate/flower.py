@@ -11,12 +11,15 @@ from typing import Literal
 import numpy as np
 
 from omnibench.data.dataset import Split, Trajectory, make_dataset
+from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 from omnibench.simulate.config import Commands, FlowerConfig, MotionGrid, Session
 from omnibench.simulate.pose_noise import reference_noise
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.truth import TrueRobot, true_record
+from omnibench.words import plural
 
+_MANY = 1000  # runs whose checks and tables take more than about a second; chosen
 PAUSE = 10.0  # s between runs
 
 
@@ -39,8 +42,10 @@ class Command:
         return np.array([x, y, self.turn_rate])
 
 
-def simulate_flower(config: FlowerConfig, name: str = "flower", description: str = "") -> Simulation:
-    """Simulate the training session and, if there is one, the validation session.
+def simulate_flower(
+    config: FlowerConfig, name: str = "flower", description: str = "", watch: Reporter = no_progress
+) -> Simulation:
+    """Simulate the training session and, if there is one, the validation session. watch: told of every run.
 
     ConfigError or DataError in one line: an effect of the truth, or a parameter of one, is not known or is missing.
     """
@@ -54,9 +59,14 @@ def simulate_flower(config: FlowerConfig, name: str = "flower", description: str
         noise=config.noise,
     )
     robot = truth.true_robot()
-    trajectories = [
-        run for split, session in config.sessions.items() for run in _session(config, robot, split, session)
-    ]
+    trajectories: list[Trajectory] = []
+    for split, session in config.sessions.items():
+        for run in _session(config, robot, split, session):
+            trajectories.append(run)
+            watch(Progress(f"simulating {name}", len(trajectories), config.runs, "run"))
+    watch(Progress(f"simulating {name}", len(trajectories), result=""))
+    if len(trajectories) > _MANY:
+        watch(Progress(f"checking and writing {plural(len(trajectories), 'run')}"))
     dataset = make_dataset(
         name,
         config.robot,

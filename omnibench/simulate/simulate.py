@@ -43,7 +43,7 @@ def simulate_dataset(
     command is faster than the motors, or leads out of the room.
     """
     if isinstance(config, FlowerConfig):
-        return simulate_flower(config, name, description)
+        return simulate_flower(config, name, description, watch)
     from omnibench.simulate.chain.robot_simulator import simulate_robot  # loads for a second (numba)
 
     return simulate_robot(config, name, description, watch)

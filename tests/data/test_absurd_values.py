@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import re
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 import pytest
+import yaml
 from commands import flower
 
 from omnibench.config import validate
-from omnibench.data.dataset import make_dataset
+from omnibench.data.dataset import Trajectory, make_dataset
 from omnibench.data.storage import load_dataset, save_dataset
-from omnibench.errors import ConfigError, DataError
+from omnibench.errors import ConfigError, DataError, OmnibenchError
+from omnibench.fit.calibrate import calibrate
+from omnibench.live.replay.concatenated_drive import concatenate_runs
+from omnibench.progress import Progress
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
@@ -47,6 +53,99 @@ def test_a_pose_that_no_robot_can_reach_is_refused_with_its_row(folder: Path) ->
     table.with_columns(moved).write_parquet(folder / "poses.parquet")
     with pytest.raises(DataError, match=r"poses.parquet, row 2: x is 1e\+200, which no robot can reach"):
         load_dataset(folder)
+
+
+@pytest.mark.parametrize("period", [1e-300, 1e-9, 1e9])
+def test_a_sample_period_far_from_that_of_the_stamps_is_refused(folder: Path, period: float) -> None:
+    header = yaml.safe_load((folder / "dataset.yaml").read_text())
+    (folder / "dataset.yaml").write_text(yaml.safe_dump(header | {"sample_period": period}))
+    with pytest.raises(DataError, match=r"sample_period is .* s, but the wheel samples come every .* s .the median"):
+        load_dataset(folder)
+
+
+def test_standstill_between_runs_is_bounded(folder: Path) -> None:
+    dataset = load_dataset(folder)
+    short = replace(dataset, sample_period=dataset.sample_period / 1000)  # within what is only warned of
+    drive = concatenate_runs(short, pause=10.0)
+    assert len(drive.wheel_times) < 3 * len(concatenate_runs(dataset, pause=10.0).wheel_times)
+    runs = [replace(run, id=str(number)) for number, run in enumerate(dataset.trajectories * 40)]
+    with pytest.raises(ConfigError, match=r"the robot stands still for .* samples, more than 10000000"):
+        concatenate_runs(replace(dataset, trajectories=tuple(runs)), pause=3600.0)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"noise": {"encoder": 1e300}},
+        {"train": {"seed": 1, "distance": 1.0, "noise_scale": 1e300}},
+        {"noise": {"pose_position": 1e300}},
+    ],
+)
+def test_noise_beyond_all_measure_is_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=r"(encoder|noise_scale|pose_position): .* less than or equal to"):
+        validate(FlowerConfig, flower(**changes), "config")
+
+
+def test_more_runs_than_anybody_drives_are_refused() -> None:
+    commands = {"speeds": [0.2], "directions_deg": list(range(100_001)), "turn_rates": [0.0]}
+    changes = {"commands": commands, "repetitions": 1, "train": {"seed": 1, "distance": 0.1}, "validation": None}
+    with pytest.raises(ConfigError, match="this is 100001 runs, more than 100000"):
+        validate(FlowerConfig, flower(**changes), "config")
+
+
+def test_simulating_many_runs_tells_of_every_run() -> None:
+    events: list[Progress] = []
+    config = validate(FlowerConfig, flower(), "config")
+    simulation = simulate_dataset(config, watch=events.append)
+    assert [event.done for event in events[:-1]] == list(range(1, len(simulation.dataset.trajectories) + 1))
+    assert {event.total for event in events[:-1]} == {len(simulation.dataset.trajectories)}
+    assert events[-1].over
+
+
+@pytest.mark.parametrize("far", [1e9, 1e6, 1e5])
+def test_a_pose_far_beyond_what_the_wheels_rolled_is_refused(folder: Path, far: float) -> None:
+    table = pl.read_parquet(folder / "poses.parquet")
+    moved = pl.when(pl.int_range(pl.len()) == 1).then(far).otherwise(pl.col("x")).alias("x")
+    table.with_columns(moved).write_parquet(folder / "poses.parquet")
+    with pytest.raises(DataError, match=r"trajectory .*: the pose at .* m from the run's start, whose wheels rolled"):
+        load_dataset(folder)
+
+
+@pytest.mark.parametrize("shift", [10.0, 1e3, 1e4])
+@pytest.mark.parametrize("calibrator", ["closed_form", "trajectory_ml"])
+def test_a_pose_that_is_just_believed_gives_an_answer_or_one_line(folder: Path, shift: float, calibrator: str) -> None:
+    dataset = load_dataset(folder)
+    first, *others = dataset.trajectories
+    poses = first.poses.copy()
+    poses[-1, 0] += shift
+    spoiled = replace(dataset, trajectories=(replace(first, poses=poses), *others))
+    with suppress(OmnibenchError):
+        calibrate(spoiled, calibrator)
+
+
+def changed(run: Trajectory, name: str, row: int, value: float) -> Trajectory:
+    array = getattr(run, name).copy()
+    array[row] = value
+    return replace(run, **{name: array})
+
+
+@pytest.mark.parametrize(
+    ("name", "row", "value", "message"),
+    [
+        ("times", 0, 0.0, "t is 0; wheel samples start after t = 0"),
+        ("times", 2, 0.001, "goes backwards: 0.001 after"),
+        ("times", 1, float("nan"), "it holds nan"),
+        ("rates", 3, float("inf"), "it holds inf"),
+        ("rates", 3, 1e10, "it holds 1e+10, which no robot can reach"),
+        ("pose_times", 0, 0.01, "has no reference pose at t = 0"),
+        ("poses", 1, float("nan"), "it holds nan"),
+    ],
+)
+def test_what_reading_refuses_making_refuses_too(folder: Path, name: str, row: int, value: float, message: str) -> None:
+    dataset = load_dataset(folder)
+    first, *others = dataset.trajectories
+    with pytest.raises(DataError, match=f"trajectory {first.id}.*{re.escape(message)}"):
+        make_dataset("d", dataset.robot, dataset.sample_period, [changed(first, name, row, value), *others])
 
 
 def test_a_table_in_both_formats_is_refused(folder: Path) -> None:

@@ -24,6 +24,7 @@ from omnibench.robot.planar import compose, moved_to, relative, rotation
 
 FULL_TURN = 2 * np.pi
 LONGEST_PAUSE = 3600.0  # s between two runs; chosen
+_MOST_RESTING = 10_000_000  # wheel samples of all pauses together: a day at 100 Hz; chosen
 _SAME_TIME = 1e-9  # s, the resolution of stamps: times that differ by less are equal
 
 
@@ -88,8 +89,16 @@ def concatenate_runs(
     starts = _composed(runs[0].start, moves)
     if start_poses is not None:
         starts = _given_start_poses(dataset, np.asarray(start_poses, dtype=float), moves)
-    resting = [*(_rest_samples(run, pause, dataset.sample_period) for run in runs[:-1]), 0]
-    legs = [_with_rest(run, rest, dataset.sample_period) for run, rest in zip(runs, resting, strict=True)]
+    # Samples of a standstill do not come oftener than others, whatever the data set's nominal period is.
+    periods = np.concatenate([np.diff(run.times, prepend=0.0) for run in runs])
+    period = max(dataset.sample_period, 0.5 * float(np.median(periods)))
+    resting = [*(_rest_samples(run, pause, period) for run in runs[:-1]), 0]
+    if sum(resting) > _MOST_RESTING:
+        raise ConfigError(
+            f"pause: with {pause:g} s the robot stands still for {sum(resting)} samples, more than {_MOST_RESTING}; "
+            "give a shorter one, and check the times of the last poses"
+        )
+    legs = [_with_rest(run, rest, period) for run, rest in zip(runs, resting, strict=True)]
     begins = np.concatenate([[0.0], np.cumsum([leg.times[-1] for leg in legs[:-1]])])
     measured = [run.pose_times > 0 for run in runs]
     measured[0] = np.ones(len(runs[0].pose_times), dtype=bool)
