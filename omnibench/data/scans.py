@@ -25,7 +25,7 @@ from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
 Ranges = NDArray[np.float32]
-_FLOOR_MARGIN = 5.0  # standard deviations of a range: one in two million floor ranges is shorter (normal)
+_FLOOR_MARGIN = 5.0  # standard deviations of a range: one floor range in 3.5 million is shorter (normal noise)
 
 
 MOST_PITCH = math.radians(60)  # rad; beyond that a plane of rays shows the floor and no room (chosen)
