@@ -135,7 +135,7 @@ def evaluate(
     if as_json:
         return print_json(evaluation.model_dump() | {"warnings": warnings})
     print_evaluation(make_console(), evaluation)
-    return print_verdict(evaluation.held_out)
+    return print_verdict(evaluation.held_out, sessions=evaluation.sessions)
 
 
 @calibration_app.command()

@@ -49,7 +49,7 @@ def compare(
     warn(result.warnings)
     print_result(make_console(), result)
     for name, entry in result.held_out.items():
-        print_verdict(entry.verdict, f"{name}, {entry.label}: ")
+        print_verdict(entry.verdict, f"{name}, {entry.label}: ", result.sessions.get(name, ()))
     typer.echo(f"report: {result.output / 'report.html'}")
     if result.every_search_failed:
         typer.echo(f"every search failed, the first: {result.failures[0]}", err=True)

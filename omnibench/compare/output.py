@@ -100,6 +100,7 @@ def summary(result: ComparisonResult) -> dict[str, Any]:
         "statistics": [_statistics_row(entry) for entry in result.statistics],
         "intervals": _interval_units(result),
         "held_out": {name: {"label": each.label} | each.verdict.model_dump() for name, each in result.held_out.items()},
+        "sessions": {name: list(sentences) for name, sentences in result.sessions.items()},
         "certificates": [certificate.model_dump() for certificate in result.certificates],
         "warnings": list(result.warnings),
         "environment": result.environment.model_dump(),

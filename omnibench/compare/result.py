@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -175,7 +175,8 @@ class ComparisonResult:
     """Everything that the report shows.
 
     design_costs: mean cost of the design values, by data set and split. uncertainties: of the entries' typical runs, by
-    data set and label. held_out: the verdict on the best calibration of each data set that has one.
+    data set and label. held_out: the verdict on the best calibration of each data set that has one. sessions: by data
+    set, a sentence for each session that differs from the others.
     """
 
     config: CompareConfig
@@ -189,6 +190,7 @@ class ComparisonResult:
     held_out: Mapping[str, EntryVerdict]
     environment: Environment
     warnings: tuple[str, ...]
+    sessions: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def every_search_failed(self) -> bool:

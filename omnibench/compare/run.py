@@ -16,7 +16,13 @@ from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
 from omnibench.compare.report.comparison_report import comparison_document
 from omnibench.compare.result import ComparisonResult, ScoredRun
 from omnibench.compare.scoring import score
-from omnibench.compare.statistics import design_costs, entry_statistics, held_out_verdicts, is_mean
+from omnibench.compare.statistics import (
+    design_costs,
+    entry_statistics,
+    held_out_verdicts,
+    is_mean,
+    sessions_that_differ,
+)
 from omnibench.compare.uncertainties import typical_uncertainties
 from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
@@ -67,6 +73,7 @@ def run_comparison(
             certificates=certificates,
             uncertainties=uncertainties,
             held_out=held_out_verdicts(statistics, datasets, config.bootstrap),
+            sessions=sessions_that_differ(datasets, config.integration),
             environment=environment(),
             warnings=tuple(_warnings(failures, datasets, runs)),
         )

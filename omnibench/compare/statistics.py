@@ -10,8 +10,11 @@ import numpy as np
 from omnibench.compare.result import EntryStatistics, EntryVerdict, ScoredRun, SplitScore, SplitStatistics
 from omnibench.data.dataset import Dataset, Split
 from omnibench.fit.held_out import judge, nothing_held_out
+from omnibench.fit.sessions.session_differences import compare_sessions
 from omnibench.fit.uncertainty.ratio_intervals import Bootstrap, Interval, RatioIntervals
 from omnibench.registry import calibrators
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import Integration
 
 # Share of the standard error of the best cost: a smaller difference is of no practical interest (chosen).
 NEGLIGIBLE_SHARE = 0.1
@@ -72,6 +75,14 @@ def held_out_verdicts(
                 verdict = judge(design, calibrated, held_out, bootstrap)
             verdicts[name] = EntryVerdict(label, verdict)
     return verdicts
+
+
+def sessions_that_differ(datasets: Mapping[str, Dataset], integration: Integration) -> dict[str, tuple[str, ...]]:
+    """By data set, a sentence for each session that differs from the others; by the design values, as any would do."""
+    return {
+        name: compare_sessions(OdometryModel.of_design(dataset.robot, integration), dataset.trajectories).sentences
+        for name, dataset in datasets.items()
+    }
 
 
 def is_mean(run: ScoredRun) -> bool:

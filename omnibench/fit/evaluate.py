@@ -11,6 +11,7 @@ from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory
 from omnibench.data.domain_check import extrapolation_warning
 from omnibench.fit.held_out import judge, nothing_held_out
+from omnibench.fit.sessions.session_differences import compare_sessions
 from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.kinematics import Array
@@ -31,7 +32,8 @@ class SplitErrors(Model):
 class Evaluation(Model):
     """Errors of a calibration and of the design values, by split; the split ``all`` is every trajectory.
 
-    held_out: the verdict by the runs that the calibration was not fitted to. warnings: one sentence if runs lie outside
+    held_out: the verdict by the runs that the calibration was not fitted to. sessions: a sentence for each session that
+    differs from the others. warnings: one sentence if runs lie outside
     the training domain of the calibration's effects. What is not excluded is the document of ``omnibench evaluate
     --json``.
     """
@@ -42,6 +44,7 @@ class Evaluation(Model):
     splits: dict[str, SplitErrors]
     design: dict[str, SplitErrors] = Field(exclude=True)
     held_out: HeldOutVerdict
+    sessions: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
 
@@ -63,6 +66,7 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
         splits={name: split_errors(model, group) for name, group in groups.items()},
         design={name: split_errors(design, group) for name, group in groups.items()},
         held_out=held_out_verdict(calibration, dataset),
+        sessions=compare_sessions(model, dataset.trajectories).sentences,
         warnings=() if warning is None else (warning,),
     )
 

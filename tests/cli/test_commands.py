@@ -51,7 +51,7 @@ def test_help_is_shown_on_standard_output(arguments: list[str], command: Command
 
 def test_evaluate_prints_the_documented_document(command: Command, prepared: Prepared) -> None:
     found = document(command("evaluate", prepared.calibration, prepared.data, "--json"))
-    assert [*found] == ["dataset", "trajectories", "splits", "held_out", "warnings"]
+    assert [*found] == ["dataset", "trajectories", "splits", "held_out", "sessions", "warnings"]
     assert found["warnings"] == []
     assert (found["dataset"], found["trajectories"]) == ("flower", 12)
     assert [*found["splits"]] == ["train", "validation", "all"]

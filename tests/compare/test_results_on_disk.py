@@ -83,7 +83,7 @@ def test_the_summary_has_the_documented_keys(output: Path) -> None:
     assert (found["dataset"], found["cost"], found["name"]) == ("flower", "final_pose", "small")
     assert {*found} == {
         *("name", "dataset", "simulated", "cost", "integration", "budget", "runs", "statistics", "warnings"),
-        *("environment", "certificates", "intervals", "held_out"),
+        *("environment", "certificates", "intervals", "held_out", "sessions"),
     }
     assert [(run["label"], run["seed"]) for run in found["runs"]] == [
         ("theoretical", 1),

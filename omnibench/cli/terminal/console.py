@@ -39,7 +39,12 @@ def print_json(document: Mapping[str, Any] | BaseModel) -> None:
     typer.echo(to_json(document))
 
 
-def print_verdict(verdict: HeldOutVerdict, subject: str = "") -> None:
-    """The last lines of ``calibrate``, ``evaluate`` and ``compare``: what held-out runs say, and which these are."""
+def print_verdict(verdict: HeldOutVerdict, subject: str = "", sessions: Iterable[str] = ()) -> None:
+    """The last lines of ``calibrate``, ``evaluate`` and ``compare``: what held-out runs say, and which these are.
+
+    sessions: a sentence for each session that differs from the others.
+    """
     typer.echo(f"{subject}{verdict.sentence}")
     typer.echo(verdict.detail)
+    for sentence in sessions:
+        typer.echo(sentence)

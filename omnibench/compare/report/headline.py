@@ -42,11 +42,12 @@ def _blocks(view: DatasetView) -> tuple[Block, ...]:
 
 def _held_out(view: DatasetView) -> tuple[Block, ...]:
     """What held-out runs say of the best calibration, in the words of ``calibrate`` and ``evaluate``."""
+    sessions = (Callout("Sessions", view.sessions, "warning"),) if view.sessions else ()
     if view.held_out is None:
-        return ()
+        return sessions
     verdict = view.held_out.verdict
     manner: Literal["plain", "warning"] = "plain" if verdict.verdict == "better" else "warning"
-    return (Callout(f"{view.held_out.label}, {verdict.sentence}", (verdict.detail,), manner),)
+    return (Callout(f"{view.held_out.label}, {verdict.sentence}", (verdict.detail,), manner), *sessions)
 
 
 def _no_winner(view: DatasetView, best: EntryStatistics | None) -> str:

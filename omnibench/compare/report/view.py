@@ -41,7 +41,7 @@ class DatasetView:
     warnings: warnings of the whole comparison. styles: styles by label, the same in the whole report. design_costs:
     mean cost of the design values on each split that has trajectories. design_errors: final pose errors (Z, 3) of the
     design matrix on each such split, m, m, rad. units: what the intervals of each such split rest on. held_out: what
-    held-out runs say of the best calibration, if there is one.
+    held-out runs say of the best calibration, if there is one. sessions: a sentence for each that differs from others.
     """
 
     name: str
@@ -56,6 +56,7 @@ class DatasetView:
     design_errors: Mapping[Split, Array]
     units: Mapping[Split, Units]
     held_out: EntryVerdict | None
+    sessions: tuple[str, ...]
 
     @property
     def splits(self) -> tuple[Split, ...]:
@@ -143,6 +144,7 @@ def _view(result: ComparisonResult, name: str, styles: Mapping[str, LegendItem])
             if dataset.split(split)
         },
         held_out=result.held_out.get(name),
+        sessions=result.sessions.get(name, ()),
     )
 
 
