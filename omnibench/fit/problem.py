@@ -210,6 +210,12 @@ class CalibrationProblem:
         """The inverse kinematic matrix (3, N) of one vector (n,)."""
         return self.parameterisation.matrices(vector[None])[0]
 
+    def settled(self, vector: Array) -> Array:
+        """For matrix elements: those of the vector's matrix (n,), or the clipped vector if these leave the box."""
+        vector = np.clip(vector, self.lower, self.upper)
+        elements = self.matrix(vector).ravel()
+        return elements if bool(self.inside(elements[None])[0]) else vector
+
     def _fast_values(self, candidates: Array, evaluator: PoseEvaluator) -> Array:
         """Costs (P,) by the fast evaluator for candidates in its box, by direct integration for the others."""
         with np.errstate(all="ignore"):

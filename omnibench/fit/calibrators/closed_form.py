@@ -104,7 +104,7 @@ def linear_start(problem: CalibrationProblem) -> Array:
     """Vector (n,) in the box by linear least squares."""
     design, identity = problem.matrix(problem.start), np.eye(len(problem.robot.wheels))
     matrix = linear_fit(problem.odometry, problem.trajectories, problem.reference, design, identity)
-    return settled(problem, matrix.ravel())
+    return problem.settled(matrix.ravel())
 
 
 def cone_program(problem: CalibrationProblem, objective: SumOfNorms, vector: Array) -> SumOfNormsProgram:
@@ -122,7 +122,7 @@ def cone_program(problem: CalibrationProblem, objective: SumOfNorms, vector: Arr
 
 def _descend(problem: CalibrationProblem, vector: Array, cost: float, step: Array) -> tuple[Array, float, bool]:
     """The vector and cost after the step, halved until the cost does not rise; False if no part of it lowers it."""
-    trial = settled(problem, vector + step)
+    trial = problem.settled(vector + step)
     for _ in range(_MOST_HALVINGS):
         trial_cost = float(problem.cost(trial[None])[0])
         if trial_cost <= cost:
@@ -131,10 +131,3 @@ def _descend(problem: CalibrationProblem, vector: Array, cost: float, step: Arra
             break
         trial = (trial + vector) / 2
     return vector, cost, False
-
-
-def settled(problem: CalibrationProblem, vector: Array) -> Array:
-    """The elements of the vector's matrix, or the vector itself (n,) where these lie outside the box."""
-    vector = np.clip(vector, problem.lower, problem.upper)
-    elements = problem.matrix(vector).ravel()
-    return elements if bool(problem.inside(elements[None])[0]) else vector

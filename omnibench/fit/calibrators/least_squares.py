@@ -19,7 +19,6 @@ import numpy as np
 
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.calibrators.closed_form import settled
 from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.linear_fit import linear_system
 from omnibench.fit.parameterisation import MatrixElements
@@ -44,7 +43,7 @@ class LeastSquares(Calibrator):
             raise ConfigError("least_squares works on the matrix parameterisation; search the geometry with another")
         if not isinstance(problem.objective, SumOfNorms):
             raise ConfigError(f"least_squares squares the norms of a sum, which {problem.objective.name} is not")
-        vector = settled(problem, _minimum(problem, problem.objective))
+        vector = problem.settled(_minimum(problem, problem.objective))
         problem.cost(vector[None])
         return Solution(vector, "one quadratic program")
 
