@@ -40,19 +40,22 @@ def import_(
     Recordings with laser scans but without reference poses get these by SLAM.
     """
     from omnibench.config import parse_settings
+    from omnibench.data.splits import division_in_words
     from omnibench.data.storage import check_dataset_folder, save_dataset
     from omnibench.files import refuse_existing
     from omnibench.registry import importers
     from omnibench.slam.import_dataset import import_dataset
 
     load_given_plugins(plugins)
-    importers.entry(importer, "import")
+    entry, options = importers.entry(importer, "import"), parse_settings(settings)
     check_dataset_folder(output)
     refuse_existing(output, force=force, folders=True)
-    dataset = import_dataset(importer, source, parse_settings(settings))
+    dataset = import_dataset(importer, source, options)
     save_dataset(dataset, output, table_format, overwrite=force)
     warn(dataset.warnings)
     typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {output}")
+    way = " (other: --set validation=PATTERN)" if "validation" in entry.cls.Options.model_fields else ""
+    typer.echo(f"{division_in_words(dataset.trajectories, options)}{way}", err=True)
 
 
 @recording_app.command()

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator
 
-from omnibench.data.dataset import Split, Trajectory
+from omnibench.data.dataset import SPLITS, Split, Trajectory
 from omnibench.errors import ConfigError, nearest
+from omnibench.words import plural
 
 _OPTIONAL = ("angles", "targets", "pose_covariances")  # fields of a run that all runs of a data set have, or none
 
@@ -106,3 +107,24 @@ def repetitions(commands: Sequence[Hashable]) -> list[int]:
         seen[command] += 1
         numbers.append(seen[command])
     return numbers
+
+
+def division_in_words(runs: Sequence[Trajectory], options: Mapping[str, Any]) -> str:
+    """How imported runs are divided, and by what: ``training 8 runs of 4 commands, validation 4 runs of ...``.
+
+    options: the importer's, with patterns under ``train`` and ``validation`` where these were given.
+    """
+    parts = []
+    for split, name in zip(SPLITS, ("training", "validation"), strict=True):
+        members = [run for run in runs if run.split == split]
+        commands = {run.command for run in members if run.command is not None}
+        of_commands = f" of {plural(len(commands), 'command')}" if commands else ""
+        parts.append(f"{name} {plural(len(members), 'run')}{of_commands}")
+    given = {side: options[side] for side in SPLITS if options.get(side)}
+    if given:
+        rule = f"by {', '.join(f'{side}={value}' for side, value in given.items())}"
+    elif [run.split for run in runs] == every_second([run.command for run in runs]):
+        rule = "every second run of a command validates"
+    else:
+        rule = "by the importer's own rule"
+    return f"{', '.join(parts)}, {rule}"

@@ -261,6 +261,8 @@ def test_import_turns_recordings_into_a_data_set(command: Command, tmp_path: Pat
     printed = command("import", "optiodom", source, "-o", tmp_path / "data", *split)
     assert printed.returncode == 0, printed.stderr
     assert printed.stdout == f"67 trajectories: {tmp_path / 'data'}\n"
+    division = "training 44 runs of 20 commands, validation 23 runs of 5 commands, by train=circular, validation=square"
+    assert division in printed.stderr
     dataset = load_dataset(tmp_path / "data")
     assert (len(dataset.split("train")), len(dataset.split("validation"))) == (44, 23)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.splits import complete, divided
+from omnibench.data.splits import complete, divided, division_in_words
 
 
 def run(name: str, command: str | None) -> Trajectory:
@@ -39,3 +39,14 @@ def test_what_only_some_runs_hold_is_left_out() -> None:
     with_angles = [replace(each, angles=np.ones((1, 3))) for each in RUNS]
     assert all(each.angles is not None for each in complete(with_angles))
     assert all(each.angles is None for each in complete([*with_angles, RUNS[0]]))
+
+
+def test_a_division_says_how_many_runs_and_commands_each_side_has_and_by_what() -> None:
+    words = division_in_words(divided(RUNS, (), ()), {})
+    assert (
+        words == "training 3 runs of 2 commands, validation 1 run of 1 command, every second run of a command validates"
+    )
+    named = division_in_words(divided(RUNS, (), ("b",)), {"validation": "b"})
+    assert named == "training 3 runs of 2 commands, validation 1 run of 1 command, by validation=b"
+    own = division_in_words(divided(RUNS, (), (), otherwise=["validation"] * 4), {})
+    assert own == "training 0 runs, validation 4 runs of 2 commands, by the importer's own rule"
