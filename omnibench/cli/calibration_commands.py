@@ -47,7 +47,8 @@ def calibrate(
     evaluations: Annotated[int, typer.Option(min=1, help="Budget: most evaluations of the cost.")] = 60_000,
     seconds: Annotated[float, typer.Option(min=0.001, help="Budget: longest time, in s.")] = 600.0,
     intervals: Annotated[
-        bool, typer.Option("--intervals", help="Also bootstrap 95 % intervals of the matrix (closed_form only).")
+        bool,
+        typer.Option("--intervals", help="Also draw 95 % intervals of the matrix by resampling (closed_form only)."),
     ] = False,
     unidentified: Annotated[
         Literal["keep", "fit"],

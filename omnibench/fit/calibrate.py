@@ -20,10 +20,11 @@ from omnibench.fit.parameterisation import (
     fitted_parameters,
 )
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
-from omnibench.fit.span import Unidentified
+from omnibench.fit.span import Unidentified, WheelDirection
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals, bootstrap_intervals
+from omnibench.fit.uncertainty.ratio_intervals import FEWEST, Units, units_of
 from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
-from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
+from omnibench.fit.uncertainty.unidentified import kept_motions, warnings_of_calibration
 from omnibench.progress import Reporter, no_progress, renamed
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import Calibration, Provenance, covariance_rows, fitted_calibration, matrix_rows
@@ -33,11 +34,12 @@ from omnibench.robot.odometry import Integration
 
 @dataclass(frozen=True, eq=False)
 class CalibrationRun:
-    """A calibration, the calibrator's result and, where asked for, 95 % bootstrap intervals of the elements.
+    """A calibration, the calibrator's result and, where asked for, resampled 95 % intervals of the elements.
 
     parameters: radius, distance and angle of each wheel, if these were searched. uncertainty: covariance of the
     elements and of the physical parameters; None if there is none, then a warning says why. warnings: one sentence for
-    every part of the calibration that the data do not determine.
+    every part of the calibration that the data do not determine. kept: motions that keep the design values; intervals
+    hold only if these are right. units: what these resample.
     """
 
     calibration: Calibration
@@ -46,6 +48,8 @@ class CalibrationRun:
     parameters: tuple[FittedParameter, ...] | None
     uncertainty: Uncertainty | None
     warnings: tuple[str, ...]
+    kept: tuple[WheelDirection, ...]
+    units: Units
 
 
 def calibrate(
@@ -66,8 +70,8 @@ def calibrate(
 ) -> CalibrationRun:
     """Fit the odometry model of a data set's training split.
 
-    intervals: also draw bootstrap intervals about the optimum (closed_form only), unless runs are too few for a
-    covariance, of which a warning tells.
+    intervals: also draw resampled intervals about the optimum (closed_form only), unless there are fewer than three
+    commands (runs, where none is repeated) or too few for a covariance, of which a warning tells.
     unidentified: for motions that the data drive so little that slip alone may explain them, ``keep`` the design values
     or ``fit`` them (see make_parameterisation). The run's warnings name them.
     watch: told the evaluations and the best cost so far, at most every 0.1 s.
@@ -130,10 +134,16 @@ def calibrate(
             held_out=verdict_on(model, validation),
         ),
     )
-    drawn = bootstrap_intervals(problem, result.vector, rng=problem.rng) if intervals and uncertainty else None
+    units, drawn = units_of(training), None
+    if intervals and units.count < FEWEST:
+        doubts += (f"no resampled intervals: {units.words}; {FEWEST} are needed",)
+    elif intervals and uncertainty:
+        drawn = bootstrap_intervals(problem, result.vector, rng=problem.rng)
     geometry = problem.parameterisation.name == "geometry"
     parameters = fitted_parameters(dataset.robot, result.vector) if geometry else None
-    return CalibrationRun(calibration, result, drawn, parameters, uncertainty, (*warnings, *doubts))
+    kept = kept_motions(dataset.robot, training, searched.name, unidentified)
+    warnings = (*warnings, *doubts)
+    return CalibrationRun(calibration, result, drawn, parameters, uncertainty, warnings, kept, units)
 
 
 def _uncertainty(

@@ -169,12 +169,17 @@ class WheelGeometry:
 
 @dataclass(frozen=True)
 class FittedParameter:
-    """A physical parameter and its deviation from the design value, as in section 4.2 of the paper."""
+    """A physical parameter and its deviation from the design value, as in section 4.2 of the paper.
+
+    deviation: in the parameter's unit. deviation_percent: of the design value; of an angle, whose zero is a convention,
+    it means nothing, and stands for comparison with the paper's section 4.2.
+    """
 
     name: str
     value: float
     unit: str
     design: float
+    deviation: float
     deviation_percent: float | None  # None where the design value is 0
 
 
@@ -187,6 +192,7 @@ def fitted_parameters(robot: Robot, vector: Array) -> tuple[FittedParameter, ...
             value=float(value),
             unit="rad" if name.startswith("angle") else "m",
             design=float(design),
+            deviation=float(value - design),
             deviation_percent=float(100 * (value - design) / design) if design else None,
         )
         for name, value, design in zip(geometry.names, vector, geometry.start, strict=True)

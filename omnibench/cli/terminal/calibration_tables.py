@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
+import numpy as np
 from rich.console import Console
 
 from omnibench.cli.terminal.tables import print_table
@@ -18,6 +19,8 @@ from omnibench.fit.uncertainty.physical import ParameterEstimate
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.robot.kinematics import Robot
 from omnibench.words import plural
+
+_TOUCHED = 1e-6  # share of a direction of wheel rates: a smaller one is rounding
 
 
 def print_certificate(console: Console, certified: CertifiedCalibration) -> None:
@@ -50,6 +53,8 @@ def print_calibration(console: Console, run: CalibrationRun) -> None:
         print_table(console, _parameter_table(calibration.robot, run.uncertainty.parameters))
     if run.uncertainty is not None:
         console.print(f"95 % intervals: {run.uncertainty.source}", soft_wrap=True)
+        if run.intervals is not None:
+            console.print(f"95 % intervals, resampled: {run.units.words}", soft_wrap=True)
         console.print(f"noise of the reference: {'; '.join(noise_in_words(run.uncertainty.noise))}", soft_wrap=True)
     console.print(
         f"{result.outcome}: {result.reason}; {plural(result.evaluations, 'evaluation')}, {result.seconds:.2f} s",
@@ -62,24 +67,32 @@ def _matrix_table(run: CalibrationRun) -> Table:
     calibration = run.calibration
     simulated = calibration.provenance is not None and calibration.provenance.simulated
     labels = ("x (m/rad)", "y (m/rad)", "w (rad/rad)")
+    touched = np.any([np.abs(each.rates) > _TOUCHED for each in run.kept], axis=0) if run.kept else []
+    marks = ["*" if touch else "" for touch in touched] or [""] * len(calibration.matrix[0])
+    note = ""
+    if run.kept:
+        motions = " and ".join(f"{each.words} ({each.motion})" for each in run.kept)
+        note = f"* only if the design values are right along {motions}: these data say nothing of it, and they are kept"
     rows = []
     for number, (label, values) in enumerate(zip(labels, calibration.matrix, strict=True)):
         design = calibration.robot.inverse_kinematic_matrix[number]
         cells = (Cell(f"{value:+.7f}", _deviation(value, first)) for value, first in zip(values, design, strict=True))
         rows.append(Row.of(label, *cells))
         for name, intervals in _intervals(run):
-            bounds = zip(intervals.low[number], intervals.high[number], strict=True)
-            rows.append(Row.of(f"  {name}", *(Cell("", f"{low:+.7f} to {high:+.7f}") for low, high in bounds)))
+            bounds = zip(intervals.low[number], intervals.high[number], marks, strict=True)
+            rows.append(
+                Row.of(f"  {name}", *(Cell("", f"{low:+.7f} to {high:+.7f}{mark}") for low, high, mark in bounds))
+            )
     wheels = (Column(f"wheel {wheel}") for wheel in calibration.robot.wheel_names)
     caption = f"{calibration.name}{' (simulated data)' if simulated else ''}"
-    return Table(caption, (Column("", numeric=False), *wheels), tuple(rows))
+    return Table(caption, (Column("", numeric=False), *wheels), tuple(rows), note)
 
 
 def _intervals(run: CalibrationRun) -> Iterator[tuple[str, ElementIntervals]]:
     if run.uncertainty is not None:
         yield "95 %", run.uncertainty.intervals
     if run.intervals is not None:
-        yield "95 %, bootstrap", run.intervals
+        yield "95 %, resampled", run.intervals
 
 
 def _parameter_table(robot: Robot, parameters: Sequence[ParameterEstimate]) -> Table:
@@ -91,7 +104,10 @@ def _parameter_table(robot: Robot, parameters: Sequence[ParameterEstimate]) -> T
             low, high = (f"{factor * bound:.{decimals}f}" for bound in (parameter.low, parameter.high))
             interval = Cell("", f"{low} to {high} {unit}")
         values = (f"{factor * value:.{decimals}f} {unit}" for value in (start, parameter.value))
-        rows.append(Row.of(parameter.name, *values, _deviation(parameter.value, start), interval))
+        deviation = _deviation(parameter.value, start)
+        if parameter.unit == "rad":  # an angle's zero is a convention, so that no share of it means anything
+            deviation = f"{math.degrees(parameter.value - start):+.3f} deg"
+        rows.append(Row.of(parameter.name, *values, deviation, interval))
     columns = (Column("parameter", numeric=False), *map(Column, ("design", "fitted", "deviation", "95 %")))
     return Table("physical parameters", columns, tuple(rows))
 

@@ -171,4 +171,6 @@ def _parameter_cell(parameter: FittedParameter | None, mark: str) -> Cell:
         return Cell(NOTHING)
     percent = parameter.deviation_percent
     deviation = "design is 0" if percent is None else f"{fixed(percent, 2, signed=True)} %"
+    if parameter.unit == "rad":  # an angle's zero is a convention, so that no share of it means anything
+        deviation = f"{fixed(math.degrees(parameter.deviation), 3, signed=True)}°"
     return Cell(_shown(parameter.value, parameter.unit) + (mark and f" {mark}"), deviation)

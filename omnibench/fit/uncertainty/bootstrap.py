@@ -1,16 +1,32 @@
-"""Bootstrap intervals of an exact optimum: how far it would move on other recordings."""
+"""Resampled intervals of an exact optimum: how far it would move on other recordings.
+
+The units that are resampled are commands where runs repeat them, since repetitions share what the model misses there,
+else runs. With t the 0.975 quantile of Student's t with n - 1 degrees of freedom, n units from ten on are drawn with
+replacement. Their spread is smaller by sqrt((n - 1) / n) than what it stands for, and its tails are normal; percentiles
+alpha and 1 - alpha make up for both (Hesterberg, Am. Statistician 69:371, 2015):
+
+    alpha = Phi(-sqrt(n / (n - 1)) t).                                                             (1)
+
+Three to nine units are too few to draw from. Of them each is left out in turn, and the optima theta_u without it have
+the jackknife's standard error s about their mean (Tukey 1958):
+
+    theta +- t s,   s^2 = (n - 1) / n sum_u (theta_u - mean)^2.                                    (2)
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrators.closed_form import cone_program
 from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
+from omnibench.fit.uncertainty.intervals import INTERVAL
+from omnibench.fit.uncertainty.ratio_intervals import BOOTSTRAPPED, FEWEST, units_of
 from omnibench.robot.kinematics import Array
 
 
@@ -25,20 +41,28 @@ class ElementIntervals:
 def bootstrap_intervals(
     problem: CalibrationProblem, optimum: Array, *, resamples: int = 400, rng: np.random.Generator
 ) -> ElementIntervals:
-    """Percentile intervals of the matrix elements about closed_form's ``optimum`` (n,).
+    """Intervals of the matrix elements about closed_form's ``optimum`` (n,), from three units or more.
 
-    Trajectories are drawn with replacement and the optimum is found again, with the poses linearised about
-    ``optimum``: the error of that is far below the width of the intervals. ConfigError for another parameterisation or
-    a cost that is no sum of norms.
+    The optimum of every resample is found with the poses linearised about ``optimum``: the error of that is far below
+    the width of the intervals. ConfigError for another parameterisation, another cost than a sum of norms, fewer units.
     """
     objective = problem.objective
     if not isinstance(problem.parameterisation, MatrixElements) or not isinstance(objective, SumOfNorms):
         raise ConfigError("bootstrap intervals need the matrix parameterisation and a cost that is a sum of norms")
+    units = units_of(problem.trajectories)
+    count = units.count
+    if count < FEWEST:
+        raise ConfigError(f"{units.words}: {FEWEST} are needed")
     program = cone_program(problem, objective, optimum)
     owner = problem.odometry.trajectory
-    shares = objective.shares(owner)
-    count = len(problem.trajectories)
-    drawn = rng.multinomial(count, np.full(count, 1 / count), size=resamples)
-    moved = np.array([problem.matrix(optimum + program.step(shares * weights[owner])) for weights in drawn])
-    low, high = np.percentile(moved, [2.5, 97.5], axis=0)
+    shares, of_stamp = objective.shares(owner), units.of_run[owner]
+    few = count < BOOTSTRAPPED
+    drawn = 1 - np.eye(count) if few else rng.multinomial(count, np.full(count, 1 / count), size=resamples)
+    moved = np.array([problem.matrix(optimum + program.step(shares * weights[of_stamp])) for weights in drawn])
+    quantile = float(stdtrit(count - 1, (1 + INTERVAL) / 2))
+    if few:
+        reach = quantile * np.sqrt((count - 1) * moved.var(axis=0))  # Eq. (2)
+        return ElementIntervals(problem.matrix(optimum) - reach, problem.matrix(optimum) + reach)
+    outside = 100 * float(ndtr(-np.sqrt(count / (count - 1)) * quantile))  # Eq. (1)
+    low, high = np.percentile(moved, [outside, 100 - outside], axis=0)
     return ElementIntervals(low, high)

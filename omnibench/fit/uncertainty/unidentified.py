@@ -60,6 +60,17 @@ def _advice(motion: str) -> str:
     return "record other motions, too" if "while" in motion else f"record runs {motion.removeprefix('moving ')}"
 
 
+def kept_motions(
+    robot: Robot, trajectories: Sequence[Trajectory], parameterisation: ParameterisationName, unidentified: Unidentified
+) -> tuple[WheelDirection, ...]:
+    """Motions of which a calibration on these runs keeps the design values, so that no interval tells of them."""
+    if parameterisation == "geometry":
+        return ()
+    directions = wheel_directions(robot, driven_span(trajectories))
+    open_ones = (each for each in directions if not each.identified and each.motion)
+    return tuple(each for each in open_ones if not (each.state == "weak" and unidentified == "fit"))
+
+
 def warnings_of_calibration(
     robot: Robot,
     trajectories: Sequence[Trajectory],
