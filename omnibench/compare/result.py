@@ -28,7 +28,7 @@ class RunRecord(Model):
     """One run as a flat row of summary.json. Costs and matrix are None where the run gave no answer.
 
     held: elements that keep their start value, because the box or the cost leaves no choice. gap: train_cost divided by
-    the exact optimum in the box ``gap_box``, minus 1. proven_gap: the share of train_cost
+    that of closed_form in the box ``gap_box``, minus 1. proven_gap: the share of train_cost
     that a matrix of the box could save at most, by proof.
     """
 

@@ -73,7 +73,7 @@ class SplitScorer:
 def score(
     plan: Sequence[PlannedRun], results: Sequence[RunResult], datasets: Mapping[str, Dataset]
 ) -> tuple[ScoredRun, ...]:
-    """Every run with its costs and errors, and its gap above the exact optimum where that is known."""
+    """Every run with its costs and errors, and its gap above closed_form where that converged in the same box."""
     scorers: dict[str, dict[Split, SplitScorer]] = {}
     design: dict[str, dict[Split, SplitScore]] = {}
     for run in plan:
@@ -172,13 +172,13 @@ def _parameters(run: PlannedRun, result: RunResult) -> tuple[FittedParameter, ..
 
 
 def _is_exact(run: PlannedRun, record: RunRecord) -> bool:
-    """True if a run's training cost is the optimum in its box of matrix elements, and one to divide by."""
+    """True if a run converged to what should be the optimum in its box of matrix elements, with a cost to divide by."""
     exact = calibrators.entry(record.calibrator).cls.exact and run.element_box is not None
     return exact and record.outcome is Outcome.CONVERGED and bool(record.train_cost)
 
 
 def _with_gap(run: PlannedRun, scored: ScoredRun, exact: Sequence[tuple[PlannedRun, ScoredRun]]) -> ScoredRun:
-    """The run with its gap above the first exact optimum that it can be compared with."""
+    """The run with its gap above the first answer of closed_form that it can be compared with."""
     cost, matrix = scored.record.train_cost, scored.matrix
     if cost is None or matrix is None:
         return scored

@@ -81,7 +81,7 @@ def calibrate(
     """
     chosen: Calibrator = calibrators.create(calibrator, options)
     if intervals and not chosen.exact:
-        raise ConfigError("intervals are drawn about the exact optimum: use the calibrator closed_form")
+        raise ConfigError("intervals are drawn about a minimum to rounding: use the calibrator closed_form")
     objective: Cost = costs.create(cost)
     training = training_split(dataset)
     searched = make_parameterisation(

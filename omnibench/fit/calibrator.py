@@ -52,7 +52,8 @@ class Calibrator(ABC):
     parameterisation: the one it searches unless the config names another.
     bounded: False if the answer does not depend on the box (a published matrix).
     stochastic: False if the seed makes no difference, so that one run is enough.
-    exact: True if a converged answer is the optimum in the box, against which others are measured.
+    exact: True if a converged answer is a minimum to rounding, against which others are measured; that it is the
+    optimum of the box is not said by this but by a proof (certify.py).
     """
 
     Options: ClassVar[type[BaseModel]] = Options

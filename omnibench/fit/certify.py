@@ -29,6 +29,12 @@ from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 
+_TIMED = 3  # parts whose mean time stands for that of all: the whole box and its first two parts
+# Parts of proofs to a gap of 0.1 %: the middle one, the fewest and the most of ten (tests/benchmarks/proof_parts.py).
+# With a tenth of the gap there are about twice as many.
+_PARTS, _FEW_PARTS, _MANY_PARTS = 155, 60, 900
+_PARTS_GAP = 1e-3
+
 
 @dataclass(frozen=True, eq=False)
 class Proof:
@@ -84,6 +90,7 @@ def certify_optimum(
     """Bound how much better than a calibration any matrix of the box could be, on a data set's training split.
 
     Cost and integration are those of the calibration. box: default the one that was searched, or ``row``.
+    watch: told early about how long the proof takes, then of every part.
     gap: stop when the best known matrix is proven to be this close to the optimum. seconds, parts: stop after this time
     or after so many parts of the box; the number ends a proof at the same place on every machine.
     Raises DataError when the wheels differ, the calibration has effects or the training split is empty, ConfigError for
@@ -112,7 +119,15 @@ def certify_optimum(
     vector = calibration.matrix_array.ravel()
     cost = float(problem.values(vector[None])[0])
     inside = bool(problem.inside(vector[None])[0])
-    proof = prove(problem, vector if inside else problem.start, gap=gap, seconds=seconds, parts=parts, watch=watch)
+    began = time.perf_counter()
+
+    def foretell(event: Progress) -> None:
+        watch(event)
+        if event.done == _TIMED and (parts or math.inf) > _TIMED:
+            each = (time.perf_counter() - began) / _TIMED
+            watch(Progress("duration", result=_duration_in_words(gap, each, seconds, parts)))
+
+    proof = prove(problem, vector if inside else problem.start, gap=gap, seconds=seconds, parts=parts, watch=foretell)
     return CertifiedCalibration(
         Certificate(
             cost=cost,
@@ -130,8 +145,11 @@ def certify_optimum(
 
 
 def proven_gap(cost: float, lower_bound: float) -> float:
-    """Largest share of a cost that could be saved; negative for a matrix outside the box that beats the bound."""
-    return 1 - lower_bound / cost if cost > 0 else 0.0
+    """Largest share of a cost that could be saved; negative for a matrix outside the box that beats the bound.
+
+    0 for a cost that no bound can see: it is rounding.
+    """
+    return 1 - lower_bound / cost if cost >= QUADRATURE else 0.0
 
 
 def prove(
@@ -172,3 +190,15 @@ def prove(
                     best_cost, best_vector = cost, vector
                 heapq.heappush(boxes, (part.bound, count, part))  # count breaks ties: nodes cannot be compared
                 count += 1
+
+
+def _duration_in_words(gap: float, each: float, seconds: float, parts: int | None) -> str:
+    """How long a proof takes that examines a part in ``each`` s, and when it ends at the latest."""
+    growth = 2 ** math.log10(_PARTS_GAP / gap)
+    about, least, most = (growth * number for number in (_PARTS, _FEW_PARTS, _MANY_PARTS))
+    limits = [f"{seconds:g} s"] * math.isfinite(seconds) + [f"{parts} parts"] * (parts is not None)
+    words = (
+        f"a proof to within {gap:.3g} of the cost takes about {each * about:.2g} s here ({each * least:.2g} to "
+        f"{each * most:.2g} s: {least:.0f} to {most:.0f} parts at {each:.2g} s)"
+    )
+    return f"{words}; it ends after {' or '.join(limits)} at the latest" if limits else words

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
+import numpy as np
 import plotly.graph_objects as go
 
 from omnibench.report.blocks import Dash
-from omnibench.report.numbers import power_of_ten
+from omnibench.report.numbers import fixed, power_of_ten
 from omnibench.robot.kinematics import Array
 
 FONT = 'system-ui, -apple-system, "Segoe UI", "Helvetica Neue", "Liberation Sans", Arial, sans-serif'
@@ -51,6 +52,10 @@ SYMBOLS = (
     "cross-open",
     "x-open",
 )
+
+# Spans that a middle is away from 0 before its axis begins elsewhere: a tick then has three digits more than one near
+# 0 (chosen).
+_FAR = 1000.0
 
 
 def colours(wanted: Mapping[str, str | None]) -> dict[str, tuple[str, Dash]]:
@@ -93,11 +98,45 @@ def plot(*traces: go.Scatter, x_title: str | None = None, y_title: str | None = 
 
 
 def plan(*traces: go.Scatter, window: Array | None = None, x_title: str = "x (m)", y_title: str = "y (m)") -> go.Figure:
-    """A figure with the same scale in x and y. window (2, 2): least and greatest x, then y; default: all is shown."""
-    figure = plot(*traces, x_title=x_title, y_title=y_title, yaxis={"scaleanchor": "x", "scaleratio": 1})
+    """A figure with the same scale in x and y. window (2, 2): least and greatest x, then y; default: all is shown.
+
+    Where a coordinate is far from 0, as in a map's frame, it is drawn from a round value that the axis names.
+    """
+    origins = [_round_origin(traces, "x"), _round_origin(traces, "y")]
+    titles = [x_title, y_title]
+    for row, (axis, origin) in enumerate(zip("xy", origins, strict=True)):
+        if origin:
+            named = f"{axis} − {fixed(origin, 0)}"
+            titles[row] = titles[row].replace(axis, named, 1)
+            traces = tuple(_moved(trace, axis, origin, named) for trace in traces)
+    if window is not None:
+        window = window - np.array(origins)[:, None]
+    figure = plot(*traces, x_title=titles[0], y_title=titles[1], yaxis={"scaleanchor": "x", "scaleratio": 1})
     if window is not None:
         figure.update_layout(xaxis_range=window[0].tolist(), yaxis_range=window[1].tolist())
     return figure
+
+
+def _moved(trace: go.Scatter, axis: str, origin: float, named: str) -> go.Scatter:
+    """A copy of a trace with one coordinate less its origin, which its hover text names."""
+    copy = go.Scatter(trace)
+    copy[axis] = [None if value is None else value - origin for value in trace[axis]]
+    if copy.hovertemplate:
+        copy.hovertemplate = copy.hovertemplate.replace(f"{axis} %{{", f"{named} = %{{")
+    return copy
+
+
+def _round_origin(traces: Sequence[go.Scatter], axis: Literal["x", "y"]) -> float:
+    """A round value near the coordinates of traces that are far from 0; 0 for others."""
+    values = np.array([value for trace in traces for value in trace[axis] if value is not None], dtype=float)
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return 0.0
+    span, middle = max(float(np.ptp(values)), 1.0), float(values.mean())
+    if abs(middle) < _FAR * span:
+        return 0.0
+    step = 10.0 ** (1 + math.ceil(math.log10(span)))
+    return step * round(middle / step)
 
 
 def logarithmic(figure: go.Figure, axis: Literal["x", "y"], low: float, high: float) -> None:

@@ -99,6 +99,15 @@ def test_a_narrow_terminal_wraps_words_and_cuts_no_number(result: ComparisonResu
         assert cell in tables
 
 
+def test_forty_columns_keep_the_calibrated_costs_and_the_improvement(result: ComparisonResult) -> None:
+    text = printed(result, 40)
+    heading = text[text.index("M⁻¹") :].split("─")[0]
+    assert "training" in heading
+    assert "Improvement" in heading
+    assert "theoretical" not in heading
+    assert "left out for want of room: CF theoretical;" in " ".join(text.split())
+
+
 def test_data_sets_are_told_apart_where_there_are_several(tmp_path: Path) -> None:
     sets = {name: {"simulate": flower()} for name in ("one", "two")}
     text = printed(compared_here(tmp_path / "out", datasets=sets, calibrators=["theoretical"]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +12,10 @@ from commands import CONFIGS
 from fit_samples import box_between, make_problem, noisy_trajectories
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 from scipy.optimize import minimize
 
+from omnibench.cli.terminal.calibration_tables import print_certificate
 from omnibench.compare.read_config import read_compare_config
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import ConfigError, DataError
@@ -27,7 +31,7 @@ from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration
-from omnibench.testing.synthetic import PERIOD, synthetic_dataset, synthetic_robot, true_robot
+from omnibench.testing.synthetic import PERIOD, synthetic_dataset, synthetic_robot, synthetic_trajectories, true_robot
 
 COSTS = ("final_pose", "final_position", "final_heading", "trajectory")
 
@@ -217,6 +221,36 @@ def test_the_proof_tells_how_it_gets_on() -> None:
     bounds = [float(event.note.removeprefix("bound ")) for event in seen]
     assert bounds == sorted(bounds)
     assert (seen[-1].done, seen[-1].best, bounds[-1]) == (proof.boxes, proof.best_cost, round(proof.lower_bound, 6))
+
+
+def test_about_how_long_a_proof_takes_is_said_after_its_first_parts() -> None:
+    seen: list[Progress] = []
+    dataset = synthetic_dataset()
+    certified = certify_optimum(
+        design_of(dataset, "arc"), dataset, gap=0.01, seconds=1e9, parts=2000, watch=seen.append
+    )
+    (place,) = [index for index, event in enumerate(seen) if event.task == "duration"]
+    assert seen[place - 1].done == 3
+    words = seen[place].result
+    assert words is not None
+    assert words.startswith("a proof to within 0.01 of the cost takes about ")
+    fewest, most = (float(number) for number in re.search(r"(\d+) to (\d+) parts", words).groups())
+    assert fewest <= certified.proof.boxes <= most
+    assert words.endswith("it ends after 1e+09 s or 2000 parts at the latest")
+
+
+def test_where_nothing_is_left_but_rounding_there_is_nothing_to_gain() -> None:
+    runs = synthetic_trajectories(synthetic_robot(), "arc")[:2]
+    dataset = make_dataset("exact", synthetic_robot(), 0.2, runs, simulated=True)
+    run = calibrate(dataset)
+    assert run.result.cost < 1e-9
+    certified = certify_optimum(run.calibration, dataset, parts=5)
+    assert certified.certificate.gap == 0.0
+    console = Console(file=io.StringIO(), width=120)
+    print_certificate(console, certified)
+    told = console.file.getvalue()
+    assert "There is nothing to gain: what is left is rounding" in told
+    assert "to gain on this calibration" not in told
 
 
 def test_a_calibration_outside_the_box_is_said_to_be_outside() -> None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omnibench.report.style import PALETTE, REFERENCE, THEORETICAL, colours, logarithmic, plot, text
+from omnibench.report.blocks import LegendItem
+from omnibench.report.style import PALETTE, REFERENCE, THEORETICAL, colours, logarithmic, plan, plot, text
+from omnibench.report.traces import path
 
 
 def test_an_entry_gets_the_colour_that_it_wants() -> None:
@@ -49,3 +52,22 @@ def test_a_logarithmic_axis_holds_its_data_and_has_labels(low: float, decades: f
 def test_names_cannot_be_markup_in_a_plot(name: str) -> None:
     assert "<" not in text(name)
     assert "& " not in text(name)
+
+
+def test_a_path_far_from_the_origin_is_drawn_from_a_round_value_that_its_axis_and_its_hover_text_name() -> None:
+    poses = np.array([[500_000.25, 4_600_000.5], [500_001.25, 4_600_001.0]])
+    item = LegendItem("a", "a path", "#111111")
+    trace = path(item, poses, 2.0)
+    for _ in range(2):  # a trace may be in several figures
+        figure = plan(trace, window=np.array([[499_999.0, 500_002.0], [4_599_999.0, 4_600_002.0]]))
+        assert figure.data[0].x == pytest.approx([0.25, 1.25])
+        assert figure.data[0].y == pytest.approx([0.5, 1.0])
+        assert figure.layout.xaxis.title.text == "x − 500,000 (m)"
+        assert figure.layout.yaxis.title.text == "y − 4,600,000 (m)"
+        assert figure.layout.xaxis.range == (-1.0, 2.0)
+        assert "y − 4,600,000 = %{y:.3f} m" in figure.data[0].hovertemplate
+
+
+def test_a_path_near_the_origin_is_drawn_as_it_is() -> None:
+    figure = plan(path(LegendItem("a", "a path", "#111111"), np.array([[90.0, 2.0], [91.0, 3.0]]), 2.0))
+    assert (figure.data[0].x, figure.layout.xaxis.title.text) == ((90.0, 91.0), "x (m)")

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from omnibench.cli.terminal.tables import print_table
 from omnibench.discover.report.wording import noise_in_words
+from omnibench.fit.bounds.stamp_sums import QUADRATURE
 from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.certify import CertifiedCalibration
 from omnibench.fit.evaluate import Evaluation
@@ -32,11 +33,14 @@ def print_certificate(console: Console, certified: CertifiedCalibration) -> None
     if proof.best_cost < certificate.cost:
         console.print(f"best matrix seen in the box  {proof.best_cost:.9f}")
     console.print(f"proven lower bound           {certificate.lower_bound:.9f}")
-    console.print(
-        f"No matrix in the box {certificate.box!r} costs less than that: whatever the optimiser, there is at most "
-        f"{max(certificate.gap, 0.0):.3%} to gain on this calibration.",
-        soft_wrap=True,
-    )
+    if certificate.cost < QUADRATURE:
+        console.print(f"There is nothing to gain: what is left is rounding (below {QUADRATURE:g}).", soft_wrap=True)
+    else:
+        console.print(
+            f"No matrix in the box {certificate.box!r} costs less than that: whatever the optimiser, there is at most "
+            f"{max(certificate.gap, 0.0):.3%} to gain on this calibration.",
+            soft_wrap=True,
+        )
     if certified.held:
         console.print(f"The box holds {', '.join(certified.held)} at the design value.", soft_wrap=True)
     ended = "" if proof.finished else "; with more (--seconds, --parts) the bound may rise"

@@ -40,7 +40,7 @@ def cost_table(view: DatasetView, split: Split) -> Table:
         caption=f"Cost of {plural(number, 'trajectory')}, {SPLIT_NAMES[split]}",
         columns=(
             Column("M⁻¹", numeric=False),
-            Column("CF theoretical"),
+            Column("CF theoretical", priority=1),
             Column(f"CF {SPLIT_NAMES[split]}"),
             Column("Improvement"),
         ),

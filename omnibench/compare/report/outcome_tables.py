@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from omnibench.compare.report.view import SPLIT_NAMES, DatasetView
 from omnibench.compare.report.wording import difference_in_words, entry_cell, interval_basis, level_in_words, on_bounds
 from omnibench.compare.result import BoxCertificate, EntryStatistics, RunRecord
+from omnibench.registry import calibrators
 from omnibench.report.blocks import Block, Cell, Column, Details, Row, Section, Table
 from omnibench.report.numbers import (
     NOTHING,
@@ -54,14 +55,14 @@ def entry_table(view: DatasetView) -> Table:
             Column("Entry", numeric=False),
             Column("Answers of runs", priority=1),
             Column("CF training, median"),
-            Column("Gap above exact optimum", "relative", priority=2),
+            Column(gap_title(view), "relative", priority=2),
             Column("Evaluations and time, median", priority=3),
             Column(f"Difference from the best in CF {SPLIT_NAMES[view.scored]}"),
             Column("Verdict", numeric=False),
         ),
         rows=tuple(rows),
-        note="Spread: interquartile range over seeds. Gap: training cost relative to the exact optimum in the same box "
-        f"(closed_form), minus one; {NOTHING} where that is not known. Proven: what share of the "
+        note="Spread: interquartile range over seeds. Gap: training cost relative to that of closed_form in the same "
+        f"box, minus one; {NOTHING} where it has no answer. Proven: what share of the "
         "cost any optimiser could still save in that box, at most. "
         f"Difference: paired by {view.units[view.scored].name}, with its 95 % interval, "
         f"{interval_basis(view, view.scored)}. Practically equal: that interval contains zero, "
@@ -69,6 +70,15 @@ def entry_table(view: DatasetView) -> Table:
         "interval. Best: the lowest training cost of the entries that are not known to differ from the one of lowest "
         f"{SPLIT_NAMES[view.scored]} cost.{_held_in_words(view)}",
     )
+
+
+def gap_title(view: DatasetView) -> str:
+    """Heading of gaps above closed_form, with how near the optimum that is, if this is proven for all boxes."""
+    exact = [run.record for entry, run in view.calibrated if calibrators.entry(entry.calibrator).cls.exact]
+    proofs = [record.proven_gap for record in exact if record.proven_gap is not None]
+    if not proofs or len(proofs) < len(exact):
+        return "Gap above closed_form, not proven optimal"
+    return f"Gap above closed_form, optimal to {percent(max(*proofs, 0.0), 2)}"
 
 
 def run_table(view: DatasetView, typical: bool = False) -> Table:

@@ -34,7 +34,7 @@ _POINTS = 12_000  # points of one plot, shared by its runs: keeps the file small
 class Course:
     """The course of a search: best cost (K,) against evaluations and seconds (K,), the final answer as last point.
 
-    best_known: the exact optimum that the record's gap is measured from; where that is not known, the lowest training
+    best_known: closed_form's cost that the record's gap is measured from; where that is not known, the lowest training
     cost that any run reached in the same search space.
     """
 

@@ -95,7 +95,7 @@ class DatasetView:
 
     @property
     def reference_entry(self) -> tuple[EntryStatistics, ScoredRun] | None:
-        """The entry that matrices are compared with: the exact optimum, else the best calibration."""
+        """The entry that matrices are compared with: closed_form's, else the best calibration."""
         exact = [pair for pair in self.calibrated if calibrators.entry(pair[0].calibrator).cls.exact]
         best = [pair for pair in self.calibrated if pair[0].is_best]
         return next(iter(exact + best + self.calibrated), None)

@@ -1,9 +1,10 @@
-"""The exact minimiser: linear least squares with known headings, then second-order cone programs.
+"""Least squares with known headings, then second-order cone programs to the minimum of a sum of norms.
 
 For a given row 3 of the matrix positions are linear in rows 1 and 2, and headings are linear in row 3. With the
 headings of the reference poses the first fit is therefore two linear least squares problems. Then the poses are
 linearised about the present matrix, which makes the minimisation of a sum of norms a second-order cone program. Its
-steps are so small that a few programs converge.
+steps are so small that a few programs converge, to a local minimum: that no other is lower is proven afterwards, and
+only to a gap (certify.py).
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class ClosedFormOptions(Options):
 
 @calibrators.register("closed_form")
 class ClosedForm(Calibrator):
-    """Exact minimiser in the box by least squares and second-order cone programs (cvxpy)."""
+    """Minimum in the box by least squares and second-order cone programs (cvxpy); certify proves how near it is."""
 
     Options = ClosedFormOptions
     options: ClosedFormOptions

@@ -1,4 +1,4 @@
-"""Resampled intervals of an exact optimum: how far it would move on other recordings.
+"""Resampled intervals of closed_form's optimum: how far it would move on other recordings.
 
 The units that are resampled are commands where runs repeat them, since repetitions share what the model misses there,
 else runs. With t the 0.975 quantile of Student's t with n - 1 degrees of freedom, n units from ten on are drawn with
