@@ -1,4 +1,4 @@
-"""``omnibench`` and ``python -m omnibench``: every user's mistake is one line on standard error and exit code 2.
+"""``omnibench`` and ``python -m omnibench``: every mistake is one line on standard error and an exit code.
 
 Ctrl-C is handled from the first import on; therefore nothing of omnibench is imported before ``main`` runs.
 """
@@ -82,7 +82,7 @@ def _run(command: Any) -> None:
     except Interrupted as error:
         _fail(str(error), 130)
     except OmnibenchError as error:
-        _fail(_with_notes(f"error: {error}", error))
+        _fail(_with_notes(f"error: {error}", error), error.exit_code)
     except typer.Abort:
         _fail("interrupted", 130)
     except BrokenPipeError:

@@ -1,4 +1,4 @@
-"""The family of errors that a user can cause: the command line prints each as one line and exits with 2."""
+"""The family of errors that a user can cause: the command line prints each as one line and exits with its code."""
 
 from __future__ import annotations
 
@@ -17,7 +17,12 @@ def one_line(text: str) -> str:
 
 
 class OmnibenchError(Exception):
-    """A mistake that the user can correct. The message is one line: what, where, and what to do."""
+    """A mistake that the user can correct. The message is one line: what, where, and what to do.
+
+    exit_code: of the command line; 2, or 1 where the command was right and its work failed.
+    """
+
+    exit_code = 2
 
     def __init__(self, message: str) -> None:
         super().__init__(one_line(message))

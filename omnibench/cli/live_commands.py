@@ -64,7 +64,7 @@ def live(
         if dataset is not None or speed is not None:
             raise ConfigError(f"{dataset or '--speed'}: is for a replay only; add --replay")
         return _run(chosen, seconds)
-    return _replay_to_node(chosen, dataset, speed, config)
+    return _replay_to_node(chosen, dataset, speed, config, seconds)
 
 
 @live_app.command()
@@ -84,9 +84,13 @@ def replay(
     config: ConfigOption = None,
     connect: Connect = None,
     profile: ProfileOption = None,
+    seconds: Seconds = None,
     plugins: Plugins = None,
 ) -> None:
-    """Play a recording onto Zenoh, as the robot and its SLAM would."""
+    """Play a recording onto Zenoh, as the robot and its SLAM would.
+
+    An omnibench node acknowledges what it takes, and is waited for; other programs do not, which is said.
+    """
     from omnibench.cli.terminal.live_tables import print_played
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings, validate
@@ -95,7 +99,7 @@ def replay(
     from omnibench.live.replay.concatenated_drive import concatenate_recording
     from omnibench.live.replay.played_recording import load_recording
     from omnibench.live.replay.replay_player import Player
-    from omnibench.live.stopping import stop_on_signals
+    from omnibench.live.stopping import set_after, stop_on_signals
     from omnibench.live.wire.topics import GraphNode
     from omnibench.robot.calibration import read_calibration
 
@@ -108,10 +112,10 @@ def replay(
     drive = concatenate_recording(recording, pause=chosen.pause, split=chosen.split)
     with _client(config, connect, profile, "replay") as (session, keys), stop_on_signals() as stop:
         player = Player(GraphNode(session, keys, "replay"), robot, drive, chosen, noise=noise)
-        with ProgressDisplay() as watch:
+        with ProgressDisplay() as watch, set_after(stop, seconds) as time_is_up:
             report = player.play(stop, watch)
     print_played(make_console(), report, recording.dataset.simulated)
-    if not report.complete:
+    if not report.complete and not time_is_up():
         raise typer.Exit(130)
 
 
@@ -238,7 +242,9 @@ def _run(config: "LiveConfig", seconds: float | None) -> None:
             pass
 
 
-def _replay_to_node(config: "LiveConfig", dataset: Path | None, speed: str | None, file: Path) -> None:
+def _replay_to_node(
+    config: "LiveConfig", dataset: Path | None, speed: str | None, file: Path, seconds: float | None
+) -> None:
     from omnibench.cli.terminal.live_tables import node_log, print_demonstration
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import validate
@@ -246,7 +252,7 @@ def _replay_to_node(config: "LiveConfig", dataset: Path | None, speed: str | Non
     from omnibench.live.replay.arrivals import ReplayConfig
     from omnibench.live.replay.demonstration import demonstrate
     from omnibench.live.replay.played_recording import load_recording
-    from omnibench.live.stopping import stop_on_signals
+    from omnibench.live.stopping import set_after, stop_on_signals
 
     source = dataset or config.replay.dataset
     if source is None:
@@ -262,10 +268,11 @@ def _replay_to_node(config: "LiveConfig", dataset: Path | None, speed: str | Non
         node_log(watch.console, warnings_only=True),
         stop_on_signals() as stop,
         log_refused_access(config.zenoh),
+        set_after(stop, seconds) as time_is_up,
     ):
         shown = demonstrate(config, recording, stop, watch)
     print_demonstration(make_console(), shown)
-    if not shown.report.complete:
+    if not shown.report.complete and not time_is_up():
         raise typer.Exit(130)
 
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
 
-from omnibench.errors import ConfigError
 from omnibench.live.closing import Closing
 from omnibench.live.config import LiveConfig
 from omnibench.live.control.query_server import QueryServer
@@ -16,8 +15,9 @@ from omnibench.live.control.robot_info import robot_info
 from omnibench.live.diagnostics_timer import DiagnosticsTimer
 from omnibench.live.estimation.health import Health
 from omnibench.live.estimation.saved_state import RobotMemory
+from omnibench.live.intake import Intake
 from omnibench.live.low_latency import low_latency
-from omnibench.live.network.presence import alive_robots
+from omnibench.live.network.presence import Claim
 from omnibench.live.network.session import open_session
 from omnibench.live.robot_service import RobotService
 from omnibench.live.robot_setup import make_tracker
@@ -48,9 +48,11 @@ class LiveNode(Closing):
             }
             self.session = open_session(config.zenoh, f"node {config.name}")
             started.callback(self.session.close)
-            self._check_other_nodes()
+            self._claim_robots(started)
+            intake = Intake()
+            started.callback(intake.close)
             listeners = started.enter_context(ExitStack())  # closed after the services, to have their last messages
-            self._services = self._start_services(started)
+            self._services = self._start_services(intake, started)
             # after the services: a replay begins with the first subscriber, and the samples are for these
             self._serve_foxglove(listeners)
             self._record(listeners)
@@ -78,11 +80,11 @@ class LiveNode(Closing):
                 started.callback(memory.close)
         return memories
 
-    def _check_other_nodes(self) -> None:
+    def _claim_robots(self, started: ExitStack) -> None:
         """Refuse a robot that another node runs, and warn of tf frames that another node may publish too."""
-        others = alive_robots(self.session, _PRESENCE_TIMEOUT)
-        _refuse_taken_robots(self.trackers, others)
-        _warn_of_shared_frames(self.config.on_common_frames(), others)
+        claim = Claim(self.session, self.trackers.keys(), _PRESENCE_TIMEOUT)
+        started.callback(claim.close)
+        _warn_of_shared_frames(self.config.on_common_frames(), claim.others)
 
     def _serve_foxglove(self, listeners: ExitStack) -> None:
         """Serve the robots' topics to Foxglove, if the config asks for it."""
@@ -102,12 +104,12 @@ class LiveNode(Closing):
         listeners.enter_context(Recorder(self.session, self.keys, list(self.trackers), path, on_failure=LOG.error))
         LOG.warning("recording to %s", path)
 
-    def _start_services(self, started: ExitStack) -> list[RobotService]:
+    def _start_services(self, intake: Intake, started: ExitStack) -> list[RobotService]:
         """Subscribe to every robot's wheels and poses, and publish what its tracker makes of them."""
         graph = GraphNode(self.session, self.keys, self.config.name)
         services = []
         for tracker in self.trackers.values():
-            services.append(service := RobotService(graph, tracker))
+            services.append(service := RobotService(graph, tracker, intake))
             started.callback(service.close)
         return services
 
@@ -116,15 +118,6 @@ def load_effects(config: LiveConfig) -> None:
     """Load the plug-ins whose effects calibrations may name; one that cannot be imported is a warning in the log."""
     for failure in load_plugins(config.plugins):
         LOG.warning("plug-in %s cannot be imported: %s", failure.origin, failure.error)
-
-
-def _refuse_taken_robots(robots: Collection[str], others: Collection[str]) -> None:
-    """Two nodes for one robot would publish every stamp twice: ConfigError."""
-    for name in robots:
-        if name in others:
-            raise ConfigError(
-                f"robot {name!r} is run by another node already; stop that, or give this one's another name"
-            )
 
 
 def _warn_of_shared_frames(robots: Sequence[str], others: Sequence[str]) -> None:

@@ -3,31 +3,60 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
+from collections import deque
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
 
 import zenoh
 
+from omnibench.live.acknowledged_flows import AcknowledgedFlows
 from omnibench.live.estimation.counts import anomalies_in_words
 from omnibench.live.estimation.health import Health, diagnostic
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.estimation.update import Update
+from omnibench.live.intake import Intake
 from omnibench.live.network.rate_limiter import RateLimiter
+from omnibench.live.wire.attachment import flow_of
 from omnibench.live.wire.messages import Diagnostics
 from omnibench.live.wire.outputs import OUTPUTS
 from omnibench.live.wire.topics import GraphNode
 
 LOG = logging.getLogger("omnibench.live")
+_LONGEST_QUEUE: Final = 20_000  # messages that wait for one robot, 200 s at 100 Hz, some 10 MB; chosen
+_BATCH: Final = 500  # messages of one robot until the others have their turn; chosen
+_PUBLISH_ALL: Final = 0.05  # s; of samples that have waited for longer only the newest pose is published; chosen
+
+
+@dataclass(frozen=True, slots=True)
+class _Message:
+    """A message that waits. arrival: s, monotonic."""
+
+    is_pose: bool
+    arrival: float
+    payload: bytes
+    attachment: bytes | None
 
 
 class RobotService:
     """Subscribes to a robot's wheels and SLAM, hands them to its tracker, and publishes the updates.
 
-    Messages are taken in Zenoh's own threads, as they come. One that fails is counted and logged.
+    Messages are queued in Zenoh's threads and taken in that of ``intake``, in the order in which they came. Where they
+    come faster than they can be taken, all are integrated and only the newest of the late ones is published; those of
+    an acknowledged flow are all published, since its sender waits. A message that fails is counted and logged.
     """
 
-    def __init__(self, graph: GraphNode, tracker: RobotTracker) -> None:
+    def __init__(self, graph: GraphNode, tracker: RobotTracker, intake: Intake) -> None:
         name = tracker.name
         self.tracker = tracker
+        self._intake = intake
+        self._waiting: deque[_Message] = deque()
+        self._scheduled = False  # a turn is queued, or has not yet looked at what waits
+        self._working = threading.Lock()  # held while messages are taken
+        self._held: Update | None = None  # the newest that was not published, as it was late
+        self._flows = AcknowledgedFlows(graph.session, name)
         self._rate_limiter = RateLimiter()
         self._logged_anomalies: dict[str, int] = {}
         self._logged_status = ""
@@ -37,9 +66,9 @@ class RobotService:
             if tracker.fusing or not output.fused
         ]
         self._diagnostics = graph.publisher(name, "diagnostics")
-        self._inputs = [graph.subscribe(name, "joint_states", self._take_wheels)]
+        self._inputs = [graph.subscribe(name, "joint_states", partial(self._queue, False))]
         if tracker.fusing:
-            self._inputs.append(graph.subscribe(name, "slam_pose", self._take_pose))
+            self._inputs.append(graph.subscribe(name, "slam_pose", partial(self._queue, True)))
         self._token = graph.session.liveliness().declare_token(f"omnibench/{name}/alive")
 
     def publish_diagnostics(self) -> None:
@@ -50,25 +79,67 @@ class RobotService:
         self._log_changes(health)
 
     def close(self) -> None:
-        """Take nothing more and leave."""
+        """Take what waits, nothing more, and leave."""
         for subscriber in self._inputs:
             subscriber.undeclare()
+        while self._waiting:
+            self._take_turn()
         self.tracker.close()
         self._token.undeclare()
+        self._flows.close()
 
-    def _take_wheels(self, sample: zenoh.Sample) -> None:
-        try:
-            self.tracker.take_wheels(sample.payload.to_bytes(), time.monotonic(), self._publish)
-        except Exception as error:  # Zenoh would print it; the stream has to go on
-            self._failed("wheels", error)
+    def _queue(self, is_pose: bool, sample: zenoh.Sample) -> None:
+        """Queue a message; in Zenoh's thread."""
+        if len(self._waiting) >= _LONGEST_QUEUE:
+            self.tracker.count_overflow()
+            return
+        attachment = sample.attachment
+        content = None if attachment is None else attachment.to_bytes()
+        self._waiting.append(_Message(is_pose, time.monotonic(), sample.payload.to_bytes(), content))
+        if not self._scheduled:
+            self._scheduled = True
+            self._intake.ready(self._take_turn)
 
-    def _take_pose(self, sample: zenoh.Sample) -> None:
+    def _take_turn(self) -> None:
+        """Take the messages that wait, at most a batch."""
+        with self._working:
+            self._scheduled = False  # before the first look: what comes from now on may schedule a turn in vain
+            behind, unpublished = 0.0, 0
+            for _ in range(min(len(self._waiting), _BATCH)):
+                message = self._waiting.popleft()
+                flow = flow_of(message.attachment)
+                if flow is not None and not self._flows.accepts(flow):
+                    continue
+                waited = 0.0 if flow is not None else time.monotonic() - message.arrival
+                behind = max(behind, waited)
+                unpublished += self._take(message, late=waited > _PUBLISH_ALL)
+            if self._held is not None:
+                unpublished -= 1
+                self._publish(self._held)
+            self._flows.acknowledge()
+            self.tracker.record_backlog(behind, unpublished)
+            if self._waiting and not self._scheduled:
+                self._scheduled = True
+                self._intake.ready(self._take_turn)
+
+    def _take(self, message: _Message, *, late: bool) -> int:
+        """Take a message; the number of updates that it made and that were not published."""
         try:
-            self.tracker.take_pose(sample.payload.to_bytes(), time.monotonic())
-        except Exception as error:
-            self._failed("pose", error)
+            if message.is_pose:
+                self.tracker.take_pose(message.payload, message.arrival)
+                return 0
+            updates = self.tracker.take_wheels(message.payload, message.arrival)
+            if late and updates:
+                self._held = updates[-1]
+                return len(updates)
+            for update in updates:
+                self._publish(update)
+        except Exception as error:  # the stream has to go on
+            self._failed("pose" if message.is_pose else "wheels", error)
+        return 0
 
     def _publish(self, update: Update) -> None:
+        self._held = None
         for publisher, encoded in self._outputs:
             publisher.put_encoded(encoded(update))
 

@@ -53,11 +53,20 @@ def print_played(console: Console, report: PlayReport, simulated: bool) -> None:
     console.print(
         f"{plural(report.sent['joint_states'], 'wheel sample')} and "
         f"{plural(report.sent['slam_pose'], 'SLAM pose')} ({kind}), "
-        f"{report.data_seconds:.1f} s of the drive in {report.wall_seconds:.1f} s",
+        f"{report.data_seconds:.1f} s of the drive in {report.wall_seconds:.1f} s; {_delivered(report)}",
         soft_wrap=True,
     )
     if not report.complete:
         console.print(f"stopped after {sum(report.sent.values())} of {plural(report.total, 'message')}", soft_wrap=True)
+
+
+def _delivered(report: PlayReport) -> str:
+    """How many of the messages sent are known to have arrived."""
+    if report.taken is None:
+        return "delivery not confirmed, since no omnibench node runs the robot"
+    sent = sum(report.sent.values())
+    again = f", which started again {plural(report.restarts, 'time')} on the way" if report.restarts else ""
+    return f"{'all' if report.taken == sent else f'{report.taken:,} of {sent:,}'} taken by the node{again}"
 
 
 def print_demonstration(console: Console, shown: Demonstration) -> None:
@@ -65,8 +74,7 @@ def print_demonstration(console: Console, shown: Demonstration) -> None:
     print_played(console, shown.report, shown.simulated)
     print_table(console, _deviation_table(shown))
     console.print(
-        f"odom against the batch odometry: {shown.batch_difference:.1e} (m, rad) at most; "
-        f"{plural(shown.lost, 'message')} of odom lost",
+        f"odom against the batch odometry: {shown.batch_difference:.1e} (m, rad) at most; no message lost",
         soft_wrap=True,
     )
     counts = {name: value for name, value in shown.health.counts.items() if value}

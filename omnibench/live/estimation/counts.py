@@ -42,6 +42,8 @@ class Counts:
     reacquired: int = _anomaly("restart", "of the filter at SLAM's pose")  # it gave up its own
     swaps: int = 0  # calibrations taken
     swaps_refused: int = _anomaly("calibration", "refused")
+    unpublished: int = _anomaly("odometry message", "not published")  # late: the next one's pose was published instead
+    overflow: int = _anomaly("message", "not taken")  # too many were waiting
     failures: int = _anomaly("error", "of omnibench")  # while it took a message; each is logged
 
     def as_dict(self) -> dict[str, int]:

@@ -32,7 +32,8 @@ class SwapRecord(Model):
 class Health(Model):
     """A robot's health, as the query ``health`` answers it.
 
-    rate_hz: wheel samples a second. age_s: since the last one came. position_sigma_m, heading_sigma_rad: standard
+    rate_hz: wheel samples a second. age_s: since the last one came. behind_s: the longest time that samples have waited
+    in the last second, where they come faster than they can be taken. position_sigma_m, heading_sigma_rad: standard
     deviations now; they grow while no sample comes. unfitted_motion_s: time outside the training domain of the
     calibration's effects, where that is known.
     """
@@ -44,6 +45,7 @@ class Health(Model):
     simulated: bool
     rate_hz: float
     age_s: float | None
+    behind_s: float
     last_stamp: float | None
     position_sigma_m: float
     heading_sigma_rad: float
@@ -60,6 +62,7 @@ def diagnostic(health: Health, hardware: str) -> Diagnostic:
         "calibration": health.calibration,
         "rate_hz": f"{health.rate_hz:.1f}",
         "age_s": "-" if health.age_s is None else f"{health.age_s:.3f}",
+        "behind_s": f"{health.behind_s:.3f}",
         "position_sigma_m": f"{health.position_sigma_m:.4g}",
         "heading_sigma_rad": f"{health.heading_sigma_rad:.4g}",
         **health.counts,

@@ -11,6 +11,7 @@ from omnibench.live.estimation.robot_state import RobotState
 from omnibench.robot.kinematics import Array
 
 _RATE_WINDOW = 0.9  # s, over which samples are counted at least; below the period of the diagnostics, 1 s
+_BEHIND = 0.1  # s that samples may wait; a node whose samples wait for longer cannot keep up; chosen
 _SECOND = 1e9  # ns
 
 
@@ -21,10 +22,11 @@ class HealthReporter:
         self._stale_after = stale_after
         self._counted = (time.monotonic(), 0)  # when samples were counted last, and how many there were
         self._rate = 0.0  # Hz
+        self._behind = 0.0  # s, in the last whole window
 
     def report(self, state: RobotState, now: float) -> Health:
         """The health at ``now`` (s, monotonic)."""
-        self._measure_rate(state.counts.samples, now)
+        self._measure(state, now)
         age = None if state.arrival is None else now - state.arrival
         status, message = self._status(state, now, age)
         covariance = _covariance(state, age if status == "stale" else None)
@@ -37,6 +39,7 @@ class HealthReporter:
             simulated=provenance is not None and provenance.simulated,
             rate_hz=self._rate,
             age_s=age,
+            behind_s=self._longest_wait(state),
             last_stamp=state.timeline.newest / _SECOND if state.timeline.entries else None,
             position_sigma_m=float(np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2)),
             heading_sigma_rad=float(np.sqrt(covariance[2, 2])),
@@ -47,18 +50,26 @@ class HealthReporter:
             unfitted_motion_s=state.monitor.seconds,
         )
 
-    def _measure_rate(self, samples: int, now: float) -> None:
+    def _measure(self, state: RobotState, now: float) -> None:
+        """Measure the rate and the waiting time of samples, once a window."""
         since, counted = self._counted
         if now - since >= _RATE_WINDOW:
-            self._rate = (samples - counted) / (now - since)
-            self._counted = now, samples
+            self._rate = (state.counts.samples - counted) / (now - since)
+            self._counted = now, state.counts.samples
+            self._behind, state.behind = state.behind, 0.0
+
+    def _longest_wait(self, state: RobotState) -> float:
+        return max(self._behind, state.behind)
 
     def _status(self, state: RobotState, now: float, age: float | None) -> tuple[Status, str]:
         """The status and its reason in words. age: of the last wheel sample, s; None before the first."""
         if age is None:
             return "waiting", "no wheel sample yet"
-        if age > self._stale_after:
+        behind = self._longest_wait(state)
+        if age > self._stale_after + behind:
             return "stale", f"no wheel sample for {age:.1f} s"
+        if behind > _BEHIND:
+            return "degraded", f"behind by {behind:.1f} s: samples come faster than they can be taken"
         fusion = state.fusion
         if fusion is None:
             return "ok", "odometry"

@@ -23,8 +23,9 @@ class RobotState:
     """Everything that samples, poses and orders change.
 
     fusion: None for odometry alone. guessed_angles: names of the calibration's effects that need wheel angles, while
-    nobody has been warned that there are none. arrival: of the last wheel sample, s, monotonic. last_refusal: why the
-    last message was refused that was. last_swap: None before the first calibration is sent.
+    nobody has been warned that there are none. arrival: of the last wheel sample, s, monotonic. behind: longest time
+    for which a sample had waited when it was taken, s, since the health was last measured. last_refusal: why the last
+    message was refused that was. last_swap: None before the first calibration is sent.
     """
 
     name: str
@@ -39,6 +40,7 @@ class RobotState:
     guessed_angles: str
     stamps: PublishedStamps = field(default_factory=PublishedStamps)
     arrival: float | None = None
+    behind: float = 0.0
     last_refusal: str = ""
     last_swap: SwapRecord | None = None
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
 
 import numpy as np
 
@@ -64,31 +63,22 @@ class RobotTracker:
         self._pose_input = PoseInput(self.frames.map, self.counts)
         self._state_writer = StateWriter(memory)
         self._health = HealthReporter(stale_after)
-        # samples may come over several links: the updates of one are published before those of the next
-        self._publish_lock = threading.Lock()
-        # held while the state is read or changed, but not while updates are published
-        self._state_lock = threading.Lock()
+        self._state_lock = threading.Lock()  # held while the state is read or changed
         self._closed = False
 
-    def take_wheels(
-        self, payload: bytes, arrival: float, publish: Callable[[Update], object] = lambda _: None
-    ) -> list[Update]:
-        """Take a sensor_msgs/JointState in CDR; its updates, after they were published in order.
+    def take_wheels(self, payload: bytes, arrival: float) -> list[Update]:
+        """Take a sensor_msgs/JointState in CDR; its updates, in order.
 
         Mostly there is one; none while a sample is refused or has to be confirmed. arrival: s, monotonic.
         """
-        with self._publish_lock:
-            with self._state_lock:
-                message = self._decode(payload)
-                steps = self._order_and_repair(message, arrival)
-                updates = []
-                for step in steps:
-                    motion = self._integrate(step)
-                    self._fuse(motion)
-                    updates.append(self._update(motion.stamp))
-                self._state_writer.save_if_due(self._state)
-            for update in updates:
-                publish(update)
+        with self._state_lock:
+            message = self._decode(payload)
+            updates = []
+            for step in self._order_and_repair(message, arrival):
+                motion = self._integrate(step)
+                self._fuse(motion)
+                updates.append(self._update(motion.stamp))
+            self._state_writer.save_if_due(self._state)
             return updates
 
     def take_pose(self, payload: bytes, arrival: float) -> Outcome | None:
@@ -106,7 +96,7 @@ class RobotTracker:
 
     def _decode(self, payload: bytes) -> JointState | None:
         """Step 1: the wheel message in a payload; None if it is not one, or the tracker is closed."""
-        if self._closed:  # a subscriber's call that was on its way
+        if self._closed:
             return None
         try:
             return self._decoder.decode(payload)
@@ -233,9 +223,20 @@ class RobotTracker:
         with self._state_lock:
             self.counts.failures += 1
 
+    def record_backlog(self, behind: float, unpublished: int) -> None:
+        """Record how long samples had waited when they were taken, s, and how many updates were not published."""
+        with self._state_lock:
+            self._state.behind = max(self._state.behind, behind)
+            self.counts.unpublished += unpublished
+
+    def count_overflow(self) -> None:
+        """Count a message that was not taken, because too many were waiting."""
+        with self._state_lock:
+            self.counts.overflow += 1
+
     def close(self) -> None:
         """Take no more wheel samples, and write the state."""
-        with self._publish_lock, self._state_lock:
+        with self._state_lock:
             self._closed = True
             self._state_writer.close(self._state)
 

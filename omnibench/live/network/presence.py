@@ -1,8 +1,16 @@
-"""Presence of robots: each robot that a node runs has a liveliness token, ``omnibench/<robot>/alive``."""
+"""Presence of robots: each robot that a node runs has a liveliness token, ``omnibench/<robot>/alive``.
+
+A node claims its robots before it runs them, by tokens ``omnibench/<robot>/claim-<session>``, and only then looks for
+others. Of two that start at the same moment at least one sees the other's claim, since each declares its own first. One
+that sees a claim of a smaller session gives way; one that sees a claim of a larger session waits until that is
+withdrawn, or its node, which may have looked before, runs the robot.
+"""
 
 from __future__ import annotations
 
 import re
+import time
+from collections.abc import Collection
 from threading import Lock
 from typing import Final
 
@@ -12,6 +20,9 @@ from omnibench.errors import ConfigError, nearest
 from omnibench.live.network.callbacks import direct
 
 _ALIVE: Final = "omnibench/*/alive"
+_CLAIMS: Final = "omnibench/*/claim-$*"
+_PATIENCE: Final = 10.0  # s for a node that starts at the same moment to run its robots, or to give way; chosen
+_LOOKING: Final = 0.05  # s between two looks at another node's claim; chosen
 _NAME = re.compile(r"[^\s/*$?#@]+")
 
 
@@ -26,6 +37,54 @@ def alive_robots(session: zenoh.Session, timeout: float = 1.0) -> tuple[str, ...
     """The names of the robots whose tokens are declared now, sorted. timeout: s."""
     replies = session.liveliness().get(_ALIVE, timeout=timeout)
     return tuple(sorted({_robot(reply.ok.key_expr) for reply in replies if reply.ok is not None}))
+
+
+class Claim:
+    """A node's claim to its robots, which no other node runs or claims before it. ``close`` withdraws it.
+
+    others: robots of other nodes. timeout: s for one look at the tokens. ConfigError: another node has a robot.
+    """
+
+    def __init__(self, session: zenoh.Session, robots: Collection[str], timeout: float) -> None:
+        own = str(session.zid())
+        liveliness = session.liveliness()
+        self._tokens = [liveliness.declare_token(f"omnibench/{robot}/claim-{own}") for robot in robots]
+        try:
+            deadline = time.monotonic() + _PATIENCE
+            while True:
+                rivals = [
+                    (robot, rival) for robot, rival in _claims(session, timeout) if robot in robots and rival != own
+                ]
+                self.others = alive_robots(session, timeout)  # after the claims: one that has gone may run by now
+                for robot in robots:
+                    if robot in self.others:
+                        raise _taken(robot, "is run by another node already; stop that")
+                for robot, rival in rivals:
+                    if rival < own or time.monotonic() > deadline:
+                        raise _taken(robot, "is being started by another node at this moment; leave it to that")
+                if not rivals:
+                    break
+                time.sleep(_LOOKING)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Withdraw the claim."""
+        for token in self._tokens:
+            token.undeclare()
+
+
+def _taken(robot: str, why: str) -> ConfigError:
+    """Two nodes for one robot would publish every stamp twice."""
+    return ConfigError(f"robot {robot!r} {why}, or give this one's another name")
+
+
+def _claims(session: zenoh.Session, timeout: float) -> list[tuple[str, str]]:
+    """Robots that are claimed, and the sessions that claim them."""
+    replies = session.liveliness().get(_CLAIMS, timeout=timeout)
+    keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+    return [(key.split("/")[1], key.rpartition("/claim-")[2]) for key in keys]
 
 
 def nothing_received(robot: str, seconds: float, alive: tuple[str, ...]) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,9 +13,11 @@ import zenoh
 
 from omnibench.live.config import LiveConfig, client_session, robot_called
 from omnibench.live.estimation.health import Health
+from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.network.session import open_session
 from omnibench.live.node import LiveNode, load_effects
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_recording, concatenated_truth
+from omnibench.live.replay.delivery import WINDOW, DeliveryError
 from omnibench.live.replay.played_recording import Recording
 from omnibench.live.replay.replay_player import Player, PlayReport
 from omnibench.live.stopping import wait_until
@@ -27,7 +31,7 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.planar import interpolated, moved_to, wrapped
 from omnibench.words import plural
 
-_LAST_MESSAGES = 5.0  # s to wait for the last messages after a replay; chosen
+_LAST_MESSAGES = 5.0  # s without any of the messages under way after which they count as lost; chosen
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,7 @@ class Demonstration:
 
     against: the reference of all deviations, in words. theoretical, calibrated: odometry with the design matrix and
     with the calibration. fused: None without fusion. batch_difference: largest difference between published odom and
-    the batch odometry of the same recording, m or rad. lost: number of odom messages that never arrived.
+    the batch odometry of the same recording, m or rad.
     """
 
     robot: str
@@ -57,7 +61,6 @@ class Demonstration:
     calibrated: Deviation
     fused: Deviation | None
     batch_difference: float
-    lost: int
     health: Health
 
 
@@ -89,6 +92,31 @@ class _Collector:
         self._subscription.close()
 
 
+class _Results:
+    """The node's messages on their way to the collectors, of which no more than ``WINDOW`` are to be under way."""
+
+    def __init__(self, tracker: RobotTracker, collectors: Sequence[_Collector]) -> None:
+        self._counts, self._collectors = tracker.counts, collectors
+        self._missing, self._changed_at = 0, time.monotonic()
+
+    def behind(self) -> bool:
+        """True while so many messages are under way that more could be lost; False once they seem lost."""
+        missing = self._missing_now()
+        if missing != self._missing:
+            self._missing, self._changed_at = missing, time.monotonic()
+        return missing > WINDOW and time.monotonic() - self._changed_at < _LAST_MESSAGES
+
+    def wait_for_the_last(self) -> None:
+        """Wait for the messages under way. DeliveryError: some were lost."""
+        if not wait_until(lambda: not self._missing_now(), _LAST_MESSAGES):
+            samples = plural(self._counts.samples, "odometry message")
+            raise DeliveryError(f"{self._missing_now():,} of {samples} of the node did not reach their subscriber")
+
+    def _missing_now(self) -> int:
+        """Messages that were published, or are about to be, and have not come."""
+        return self._counts.samples - min(len(each.stamps) for each in self._collectors)
+
+
 def demonstrate(
     config: LiveConfig,
     recording: Recording,
@@ -97,8 +125,8 @@ def demonstrate(
 ) -> Demonstration:
     """Run the node of ``config``, replay ``recording`` to it as the config's ``replay`` says, and evaluate its output.
 
-    The node starts without saved state. DataError: the recording has other wheels than the robot's calibration; other
-    errors as from LiveNode and Player.
+    The node starts without saved state. DataError: the recording has other wheels than the robot's calibration.
+    DeliveryError: samples, or the odometry of some, were lost. Other errors as from LiveNode and Player.
     """
     stop = stop or threading.Event()
     robot = robot_called(config, config.replay.robot)
@@ -130,8 +158,9 @@ def demonstrate(
                 fused = plural(health.counts["poses"], "pose")
                 watch(replace(event, note=f"{event.note}, {health.rate_hz:.0f} samples/s, {fused} fused"))
 
-            report = player.play(stop, with_health)
-            _wait_for_the_last(odometry, fused, node, robot.name, stop)
+            results = _Results(tracker, [each for each in (odometry, fused) if each is not None])
+            report = player.play(stop, with_health, hold=results.behind)
+            results.wait_for_the_last()
             health = node.health(robot.name)
             for collector in (odometry, fused):
                 if collector is not None:
@@ -140,17 +169,6 @@ def demonstrate(
             if not guarded:
                 session.close()
         return _evaluated(drive, recording, tracker.calibration, report, odometry, fused, health)
-
-
-def _wait_for_the_last(
-    odometry: _Collector, fused: _Collector | None, node: LiveNode, robot: str, stop: threading.Event
-) -> None:
-    def all_arrived() -> bool:
-        taken = node.health(robot).counts["samples"]
-        arrived = len(odometry.stamps) >= taken and (fused is None or len(fused.stamps) >= taken)
-        return arrived and not stop.wait(0.1) and node.health(robot).counts["samples"] == taken
-
-    wait_until(all_arrived, _LAST_MESSAGES, stop, 0.02)
 
 
 def _evaluated(
@@ -188,7 +206,6 @@ def _evaluated(
         calibrated=_deviation(batch[chosen], reference[chosen]),
         fused=None if fused is None else _fused_deviation(fused, origin, drive, reference, chosen),
         batch_difference=_difference(published, batch[rows]),
-        lost=health.counts["samples"] - len(odometry.stamps),
         health=health,
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from omnibench.errors import ConfigError, OmnibenchError
 from omnibench.live.estimation.wheel_input import check_joints
-from omnibench.live.network.presence import checked_robot
+from omnibench.live.network.presence import alive_robots, checked_robot
 from omnibench.live.replay.arrivals import (
     TOPICS_PLAYED,
     WHEELS,
@@ -24,16 +24,20 @@ from omnibench.live.replay.arrivals import (
     make_schedule,
 )
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive
+from omnibench.live.replay.delivery import AcknowledgedDelivery, Delivery, DeliveryError, UnconfirmedDelivery
 from omnibench.live.stopping import wait_until
 from omnibench.live.wire.messages import JointState, PoseEstimate
 from omnibench.live.wire.topics import GraphNode
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
+from omnibench.words import plural
 
 MAP = "map"
 _LEAST_DEVIATION = 1e-4  # m, rad; least standard deviation, so that no covariance is singular; chosen
 _SLAM_WAIT = 0.5  # s for a node to subscribe to slam_pose after joint_states; chosen
+_LEAST_PATIENCE = 1.0  # s without an acknowledgement until a node is given up, where `wait` is less; chosen
+_HOLDING = 0.002  # s between two looks at whether to go on; chosen
 _PROGRESS_PERIOD = 0.1  # s between two reports of progress; chosen
 
 
@@ -101,10 +105,17 @@ class _Messages:
 
 @dataclass(frozen=True)
 class PlayReport:
-    """Result of a replay. sent: messages by topic; total: messages in all; late: largest delay in sending, s."""
+    """Result of a replay.
+
+    sent: messages by topic; total: messages in all; taken: messages that a node acknowledged, None where nobody does.
+    restarts: how often another node went on in the place of one that had gone, and whose odometry begins anew. late:
+    largest delay in sending, s, in which a pause for a receiver that was gone does not count.
+    """
 
     sent: dict[str, int]
     total: int
+    taken: int | None
+    restarts: int
     data_seconds: float
     wall_seconds: float
     late: float
@@ -123,8 +134,10 @@ class PlayReport:
 class Player:
     """Replays a drive as one robot. Closing the session of ``graph`` closes its publishers.
 
-    A slow subscriber delays the replay, so that no message is lost at any speed. names, noise: as for ``events``.
-    ConfigError: the robot's name is not valid, or the names are not one for each wheel.
+    A node that runs the robot acknowledges what it takes: nothing is lost at any speed, the node is waited for while it
+    is gone, and is given up after the config's ``wait``. Other subscribers confirm nothing; a slow one delays the
+    replay. names, noise: as for ``events``. ConfigError: the robot's name is not valid, or the names are not one for
+    each wheel.
     """
 
     def __init__(
@@ -139,42 +152,77 @@ class Player:
         self._robot = checked_robot(robot)
         self._config = config
         self._messages = _Messages(drive, config, noise, names)
+        self._session = graph.session
         self._publishers = {topic: graph.publisher(robot, topic, lossless=True) for topic in TOPICS_PLAYED}
 
-    def play(self, stop: threading.Event | None = None, watch: Reporter = no_progress) -> PlayReport:
+    def play(
+        self,
+        stop: threading.Event | None = None,
+        watch: Reporter = no_progress,
+        hold: Callable[[], bool] = lambda: False,
+    ) -> PlayReport:
         """Send all messages, or stop when ``stop`` is set or Ctrl-C is pressed.
 
-        Waits for a subscriber first; ConfigError: none comes in time. watch: told the messages sent ten times a second
-        and at the end.
+        Waits for a subscriber first; ConfigError: none comes in time. DeliveryError: the robot's node, or the next
+        router to other subscribers, does not take the messages any more. watch: told the messages sent ten times a
+        second and at the end. hold: while it is true, nothing is sent.
         """
         stop = stop or threading.Event()
-        total, sent = len(self._messages), dict.fromkeys(TOPICS_PLAYED, 0)
+        sent = dict.fromkeys(TOPICS_PLAYED, 0)
         begin, arrival, late = time.perf_counter(), 0.0, 0.0
+        delivery: Delivery | None = None
         try:
             self._wait_for_subscriber(stop)
+            delivery = self._delivery(stop)
             begin = reported_at = time.perf_counter()
             for number, event in enumerate(self._messages.stamped_from(None), 1):
-                due = begin + event.arrival / self._config.speed
+                due = begin + delivery.paused + event.arrival / self._config.speed
                 now = time.perf_counter()
                 if due > now:
                     stop.wait(due - now)
                     now = time.perf_counter()
+                while hold() and not stop.is_set():
+                    stop.wait(_HOLDING)
                 if stop.is_set():
                     break
-                self._publishers[event.topic].put(event.message)
+                publisher = self._publishers[event.topic]
+                if not delivery.put(publisher, publisher.message_type.encode(event.message)):
+                    break
                 sent[event.topic] += 1
                 arrival, late = event.arrival, max(late, now - due)
                 if now - reported_at >= _PROGRESS_PERIOD:
                     reported_at = now
                     watch(self._progress(number, arrival))
+            delivery.finish()
         except KeyboardInterrupt:
             pass
         except zenoh.ZError as error:
             if not stop.is_set():  # otherwise the session was closed after stopping
                 raise OmnibenchError(f"replay of {self._robot}: cannot publish any more: {error}") from None
+        except DeliveryError as error:
+            raise self._not_delivered(error, sum(sent.values()), delivery) from None
+        finally:
+            if delivery is not None:
+                delivery.close()
         seconds = time.perf_counter() - begin
         watch(self._progress(sum(sent.values()), arrival))
-        return PlayReport(sent, total, arrival, seconds, 0.0 if math.isinf(self._config.speed) else late)
+        taken, restarts = (None, 0) if delivery is None else (delivery.taken, delivery.restarts)
+        late = 0.0 if math.isinf(self._config.speed) else late
+        return PlayReport(sent, len(self._messages), taken, restarts, arrival, seconds, late)
+
+    def _delivery(self, stop: threading.Event) -> Delivery:
+        """Delivery to the robot's node, if there is one, or else to whoever subscribes."""
+        patience = max(self._config.wait, _LEAST_PATIENCE)
+        if self._robot in alive_robots(self._session):
+            return AcknowledgedDelivery(self._session, self._robot, stop, patience)
+        return UnconfirmedDelivery(self._session, self._robot, stop, patience)
+
+    def _not_delivered(self, error: DeliveryError, sent: int, delivery: Delivery | None) -> DeliveryError:
+        """The error with the number of messages that are missing."""
+        total = len(self._messages)
+        taken = None if delivery is None else delivery.taken
+        missing = f"{total - (sent if taken is None else taken):,} of {plural(total, 'message')}"
+        return DeliveryError(f"{missing} did not reach robot {self._robot!r}: {error}")
 
     def _progress(self, sent: int, seconds: float) -> Progress:
         """Messages sent, and how many ``seconds`` of the recording they are."""

@@ -1,14 +1,12 @@
 """The Zenoh keys of a robot's topics, in three profiles for other programs.
 
-plain: the key is the topic's name, as the DDS bridge (zenoh-bridge-ros2dds) maps it. rmw: keys, liveliness tokens and
-attachments of a ROS 2 node on rmw_zenoh; without tokens ``ros2 topic list`` would not show the topic, and without
-attachments ROS 2 would drop the messages. humble: rmw with Humble's placeholder for type hashes.
+plain: the key is the topic's name, as the DDS bridge (zenoh-bridge-ros2dds) maps it. rmw: keys and liveliness tokens of
+a ROS 2 node on rmw_zenoh; without tokens ``ros2 topic list`` would not show the topic. humble: rmw with Humble's
+placeholder for type hashes. Messages of all profiles carry rmw_zenoh's attachment, without which ROS 2 would drop them.
 """
 
 from __future__ import annotations
 
-import struct
-import time
 from collections.abc import Callable
 from itertools import count
 from typing import Any, Final, Generic, Literal, TypeVar
@@ -17,6 +15,7 @@ import xxhash
 import zenoh
 
 from omnibench.live.network.callbacks import direct
+from omnibench.live.wire.attachment import Flow, packed
 from omnibench.live.wire.messages import DIAGNOSTICS, JOINT_STATE, POSE_ESTIMATE, MessageType
 from omnibench.live.wire.outputs import OUTPUTS
 
@@ -94,23 +93,23 @@ class GraphNode:
         return self.session.declare_subscriber(self.keys.expression(robot, topic), direct(callback))
 
     def _token(self, kind: str, number: int, robot: str = "", topic: str = "") -> str:
-        """Declare a liveliness token of rmw_zenoh and return its key; an empty text in the profile ``plain``."""
-        if self.keys.profile == "plain":
-            return ""
+        """Declare a liveliness token of rmw_zenoh, but in the profile ``plain``, and return its key."""
         zid = self.session.zid()
         key = f"@ros2_lv/{self.keys.domain}/{zid}/0/{number}/{kind}/%/%/{self._name}"
         if topic:
             message_type = TOPICS[topic]
             name = "%" + topic_name(robot, topic).replace("/", "%")
             key += f"/{name}/{dds_name(message_type)}/{self.keys.type_hash(message_type)}/{_QOS}"
-        self._tokens.append(self.session.liveliness().declare_token(key))
+        if self.keys.profile != "plain":
+            self._tokens.append(self.session.liveliness().declare_token(key))
         return key
 
 
 class Publisher(Generic[M]):
-    """Publishes messages of one topic; a subscriber that is too slow loses messages and delays no other.
+    """Publishes messages of one topic, numbered; a subscriber that is too slow loses messages and delays no other.
 
-    lossless: a slow subscriber loses nothing and delays the publisher instead, for replays of recordings.
+    token: the text by which its messages tell it from others. lossless: a slow subscriber delays the publisher, up to
+    Zenoh's limit (5 s), instead of losing messages, for replays of recordings.
     """
 
     def __init__(
@@ -124,9 +123,9 @@ class Publisher(Generic[M]):
             congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.INTERACTIVE_HIGH,
         )
-        self._sequence = count(1)
+        self._numbers = count(1)
         # XXH3-128 hash of the token: the low 64 bits, then the high ones, little-endian
-        self._gid = xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little") if token else b""
+        self._identity = xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
 
     @property
     def matched(self) -> bool:
@@ -140,8 +139,12 @@ class Publisher(Generic[M]):
 
     def put_encoded(self, payload: bytes) -> None:
         """Publish a payload that is encoded already."""
-        if not self._gid:
-            self._publisher.put(payload)
-            return
-        attachment = struct.pack("<qqB", next(self._sequence), time.time_ns(), len(self._gid)) + self._gid
-        self._publisher.put(payload, attachment=attachment)
+        self.put_numbered(payload, self.next_number())
+
+    def next_number(self) -> int:
+        """The number of the next message, for ``put_numbered``."""
+        return next(self._numbers)
+
+    def put_numbered(self, payload: bytes, number: int, flow: Flow | None = None) -> None:
+        """Publish a payload under a number, a second time under the same. flow: its place, if it is acknowledged."""
+        self._publisher.put(payload, attachment=packed(number, self._identity, flow))

@@ -1,0 +1,89 @@
+"""Acknowledged flows: a node takes each message of a replay once and in order, and tells which it expects next.
+
+The rule is go-back-n: a message after a gap is refused, and the sender sends again from the first that is missing. A
+node that does not know a flow, since it has just started, expects the lowest number that the sender has no
+acknowledgement of.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+import zenoh
+
+from omnibench.live.wire.attachment import Flow
+
+_ACKNOWLEDGEMENT: Final = struct.Struct("<Q?")
+_MOST_FLOWS: Final = 16  # of one robot at once; another one takes the oldest one's place; chosen
+
+
+def acknowledgement_key(robot: str, flow: int | str) -> str:
+    """The key to which a node acknowledges a flow; ``*`` stands for all."""
+    return f"omnibench/{robot}/received/{flow if isinstance(flow, str) else format(flow, 'x')}"
+
+
+def read_acknowledgement(payload: bytes) -> tuple[int, bool]:
+    """The number that the node expects next, and whether it refused one after a gap. struct.error: it is damaged."""
+    expected, gap = _ACKNOWLEDGEMENT.unpack(payload)
+    return expected, gap
+
+
+class _ReceivedFlow:
+    """One flow to a robot. expected: number of its next message. gap: one after a gap was refused."""
+
+    def __init__(self, session: zenoh.Session, robot: str, flow: int, expected: int) -> None:
+        self.expected = expected
+        self.gap = False
+        self._publisher = session.declare_publisher(
+            acknowledgement_key(robot, flow),
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.REAL_TIME,
+        )
+
+    def acknowledge(self) -> None:
+        self._publisher.put(_ACKNOWLEDGEMENT.pack(self.expected, self.gap))
+        self.gap = False
+
+    def close(self) -> None:
+        self._publisher.undeclare()
+
+
+class AcknowledgedFlows:
+    """The flows to one robot. For one thread."""
+
+    def __init__(self, session: zenoh.Session, robot: str) -> None:
+        self._session, self._robot = session, robot
+        self._flows: dict[int, _ReceivedFlow] = {}
+        self._heard: set[_ReceivedFlow] = set()  # flows with messages since the last acknowledgement
+
+    def accepts(self, place: Flow) -> bool:
+        """True if a message at this place is the flow's next one, and is to be taken."""
+        identity, number, unacknowledged = place
+        flow = self._flows.get(identity)
+        if flow is None:
+            flow = self._flows[identity] = _ReceivedFlow(self._session, self._robot, identity, unacknowledged)
+            if len(self._flows) > _MOST_FLOWS:
+                self._forget(next(iter(self._flows)))
+        self._heard.add(flow)
+        if number != flow.expected:
+            flow.gap |= number > flow.expected
+            return False
+        flow.expected += 1
+        return True
+
+    def acknowledge(self) -> None:
+        """Tell the senders of all messages since the last call which number is expected next."""
+        for flow in self._heard:
+            flow.acknowledge()
+        self._heard.clear()
+
+    def close(self) -> None:
+        """Acknowledge no more."""
+        for identity in list(self._flows):
+            self._forget(identity)
+
+    def _forget(self, identity: int) -> None:
+        flow = self._flows.pop(identity)
+        self._heard.discard(flow)
+        flow.close()
