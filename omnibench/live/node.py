@@ -25,6 +25,7 @@ from omnibench.live.wire.foxglove import PORT, FoxgloveServer
 from omnibench.live.wire.recorder import Recorder, free_path
 from omnibench.live.wire.topics import GraphNode, KeySpace
 from omnibench.registry import load_plugins
+from omnibench.words import plural
 
 LOG = logging.getLogger("omnibench.live")
 _PRESENCE_TIMEOUT = 2.0  # s, at most, for the tokens of other nodes' robots, which mostly come at once; chosen
@@ -94,6 +95,7 @@ class LiveNode(Closing):
             FoxgloveServer(port=PORT if self.config.foxglove is True else self.config.foxglove)
         )
         server.forward(self.session, self.keys, list(self.trackers))
+        listeners.callback(lambda: _tell_missed("Foxglove", server.missed))
         LOG.warning("Foxglove: open %s", server.address)
 
     def _record(self, listeners: ExitStack) -> None:
@@ -101,7 +103,9 @@ class LiveNode(Closing):
         if self.config.record is None:
             return
         path = free_path(self.config.record)
-        listeners.enter_context(Recorder(self.session, self.keys, list(self.trackers), path, on_failure=LOG.error))
+        recorder = Recorder(self.session, self.keys, list(self.trackers), path, on_failure=LOG.error)
+        listeners.enter_context(recorder)
+        listeners.callback(lambda: _tell_missed(f"the recording {path}", recorder.missed.total()))
         LOG.warning("recording to %s", path)
 
     def _start_services(self, intake: Intake, started: ExitStack) -> list[RobotService]:
@@ -118,6 +122,11 @@ def load_effects(config: LiveConfig) -> None:
     """Load the plug-ins whose effects calibrations may name; one that cannot be imported is a warning in the log."""
     for failure in load_plugins(config.plugins):
         LOG.warning("plug-in %s cannot be imported: %s", failure.origin, failure.error)
+
+
+def _tell_missed(where: str, messages: int) -> None:
+    if messages:
+        LOG.warning("%s lacks %s, lost on the way", where, plural(messages, "message"))
 
 
 def _warn_of_shared_frames(robots: Sequence[str], others: Sequence[str]) -> None:

@@ -20,6 +20,7 @@ from omnibench.live.network.callbacks import direct
 from omnibench.live.network.presence import Presence, checked_robot, nothing_received
 from omnibench.live.robot_status import HealthSummary, OdometryStatus, RobotStatus
 from omnibench.live.stopping import wait_until
+from omnibench.live.wire.attachment import MissedMessages
 from omnibench.live.wire.messages import DIAGNOSTICS, ODOMETRY, MessageError, Odometry
 from omnibench.live.wire.topics import KeySpace
 
@@ -100,7 +101,7 @@ class RobotMonitor(Closing):
                 key = self._name(sample), topic
                 with self._lock:
                     stream = self._streams.setdefault(key, _Stream())
-                stream.take(sample.payload.to_bytes())
+                stream.take(sample)
 
         return self._session.declare_subscriber(expression, direct(take_odometry))
 
@@ -145,6 +146,7 @@ class _Stream:
 
     def __init__(self) -> None:
         self._lock = Lock()
+        self._numbers = MissedMessages()
         self._count = 0
         self._undecodable = 0
         self._arrived_at, self._arrived_at_by_clock = 0.0, 0.0
@@ -152,8 +154,11 @@ class _Stream:
         self._message: Odometry | None = None
         self._history: deque[tuple[float, int]] = deque()  # (time of arrival, messages until then) at each reading
 
-    def take(self, payload: bytes) -> None:
+    def take(self, sample: zenoh.Sample) -> None:
+        payload = sample.payload.to_bytes()
         with self._lock:
+            if not self._numbers.take(sample.attachment):
+                return
             self._count += 1
             self._arrived_at, self._arrived_at_by_clock = time.monotonic(), time.time()
             self._payload = payload
@@ -175,7 +180,7 @@ class _Stream:
         lag = arrived_at_by_clock - self._message.seconds
         age = max(now - arrived_at, 0.0)
         stamp_age = age + lag if 0 <= lag <= _LARGEST_LAG else None
-        return OdometryStatus(self._message, self._rate(), age, stamp_age, self._undecodable)
+        return OdometryStatus(self._message, self._rate(), age, stamp_age, self._undecodable, self._numbers.count)
 
     def _rate(self) -> float | None:
         (first, count_before), (last, count) = self._history[0], self._history[-1]

@@ -27,7 +27,7 @@ from omnibench.live.wire.topics import GraphNode
 LOG = logging.getLogger("omnibench.live")
 _LONGEST_QUEUE: Final = 20_000  # messages that wait for one robot, 200 s at 100 Hz, some 10 MB; chosen
 _BATCH: Final = 500  # messages of one robot until the others have their turn; chosen
-_PUBLISH_ALL: Final = 0.05  # s; of samples that have waited for longer only the newest pose is published; chosen
+_LATE: Final = 0.1  # s; of samples in real time that have waited for longer, only the newest is published; chosen
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,8 @@ class RobotService:
 
     Messages are queued in Zenoh's threads and taken in that of ``intake``, in the order in which they came. Where they
     come faster than they can be taken, all are integrated and only the newest of the late ones is published; those of
-    an acknowledged flow are all published, since its sender waits. A message that fails is counted and logged.
+    an acknowledged flow, whose sender waits, and of other replays are all published. A message that fails is counted
+    and logged.
     """
 
     def __init__(self, graph: GraphNode, tracker: RobotTracker, intake: Intake) -> None:
@@ -112,7 +113,7 @@ class RobotService:
                     continue
                 waited = 0.0 if flow is not None else time.monotonic() - message.arrival
                 behind = max(behind, waited)
-                unpublished += self._take(message, late=waited > _PUBLISH_ALL)
+                unpublished += self._take(message, late=waited > _LATE)
             if self._held is not None:
                 unpublished -= 1
                 self._publish(self._held)
@@ -129,7 +130,7 @@ class RobotService:
                 self.tracker.take_pose(message.payload, message.arrival)
                 return 0
             updates = self.tracker.take_wheels(message.payload, message.arrival)
-            if late and updates:
+            if late and updates and self.tracker.in_real_time:
                 self._held = updates[-1]
                 return len(updates)
             for update in updates:

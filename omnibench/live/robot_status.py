@@ -16,7 +16,8 @@ class OdometryStatus:
     """The newest message of one odometry topic.
 
     rate: Hz over the last 2 s. age: s since the message arrived. stamp_age: s since its stamp, None where the sender's
-    clock differs from ours. undecodable: number of messages so far that were not odometry.
+    clock differs from ours. undecodable: number of messages so far that were not odometry. missed: number of messages
+    since the first that were published and did not come.
     """
 
     message: Odometry
@@ -24,6 +25,7 @@ class OdometryStatus:
     age: float
     stamp_age: float | None
     undecodable: int
+    missed: int
 
     @property
     def position_sigma(self) -> float:
@@ -85,4 +87,5 @@ def _odometry_record(status: OdometryStatus | None) -> dict[str, Any] | None:
         "age_s": status.age,
         "stamp_age_s": status.stamp_age,
         "undecodable": status.undecodable,
+        "missed": status.missed,
     }

@@ -216,7 +216,8 @@ def test_a_sample_on_its_way_while_the_node_closes_is_no_failure(tmp_path: Path)
         sent(session.declare_publisher("apr/joint_states"), drive(0.01).samples())
         until(lambda: samples, "a sample")
     taken = node.health("apr").counts["samples"]
-    node._services[0]._take_wheels(samples[0])
+    node._services[0]._queue(False, samples[0])
+    node._services[0]._take_turn()
     assert node.health("apr").counts["failures"] == 0
     assert node.health("apr").counts["samples"] == taken
 

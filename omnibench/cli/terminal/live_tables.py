@@ -74,7 +74,7 @@ def print_demonstration(console: Console, shown: Demonstration) -> None:
     print_played(console, shown.report, shown.simulated)
     print_table(console, _deviation_table(shown))
     console.print(
-        f"odom against the batch odometry: {shown.batch_difference:.1e} (m, rad) at most; no message lost",
+        f"odom against the batch odometry: {shown.batch_difference:.1e} (m, rad) at most; 0 messages of odom lost",
         soft_wrap=True,
     )
     counts = {name: value for name, value in shown.health.counts.items() if value}

@@ -60,18 +60,25 @@ def record(
         for robot in recorder.silent_robots:
             status.keep(nothing_received(robot, seconds_recorded, alive_robots(session)))
     status.keep(f"{path}: {_figures(recorder, seconds_recorded)}")
-    for name in sorted(recorder.counts.keys() | recorder.undecodable.keys()):
-        status.keep(f"  {name}: {recorder.counts[name]:,}{_left_out(recorder.undecodable[name])}")
+    missed = recorder.missed
+    for name in sorted(recorder.counts.keys() | recorder.undecodable.keys() | missed.keys()):
+        others = f"{_left_out(recorder.undecodable[name])}{_missed(missed[name])}"
+        status.keep(f"  {name}: {recorder.counts[name]:,}{others}")
     return recorder
 
 
 def _figures(recorder: Recorder, seconds: float) -> str:
     """Messages and bytes that were recorded in ``seconds``."""
     lost = f", {recorder.lost:,} lost because the disk was too slow" if recorder.lost else ""
+    missed = _missed(recorder.missed.total())
     return (
         f"{seconds:.1f} s, {plural(recorder.messages, 'message')}, {recorder.bytes / 1e6:.2f} MB"
-        f"{_left_out(recorder.undecodable.total())}{lost}"
+        f"{_left_out(recorder.undecodable.total())}{missed}{lost}"
     )
+
+
+def _missed(messages: int) -> str:
+    return f", {messages:,} missed on the way" if messages else ""
 
 
 def _left_out(undecodable: int) -> str:

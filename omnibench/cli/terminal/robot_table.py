@@ -20,6 +20,7 @@ from omnibench.live.robot_status import OdometryStatus, RobotStatus, json_docume
 from omnibench.live.stopping import ticks
 from omnibench.live.wire.topics import KeySpace
 from omnibench.report.blocks import Column, Row, RowRole, Table
+from omnibench.words import plural
 
 _REFRESH: Final = 0.2  # s between two drawings of the table; chosen
 _LINE_PERIOD: Final = 1.0  # s between two lines of a robot
@@ -102,6 +103,9 @@ def describe(status: RobotStatus) -> str:
     undecodable = sum(stream.undecodable for stream in streams)
     if undecodable:
         parts.append(f"undecodable odometry {undecodable}")
+    missed = sum(stream.missed for stream in streams)
+    if missed:
+        parts.append(f"{plural(missed, 'message')} missed on the way")
     return ", ".join(parts)
 
 

@@ -181,6 +181,11 @@ class RobotTracker:
         """True if SLAM poses are fused."""
         return self._state.fusion is not None
 
+    @property
+    def in_real_time(self) -> bool:
+        """False while wheel samples come much faster than they were measured, as from a replay."""
+        return self._state.wheel_input.in_real_time
+
     def health(self, now: float) -> Health:
         """The robot's health. now: s, monotonic."""
         with self._state_lock:

@@ -28,6 +28,8 @@ _MESSAGES: Final[dict[Right, tuple[str, ...]]] = {
 _ALL: Final = _MESSAGES["write"] + _MESSAGES["read"]
 
 _ALIVE: Final = "omnibench/{}/alive"
+_CLAIM: Final = "omnibench/{}/claim-$*"
+_RECEIVED: Final = "omnibench/{}/received/*"  # acknowledgements of what a replay sends
 _ANSWERS: Final = tuple("omnibench/{}/" + service for service in ("info", "calibration", "health", "pose"))
 _SERVICES: Final = "omnibench/{}/*"
 _CALIBRATION: Final = "omnibench/{}/calibration"
@@ -55,12 +57,14 @@ def rights_of(access: Access) -> Rights:
     for robot, name in access.robots.items():
         own_keys = (f"{robot}/**", *_services(robot, _ROS_KEYS), *_topics(robot, ("tf",)))
         grant([name], write=[*_topics(robot, INPUTS), _ROS_GRAPH], read=[*own_keys, *tokens])
-        grant([name], ask=_services(robot, *_ANSWERS))
+        received = _services(robot, _RECEIVED)
+        grant([name], ask=[*_services(robot, *_ANSWERS), *received], subscribe=received)
     everything = [*_topics("*", TOPICS), *tokens]
     answers, services, calibrations = _services("*", *_ANSWERS), _services("*", _SERVICES), _services("*", _CALIBRATION)
     # Nodes answer for their robots and take calibrations; to give orders and calibrations is for operators alone.
     grant(access.nodes, write=[*_topics("*", _OUTPUTS), _ROS_GRAPH], serve=services)
-    grant(access.nodes, read=everything, ask=answers, subscribe=calibrations)
+    grant(access.nodes, read=[*everything, *_services("*", _CLAIM)], ask=answers, subscribe=calibrations)
+    grant(access.nodes, put=_services("*", _RECEIVED))
     grant(access.viewers, write=[_ROS_GRAPH], read=everything, ask=answers)
     grant(access.operators, write=[_ROS_GRAPH], read=everything, ask=services, put=calibrations)
     for rule in access.rules:

@@ -66,6 +66,11 @@ class FoxgloveServer(Closing):
             self._channels[name] = foxglove.Channel(name, schema=schema, message_encoding="cdr", context=self._context)
         self._listeners.append(listener)
 
+    @property
+    def missed(self) -> int:
+        """Messages that were published and never came here, so that no client got them."""
+        return sum(sum(listener.missed.values()) for listener in self._listeners)
+
     def close(self) -> None:
         """Stop serving, and return when another server can have the port."""
         for listener in self._listeners:

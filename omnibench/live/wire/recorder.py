@@ -36,7 +36,8 @@ class Recorder:
     readable.
 
     counts: messages written, by ROS topic. undecodable: payloads that are not of their topic's type and were left out,
-    by ROS topic. lost: messages dropped because the queue was full while the disk did not write.
+    by ROS topic. missed: messages that were published and never came, by ROS topic. lost: messages dropped because the
+    queue was full while the disk did not write.
 
     ConfigError: a robot's name or a topic is not valid. DataError: ``path`` exists already or cannot be written.
     """
@@ -68,6 +69,11 @@ class Recorder:
     def messages(self) -> int:
         """Messages written."""
         return self.counts.total()
+
+    @property
+    def missed(self) -> Counter[str]:
+        """Messages that were published and never came, by ROS topic."""
+        return Counter(self._listener.missed if self._listener else {})
 
     @property
     def silent_robots(self) -> list[str]:

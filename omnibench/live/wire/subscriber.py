@@ -19,6 +19,7 @@ from omnibench.live.network.presence import checked_robot
 from omnibench.live.network.rate_limiter import RateLimiter
 from omnibench.live.network.session import open_session
 from omnibench.live.network.session_config import SessionConfig
+from omnibench.live.wire.attachment import MissedMessages
 from omnibench.live.wire.messages import ODOMETRY, MessageError, Odometry
 from omnibench.live.wire.topics import TOPICS, KeySpace, Profile
 
@@ -49,7 +50,7 @@ def subscribe(
 
     callback: called with each message in a thread of its own, instead of iterating. buffer: how many messages wait for
     a slow reader; by default only the newest. With ``lossless`` up to 10,000 messages wait, in order; only when these
-    are full does the sender drop messages.
+    are full does the sender drop messages, which ``missed`` counts and the log tells once.
 
     ConfigError: a name is not valid, or nothing listens at ``connect``. ::
 
@@ -73,14 +74,16 @@ def subscribe(
         if isinstance(connect, str):
             connect = validate(SessionConfig, {"mode": "client", "connect": connect}, f"subscribing to {robot}")
         session = own_session = open_session(connect, f"subscribing to {robot}")
-    return Subscription(session.declare_subscriber(key, channel), callback, own_session)
+    return Subscription(session.declare_subscriber(key, channel), callback, own_session, lossless)
 
 
 class Subscription(Closing):
     """A stream of odometry messages: iterate over it, or get the ``latest``; a context manager.
 
-    received: messages decoded so far. undecodable: messages skipped because they were not odometry. callback_errors:
-    how often the callback raised; each kind of exception is logged once, and the stream goes on.
+    received: messages decoded so far. missed: messages published since the first and not received, because they were
+    lost on the way or newer ones took their place before they were read. undecodable: messages skipped because they
+    were not odometry. callback_errors: how often the callback raised; each kind of exception is logged once, and the
+    stream goes on.
     """
 
     def __init__(
@@ -88,6 +91,7 @@ class Subscription(Closing):
         subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]],
         callback: Callable[[Odometry], object] | None,
         session: zenoh.Session | None,
+        lossless: bool,
     ) -> None:
         self.received = 0
         self.undecodable = 0
@@ -96,6 +100,8 @@ class Subscription(Closing):
         self._channel = subscriber.handler  # readers wait in the channel, so that the subscriber can be closed
         self._session = session
         self._callback = callback
+        self._lossless = lossless
+        self._numbers = MissedMessages()
         self._log_limiter = RateLimiter(math.inf)
         self._closing = threading.Lock()  # Zenoh does not allow two threads to close at once
         self._closed = False
@@ -105,6 +111,11 @@ class Subscription(Closing):
                 target=self._call, args=(callback,), name="omnibench-subscribe", daemon=True
             )
             self._thread.start()
+
+    @property
+    def missed(self) -> int:
+        """Messages published since the first and not received."""
+        return self._numbers.count
 
     def __iter__(self) -> Iterator[Odometry]:
         if self._callback is not None:
@@ -151,6 +162,11 @@ class Subscription(Closing):
     def _decoded(self, sample: zenoh.Sample) -> Odometry | None:
         if sample.kind != zenoh.SampleKind.PUT:
             return None
+        before = self._numbers.count
+        if not self._numbers.take(sample.attachment):
+            return None
+        if self._lossless and self._numbers.count > before and self._log_limiter.allows("missed"):
+            _log.warning("%d messages of %s were lost on the way; `missed` counts them", self.missed, sample.key_expr)
         try:
             message = ODOMETRY.decode(sample.payload.to_bytes())
         except MessageError:

@@ -13,6 +13,7 @@ import zenoh
 from omnibench.errors import UnknownNameError
 from omnibench.live.network.callbacks import direct
 from omnibench.live.network.presence import checked_robot
+from omnibench.live.wire.attachment import MissedMessages
 from omnibench.live.wire.topics import TOPICS, KeySpace, topic_name
 
 
@@ -33,7 +34,8 @@ class Arrival:
 class TopicListener:
     """Calls ``consume`` with each message of the robots' topics, one at a time, in Zenoh's thread: it must be quick.
 
-    topics: ROS 2 name -> key in TOPICS. ConfigError: no such topic, or a robot's name is not valid.
+    topics: ROS 2 name -> key in TOPICS. A message that its sender sent again, and that came before, is left out.
+    ConfigError: no such topic, or a robot's name is not valid.
     """
 
     def __init__(
@@ -49,10 +51,16 @@ class TopicListener:
         self._lock = Lock()
         sources = {f"/{topic_name(robot, topic)}": (robot, topic) for robot, topic in _pairs(robots, topics)}
         self.topics = {name: topic for name, (_, topic) in sources.items()}  # all robots share tf
+        self._missed = {name: MissedMessages() for name in sources}
         self._subscribers: list[zenoh.Subscriber[None]] = []
         for name, (robot, topic) in sources.items():
             expression, take = keys.expression(robot, topic), partial(self._take, name, topic)
             self._subscribers.append(session.declare_subscriber(expression, direct(take)))
+
+    @property
+    def missed(self) -> dict[str, int]:
+        """Messages that were published and did not come, by ROS 2 name; for publishers that number theirs."""
+        return {name: messages.count for name, messages in self._missed.items() if messages.count}
 
     def close(self) -> None:
         """Stop listening; ``consume`` is not called after this."""
@@ -66,6 +74,8 @@ class TopicListener:
             return
         payload = sample.payload.to_bytes()
         with self._lock:
+            if not self._missed[name].take(sample.attachment):
+                return
             self._time = max(self._time, time.time_ns())  # readers of recordings expect increasing times
             self._consume(Arrival(name, topic, self._time, payload))
 
