@@ -33,6 +33,7 @@ TOPICS: Final[dict[str, MessageType[Any]]] = {
 
 _QOS = "::,10:,:,:,,"  # rmw_zenoh's code of: reliable, volatile, depth 10
 _HASH_OF_HUMBLE = "TypeHashNotSupported"
+_ENTITIES = count()  # numbers of this process's nodes, publishers and subscribers
 
 
 def topic_name(robot: str, topic: str) -> str:
@@ -78,18 +79,17 @@ class GraphNode:
         self.session = session
         self.keys = keys
         self._name = name
-        self._numbers = count()
         self._tokens: list[zenoh.LivelinessToken] = []  # kept, because a token without a reference is undeclared
-        self._token("NN", next(self._numbers))
+        self._token("NN", next(_ENTITIES))
 
     def publisher(self, robot: str, topic: str, *, lossless: bool = False) -> Publisher[Any]:
         """A publisher of a robot's topic."""
-        token = self._token("MP", next(self._numbers), robot, topic)
+        token = self._token("MP", next(_ENTITIES), robot, topic)
         return Publisher(self.session, TOPICS[topic], self.keys.key(robot, topic), token, lossless=lossless)
 
     def subscribe(self, robot: str, topic: str, callback: Callable[[zenoh.Sample], None]) -> zenoh.Subscriber[None]:
         """Call ``callback`` with each sample of a robot's topic, in Zenoh's thread: it must be quick."""
-        self._token("MS", next(self._numbers), robot, topic)
+        self._token("MS", next(_ENTITIES), robot, topic)
         return self.session.declare_subscriber(self.keys.expression(robot, topic), direct(callback))
 
     def _token(self, kind: str, number: int, robot: str = "", topic: str = "") -> str:
