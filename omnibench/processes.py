@@ -40,6 +40,8 @@ def end_with_parent() -> None:
     assert parent is not None  # this is a worker
     with suppress(OSError):
         wait([parent.sentinel])
+        if os.getpgrp() == os.getpid():
+            os.killpg(0, signal.SIGKILL)  # with all processes that it started
         os._exit(1)
 
 

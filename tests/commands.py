@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CONFIGS = ROOT / "configs"
 RECORDINGS = ROOT.parent / "shared" / "data"
 COMMAND = (sys.executable, "-m", "omnibench")
-ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", "OMNIBENCH_PLUGINS": "none"}
+ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
 
 # What every plug-in file of the tests begins with.
 PLUGIN_IMPORTS = """
@@ -41,11 +41,11 @@ from omnibench.registry import Options, calibrators
 def omnibench(
     *arguments: object, cwd: Path | None = None, timeout: float = 300, **others: Any
 ) -> subprocess.CompletedProcess[str]:
-    """Run one command to its end; what it printed."""
+    """Run one command to its end; what it printed. Without a folder, plug-ins of the tests' own are not loaded."""
     return subprocess.run(
         [*COMMAND, *map(str, arguments)],
         cwd=cwd,
-        env=ENVIRONMENT,
+        env=ENVIRONMENT | ({"OMNIBENCH_PLUGINS": "none"} if cwd is None else {}),
         capture_output=True,
         text=True,
         timeout=timeout,

@@ -79,14 +79,15 @@ def plugin_new(
 def plugin_check(
     file: Annotated[Path, typer.Argument(help="Plug-in file.")],
     sample: Annotated[Path | None, typer.Option(help="Sample recordings for an importer to read.")] = None,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Longest time of the whole check, in s.")] = 600.0,
 ) -> None:
     """Run the conformance tests on a plug-in.
 
     The exit code is 1 if a test fails.
     """
-    from omnibench.testing.plugin_files import check_plugin
+    from omnibench.testing.plugin_files import check_plugin_apart
 
-    report = check_plugin(file, sample)
+    report = check_plugin_apart(file, sample, seconds)
     for result in report.results:
         message = f": {result.message}" if result.message else ""
         typer.echo(f"{result.outcome:7} {result.kind} {result.name}: {result.case}{message}")

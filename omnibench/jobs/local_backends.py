@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import pickle
 import threading
 from collections.abc import Iterable, Iterator, Sequence
@@ -83,17 +84,23 @@ class Processes:
                         yield ended.ending()
             finally:
                 _end(title)
+                for left in active:
+                    left.end_group()
 
 
 @dataclass(eq=False)
 class _Active:
-    """A job that is under way. future: its end. progress: its reports, None once they have ended."""
+    """A job that is under way. future: its end. progress: its reports, None once they have ended.
+
+    group: id of its process's group, in which all processes are that the job starts; None until that is known.
+    """
 
     number: int
     job: Job[Any]
     future: futures.Future[None]
     progress: Connection | None
     kills: int
+    group: int | None = None
 
     def receive(self, watch: JobWatch[Any]) -> None:
         """Pass one report on. At the end of all reports the job is about to end, too, which is waited for."""
@@ -105,10 +112,14 @@ class _Active:
             self.progress = None
             futures.wait([self.future], timeout=_PERIOD)
         else:
-            watch.moved(self.number, event)
+            if isinstance(event, int):
+                self.group = event
+            else:
+                watch.moved(self.number, event)
 
     def ending(self) -> Ended:
         """The job's end: with a result, an error, over its time or with its process."""
+        self.end_group()
         if self.progress is not None:
             self.progress.close()
         error = self.future.exception()
@@ -119,6 +130,18 @@ class _Active:
         if isinstance(error, TimeoutError) and error.args[1:] == (self.job.seconds,):  # pebble's, not the job's own
             return Ended(self.number, self.job, Failure(f"over time (limit {self.job.seconds:g} s)", over_time=True))
         return Ended(self.number, self.job, _raised(self.job, error))
+
+    def end_group(self) -> None:
+        """End the processes that the job left behind."""
+        while self.group is None and self.progress is not None and self.progress.poll():
+            try:
+                first = self.progress.recv()
+            except (EOFError, OSError):
+                break
+            self.group = first if isinstance(first, int) else None
+        if self.group is not None:
+            with suppress(OSError):  # there is none
+                os.killpg(self.group, SIGKILL)
 
 
 def _start(number: int, job: Job[T], store: ResultStore[T], context: Any, title: str) -> _Active:
@@ -159,6 +182,9 @@ def _work(job: Job[T], store: ResultStore[T], progress: Connection) -> None:
     global _in_job
     _in_job = True
     signal(SIGTERM, SIG_DFL)  # end at once: Python's handlers would wait for compiled code
+    os.setpgid(0, 0)  # all that a plug-in starts can be ended with the job
+    process = os.getpid()
+    progress.send(process)
     threading.Thread(target=end_with_parent, daemon=True).start()
 
     def report(event: Progress) -> None:
@@ -167,8 +193,13 @@ def _work(job: Job[T], store: ResultStore[T], progress: Connection) -> None:
 
     try:
         with one_thread(), limited_memory(job.memory_mb):
-            job.run(store, report)
+            result = job.function(job.argument, report)
+            if os.getpid() != process:  # a plug-in forked: its copy of this process has no answer to give
+                os._exit(0)
+            store.put(job.key, result)
     except Exception as error:
+        if os.getpid() != process:
+            os._exit(1)
         raise _sendable(error) from error
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from omnibench.errors import OmnibenchError, PluginError
+from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import Options, Registry, load_plugin_file
 
 
@@ -69,10 +70,17 @@ class CaseResult:
         return self.outcome is not CaseOutcome.FAILED
 
 
-def run_cases(suite: Conformance) -> list[CaseResult]:
-    """Run every case of ``suite``, in the order of definition; an exception becomes the case's result."""
+def run_cases(suite: Conformance, watch: Reporter = no_progress) -> list[CaseResult]:
+    """Run every case of ``suite``, in the order of definition; an exception becomes the case's result.
+
+    watch: told of each before it runs.
+    """
     defined = [name for cls in reversed(type(suite).__mro__) for name in vars(cls) if name.startswith("test_")]
-    return [_run_case(suite, method) for method in dict.fromkeys(defined)]
+    results = []
+    for method in dict.fromkeys(defined):
+        watch(Progress(f"{suite.registry.kind} {suite.name} is tested: {_in_words(method)}"))
+        results.append(_run_case(suite, method))
+    return results
 
 
 def _run_case(suite: Conformance, method: str) -> CaseResult:
@@ -85,8 +93,11 @@ def _run_case(suite: Conformance, method: str) -> CaseResult:
         outcome, message = CaseOutcome.FAILED, str(error)
     except (Exception, SystemExit) as error:  # a plug-in may raise anything
         outcome, message = CaseOutcome.FAILED, f"{type(error).__name__}: {error}"
-    case = method.removeprefix("test_").replace("_", " ")
-    return CaseResult(suite.registry.kind, suite.name, case, outcome, " ".join(message.split()))
+    return CaseResult(suite.registry.kind, suite.name, _in_words(method), outcome, " ".join(message.split()))
+
+
+def _in_words(method: str) -> str:
+    return method.removeprefix("test_").replace("_", " ")
 
 
 def load_plugin(path: Path) -> None:

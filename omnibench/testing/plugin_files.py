@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import importlib.util
 import keyword
+import os
 import re
-from dataclasses import dataclass
+import sys
+from contextlib import redirect_stdout
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from string import Template
+from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
 
 from omnibench.config import validate
-from omnibench.errors import ConfigError, PluginError, UnknownNameError
+from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
 from omnibench.files import refuse_existing, write_text
+from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
+from omnibench.jobs.local_backends import Processes
+from omnibench.jobs.result_store import ResultStore
+from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import REGISTRIES, Entry, Registry, calibrators, costs, effects, importers, registered_from
 from omnibench.testing.calibrator_cases import CalibratorConformance
 from omnibench.testing.conformance import CaseOutcome, CaseResult, Conformance, load_plugin, run_cases
@@ -76,10 +84,62 @@ def new_plugin(
     return list(targets)
 
 
-def check_plugin(path: Path | str, sample: Path | str | None = None) -> CheckReport:
+def check_plugin_apart(path: Path, sample: Path | None = None, seconds: float = 600.0) -> CheckReport:
+    """As ``check_plugin``, in a process of its own, which the plug-in may crash, leave or keep for ``seconds`` only.
+
+    PluginError, in one line, names these ends, too, and during what they came.
+    """
+    watch = _CheckWatch(path)
+    job = Job("report", _check_apart, (path.absolute(), sample), seconds)
+    with TemporaryDirectory() as folder:
+        run_jobs([job], ResultStore(Path(folder), CheckReport), Processes(1, (__name__,)), watch)
+    assert watch.report is not None  # run_jobs tells of every end
+    return watch.report
+
+
+class _CheckWatch(JobWatch[CheckReport]):
+    """Takes the report of a check, or raises PluginError. stage: what the check is at."""
+
+    def __init__(self, path: Path) -> None:
+        self.report: CheckReport | None = None
+        self._path, self._stage = path, "it is imported"
+
+    def moved(self, number: int, event: Progress) -> None:  # noqa: ARG002 (there is one job)
+        self._stage = event.task
+
+    def ended(self, number: int, ending: CheckReport | Failure, reused: bool) -> None:  # noqa: ARG002
+        if isinstance(ending, CheckReport):
+            self.report = replace(ending, path=self._path)
+        elif isinstance(ending.error, OmnibenchError):
+            raise ending.error
+        else:
+            raise PluginError(f"{self._path}: {ending.reason} while {self._stage}")
+
+
+def _check_apart(arguments: tuple[Path, Path | None], report: Reporter) -> CheckReport:
+    path, sample = arguments
+    with redirect_stdout(sys.stderr):  # a plug-in that prints must not spoil the report
+        checked = check_plugin(path, sample, report)
+    if not _has_child():
+        return checked
+    message = "it started or forked a process that still runs or was not waited for; end what it starts"
+    left = CaseResult("plug-in", path.stem, "it leaves no process behind", CaseOutcome.FAILED, message)
+    return replace(checked, results=(*checked.results, left))
+
+
+def _has_child() -> bool:
+    """True if this process started one that still runs, or for whose end nobody has waited."""
+    try:
+        os.waitpid(-1, os.WNOHANG)
+    except ChildProcessError:
+        return False
+    return True
+
+
+def check_plugin(path: Path | str, sample: Path | str | None = None, watch: Reporter = no_progress) -> CheckReport:
     """Load a plug-in file and run the conformance cases on every class that it registers.
 
-    sample: recordings for an importer; without them only its refusals are tested.
+    sample: recordings for an importer; without them only its refusals are tested. watch: told of every case.
     PluginError, in one line: there is no such file, it cannot be imported, or it registers nothing.
     """
     path = Path(path)
@@ -89,11 +149,11 @@ def check_plugin(path: Path | str, sample: Path | str | None = None) -> CheckRep
         raise PluginError(f"{path} registers nothing; decorate a class with @calibrators.register(...), for example")
     source = None if sample is None else Path(sample)
     return CheckReport(
-        path, tuple(result for registry, entry in registered for result in _check(registry, entry, source))
+        path, tuple(result for registry, entry in registered for result in _check(registry, entry, source, watch))
     )
 
 
-def _check(registry: Registry[Any], entry: Entry[Any], source: Path | None) -> list[CaseResult]:
+def _check(registry: Registry[Any], entry: Entry[Any], source: Path | None, watch: Reporter) -> list[CaseResult]:
     try:
         validate(entry.options, {}, f"{registry.kind} {entry.name!r}")
     except ConfigError as error:
@@ -101,7 +161,7 @@ def _check(registry: Registry[Any], entry: Entry[Any], source: Path | None) -> l
         return [CaseResult(registry.kind, entry.name, "can be made without options", CaseOutcome.FAILED, message)]
     base = _SUITES.get(registry, Conformance)
     suite = type("Checked", (base,), {"name": entry.name, "registry": registry, "source": source})
-    return run_cases(suite())
+    return run_cases(suite(), watch)
 
 
 def _check_identifier(name: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from job_samples import Answer, Notes, jobs_of, run, squared, tried
+from timing import PATIENCE
 
 from omnibench.errors import DataError
 from omnibench.jobs.job import Backend, Failure, Job, run_jobs
@@ -185,6 +187,30 @@ def test_a_job_may_change_its_working_folder(tmp_path: Path, monkeypatch: pytest
     monkeypatch.chdir(tmp_path)
     (tmp_path / "other").mkdir()
     assert run(Path("results"), jobs_of(elsewhere, [tmp_path / "other"]), Processes(1)).answers() == {0: 3}
+
+
+def leaving(order: tuple[Path, str], _: Reporter) -> Answer:
+    file, end = order
+    file.write_text(str(subprocess.Popen(["sleep", "10000"]).pid))
+    if end == "crash":
+        os._exit(3)
+    if end == "hang":
+        time.sleep(10_000)
+    return Answer(1)
+
+
+@pytest.mark.parametrize("end", ["answer", "crash", "hang"])
+def test_what_a_job_started_ends_with_it(end: str, tmp_path: Path) -> None:
+    file = tmp_path / "pid"
+    job = Job("job", leaving, (file, end), seconds=2.0 if end == "hang" else None)
+    notes = Notes()
+    run_jobs([job], ResultStore(tmp_path / "store", Answer), Processes(1), notes)
+    assert isinstance(notes.endings[0], Answer) == (end == "answer")
+    state = Path(f"/proc/{file.read_text()}/stat")
+    deadline = time.monotonic() + PATIENCE
+    while state.exists() and " Z " not in state.read_text():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def test_every_job_has_a_process_of_one_thread(tmp_path: Path) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,7 @@ from timing import PATIENCE
 from omnibench.errors import ConfigError, DataError, OmnibenchError, PluginError
 from omnibench.registry import registered_from
 from omnibench.testing import CaseOutcome, load_plugin
-from omnibench.testing.plugin_files import PLUGIN_KINDS, CheckReport, check_plugin, new_plugin
+from omnibench.testing.plugin_files import PLUGIN_KINDS, CheckReport, check_plugin, check_plugin_apart, new_plugin
 
 pytestmark = pytest.mark.usefixtures("registries_as_before")
 
@@ -128,6 +130,49 @@ def test_a_flawed_plugin_fails_the_case_it_breaks(tmp_path: Path) -> None:
     (failure,) = (result for result in report.failures if result.case == "bounds are kept")
     assert (failure.kind, failure.name) == ("calibrator", "flawed_1")
     assert failure.message.startswith("the answer is outside the box (m11")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("import os; os._exit(3)", "the process died without an answer (exit code 3) while it is imported"),
+        ("import os; os.kill(os.getpid(), 11)", "died without an answer (killed by SIGSEGV) while it is imported"),
+        ("while True: pass", "over time (limit 1 s) while it is imported"),
+        ("1 / 0", "cannot be loaded: ZeroDivisionError: division by zero"),
+    ],
+    ids=["exit", "crash", "hang", "error"],
+)
+def test_a_plugin_that_ends_its_process_or_never_ends_is_named(content: str, message: str, tmp_path: Path) -> None:
+    file = tmp_path / "wild.py"
+    file.write_text(content)
+    with pytest.raises(PluginError, match=re.escape(message)):
+        check_plugin_apart(file, seconds=1.0 if "over time" in message else PATIENCE)
+
+
+def test_a_crash_in_a_case_is_named_with_the_case(tmp_path: Path) -> None:
+    crashing = FLAWED.format(number=7).replace("problem.cost(problem.start[None])", "import os; os._exit(4)")
+    (tmp_path / "crashing.py").write_text(crashing)
+    with pytest.raises(PluginError, match=r"exit code 4\) while calibrator flawed_7 is tested: "):
+        check_plugin_apart(tmp_path / "crashing.py", seconds=PATIENCE)
+
+
+@pytest.mark.parametrize("child", ["time.sleep(10_000)", "pass"], ids=["that stays", "that goes on as its twin"])
+def test_a_fork_is_named_and_ended(child: str, tmp_path: Path) -> None:
+    pid_file = tmp_path / "pid"
+    fork = f"import os, time\npid = os.fork()\nif pid == 0:\n    {child}\n"
+    note = f"else:\n    open({str(pid_file)!r}, 'w').write(str(pid))\n"
+    (tmp_path / "forking.py").write_text(fork + note + FLAWED.format(number=8))
+    report = check_plugin_apart(tmp_path / "forking.py", seconds=PATIENCE)
+    assert outcomes(report)["it leaves no process behind"] is CaseOutcome.FAILED
+    assert len([result for result in report.results if result.case == "bounds are kept"]) == 1
+    until_gone(int(pid_file.read_text()))
+
+
+def until_gone(pid: int) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while Path(f"/proc/{pid}").exists() and " Z " not in Path(f"/proc/{pid}/stat").read_text():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def test_everything_that_a_file_registers_is_checked(tmp_path: Path) -> None:
