@@ -21,9 +21,9 @@ from omnibench.discover.selection.model_selection import Selection
 from omnibench.discover.selection.motor_effects import MotorEffects
 from omnibench.discover.selection.screening import Screening
 
-# delta of the generic bases, which no effect has the form of. With it the likeliest covariate is right in 71 % of 58
-# blind sets, of which 77 % is said, and the second in 16 %, of which 11 % is said. Half of it says 99 % of 72 %, 1.5
-# times 48 % of 33 % (tests/benchmarks/place_study.py).
+# delta of the generic bases, which no effect has the form of. With it the likeliest covariate is right in 70 % of 57
+# blind sets, of which 75 % is said, and the second in 18 %, of which 12 % is said. Half of it says 99 % of 72 %, 1.5
+# times 47 % of 30 % (tests/benchmarks/place_study.py).
 _DISCREPANCY = 0.2
 _SHOWN = 0.01  # chance up to which a dependence is mentioned; verdicts count those below CHANCE alone
 

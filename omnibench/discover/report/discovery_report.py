@@ -81,18 +81,21 @@ def _answer(discovery: Discovery) -> Iterator[Block]:
 
 
 def _tiles(discovery: Discovery) -> Iterator[Fact]:
-    yield Fact("Verdict", discovery.verdict, verdict_in_words(discovery))
+    differ = ", sessions differ" if discovery.sessions.differences else ""
+    yield Fact("Verdict", f"{discovery.verdict}{differ}", verdict_in_words(discovery))
     for effect in discovery.effects:
         values = "; ".join(parameter_in_words(each) for each in effect.parameters[:2])
         more = f" and {len(effect.parameters) - 2} more" if len(effect.parameters) > 2 else ""
+        others = [name.replace("_", " ") for name in effect.confusable_with if name != effect.name]
+        alike = f"or as well: {listing(others)}; " if len(others) > 1 else ""
         yield Fact(
             f"{effect.stage}, weight {weight_in_words(effect.weight)}",
-            effect_in_words(effect).replace("_", " "),
-            values + more,
+            f"{effect.name.replace('_', ' ')} or {len(others)} others" if alike else _spaced(effect),
+            alike + values + more,
         )
     held = decisive(discovery)
     if held is None:
-        yield _gap_fact(discovery, discovery.gap, "training runs")
+        yield _gap_fact(discovery, discovery.gap, f"training runs, {gap_in_words(discovery.gap)}")
         return
     position, heading = final_errors_in_words(discovery, held)
     where = f"{held_out_in_words(discovery, held)}, {plural(held.runs, 'run')}"
@@ -101,10 +104,14 @@ def _tiles(discovery: Discovery) -> Iterator[Fact]:
     yield _gap_fact(discovery, held.eq6, where)
 
 
+def _spaced(effect: NamedEffect) -> str:
+    return effect_in_words(effect).replace("_", " ")
+
+
 def _gap_fact(discovery: Discovery, gap: Gap, where: str) -> Fact:
     """The share of the gap that is closed or, where nothing was added, the error beside its floor."""
     if discovery.extends:
-        return Fact("Gap closed, Eq. (6)", closed_in_words(gap), f"{gap_in_words(gap)}; {where}")
+        return Fact("Gap closed, Eq. (6)", closed_in_words(gap), where)
     decimals = gap_decimals(gap)
     return Fact("Eq. (6)", fixed(gap.before, decimals), f"floor {fixed(gap.floor, decimals)}; {where}")
 
@@ -146,7 +153,7 @@ def sure_blocks(discovery: Discovery) -> Iterator[Block]:
         yield Facts(
             tuple(
                 Fact(
-                    effect_in_words(effect).replace("_", " "),
+                    _spaced(effect),
                     weight_in_words(effect.weight),
                     f"weight of the name; χ² falls by {count(effect.chi_square)} "
                     f"for {plural(effect.degrees_of_freedom, 'parameter')}",

@@ -13,14 +13,21 @@ from numpy.typing import NDArray
 from omnibench.discover.report.before_after import Curve, ModelStyle, Panel, drawn, legend
 from omnibench.discover.report.residuals import CIRCLE_95, NORMAL_95, Fitted, Residuals, shares
 from omnibench.report.blocks import Figure, FigureGrid
+from omnibench.report.numbers import listing
 from omnibench.robot.kinematics import Array
 
 _BINS = 12  # bins along an axis; only the drawing hangs on it
 _HEIGHT = 270  # px
+_BY_CHANCE = 0.05  # share of the values that leave bands of 95 % by chance
 _LEAST = 0.002  # share of the samples; a bin with fewer, 2 % of its even part, is left out of the drawing
 _STILL = 1e-3  # rad/s, m/s; slower counts as standing
 # Harmonics per turn, as in the bases of covariate dependence: by halves, then whole ones up to 16.
 _HARMONICS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, *map(float, range(4, 17)))
+# Why a test may find what no value of a figure shows.
+_WITHIN = (
+    "The test in the table above, of all values together and against noise alone, may still find a dependence: the "
+    "band also holds what depends on other covariates, so that what is missing need not depend on this one."
+)
 # A figure over a covariate; None where the recordings do not show it.
 CovariateFigure = Callable[[Residuals, Sequence[ModelStyle]], FigureGrid | None]
 # Modes of the error of the motion: name, factor from SI, unit.
@@ -101,9 +108,26 @@ def grid(panels: Sequence[Panel], styles: Sequence[ModelStyle], caption: str = "
             panel = panels[index]
             words = f"{panel.title}: {panel.y_title} against {panel.x_title}"
             figures[index] = Figure(panel.title, figure, words, _HEIGHT)
+    caption = f"{caption} {_within_bands(panels)}".strip()
     found = tuple(figure for figure in figures if figure is not None)
     columns: Literal[2, 3] = 2 if len(found) % 3 and len(found) % 2 == 0 else 3
     return FigureGrid(found, legend(styles, all(panel.shared for panel in panels)), columns, caption) if found else None
+
+
+def _within_bands(panels: Sequence[Panel]) -> str:
+    """Words on each model of which no more values leave their bands than by chance; empty if there is none."""
+    counts: dict[str, tuple[int, int]] = {}
+    for curve in (curve for panel in panels for curve in panel.curves):
+        outside, known = counts.get(curve.style.label, (0, 0))
+        seen = np.isfinite(curve.values) & np.isfinite(curve.half_width)
+        left = int((np.abs(curve.values) > curve.half_width)[seen].sum())
+        counts[curve.style.label] = (outside + left, known + int(seen.sum()))
+    within = [
+        f"of the {label} {outside} of {known} values leave their band"
+        for label, (outside, known) in counts.items()
+        if known and outside <= _BY_CHANCE * known
+    ]
+    return f"No more than by chance, {listing(within)}. {_WITHIN}" if within else ""
 
 
 def heading_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> FigureGrid | None:

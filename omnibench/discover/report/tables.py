@@ -15,6 +15,7 @@ from omnibench.discover.report.wording import (
     floor_in_words,
     gap_decimals,
     held_out_in_words,
+    is_unbounded,
     reading,
     share_of_plausible,
     value_and_interval,
@@ -213,10 +214,14 @@ def not_looked_for_table(discovery: Discovery) -> Table:
     return Table("Not looked for", columns, rows)
 
 
+def _extended_bound(extrapolation: Extrapolation) -> str:
+    return "cannot be said" if is_unbounded(extrapolation) else significant(1e3 * extrapolation.after_m, 3)
+
+
 def extrapolation_table(extrapolations: Sequence[Extrapolation]) -> Table:
     """Motions that no training run had, with the error bounds there."""
     rows = tuple(
-        Row.of(each.command, each.description, significant(1e3 * each.before_m, 3), significant(1e3 * each.after_m, 3))
+        Row.of(each.command, each.description, significant(1e3 * each.before_m, 3), _extended_bound(each))
         for each in extrapolations
     )
     return Table(

@@ -50,6 +50,9 @@ STAGES: Mapping[Stage, str] = {
 }
 METRICS: Mapping[Literal["eq6", "chi2"], str] = {"eq6": "Eq. (6), final poses", "chi2": "whitened χ² per residual"}
 
+# Times the plain matrix's bound: a larger one of the extended model, which its training says nothing of, is no figure
+# to go by. Words alone hang on it (chosen; on omni3's squares the bounds are 50 to 2,000 times as large).
+_UNBOUNDED = 10.0
 _DIMENSIONLESS = ("", "1")  # how effects write the unit of a parameter without a dimension
 _DEGREES = math.degrees(1.0)
 # Units that people read in place of SI units: factor and unit.
@@ -225,9 +228,20 @@ def extrapolations_in_words(extrapolations: tuple[Extrapolation, ...]) -> tuple[
     """Motions of held-out runs on which the extended model extrapolates, a sentence each."""
     return tuple(
         f"{each.command}: {each.description}. Final position within {_millimetres(each.before_m)} by the plain matrix, "
-        f"within {_millimetres(each.after_m)} by the extended model (95 %)."
+        f"{_by_extended(each)}."
         for each in extrapolations
     )
+
+
+def is_unbounded(extrapolation: Extrapolation) -> bool:
+    """True if the models that the data cannot tell apart say nothing of where the run ends."""
+    return not extrapolation.after_m <= _UNBOUNDED * extrapolation.before_m
+
+
+def _by_extended(extrapolation: Extrapolation) -> str:
+    if is_unbounded(extrapolation):
+        return "by the extended model it cannot be said (95 %)"
+    return f"within {_millimetres(extrapolation.after_m)} by the extended model (95 %)"
 
 
 def _millimetres(metres: float) -> str:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
+import numpy as np
 import pytest
 from discovery_samples import (
     COUPLING,
@@ -26,9 +27,10 @@ from discovery_samples import (
 from report_page import Page
 
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.report.before_after import EXTENDED, PLAIN
+from omnibench.discover.report.before_after import ALONE, EXTENDED, PLAIN, Curve, Panel
 from omnibench.discover.report.command_figures import command_blocks
 from omnibench.discover.report.discovery_report import discovery_report, sure_blocks, what_blocks
+from omnibench.discover.report.motion_figures import grid
 from omnibench.discover.report.residuals import Residuals
 from omnibench.discover.result import Absorbed, Discovery, EstimatedParameter
 from omnibench.report.blocks import Document, FigureGrid, Section
@@ -170,6 +172,28 @@ def test_absorbed_effects_come_with_the_measurement_that_would_tell(report: Page
     rows = report.tables["Absorbed: any of these may be there, and no odometry run would show it"][1:]
     assert {row[0]: row[2] for row in rows} == {each.name: each.measurement for each in named().measurements}
     assert "lidar_yaw" in [row[0] for row in rows]
+
+
+def test_a_figure_of_which_no_more_values_leave_their_bands_than_by_chance_says_so() -> None:
+    x = np.arange(20.0)
+
+    def caption(largest: float) -> str:
+        curve = Curve(ALONE, np.where(x < 2, largest, 0.1), np.ones(20))
+        drawn = grid([Panel("", x, (curve,), "", "", "%")], (ALONE,))
+        assert drawn is not None
+        return drawn.caption
+
+    assert caption(0.5).startswith("No more than by chance, of the plain matrix 0 of 20 values leave their band.")
+    assert caption(1.5) == ""
+
+
+def test_a_class_of_effects_has_a_short_tile() -> None:
+    found = named()
+    (effect,) = found.effects
+    several = replace(effect, confusable_with=("heading_drift", "coulomb_creep", "wheel_dead_zone"))
+    told = part(discovery_report(replace(found, effects=(several,)), "").sections[0])
+    assert "rotation translation coupling or 3 others" in told.text
+    assert "or as well: heading drift, coulomb creep and wheel dead zone" in told.text
 
 
 def test_new_motions_are_a_warning_with_both_bounds() -> None:

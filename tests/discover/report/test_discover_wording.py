@@ -7,10 +7,12 @@ from dataclasses import replace
 import pytest
 from discovery_samples import held_out, named
 
+from omnibench.discover.report.tables import extrapolation_table
 from omnibench.discover.report.wording import (
     added,
     chance,
     closed_in_words,
+    extrapolations_in_words,
     floor_in_words,
     gap_in_words,
     held_out_in_words,
@@ -19,7 +21,7 @@ from omnibench.discover.report.wording import (
     reading,
     weight_in_words,
 )
-from omnibench.discover.result import EstimatedParameter, Gap, Step
+from omnibench.discover.result import EstimatedParameter, Extrapolation, Gap, Step
 from omnibench.robot.calibration import Noise
 
 
@@ -81,6 +83,16 @@ def test_a_step_names_the_effect_it_added() -> None:
 
 def test_noise_that_is_not_there_is_not_told() -> None:
     assert noise_in_words(Noise(pose_position=0.01)) == ("white 10 mm", "none")
+
+
+def test_a_bound_many_times_the_plain_matrix_s_is_not_given_as_a_figure() -> None:
+    said, not_said = (Extrapolation("square", "turns", 0.158, after) for after in (0.3, 8.14))
+    assert extrapolations_in_words((said,)) == (
+        "square: turns. Final position within 158 mm by the plain matrix, within 300 mm by the extended model (95 %).",
+    )
+    assert "cannot be said" in extrapolations_in_words((not_said,))[0]
+    assert "8.14" not in extrapolations_in_words((not_said,))[0]
+    assert extrapolation_table((not_said,)).rows[0].cells[-1].text == "cannot be said"
 
 
 def test_runs_of_which_none_is_repeated_are_not_called_repetitions() -> None:
