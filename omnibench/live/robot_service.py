@@ -67,9 +67,11 @@ class RobotService:
             if tracker.fusing or not output.fused
         ]
         self._diagnostics = graph.publisher(name, "diagnostics")
-        self._inputs = [graph.subscribe(name, "joint_states", partial(self._queue, False))]
+        self._graph = graph
+        self._inputs: dict[str, zenoh.Subscriber[None]] = {}
         if tracker.fusing:
-            self._inputs.append(graph.subscribe(name, "slam_pose", partial(self._queue, True)))
+            self._receive_poses()
+        self._inputs["joint_states"] = graph.subscribe(name, "joint_states", partial(self._queue, False))
         self._token = graph.session.liveliness().declare_token(f"omnibench/{name}/alive")
 
     def publish_diagnostics(self) -> None:
@@ -81,13 +83,20 @@ class RobotService:
 
     def close(self) -> None:
         """Take what waits, nothing more, and leave."""
-        for subscriber in self._inputs:
+        for subscriber in list(self._inputs.values()):
             subscriber.undeclare()
         while self._waiting:
             self._take_turn()
         self.tracker.close()
         self._token.undeclare()
         self._flows.close()
+
+    def _receive_poses(self) -> None:
+        """Subscribe to the poses of SLAM: without fusion only because a replay counts them in its flow."""
+        if "slam_pose" not in self._inputs:
+            self._inputs["slam_pose"] = self._graph.subscribe(
+                self.tracker.name, "slam_pose", partial(self._queue, True)
+            )
 
     def _queue(self, is_pose: bool, sample: zenoh.Sample) -> None:
         """Queue a message; in Zenoh's thread."""
@@ -109,8 +118,10 @@ class RobotService:
             for _ in range(min(len(self._waiting), _BATCH)):
                 message = self._waiting.popleft()
                 flow = flow_of(message.attachment)
-                if flow is not None and not self._flows.accepts(flow):
-                    continue
+                if flow is not None:
+                    self._receive_poses()
+                    if not self._flows.accepts(flow):
+                        continue
                 waited = 0.0 if flow is not None else time.monotonic() - message.arrival
                 behind = max(behind, waited)
                 unpublished += self._take(message, late=waited > _LATE)

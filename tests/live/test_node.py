@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import sys
 from pathlib import Path
 
@@ -12,12 +13,17 @@ import zenoh
 from drives import SECOND, drive, slam
 from nodes import asked, config_of, running, sent
 from received_messages import ReceivedMessages
+from recordings import random_dataset
 from sessions import until
 
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.config import LiveConfig, read_live_config
 from omnibench.live.node import LiveNode
+from omnibench.live.replay.arrivals import ReplayConfig
+from omnibench.live.replay.concatenated_drive import concatenate_runs
+from omnibench.live.replay.replay_player import Player
 from omnibench.live.wire.messages import DIAGNOSTICS, ODOMETRY, TRANSFORMS, Odometry
+from omnibench.live.wire.topics import GraphNode, KeySpace
 
 
 def test_wheel_samples_become_the_batch_odometry_on_every_topic(tmp_path: Path) -> None:
@@ -60,6 +66,15 @@ def test_without_fusion_slam_and_tf_are_left_alone(tmp_path: Path) -> None:
         wheels = session.declare_publisher("apr/joint_states")
         until(lambda: wheels.matching_status.matching, "the node's subscription")
         assert not publisher.matching_status.matching
+
+
+def test_without_fusion_a_replay_with_poses_is_taken_whole(tmp_path: Path) -> None:
+    played = concatenate_runs(random_dataset(1))
+    with running(config_of(tmp_path, fusion="none")) as (node, session):
+        graph = GraphNode(session, KeySpace(), "replay")
+        report = Player(graph, "apr", played, ReplayConfig(speed=math.inf)).play()
+        assert report.taken == report.total > len(played.wheel_times)
+        assert node.health("apr").counts["samples"] == len(played.wheel_times)
 
 
 def test_diagnostics_come_once_a_second_with_the_counters(tmp_path: Path) -> None:
