@@ -228,7 +228,7 @@ class Contrast:
         for name in dict.fromkeys(self.sessions):  # s^2 of each session, or of all where one repeats nothing
             inside = of_groups == name
             known = inside if repeated[inside].any() else repeated
-            expected[inside] *= max(traces[0][known].sum() / max(traces[1][known].sum(), 1e-300), 1e-300)
+            expected[inside] *= max(traces[0][known].sum() / max(traces[1][known].sum(), 1e-300), _ROUNDING)
         seen[~repeated] = expected[~repeated]
         freedom = _size(expected.sum(axis=0)) / np.sum(
             [_size(each) / (count - 1) for each, count in zip(expected[repeated], counts[repeated], strict=True)]

@@ -3,6 +3,11 @@
 The tests are those of session_contrast.py. Looked for are a common change of all radii (d = 1), one of each (d = N) and
 any change of the matrix (d = 3N); the least chance counts, times three and times the number of sessions that are tested
 (Bonferroni). The session that differs most is taken out, and the others are tested again.
+
+Derivatives are at a matrix that is fitted to all runs, to a share p of which a session's change belongs. Relative to
+that matrix a radius changes by u, and relative to that of the other sessions by
+
+    k = u / (1 - p u).                                                                                    (1)
 """
 
 from __future__ import annotations
@@ -17,11 +22,13 @@ from scipy.special import stdtrit
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
+from omnibench.fit.least_squares.noise import whiteners
 from omnibench.fit.least_squares.nuisance_noise import FitNoise, noise_of_fit
 from omnibench.fit.least_squares.nuisances import Nuisances
 from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
 from omnibench.fit.least_squares.usable_runs import usable_runs
+from omnibench.fit.least_squares.whitened import given
 from omnibench.fit.sessions.session_contrast import Contrast, SessionScores, sessions_of
 from omnibench.fit.uncertainty.intervals import INTERVAL
 from omnibench.robot.kinematics import Array
@@ -114,7 +121,7 @@ def session_comparison(fit: TrajectoryFit, noise: FitNoise) -> SessionComparison
     """Compare the sessions of a fit's runs under a noise; the nuisances' deviations are the noise's."""
     if untested := _untested(fit.runs):
         return SessionComparison(untested=untested)
-    fit = replace(fit, nuisances=Nuisances(fit.nuisances.values, noise.deviations))
+    fit = _centred(replace(fit, nuisances=Nuisances(fit.nuisances.values, noise.deviations)), noise)
     try:
         data = SessionScores.of(fit, noise.estimate.noise)
     except DataError as error:
@@ -122,6 +129,13 @@ def session_comparison(fit: TrajectoryFit, noise: FitNoise) -> SessionComparison
     other_commands = _with_other_commands(data)
     untested = "" if data.comparable or other_commands else "the sessions share no command"
     return SessionComparison(tuple(_differences(data)), other_commands, untested)
+
+
+def _centred(fit: TrajectoryFit, noise: FitNoise) -> TrajectoryFit:
+    """The fit with its matrix fitted to all runs, by one step, so that the sessions' changes about it are small."""
+    data = fit.linearised(fit.matrix_jacobian(), whiteners(noise.estimate.noise, fit.stamps))
+    step, _ = given(data, []).estimate(range(fit.model.matrix.size))
+    return replace(fit, model=replace(fit.model, matrix=fit.model.matrix + step.reshape(fit.model.matrix.shape)))
 
 
 def _untested(runs: Sequence[Trajectory]) -> str:
@@ -169,6 +183,7 @@ def _difference(data: SessionScores, session: str, chance: float) -> SessionDiff
     change, inverse = roots @ total, np.linalg.pinv(directions)
     values, deviations = inverse @ change, np.sqrt(np.diag(inverse @ roots @ scatter @ roots.T @ inverse.T))
     reach = float(stdtrit(freedom, (1 + INTERVAL) / 2)) * deviations
+    share = contrast.sessions.count(session) / len(contrast.sessions)
     return SessionDifference(
         session=session,
         others=tuple(sorted(set(contrast.sessions) - {session})),
@@ -177,8 +192,8 @@ def _difference(data: SessionScores, session: str, chance: float) -> SessionDiff
         chance=chance,
         kind=kind,
         radii=tuple(
-            RadiusChange(wheel, float(value), float(value - width), float(value + width))
-            for wheel, value, width in zip(wheels, values, reach, strict=False)  # none of the matrix
+            RadiusChange(wheel, *(float(each / (1 - share * each)) for each in (value, value - width, value + width)))
+            for wheel, value, width in zip(wheels, values, reach, strict=False)  # none of the matrix; Eq. (1)
         ),
         matrix=tuple(tuple(float(value) for value in row) for row in change.reshape(data.matrix.shape)),
     )
