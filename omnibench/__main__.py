@@ -1,6 +1,7 @@
 """``omnibench`` and ``python -m omnibench``: every mistake is one line on standard error and an exit code.
 
-Ctrl-C is handled from the first import on; therefore nothing of omnibench is imported before ``main`` runs.
+Ctrl-C and SIGTERM are handled from the first import on; therefore nothing of omnibench is imported before ``main``
+runs. The exit code is 128 and the signal's number.
 """
 
 import gc
@@ -12,18 +13,20 @@ from types import FrameType
 from typing import Any, NoReturn
 
 _PACKAGE = os.path.dirname(__file__)
+_INTERRUPTED = 130  # exit code after Ctrl-C; of another signal once it has come
 _COMMANDS = os.path.join(_PACKAGE, "cli")
 
 
 def main() -> None:
     """Run the command line."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        with suppress(ValueError):  # not in the main thread
-            signal.signal(signal.SIGINT, _interrupted)
+    for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
+        if signal.getsignal(number) == usual:
+            with suppress(ValueError):  # not in the main thread
+                signal.signal(number, _interrupted)
     try:
         _run(_command_line())
     except KeyboardInterrupt:
-        _fail("interrupted", 130)
+        _fail("interrupted", _INTERRUPTED)
 
 
 def _command_line() -> Any:
@@ -43,9 +46,11 @@ def _command_line() -> Any:
 
 def _interrupted(number: int, frame: FrameType | None) -> None:
     """Raise KeyboardInterrupt; end at once during a command's imports, where libraries make it errors of their own."""
+    global _INTERRUPTED
+    _INTERRUPTED = 128 + number
     if _imports_of_a_command(frame):
         os.write(2, b"interrupted\n")
-        os._exit(130)
+        os._exit(_INTERRUPTED)
     signal.default_int_handler(number, frame)
 
 
@@ -80,11 +85,11 @@ def _run(command: Any) -> None:
             _fail(error.format_message())
         _fail(_usage(error))
     except Interrupted as error:
-        _fail(str(error), 130)
+        _fail(str(error), _INTERRUPTED)
     except OmnibenchError as error:
         _fail(_with_notes(f"error: {error}", error), error.exit_code)
     except typer.Abort:
-        _fail("interrupted", 130)
+        _fail("interrupted", _INTERRUPTED)
     except BrokenPipeError:
         sys.stderr.close()  # the program that read our output has ended
         sys.exit(1)
@@ -94,7 +99,7 @@ def _run(command: Any) -> None:
         _fail(_with_notes(f"error: {error.filename or 'output'}: {error.strerror or error}", error))
     else:
         if code == 130:  # newer versions of Typer return this after Ctrl-C
-            _fail("interrupted", 130)
+            _fail("interrupted", _INTERRUPTED)
         sys.exit(code if isinstance(code, int) else 0)
 
 

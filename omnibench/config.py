@@ -57,11 +57,15 @@ class _Loader(yaml.SafeLoader):
     """YAML 1.1 without its traps: a key given twice is refused, ``1e-6`` is a number."""
 
 
+_MERGE = "tag:yaml.org,2002:merge"  # of the key <<, https://yaml.org/type/merge.html
+
+
 def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
-    keys = [loader.construct_object(key, deep=True) for key, _ in node.value]
+    nodes = [key for key, _ in node.value if key.tag != _MERGE]  # a key beside << takes the place of a merged one
+    keys = [loader.construct_object(key, deep=True) for key in nodes]
     for index, key in enumerate(keys):
         if key in keys[:index]:
-            line = node.value[index][0].start_mark.line + 1
+            line = nodes[index].start_mark.line + 1
             raise ConfigError(f"line {line}: key {key!r} is given twice")
     return loader.construct_mapping(node, deep=True)
 

@@ -44,6 +44,13 @@ class Interrupted(OmnibenchError):  # noqa: N818 (the user's wish, not a mistake
     """Ctrl-C; the message says what is kept and how to go on."""
 
 
+def require_type(value: object, kind: type, reader: str) -> None:
+    """ConfigError: an argument is not of its type, as a path is not what ``reader`` reads from it."""
+    if not isinstance(value, kind):
+        shown = repr(value) if len(repr(value)) <= 60 else type(value).__name__
+        raise ConfigError(f"expected a {kind.__name__}, found {shown}; read a file or folder with omnibench.{reader}")
+
+
 class UnknownNameError(ConfigError):
     """A name that nothing is registered under."""
 

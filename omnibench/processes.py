@@ -81,6 +81,25 @@ def _interrupts_ignored() -> Iterator[None]:
 
 
 @contextmanager
+def interrupts_deferred() -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM act at the end of the block: a process whose start they cut short prints a traceback."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        for number in before:
+            signal.signal(number, lambda signalled, _: came.append(signalled))
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for signalled in came[:1]:
+            signal.raise_signal(signalled)
+
+
+@contextmanager
 def main_module_hidden() -> Iterator[None]:
     """Keep processes that start in the block from running the user's script again.
 

@@ -18,7 +18,7 @@ from omnibench.data.run_checks import Flaw, pose_times_flaw, wheel_times_flaw
 from omnibench.data.scan_files import ScansOnDisk, write_scans
 from omnibench.data.scans import Scanner, Scans
 from omnibench.data.table import Table, read_table, table_file
-from omnibench.errors import ConfigError, DataError, nearest
+from omnibench.errors import ConfigError, DataError, nearest, require_type
 from omnibench.files import FileContent, TableFormat, encode_table, remove, resolved, write_files
 from omnibench.robot.kinematics import Array, Robot
 
@@ -94,6 +94,7 @@ def save_dataset(
     overwrite: replace any data set. DataError when the poses are placeholders, the folder holds something else or (not
     ``overwrite``) another data set, by its name or by being simulated, or the disk refuses.
     """
+    require_type(dataset, Dataset, "load_dataset")
     folder = Path(path)
     if not dataset.referenced:
         raise DataError(

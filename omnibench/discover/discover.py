@@ -41,7 +41,7 @@ from omnibench.discover.selection.screening import (
 )
 from omnibench.discover.selection.unknown_term import add_smooth_term
 from omnibench.discover.verdict import lacks_a_name, verdict_of
-from omnibench.errors import DataError
+from omnibench.errors import DataError, require_type
 from omnibench.fit.least_squares.usable_runs import usable_runs
 from omnibench.progress import Reporter, Stages, no_progress
 from omnibench.robot.calibration import Calibration
@@ -73,6 +73,9 @@ def discover_effects(
     Raises UnknownNameError for a name in ``without`` that is no effect's, DataError for a training split without
     reference poses or another robot's calibration.
     """
+    require_type(dataset, Dataset, "load_dataset")
+    if calibration is not None:
+        require_type(calibration, Calibration, "read_calibration")
     began, progress = time.monotonic(), Stages(watch)
     check_names(without)
     rng = np.random.default_rng(seed)

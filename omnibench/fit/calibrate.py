@@ -8,7 +8,7 @@ from typing import Any
 
 from omnibench.data.dataset import Dataset
 from omnibench.environment import package_versions
-from omnibench.errors import ConfigError
+from omnibench.errors import ConfigError, require_type
 from omnibench.fit.calibrator import Calibrator, RunResult, run_calibrator
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import verdict_on
@@ -79,6 +79,7 @@ def calibrate(
     Raises UnknownNameError or ConfigError for wrong arguments, DataError for an empty training split, and ConfigError
     when the calibrator gives no answer.
     """
+    require_type(dataset, Dataset, "load_dataset")
     chosen: Calibrator = calibrators.create(calibrator, options)
     if intervals and not chosen.exact:
         raise ConfigError("intervals are drawn about a minimum to rounding: use the calibrator closed_form")

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
-from omnibench.errors import DataError
+from omnibench.errors import DataError, require_type
 from omnibench.fit.bounds.lower_bound import LowerBounds, Node
 from omnibench.fit.bounds.stamp_sums import QUADRATURE
 from omnibench.fit.parameterisation import Box
@@ -96,6 +96,8 @@ def certify_optimum(
     Raises DataError when the wheels differ, the calibration has effects or the training split is empty, ConfigError for
     a cost that is no sum of norms.
     """
+    require_type(calibration, Calibration, "read_calibration")
+    require_type(dataset, Dataset, "load_dataset")
     calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
     if calibration.effects:
         named = ", ".join(term.name for term in calibration.effects)

@@ -10,6 +10,7 @@ from pydantic import Field
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory
 from omnibench.data.domain_check import extrapolation_warning
+from omnibench.errors import require_type
 from omnibench.fit.held_out import judge, nothing_held_out
 from omnibench.fit.sessions.session_differences import compare_sessions
 from omnibench.registry import costs
@@ -53,6 +54,8 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
 
     DataError: the robots' wheels differ, or the recordings lack what an effect of the calibration needs.
     """
+    require_type(calibration, Calibration, "read_calibration")
+    require_type(dataset, Dataset, "load_dataset")
     calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
     present = {split: dataset.split(split) for split in SPLITS if dataset.split(split)}
     groups: dict[str, tuple[Trajectory, ...]] = {str(name): group for name, group in present.items()}

@@ -7,6 +7,7 @@ import numpy as np
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Split
 from omnibench.data.scans import Scans
+from omnibench.errors import require_type
 from omnibench.fit.span import direction_in_words, driven_span
 from omnibench.fit.uncertainty.identifiability import Identifiability, identifiability
 from omnibench.words import plural
@@ -73,6 +74,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
 
     Every scan is read; DataError names one that is broken.
     """
+    require_type(dataset, Dataset, "load_dataset")
     trajectories = dataset.trajectories
     periods = np.concatenate([np.diff(t.times, prepend=0.0) for t in trajectories])
     pose_periods = np.concatenate([np.diff(t.pose_times) for t in trajectories])

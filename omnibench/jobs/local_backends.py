@@ -22,7 +22,13 @@ from omnibench.errors import one_line
 from omnibench.jobs.job import Backend, Ended, Failure, Job, JobWatch
 from omnibench.jobs.memory import limited_memory, oom_kills
 from omnibench.jobs.result_store import ResultStore
-from omnibench.processes import end_with_parent, main_module_hidden, one_thread, one_thread_processes
+from omnibench.processes import (
+    end_with_parent,
+    interrupts_deferred,
+    main_module_hidden,
+    one_thread,
+    one_thread_processes,
+)
 from omnibench.progress import Progress
 
 T = TypeVar("T")
@@ -149,7 +155,7 @@ def _start(number: int, job: Job[T], store: ResultStore[T], context: Any, title:
     kills = oom_kills()
     options: dict[str, Any] = {"name": title, "timeout": job.seconds, "context": context}
     work: Any = in_process(**options)
-    with main_module_hidden():
+    with interrupts_deferred(), main_module_hidden():
         future = work(_work)(job, store, writer)
     writer.close()
     return _Active(number, job, future, reader, kills)

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, FiniteFloat, ValidationError, model_validator
 
 from omnibench.config import Model, NonNegative, Positive, parse_yaml, printable, read_yaml, to_yaml, validate
-from omnibench.errors import ConfigError, DataError
+from omnibench.errors import ConfigError, DataError, require_type
 from omnibench.files import write_text
 from omnibench.robot.effects.term import make_term
 from omnibench.robot.kinematics import Array, Robot
@@ -208,4 +208,5 @@ def _checked(content: Any, where: str) -> Calibration:
 
 def write_calibration(calibration: Calibration, path: Path | str) -> None:
     """Write a calibration file, whole or not at all. DataError when it cannot be written."""
+    require_type(calibration, Calibration, "read_calibration")
     write_text(Path(path), to_yaml(calibration))

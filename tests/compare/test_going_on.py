@@ -176,6 +176,47 @@ def test_ctrl_c_before_the_first_run_ends_in_one_line(tmp_path: Path) -> None:
     assert [line.split(";")[0] for line in run.stderr.splitlines() if line] == ["interrupted"]
 
 
+def test_ctrl_c_while_the_workers_start_is_one_line(tmp_path: Path) -> None:
+    config = write_config(tmp_path, **waiting(tmp_path), workers=4)
+    for attempt in range(3):
+        process = subprocess.Popen(
+            [*COMMAND, "compare", str(config), "--output", str(tmp_path / f"out{attempt}")],
+            env=ENVIRONMENT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        assert process.stderr is not None
+        assert process.stderr.readline() == "comparing: 4 runs\n"
+        os.killpg(process.pid, signal.SIGINT)
+        _, said = process.communicate(timeout=PATIENCE)
+        assert next(line for line in said.splitlines() if not line.startswith("[")).startswith("interrupted; ")
+        assert "Traceback" not in said
+        assert wait_until_gone(process.pid) == []
+
+
+def test_sigterm_says_what_is_kept_as_ctrl_c_does(tmp_path: Path) -> None:
+    process = started(write_config(tmp_path, **waiting(tmp_path), workers=1), tmp_path / "out")
+    process.terminate()
+    _, said = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 128 + signal.SIGTERM
+    assert said.splitlines()[-1] == (
+        f"interrupted; 1 of 4 runs are kept in {tmp_path / 'out'}: run again with -o {tmp_path / 'out'}"
+    )
+
+
+def test_a_reader_that_leaves_early_gets_no_more_and_the_report_is_written(tmp_path: Path) -> None:
+    config = write_config(tmp_path)
+    shell = f"{' '.join(COMMAND)} compare {config} -o {tmp_path / 'out'} 2>&1 | head -n 1"
+    run = subprocess.run(
+        ["bash", "-c", shell], env=ENVIRONMENT, capture_output=True, text=True, timeout=PATIENCE, check=False
+    )
+    assert len(run.stdout.splitlines()) == 1
+    assert run.stderr == ""
+    assert (tmp_path / "out" / "report.html").is_file()
+
+
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGKILL"])
 def test_the_runs_end_with_a_comparison_that_is_killed_which_then_goes_on(name: str, tmp_path: Path) -> None:
     config = write_config(tmp_path, **waiting(tmp_path), workers=4)  # none starts later

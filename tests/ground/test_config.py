@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import Field, model_validator
 
-from omnibench.config import Model, read_model, read_yaml, to_yaml, validate
+from omnibench.config import Model, parse_yaml, read_model, read_yaml, to_yaml, validate
 from omnibench.errors import ConfigError
 
 
@@ -238,3 +238,19 @@ def validated(model: type[Model], document: Model) -> Model:
         file = Path(folder) / "document.yaml"
         file.write_text(to_yaml(document), encoding="utf-8")
         return read_model(model, file)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a: &a {x: 1, y: 2}\nb: {<<: *a, x: 3}", {"x": 3, "y": 2}),
+        ("a: &a {x: 1}\nc: &c {z: 1}\nb:\n  <<: [*a, *c]\n  y: 5", {"x": 1, "z": 1, "y": 5}),
+    ],
+)
+def test_merge_keys_take_over_what_is_not_given(text: str, expected: dict[str, int]) -> None:
+    assert parse_yaml(text, "config")["b"] == expected
+
+
+def test_a_key_that_is_given_twice_beside_a_merge_key_is_refused() -> None:
+    with pytest.raises(ConfigError, match="line 2: key 'x' is given twice"):
+        parse_yaml("a: &a {x: 1}\nb: {<<: *a, x: 1, x: 2}", "config")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,27 @@ def test_a_name_that_is_not_public_is_missed_by_its_name() -> None:
     package: Any = omnibench  # whose type does not have the name, either
     with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
         _ = package.calibrat
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: omnibench.calibrate("data/robot"),
+            "expected a Dataset, found 'data/robot'; .* omnibench.load_dataset",
+        ),
+        (lambda: omnibench.inspect_dataset(Path("data")), "expected a Dataset, found PosixPath"),
+        (lambda: omnibench.discover_effects("data"), "expected a Dataset"),
+        (lambda: omnibench.save_dataset("data", "copy"), "expected a Dataset"),
+        (lambda: omnibench.evaluate("robot.yaml", "data"), "expected a Calibration, found 'robot.yaml'; .*read_calib"),
+        (lambda: omnibench.certify_optimum("robot.yaml", "data"), "expected a Calibration"),
+        (lambda: omnibench.export_calibration("robot.yaml", "c_header"), "expected a Calibration"),
+        (lambda: omnibench.write_calibration("robot.yaml", "copy.yaml"), "expected a Calibration"),
+    ],
+)
+def test_a_path_in_the_place_of_what_it_holds_is_named(call: Callable[[], Any], message: str) -> None:
+    with pytest.raises(omnibench.OmnibenchError, match=message):
+        call()
 
 
 # Stands for Ctrl-C while a package that takes long is still being imported.

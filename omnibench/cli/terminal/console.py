@@ -18,8 +18,17 @@ _PIPED_WIDTH = 160  # columns of a table in a pipe or a file, where nobody's win
 
 
 def make_console(error: bool = False) -> Console:
-    """A console that shows texts as they are, and does not squeeze tables into 80 columns when it is piped."""
-    from rich.console import Console
+    """A console that shows texts as they are, and does not squeeze tables into 80 columns when it is piped.
+
+    error: on standard error, where progress goes; work goes on in silence when nobody reads it any more.
+    """
+    from rich.console import Console as RichConsole
+
+    class Console(RichConsole):
+        def on_broken_pipe(self) -> None:
+            if not error:
+                super().on_broken_pipe()
+            self.quiet = True
 
     stream = sys.stderr if error else sys.stdout
     width = None if stream.isatty() else _PIPED_WIDTH

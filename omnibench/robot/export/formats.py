@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from omnibench.errors import UnknownNameError
+from omnibench.errors import UnknownNameError, require_type
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.export.c_header import c_header
 from omnibench.robot.export.ros2_controllers import ros2_controllers
@@ -43,6 +43,7 @@ def export_calibration(calibration: Calibration, format: str) -> Export:  # noqa
 
     Raises UnknownNameError for another format and ConfigError when the format cannot describe this robot at all.
     """
+    require_type(calibration, Calibration, "read_calibration")
     if format not in EXPORT_FORMATS:
         raise UnknownNameError("export format", format, EXPORT_FORMATS)
     return EXPORT_FORMATS[format](calibration)
