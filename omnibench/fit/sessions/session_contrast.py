@@ -76,7 +76,10 @@ def sessions_of(runs: Sequence[Trajectory]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class SessionScores:
-    """Scores (Z, n) and information (Z, n, n) of runs, Eq. (1), their sessions, and the matrix (3, N) of the model."""
+    """Scores (Z, n) and information (Z, n, n) of runs, Eq. (1).
+
+    sessions: the runs' sessions. matrix (3, N): of the model. wheels: names of its N wheels.
+    """
 
     runs: tuple[Trajectory, ...]
     sessions: tuple[str, ...]
@@ -111,10 +114,10 @@ class SessionScores:
             raise DataError("the runs of a command have no reference poses at common times")
         residuals, fitted, slopes = zip(*parts, strict=True)
         data = whitened(residuals, fitted, whiteners(noise, stamps_of), slopes, deviations)
-        runs = tuple(fit.runs[index] for index in kept)
+        names = sessions_of(fit.runs)
         return cls(
-            runs,
-            sessions_of(runs),
+            tuple(fit.runs[index] for index in kept),
+            tuple(names[index] for index in kept),
             data.scores,
             data.information_of_runs,
             fit.model.matrix,
