@@ -55,7 +55,9 @@ def judge(
             meaning = "undecided: the design values have no error there to be improved"
         elif units.count < FEWEST:
             meaning = f"undecided: {plural(units.count, units.name)} cannot show it, hold out {FEWEST} or more"
-    change = "" if gain is None else f"Eq. (6) {'falls' if gain.value >= 0 else 'rises'} by {abs(gain.value):.1%}"
+    change = (
+        "" if gain is None else f"Eq. (6) {'falls' if gain.value >= 0 else 'rises'} by {100 * abs(gain.value):.1f} %"
+    )
     basis = units.words
     if ends is not None and gain is not None:
         low, high = ends if gain.value >= 0 else (-ends[1], -ends[0])

@@ -56,7 +56,7 @@ def test_a_calibration_that_raises_the_errors_of_held_out_runs_is_not_to_be_used
     assert (
         found.sentence == "held out (3 runs): 22 mm -> 33 mm, 0.13 deg -> 0.19 deg, worse than the design: do not use"
     )
-    assert "rises by 51.5% (95 % interval" in found.detail
+    assert "rises by 51.5 % (95 % interval" in found.detail
     assert found.detail.endswith("Student's t over 3 runs); runs: c0-0, c1-0, c2-0")
 
 

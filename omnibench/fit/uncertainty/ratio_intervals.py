@@ -150,14 +150,14 @@ class RatioIntervals:
     def ratio(self, numerators: Array, denominators: Array, units: Units) -> Interval:
         """The ratio of two sums over runs (Z,), with its interval. The denominators' sum must not be 0."""
         upper, lower = units.sums(numerators), units.sums(denominators)
-        ratio = float(upper.sum() / lower.sum())  # Eq. (R1)
+        ratio = float(numerators.mean() / denominators.mean())  # Eq. (R1)
         if units.count < FEWEST:
             return Interval(ratio, None, None)
         left = upper - ratio * lower
         if np.abs(left).max() <= _ALIKE * np.abs(numerators).sum():
             return Interval(ratio, ratio, ratio)
         if units.count < BOOTSTRAPPED:
-            return _jackknifed(upper, lower, logarithm=bool((numerators >= 0).all()))
+            return _jackknifed(ratio, upper, lower, logarithm=bool((numerators >= 0).all()))
         below, above = self._quantiles(left)
         low, high = _end(upper, lower, above, -1), _end(upper, lower, below, 1)
         return Interval(ratio, None, None) if low is None or high is None else Interval(ratio, low, high)
@@ -190,9 +190,9 @@ class RatioIntervals:
         return max(-float(low), 0.0), max(float(high), 0.0)  # Eq. (R4)
 
 
-def _jackknifed(upper: Array, lower: Array, logarithm: bool) -> Interval:
+def _jackknifed(ratio: float, upper: Array, lower: Array, logarithm: bool) -> Interval:
     """The interval of a ratio of sums (n,) by Eq. (R6), on the scale of its logarithm or its own."""
-    count, ratio = len(upper), float(upper.sum() / lower.sum())
+    count = len(upper)
     rest = lower.sum() - lower
     others = (upper.sum() - upper) / np.where(rest > 0, rest, np.nan)
     if not np.isfinite(others).all() or (logarithm and not (others > 0).all()):
