@@ -30,9 +30,9 @@ from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 
 _TIMED = 3  # parts whose mean time stands for that of all: the whole box and its first two parts
-# Parts of proofs to a gap of 0.1 %: the middle one, the fewest and the most of ten (tests/benchmarks/proof_parts.py).
-# With a tenth of the gap there are about twice as many.
-_PARTS, _FEW_PARTS, _MANY_PARTS = 155, 60, 900
+# Parts of proofs to a gap of 0.1 %: the median and the fewest of twelve of simulated data (61 to 379), and the 901 of
+# the real omni3 in the box paper. A tenth of the gap takes about twice as many (tests/benchmarks/proof_parts.py).
+_PARTS, _FEW_PARTS, _MANY_PARTS = 150, 60, 900
 _PARTS_GAP = 1e-3
 
 

@@ -9,12 +9,13 @@ from typing import Literal
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.uncertainty.ratio_intervals import FEWEST, Bootstrap, RatioIntervals, units_of
+from omnibench.fit.uncertainty.ratio_intervals import FEWEST, Bootstrap, Interval, RatioIntervals, Units, units_of
 from omnibench.robot.calibration import HeldOutVerdict
 from omnibench.robot.kinematics import Array
 from omnibench.words import noun_for, plural
 
 _SHOWN = 6  # runs that are named; the rest are counted (chosen: two lines of a terminal)
+_MEANINGS = {"better": "better than the design", "worse": "worse than the design: do not use"}
 _HOLD_OUT = (
     "keep runs for validation (omnibench import ... --set validation=PATTERN), or evaluate the calibration on a "
     "recording that it was not fitted to (omnibench evaluate CALIBRATION DATASET)"
@@ -37,33 +38,15 @@ def judge(
     units = units_of(runs, bootstrap.unit)
     costs, before = np.linalg.norm(calibrated, axis=1), np.linalg.norm(design, axis=1)  # Eq. (6), run by run
     gain = RatioIntervals(bootstrap).improvement(costs, before, units)
-    ends = None if gain is None else gain.known
+    low, high = (None, None) if gain is None else (gain.low, gain.high)
     verdict: Literal["better", "worse", "undecided"] = "undecided"
-    if ends is not None and not (ends[0] <= 0 <= ends[1]):
-        verdict = "better" if ends[0] > 0 else "worse"
+    if low is not None and high is not None and not (low <= 0 <= high):
+        verdict = "better" if low > 0 else "worse"
     positions = [float(np.hypot(errors[:, 0], errors[:, 1]).mean()) for errors in (design, calibrated)]
     headings = [float(np.abs(errors[:, 2]).mean()) for errors in (design, calibrated)]
-    position, heading = _lengths(*positions), _angles(*headings)
-    meaning = {
-        "better": "better than the design",
-        "worse": "worse than the design: do not use",
-        "undecided": "undecided: chance alone can explain the difference",
-    }[verdict]
-    if verdict == "undecided" and ends is None:
-        meaning = "undecided: the commands or runs differ too much for an interval"
-        if gain is None:
-            meaning = "undecided: the design values have no error there to be improved"
-        elif units.count < FEWEST:
-            meaning = f"undecided: {plural(units.count, units.name)} cannot show it, hold out {FEWEST} or more"
-    change = (
-        "" if gain is None else f"Eq. (6) {'falls' if gain.value >= 0 else 'rises'} by {100 * abs(gain.value):.1f} %"
+    meaning = (
+        _MEANINGS[verdict] if verdict != "undecided" else _undecided(gain, units, same=bool((costs == before).all()))
     )
-    basis = units.words
-    if ends is not None and gain is not None:
-        low, high = ends if gain.value >= 0 else (-ends[1], -ends[0])
-        basis = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %, {units.words}"
-    named = ", ".join(run.id for run in runs[:_SHOWN])
-    rest = f" and {len(runs) - _SHOWN} more" if len(runs) > _SHOWN else ""
     return HeldOutVerdict(
         verdict=verdict,
         runs=tuple(run.id for run in runs),
@@ -72,14 +55,43 @@ def judge(
         design_heading_rad=headings[0],
         heading_rad=headings[1],
         improvement=None if gain is None else gain.value,
-        low=None if ends is None else ends[0],
-        high=None if ends is None else ends[1],
+        low=low,
+        high=high,
         unit=units.name,
         units=units.count,
         method=units.method,
-        sentence=f"held out ({plural(len(runs), 'run')}): {position}, {heading}, {meaning}",
-        detail=f"{change and f'{change} ({basis}); '}{noun_for(len(runs), 'run')}: {named}{rest}",
+        sentence=f"held out ({plural(len(runs), 'run')}): {_lengths(*positions)}, {_angles(*headings)}, {meaning}",
+        detail=f"{_gain_in_words(gain, units)}{noun_for(len(runs), 'run')}: {_named(runs)}",
     )
+
+
+def _undecided(gain: Interval | None, units: Units, same: bool) -> str:
+    """Why held-out runs leave it undecided whether the calibration is better or worse."""
+    if same:
+        return "the same as the design"
+    if gain is None:
+        return "undecided: the design values have no error there to be improved"
+    if units.count < FEWEST:
+        return f"undecided: {plural(units.count, units.name)} cannot show it, hold out {FEWEST} or more"
+    if gain.known is None:
+        return f"undecided: the {noun_for(units.count, units.name)} differ too much for an interval"
+    return "undecided: chance alone can explain the difference"
+
+
+def _gain_in_words(gain: Interval | None, units: Units) -> str:
+    """The improvement of Eq. (6) with its interval and what that rests on; empty where there is none."""
+    if gain is None:
+        return ""
+    basis = units.words
+    if gain.known is not None:
+        low, high = sorted(end if gain.value >= 0 else -end for end in gain.known)
+        basis = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %, {units.words}"
+    return f"Eq. (6) {'falls' if gain.value >= 0 else 'rises'} by {100 * abs(gain.value):.1f} % ({basis}); "
+
+
+def _named(runs: Sequence[Trajectory]) -> str:
+    rest = f" and {len(runs) - _SHOWN} more" if len(runs) > _SHOWN else ""
+    return ", ".join(run.id for run in runs[:_SHOWN]) + rest
 
 
 def _lengths(before: float, after: float) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,11 +12,13 @@ import numpy as np
 import pytest
 from fit_samples import noisy_trajectories
 from motions import RING, driven
+from rich.console import Console
 
+from omnibench.cli.terminal.calibration_tables import print_calibration
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError, DataError, UnknownNameError
-from omnibench.fit.calibrate import calibrate
+from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.calibrator import Outcome
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.parameterisation import GeometryLimits
@@ -131,6 +135,17 @@ def test_intervals_are_drawn_on_demand(dataset: Dataset) -> None:
     assert (intervals.low <= intervals.high).all()
 
 
+def test_many_runs_of_two_commands_have_no_resampled_intervals_and_it_is_said(dataset: Dataset) -> None:
+    runs = [replace(run, command=f"{index % 2}") for index, run in enumerate(dataset.split("train"))]
+    run = calibrate(make_dataset("two", ROBOT, 0.2, runs), intervals=True)
+    assert run.intervals is None
+    assert "no resampled intervals: no interval from 2 commands; 3 are needed" in run.warnings
+    three = [replace(each, command=f"{index % 3}") for index, each in enumerate(runs)]
+    found = calibrate(make_dataset("three", ROBOT, 0.2, three), intervals=True)
+    assert found.intervals is not None
+    assert found.units.words == "Student's t over 3 commands"
+
+
 def test_noise_and_covariance_are_written_with_the_calibration(dataset: Dataset) -> None:
     run = calibrate(dataset)
     assert run.uncertainty is not None
@@ -233,3 +248,29 @@ def test_intervals_of_a_search_are_refused_before_it_runs(dataset: Dataset) -> N
     message = refused(dataset, ConfigError, calibrator="crs", intervals=True, watch=shown.append)
     assert "use the calibrator closed_form" in message
     assert not shown
+
+
+def printed(run: CalibrationRun) -> str:
+    """What ``calibrate`` prints of a run."""
+    stream = io.StringIO()
+    print_calibration(Console(file=stream, width=160), run)
+    return stream.getvalue()
+
+
+def test_intervals_that_hold_only_if_kept_values_are_right_are_marked_on_their_row() -> None:
+    straight = make_dataset("straight", ROBOT, 0.1, driven(RING, slip=0.02))
+    told = printed(calibrate(straight))
+    (row,) = [line for line in told.splitlines() if line.startswith("  95 %")][:1]
+    assert row.count("*") == 3
+    assert "* only if the design values are right along a + b + c (turning on the spot)" in told
+    assert "*" not in printed(calibrate(straight, unidentified="fit"))
+
+
+def test_an_angle_deviates_in_degrees(dataset: Dataset) -> None:
+    run = calibrate(dataset)
+    assert run.uncertainty is not None
+    assert run.uncertainty.parameters is not None
+    angle = next(each for each in run.uncertainty.parameters if each.name == "angle_a")
+    row = next(line for line in printed(run).splitlines() if line.startswith("angle_a"))
+    assert f" {math.degrees(angle.value - ROBOT.wheels[0].angle):+.3f} deg " in row
+    assert "%" not in row

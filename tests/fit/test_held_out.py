@@ -116,6 +116,11 @@ def test_runs_of_a_recording_that_was_changed_since_do_not_count_as_held_out() -
     assert "is not known" in found.sentence
 
 
+def test_the_design_values_themselves_are_the_same_as_the_design() -> None:
+    same = errors([0.02, 0.03, 0.04, 0.05])
+    assert judge(same, same, runs(4)).sentence.endswith("the same as the design")
+
+
 def test_a_design_without_errors_leaves_nothing_to_improve() -> None:
     found = judge(np.zeros((4, 3)), errors([0.01, 0.01, 0.02, 0.01]), runs(4))
     assert (found.verdict, found.improvement) == ("undecided", None)

@@ -183,6 +183,11 @@ def test_parameters_are_told_with_their_deviation(tmp_path: Path) -> None:
     )
     assert cells[1] == "0.14800 m"
     assert cells[2] == f"{radius.value:.5f} m | {fixed(radius.deviation_percent, 2, signed=True)} %"
+    angle = next(each for each in result.runs[1].record.parameters if each.name == "angle_a")
+    told = page(result, tmp_path).row(
+        "Physical parameters and their deviation from the design values", "angle, wheel a"
+    )
+    assert told[2].endswith(f"| {fixed(math.degrees(angle.deviation), 3, signed=True)}°")
 
 
 def test_four_wheels_have_twelve_elements_compared_on_the_driven_span(tmp_path: Path) -> None:
