@@ -139,7 +139,7 @@ def calibrate(
     if intervals and units.count < FEWEST:
         doubts += (f"no resampled intervals: {units.words}; {FEWEST} are needed",)
     elif intervals and uncertainty:
-        drawn = bootstrap_intervals(problem, result.vector, rng=problem.rng)
+        drawn = bootstrap_intervals(problem, result.vector, units=units, rng=problem.rng)
     geometry = problem.parameterisation.name == "geometry"
     parameters = fitted_parameters(dataset.robot, result.vector) if geometry else None
     kept = kept_motions(dataset.robot, training, searched.name, unidentified)

@@ -1,7 +1,7 @@
 """Resampled intervals of closed_form's optimum: how far it would move on other recordings.
 
-The units that are resampled are commands where runs repeat them, since repetitions share what the model misses there,
-else runs. With t the 0.975 quantile of Student's t with n - 1 degrees of freedom, n units from ten on are drawn with
+The units that are resampled should be commands where runs repeat them, since repetitions share what the model misses
+there. With t the 0.975 quantile of Student's t with n - 1 degrees of freedom, n units from ten on are drawn with
 replacement. Their spread is smaller by sqrt((n - 1) / n) than what it stands for, and its tails are normal; percentiles
 alpha and 1 - alpha make up for both (Hesterberg, Am. Statistician 69:371, 2015):
 
@@ -26,7 +26,7 @@ from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.uncertainty.intervals import INTERVAL
-from omnibench.fit.uncertainty.ratio_intervals import BOOTSTRAPPED, FEWEST, units_of
+from omnibench.fit.uncertainty.ratio_intervals import BOOTSTRAPPED, FEWEST, Units, units_of
 from omnibench.robot.kinematics import Array
 
 
@@ -39,17 +39,23 @@ class ElementIntervals:
 
 
 def bootstrap_intervals(
-    problem: CalibrationProblem, optimum: Array, *, resamples: int = 400, rng: np.random.Generator
+    problem: CalibrationProblem,
+    optimum: Array,
+    *,
+    units: Units | None = None,
+    resamples: int = 400,
+    rng: np.random.Generator,
 ) -> ElementIntervals:
     """Intervals of the matrix elements about closed_form's ``optimum`` (n,), from three units or more.
 
-    The optimum of every resample is found with the poses linearised about ``optimum``: the error of that is far below
-    the width of the intervals. ConfigError for another parameterisation, another cost than a sum of norms, fewer units.
+    units: what is resampled; default: the runs. The optimum of every resample is found with the poses linearised about
+    ``optimum``: the error of that is far below the width of the intervals. ConfigError for another parameterisation,
+    another cost than a sum of norms, or fewer units.
     """
     objective = problem.objective
     if not isinstance(problem.parameterisation, MatrixElements) or not isinstance(objective, SumOfNorms):
         raise ConfigError("bootstrap intervals need the matrix parameterisation and a cost that is a sum of norms")
-    units = units_of(problem.trajectories)
+    units = units or units_of(problem.trajectories, "run")
     count = units.count
     if count < FEWEST:
         raise ConfigError(f"{units.words}: {FEWEST} are needed")
