@@ -19,6 +19,7 @@ from omnibench.compare.read_config import read_compare_config
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.fit.uncertainty.bootstrap import bootstrap_intervals
+from omnibench.fit.uncertainty.ratio_intervals import UnitName, units_of
 from omnibench.registry import calibrators, costs
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.source import read_simulation
@@ -26,7 +27,7 @@ from omnibench.simulate.source import read_simulation
 CONFIG = Path(__file__).parents[2] / "configs" / "apr02.yaml"
 
 
-def covered(seed: int, resamples: int) -> np.ndarray:
+def covered(seed: int, resamples: int, unit: UnitName = "run") -> np.ndarray:
     """Which elements (3, 3) of the hidden matrix lie in their intervals, for one seed of the simulation."""
     config = read_compare_config(CONFIG)
     flower = read_simulation(CONFIG).config
@@ -45,7 +46,9 @@ def covered(seed: int, resamples: int) -> np.ndarray:
     )
     result = run_calibrator(calibrators.create("closed_form"), problem)
     assert result.vector is not None, result.reason
-    intervals = bootstrap_intervals(problem, result.vector, resamples=resamples, rng=np.random.default_rng(seed))
+    units = units_of(training, unit)
+    rng = np.random.default_rng(seed)
+    intervals = bootstrap_intervals(problem, result.vector, units=units, resamples=resamples, rng=rng)
     truth = np.array(simulation.truth.matrix)
     return (truth >= intervals.low) & (truth <= intervals.high)
 
@@ -55,10 +58,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--resamples", type=int, default=400)
+    parser.add_argument("--unit", choices=["command", "run"], default="command", help="what is resampled")
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
+    chosen = partial(covered, resamples=arguments.resamples, unit=arguments.unit)
     with ProcessPoolExecutor(arguments.workers) as pool:
-        hits = np.array(list(pool.map(partial(covered, resamples=arguments.resamples), range(arguments.seeds))))
+        hits = np.array(list(pool.map(chosen, range(arguments.seeds))))
     print("coverage of the elements of the hidden matrix (simulated data), %:")
     print(np.round(100 * hits.mean(axis=0), 1))
     low, high = binom.interval(0.95, arguments.seeds, 0.95)

@@ -78,7 +78,7 @@ def gap_title(view: DatasetView) -> str:
     proofs = [record.proven_gap for record in exact if record.proven_gap is not None]
     if not proofs or len(proofs) < len(exact):
         return "Gap above closed_form, not proven optimal"
-    return f"Gap above closed_form, optimal to {percent(max(*proofs, 0.0), 2)}"
+    return f"Gap above closed_form, proven within {percent(max(*proofs, 0.0), 2)} of the optimum"
 
 
 def run_table(view: DatasetView, typical: bool = False) -> Table:
