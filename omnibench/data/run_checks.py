@@ -35,6 +35,13 @@ def pose_times_flaw(times: Array, run: str) -> Flaw | None:
         return flaw
     if times[0] != 0:
         return 0, f"trajectory {run} has no reference pose at t = 0, its start pose"
+    return None
+
+
+def stored_pose_times_flaw(times: Array, run: str) -> Flaw | None:
+    """As ``pose_times_flaw``; on disk a run has a pose after its start, too, or nothing could be learnt from it."""
+    if (flaw := pose_times_flaw(times, run)) is not None:
+        return flaw
     return None if len(times) > 1 else (0, f"trajectory {run} has no reference pose after its start")
 
 

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from omnibench.config import Model, Positive, read_yaml, to_yaml, validate
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, make_dataset
-from omnibench.data.run_checks import Flaw, pose_times_flaw, wheel_times_flaw
+from omnibench.data.run_checks import Flaw, stored_pose_times_flaw, wheel_times_flaw
 from omnibench.data.scan_files import ScansOnDisk, write_scans
 from omnibench.data.scans import Scanner, Scans
 from omnibench.data.table import Table, read_table, table_file
@@ -66,7 +66,7 @@ def load_dataset(path: Path | str) -> Dataset:
     wheel_rows = _rows_by_trajectory(runs, wheels)
     pose_rows = _rows_by_trajectory(runs, poses)
     _check_times(wheels, wheel_rows, wheel_times_flaw)
-    _check_times(poses, pose_rows, pose_times_flaw)
+    _check_times(poses, pose_rows, stored_pose_times_flaw)
     samples = _WheelColumns(wheels, header.wheels)
     reference = _PoseColumns(poses)
     trajectories = [
@@ -101,6 +101,9 @@ def save_dataset(
             f"data set {dataset.name}: it has no reference poses; make them from its scans with slam_dataset, as "
             "omnibench.import_dataset does"
         )
+    for trajectory in dataset.trajectories:
+        if (flaw := stored_pose_times_flaw(trajectory.pose_times, trajectory.id)) is not None:
+            raise DataError(f"data set {dataset.name}: {flaw[1]}; leave it out")
     check_dataset_folder(folder)
     if not overwrite:
         _check_origin(folder, dataset)

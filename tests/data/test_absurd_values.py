@@ -123,6 +123,16 @@ def test_a_pose_that_is_just_believed_gives_an_answer_or_one_line(folder: Path, 
         calibrate(spoiled, calibrator)
 
 
+def test_a_run_with_its_start_pose_alone_is_not_written_as_it_could_not_be_read(folder: Path, tmp_path: Path) -> None:
+    dataset = load_dataset(folder)
+    first, *others = dataset.trajectories
+    short = replace(first, pose_times=first.pose_times[:1], poses=first.poses[:1])
+    made = make_dataset("d", dataset.robot, dataset.sample_period, [short, *others])
+    with pytest.raises(DataError, match=f"trajectory {first.id} has no reference pose after its start; leave it out"):
+        save_dataset(made, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
 def changed(run: Trajectory, name: str, row: int, value: float) -> Trajectory:
     array = getattr(run, name).copy()
     array[row] = value
