@@ -1,0 +1,371 @@
+"""The suite: rounds of faults, each ended by healing all and an account of every sample."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from chaos.audit import (
+    POSES,
+    Account,
+    account_replays,
+    account_stream,
+    check_path,
+    check_published,
+    check_stamps,
+    difference,
+    refused,
+)
+from chaos.faults import Faults
+from chaos.programs import PATIENCE, Ending
+from chaos.robots import ORIGIN, STEP, Robot, batch
+from chaos.system import NUMBERED, PLAIN, PLAYED, System, messages_said, read_recording
+from chaos.witness import Heard
+
+_ROUND: Final = 25.0  # s of faults until the next account; chosen
+_TICK: Final = 0.05  # s
+_SAID: Final = 5.0  # s between two lines of progress; chosen
+_WARM_UP: Final = 20.0  # s of a node in which its memory grows; chosen
+# MB that a node may grow in its life: messages that wait and published stamps take 10 MB each, for each of 3 robots.
+_MOST_GROWTH: Final = 60.0
+_ROBOTS: Final = (PLAYED, NUMBERED, PLAIN)
+_KEPT: Final = 600  # messages of a replay that a node may take and a kill leave without a trace: its window and a batch
+
+
+class Chaos:
+    """One run. problems: what failed, in words; the rest is for the table."""
+
+    def __init__(self, system: System, seed: int, say: Callable[[str], object]) -> None:
+        self.system = system
+        self.accounts = {name: Account() for name in _ROBOTS}
+        self.problems: list[str] = []
+        self.memory: list[tuple[float, int, int]] = []  # s since the beginning, start of the node, bytes
+        self.rounds = self.replays = 0
+        self.began = time.monotonic()
+        self.faults = Faults(system.kinds(), np.random.default_rng(seed))
+        self._seed, self._say = seed, say
+        self._counts: dict[str, dict[str, int]] = {}  # of each robot at the end of the last round
+        self._last: dict[str, Heard] = {}  # the last message of each robot in the last round
+        self._node_starts = 0  # until the last round
+        self._long_stops = 0  # of the node, until the last round
+        self._said = 0.0, 0  # time and messages of the last line of progress
+        self._endings_checked = self._endings_before = 0  # of all, and until the last round
+
+    @property
+    def elapsed(self) -> float:
+        return time.monotonic() - self.began
+
+    def run(self, seconds: float, round_seconds: float) -> None:
+        """Rounds until ``seconds`` have passed; in the last third the node is not ended, so that its memory shows.
+
+        Ctrl-C ends the faults, takes the account of the round, and ends.
+        """
+        try:
+            while self.elapsed < seconds or not self.rounds:
+                rest = seconds - self.elapsed
+                self.round(min(round_seconds, max(rest, 1.0)), kills=self.elapsed < 2 * seconds / 3)
+        except KeyboardInterrupt:
+            self._say("interrupted: all faults end, and this round's account is taken")
+            self.settle()
+
+    def round(self, seconds: float, *, kills: bool) -> None:
+        """Faults for ``seconds``, then peace, and the account."""
+        self._begin_round()
+        end = time.monotonic() + seconds
+        said = time.monotonic()
+        weights = {} if kills else {"kill node": 0.0, "ask node to end": 0.0}
+        while time.monotonic() < end:
+            self.faults.step(self.elapsed, weights)
+            self._look_after()
+            if time.monotonic() - said > _SAID:
+                said = time.monotonic()
+                self._report_progress()
+            time.sleep(_TICK)
+        self.settle()
+
+    def settle(self) -> None:
+        """End all faults, wait until everything that is under way has arrived, and take the account."""
+        system = self.system
+        self.faults.heal()
+        if system.replay.running and self._end_of_replay(PATIENCE) is None:
+            self.problem(f"a replay does not end within {PATIENCE:g} s after all faults have ended")
+            system.endings.append(system.replay.kill())
+        self._look_after(restart_only=True)
+        self._wait_for(system.numbered)
+        self._wait_for(system.plain)
+        self._account()
+        self.rounds += 1
+
+    def problem(self, what: str) -> None:
+        line = f"FAILED at {self.elapsed:.1f} s, seed {self._seed}, round {self.rounds + 1}: {what}"
+        self.problems.append(line)
+        self._say(line)
+        for fault in self.faults.recent():
+            self._say(f"    before it: {fault}")
+
+    def check_endings(self) -> None:
+        """Every process ended in order, unless it was killed."""
+        for ending in self.system.endings[self._endings_checked :]:
+            self._check_ending(ending)
+        self._endings_checked = len(self.system.endings)
+
+    def _check_ending(self, ending: Ending) -> None:
+        log = f"see logs/{ending.program}.log"
+        for sign in ("Traceback", "panicked", "Exception ignored"):
+            if sign in ending.said:
+                self.problem(f"{ending.program} says {sign!r}; {log}")
+        if ending.asked == signal.SIGKILL:
+            return
+        asked = "by itself" if ending.asked is None else f"asked by {signal.Signals(ending.asked).name}"
+        full = ending.program == "recorder" and ending.code == 2 and "cannot be written" in ending.said
+        codes = {"replay": (0,) if ending.asked is None else (0, 130)}.get(
+            ending.program, () if ending.asked is None else (0,)
+        )
+        if ending.code not in codes and not full:
+            last = ending.said.strip().rpartition("\n")[2]
+            self.problem(f"{ending.program} ended {asked} with exit code {ending.code}: {last!r}; {log}")
+        if ending.program == "recorder":
+            self._check_recording(ending, full)
+
+    def _check_recording(self, ending: Ending, full: bool) -> None:
+        file = Path(re.findall(r"\S+\.mcap", ending.said)[-1]) if ".mcap" in ending.said else None
+        said = messages_said(ending.said)
+        if file is None or not file.exists():
+            return
+        held = read_recording(file)
+        if not full and said is not None and said != held:
+            self.problem(f"{file.name} holds {held} messages, and its recorder says {said}")
+
+    def _begin_round(self) -> None:
+        for robot in (self.system.numbered, self.system.plain):
+            robot.driving.set()
+
+    def _look_after(self, *, restart_only: bool = False) -> None:
+        """Take the ends of processes that ended by themselves, and start the next ones."""
+        system = self.system
+        for program in system.programs:
+            if not program.running or program.paused or program.name in self.faults.targets:
+                continue
+            if (ending := program.ended()) is not None:
+                system.endings.append(ending)
+                if program is not system.replay:
+                    program.start()
+        if not restart_only and not system.replay.running and "replay" not in self.faults.targets:
+            self.replays += 1
+            system.start_replay()
+        resident = system.node.resident()
+        if resident is not None and (not self.memory or self.elapsed - self.memory[-1][0] > 1.0):
+            self.memory.append((self.elapsed, system.node.starts, resident))
+        self.check_endings()
+
+    def _end_of_replay(self, patience: float) -> Ending | None:
+        ending = self.system.replay.ended(patience)
+        if ending is not None:
+            self.system.endings.append(ending)
+        return ending
+
+    def _wait_for(self, robot: Robot) -> None:
+        """Let a robot send until its newest sample comes back as odometry, then let it stand."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            robot.pause()
+            for _ in range(20):
+                latest = self.system.witness.latest(robot.name)
+                # a stamp that was published before is moved by some ns
+                if robot.sent and latest is not None and 0 <= latest - robot.sent[-1][0] < STEP // 2:
+                    return
+                time.sleep(0.05)
+            if time.monotonic() > deadline or robot.failed:
+                self.problem(f"no odometry of robot {robot.name} after all faults have ended; {robot.failed}")
+                return
+            robot.driving.set()
+            time.sleep(0.2)
+
+    def _settled_counts(self, robot: str) -> dict[str, int] | None:
+        """The node's counters of a robot, once they do not change any more."""
+        deadline, before = time.monotonic() + PATIENCE, None
+        while time.monotonic() < deadline:
+            now = self.system.witness.counts(robot)
+            if now is not None and now == before:
+                return now
+            before = now
+            time.sleep(0.5)
+        return None
+
+    def _account(self) -> None:
+        """Every sample of the round, robot by robot."""
+        for name in _ROBOTS:
+            now = self._settled_counts(name)
+            if now is None:
+                self.problem(f"the node does not answer omnibench/{name}/health after all faults have ended")
+                continue
+            parts = self.system.witness.heard(name)
+            if parts or name in self._last:
+                self._account_of(name, parts, now)
+        self._node_starts = self.system.node.starts
+        self._long_stops = self.faults.count["stop node for long"]
+        self._endings_before = len(self.system.endings)
+        self.system.replays.clear()
+        self.system.swaps = self.system.swaps_refused = 0
+        self.system.witness.acknowledged()
+
+    def _account_of(self, name: str, parts: list[Heard], now: dict[str, int]) -> None:
+        last = self._last.get(name)
+        if last is None:  # nothing came before the first sample
+            last = Heard(b"", np.array([0]), np.array([ORIGIN]), np.zeros((1, 3)))
+        if parts and parts[0].node == last.node:
+            parts[0] = Heard(
+                last.node,
+                *(
+                    np.concatenate(pair)
+                    for pair in (
+                        (last.numbers, parts[0].numbers),
+                        (last.stamps, parts[0].stamps),
+                        (last.poses, parts[0].poses),
+                    )
+                ),
+            )
+        else:
+            parts.insert(0, last)
+        if now["samples"] == 0 and parts[-1].numbers[-1]:  # a new node, which has heard nothing of this robot
+            parts.append(Heard(b"new", np.array([0]), np.array([0]), np.zeros((1, 3))))
+        before = self._counts.get(name) if self._node_starts == self.system.node.starts else None
+        account = {PLAYED: self._played, NUMBERED: self._numbered, PLAIN: self._plain}[name](parts, now, before)
+        check_stamps(account, parts, jumps=name == PLAIN)
+        for problem in account.problems:
+            self.problem(f"robot {name}: {problem}")
+        account.problems.clear()
+        self.accounts[name].add(account)
+        end = parts[-1]
+        self._last[name] = Heard(end.node, end.numbers[-1:], end.stamps[-1:], end.poses[-1:])
+        self._counts[name] = now
+
+    def _numbered(self, parts: list[Heard], now: dict[str, int], before: dict[str, int] | None) -> Account:
+        robot = self.system.numbered
+        stamps = [stamp for stamp, _ in robot.sent]
+        angles = np.array([angles for _, angles in robot.sent])
+        index = [(part.stamps - stamps[0]) // STEP for part in parts]
+        account = account_stream(parts, index, now, before)
+        account.sent = len(stamps) - (NUMBERED in self._last)
+        paths = [batch(calibration, stamps, angles) for calibration in self.system.calibrations]
+        for part, samples in zip(parts, index, strict=True):
+            known = (samples >= 0) & (samples < len(stamps))
+            account.problem(int(np.count_nonzero(~known[NUMBERED not in self._last :])), "stamps that were never sent")
+            if known.all() and len(samples) > 1:
+                check_path(account, part, samples, paths, self.system.swaps)
+        check_published(account, parts[-1], now)
+        told = account.published + account.unpublished + account.refused + account.missing + account.in_gaps
+        account.problem(account.sent - told - account.killed - account.unaccounted, "samples in no column")
+        robot.forget()
+        return account
+
+    def _plain(self, parts: list[Heard], now: dict[str, int], before: dict[str, int] | None) -> Account:
+        robot, account = self.system.plain, Account()
+        counted = difference(now, before)
+        account.sent = len(robot.sent) - (PLAIN in self._last) + robot.junk
+        account.published = int(parts[0].numbers[-1] - parts[0].numbers[0]) + sum(int(p.numbers[-1]) for p in parts[1:])
+        account.unpublished, account.refused = counted["unpublished"], refused(counted)
+        check_published(account, parts[-1], now)
+        rest = account.sent - account.published - account.unpublished - account.refused
+        if before is None or self.faults.count["stop node for long"] > self._long_stops:
+            account.killed = rest
+        else:
+            account.problem(rest, "messages neither taken nor refused")
+        robot.forget()
+        return account
+
+    def _played(self, parts: list[Heard], now: dict[str, int], before: dict[str, int] | None) -> Account:
+        system = self.system
+        replays = []
+        endings = [each for each in system.endings[self._endings_before :] if each.program == "replay"]
+        for (origin, _), ending in zip(system.replays, endings, strict=True):
+            stamps = origin + np.round(system.times * 1e9).astype(np.int64)
+            replays.append((stamps, ending.code == 0, "not confirmed" not in ending.said))
+        account = account_replays(replays, parts, now, before, _KEPT)
+        flows = system.witness.acknowledged()
+        handled = sum(difference(now, before)[name] for name in ("samples", *POSES)) + refused(difference(now, before))
+        if before is not None and all(confirmed for _, _, confirmed in replays):
+            account.problem(sum(flows.values()) - handled, "messages acknowledged, but neither taken nor refused")
+        for part in parts:
+            for stamps, _, _ in replays:
+                inside = (part.stamps >= stamps[0]) & (part.stamps <= stamps[-1])
+                if np.count_nonzero(inside) > 1:
+                    chosen = Heard(part.node, part.numbers[inside], part.stamps[inside], part.poses[inside])
+                    index = np.searchsorted(stamps, chosen.stamps)
+                    check_path(account, chosen, index, [system.played_path], 0)
+        return account
+
+    def _report_progress(self) -> None:
+        """One line: time, rates, faults so far."""
+        witness, robots = self.system.witness, (self.system.numbered, self.system.plain)
+        resident = self.memory[-1][2] / 1e6 if self.memory else 0.0
+        self._say(
+            f"{self.elapsed:7.1f} s, round {self.rounds + 1}: {sum(robot.total for robot in robots):,} samples "
+            f"of robots, {self.replays} replays, {witness.messages:,} odom messages "
+            f"({(witness.messages - self._said[1]) / max(self.elapsed - self._said[0], 1e-3):.0f}/s), "
+            f"{self.faults.count.total()} faults, node {resident:.0f} MB, {len(self.problems)} problems"
+        )
+        self._said = self.elapsed, witness.messages
+
+    def growth(self) -> float:
+        """Largest growth (MB) of a node's memory from its first 20 s on."""
+        grown = [0.0]
+        for start in {start for _, start, _ in self.memory}:
+            sizes = [(at, size) for at, number, size in self.memory if number == start]
+            settled = [size for at, size in sizes if at > sizes[0][0] + _WARM_UP]
+            if settled:
+                grown.append((max(settled) - settled[0]) / 1e6)
+        return max(grown)
+
+    def table(self) -> list[str]:
+        """The account of all samples, faults and ends."""
+        columns = [item.name for item in fields(Account) if item.name not in ("worst", "problems")]
+        rows = [f"{'':>14}" + "".join(f"{name:>12}" for name in _ROBOTS)]
+        rows += [
+            f"{column:>14}" + "".join(f"{getattr(self.accounts[name], column):>12,}" for name in _ROBOTS)
+            for column in columns
+        ]
+        rows.append(f"{'against batch':>14}" + "".join(f"{self.accounts[n].worst:>12.1e}" for n in _ROBOTS))
+        rows.append("faults: " + ", ".join(f"{count} {name}" for name, count in sorted(self.faults.count.items())))
+        endings = self.system.endings
+        killed = sum(ending.asked == signal.SIGKILL for ending in endings)
+        rows.append(f"{self.replays} replays; {len(endings)} ends of processes, {killed} of them killed")
+        rows.append(f"memory of the node: +{self.growth():.1f} MB at most within one life")
+        rows.append(f"{self.rounds} rounds in {self.elapsed:.0f} s, seed {self._seed}: {len(self.problems)} problems")
+        return rows
+
+
+def run(seconds: float, seed: int, say: Callable[[str], object] = print, round_seconds: float = _ROUND) -> bool:
+    """Run the suite for about so long; True if every check held. The folder with its logs stays where one failed."""
+    folder = Path(tempfile.mkdtemp(prefix="chaos-"))
+    system = System(folder, seed)
+    chaos = None
+    try:
+        system.start()
+        chaos = Chaos(system, seed, say)
+        chaos.run(seconds, round_seconds)
+    finally:
+        if chaos is not None:
+            chaos.faults.heal()
+        system.end()
+    chaos.check_endings()
+    if chaos.growth() > _MOST_GROWTH:
+        chaos.problem(f"the node's memory grew by {chaos.growth():.0f} MB within one life")
+    for row in chaos.table():
+        say(row)
+    if chaos.problems:
+        for problem in chaos.problems:
+            say(problem)
+        say(f"logs and files: {folder}")
+    else:
+        shutil.rmtree(folder)
+    return not chaos.problems
