@@ -1,10 +1,12 @@
 """Saved state of a robot, which outlives the node: pose, wheel angles, and a calibration that was swapped in.
 
 The pose goes to the two slots of one file in turn, so that a node that is killed while it writes leaves the other slot.
+A state is one line of JSON that fills a block, or of many wheels some.
 """
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import json
@@ -22,7 +24,8 @@ from omnibench.files import remove, write_text
 from omnibench.robot.calibration import Calibration, read_calibration
 
 LOG = logging.getLogger("omnibench.live")
-_SLOT = 4096  # bytes, a block of most disks; a state takes some 1000
+_BLOCK = 4096  # bytes, a block of most disks; a state takes some 1000, and 20 more for each wheel
+_LONG = 16 * _BLOCK  # bytes; room for some 3000 wheels
 
 SavedPose = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 SavedCovariance = Annotated[tuple[FiniteFloat, ...], Field(min_length=9, max_length=9)]
@@ -87,7 +90,7 @@ class RobotMemory:
         if self._file is None:
             return None
         states: list[SavedState] = []
-        slots = [os.pread(self._file, _SLOT, slot * _SLOT) for slot in range(2)]
+        slots = [os.pread(self._file, _LONG, place).partition(b"\n")[0] for place in (0, _BLOCK, _LONG)]
         for content in slots:
             with suppress(ValueError, ValidationError, RecursionError):  # torn, or never written
                 states.append(SavedState.model_validate(json.loads(content)))
@@ -98,13 +101,17 @@ class RobotMemory:
         return newest
 
     def save(self, state: SavedState) -> None:
-        """Write a state under the next number. OSError: the disk refuses."""
+        """Write a state under the next number. OSError: the disk refuses, or the state is longer than a slot."""
         if self._file is None:
             return
         self._sequence += 1
         numbered = state.model_copy(update={"sequence": self._sequence})
-        text = numbered.model_dump_json().encode().ljust(_SLOT - 1) + b"\n"
-        os.pwrite(self._file, text, (self._sequence % 2) * _SLOT)
+        text = numbered.model_dump_json().encode()
+        slot = _BLOCK if len(text) < _BLOCK else _LONG
+        if len(text) >= slot:
+            raise OSError(errno.EFBIG, f"it takes {len(text)} bytes")
+        blocks = len(text) // _BLOCK + 1
+        os.pwrite(self._file, text.ljust(blocks * _BLOCK - 1) + b"\n", (self._sequence % 2) * slot)
 
     def keep_calibration(self, calibration: Calibration) -> None:
         """Use this calibration after a restart too, unless the config's own file has changed by then.

@@ -51,6 +51,16 @@ def test_a_state_comes_back_as_it_was(memory: RobotMemory) -> None:
     np.testing.assert_array_equal(np.reshape(found.covariance, (3, 3)), np.diag([1e-4, 1e-4, 1e-5]))
 
 
+@pytest.mark.parametrize("wheels", [12, 200, 2000])
+def test_the_newest_state_of_any_number_of_wheels_comes_back(memory: RobotMemory, wheels: int) -> None:
+    angles = tuple((np.pi * 10.0 ** np.arange(wheels).clip(max=9)).tolist())
+    for stamp in range(3):
+        memory.save(SavedState(**STATE | {"stamp": stamp, "positions": angles}))
+        found = memory.load()
+        assert found is not None
+        assert (found.stamp, found.positions) == (stamp, angles)
+
+
 def test_the_state_of_the_examples_below_is_taken(tmp_path: Path) -> None:
     found = loaded(tmp_path, json.dumps(STATE))
     assert found is not None
