@@ -18,6 +18,7 @@ from omnibench.live.estimation.health import Health, diagnostic
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.estimation.update import Update
 from omnibench.live.intake import Intake
+from omnibench.live.late_updates import LATE, LateUpdates
 from omnibench.live.network.rate_limiter import RateLimiter
 from omnibench.live.wire.attachment import flow_of
 from omnibench.live.wire.messages import Diagnostics
@@ -27,7 +28,6 @@ from omnibench.live.wire.topics import GraphNode
 LOG = logging.getLogger("omnibench.live")
 _LONGEST_QUEUE: Final = 20_000  # messages that wait for one robot, 200 s at 100 Hz, some 10 MB; chosen
 _BATCH: Final = 500  # messages of one robot until the others have their turn; chosen
-_LATE: Final = 0.1  # s; of samples in real time that have waited for longer, only the newest is published; chosen
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +44,9 @@ class RobotService:
     """Subscribes to a robot's wheels and SLAM, hands them to its tracker, and publishes the updates.
 
     Messages are queued in Zenoh's threads and taken in that of ``intake``, in the order in which they came. Where they
-    come faster than they can be taken, all are integrated and only the newest of the late ones is published; those of
-    an acknowledged flow, whose sender waits, and of other replays are all published. A message that fails is counted
-    and logged.
+    come faster than they can be taken, all are integrated and only the newest of the late ones is published
+    (``late_updates``), but for those of an acknowledged flow, whose sender waits. A message that fails is counted and
+    logged.
     """
 
     def __init__(self, graph: GraphNode, tracker: RobotTracker, intake: Intake) -> None:
@@ -56,7 +56,7 @@ class RobotService:
         self._waiting: deque[_Message] = deque()
         self._scheduled = False  # a turn is queued, or has not yet looked at what waits
         self._working = threading.Lock()  # held while messages are taken
-        self._held: Update | None = None  # the newest that was not published, as it was late
+        self._late = LateUpdates(self._publish)
         self._flows = AcknowledgedFlows(graph.session, name)
         self._rate_limiter = RateLimiter()
         self._logged_anomalies: dict[str, int] = {}
@@ -114,44 +114,42 @@ class RobotService:
         """Take the messages that wait, at most a batch."""
         with self._working:
             self._scheduled = False  # before the first look: what comes from now on may schedule a turn in vain
-            behind, unpublished = 0.0, 0
+            behind, unpublished = 0.0, self._late.unpublished
             for _ in range(min(len(self._waiting), _BATCH)):
                 message = self._waiting.popleft()
                 flow = flow_of(message.attachment)
-                if flow is not None:
-                    self._receive_poses()
-                    if not self._flows.accepts(flow):
-                        continue
-                waited = 0.0 if flow is not None else time.monotonic() - message.arrival
-                behind = max(behind, waited)
-                unpublished += self._take(message, late=waited > _LATE)
-            if self._held is not None:
-                unpublished -= 1
-                self._publish(self._held)
+                if flow is None:
+                    waited = time.monotonic() - message.arrival
+                    behind = max(behind, waited)
+                    self._take(message, late=waited > LATE)
+                    continue
+                self._receive_poses()
+                if self._flows.accepts(flow):
+                    self._take(message, late=False)
+            self._late.end_turn(self.tracker.in_real_time)
             self._flows.acknowledge()
-            self.tracker.record_backlog(behind, unpublished)
+            self.tracker.record_backlog(behind, self._late.unpublished - unpublished)
             if self._waiting and not self._scheduled:
                 self._scheduled = True
                 self._intake.ready(self._take_turn)
 
-    def _take(self, message: _Message, *, late: bool) -> int:
-        """Take a message; the number of updates that it made and that were not published."""
+    def _take(self, message: _Message, *, late: bool) -> None:
+        """Take a message, and publish its updates unless it is late."""
         try:
             if message.is_pose:
                 self.tracker.take_pose(message.payload, message.arrival)
-                return 0
+                return
             updates = self.tracker.take_wheels(message.payload, message.arrival)
-            if late and updates and self.tracker.in_real_time:
-                self._held = updates[-1]
-                return len(updates)
-            for update in updates:
-                self._publish(update)
+            if late:
+                self._late.take(message.arrival, updates)
+            elif updates:
+                self._late.on_time(self.tracker.in_real_time)
+                for update in updates:
+                    self._publish(update)
         except Exception as error:  # the stream has to go on
             self._failed("pose" if message.is_pose else "wheels", error)
-        return 0
 
     def _publish(self, update: Update) -> None:
-        self._held = None
         for publisher, encoded in self._outputs:
             publisher.put_encoded(encoded(update))
 

@@ -197,3 +197,12 @@ def test_only_the_robot_that_was_asked_for_is_shown(loopback: Loopback, apr02: A
         until_status(monitor, "apr02", "odometry", odom=...)
         assert [status.robot for status in monitor.statuses()] == ["apr02"]
         assert monitor.alive == ("apr02", "apr03")
+
+
+def test_messages_that_never_came_are_counted(monitor: RobotMonitor, apr02: AnnouncedRobot) -> None:
+    apr02.wait_for_subscribers()
+    apr02.odom.put(odometry(0))
+    for _ in range(5):
+        apr02.odom.next_number()  # of a message that is lost
+    apr02.odom.put(odometry(6))
+    until(lambda: (status := status_of(monitor, "apr02")) and status.odom and status.odom.missed == 5, "the count")

@@ -160,11 +160,12 @@ def _lines(path: Path, what: str) -> list[str]:
 def _check_connected(session: zenoh.Session, config: SessionConfig) -> None:
     """ConfigError: no connection. Zenoh opens a router or peer even if it is refused, and retries for ever."""
     patience = 0.0 if config.mode == "client" else max(_CONNECT_TIMEOUT, config.wait)
-    if config.connecting and not wait_until(lambda: _is_connected(session), patience):
+    if config.connecting and not wait_until(lambda: is_connected(session), patience):
         raise ConfigError(why_not_connected(config))
 
 
-def _is_connected(session: zenoh.Session) -> bool:
+def is_connected(session: zenoh.Session) -> bool:
+    """True while the session has a link to a router or a peer."""
     return bool(session.info.routers_zid() or session.info.peers_zid())
 
 

@@ -23,6 +23,7 @@ from omnibench.errors import OmnibenchError
 from omnibench.live.acknowledged_flows import acknowledgement_key, read_acknowledgement
 from omnibench.live.closing import Closing
 from omnibench.live.network.callbacks import direct
+from omnibench.live.network.session import is_connected
 from omnibench.live.wire.topics import Publisher
 
 WINDOW: Final = 256  # messages under way at most, some 90 kB: less than Zenoh's queue holds; chosen
@@ -137,7 +138,9 @@ class AcknowledgedDelivery(Delivery):
         self._heard.clear()
         silence, now = self._silence(), time.monotonic()
         if silence > self._patience:
-            raise DeliveryError(f"its node has taken nothing for {silence:.0f} s; `wait` says how long to wait for it")
+            key = acknowledgement_key(self._robot, "*")
+            rights = "" if self._taken else f" (may this session read {key}?)"
+            raise DeliveryError(f"its node has taken nothing for {silence:.0f} s{rights}; `wait` says how long to wait")
         again = now - self._sent_again_at
         if (self._gap and again > _GAP_RETRY) or (silence > self._retry and again > self._retry):
             self._retry = min(2 * self._retry, _LAST_RETRY) if silence > self._retry else self._retry
@@ -212,12 +215,15 @@ class UnconfirmedDelivery(Delivery):
         self._since = 0
         self._arrived.clear()
         handler: Any = zenoh.handlers.Callback(lambda _: None, self._arrived.set, indirect=False)
-        self._session.get(self._key, handler, timeout=max(self._patience, 1.0), priority=zenoh.Priority.BACKGROUND)
+        # Zenoh closes the query at its timeout too, which must come after our patience
+        self._session.get(self._key, handler, timeout=2 * self._patience, priority=zenoh.Priority.BACKGROUND)
 
     def _round_trip_over(self) -> None:
         began = time.monotonic()
         while not self._arrived.wait(_POLL_PERIOD) and not self._stop.is_set():
-            if time.monotonic() - began > max(self._patience, 1.0):
-                raise DeliveryError("the connection does not take the messages any more")
+            if time.monotonic() - began > self._patience:
+                raise DeliveryError(f"the router has taken nothing for {self._patience:g} s")
+        if self._arrived.is_set() and not self._stop.is_set() and not is_connected(self._session):
+            raise DeliveryError("the link to the router was lost")  # which closes a query, too
         waited = time.monotonic() - began
         self.paused += waited if waited > _FIRST_RETRY else 0.0

@@ -22,6 +22,7 @@ from omnibench.live.network.session_config import SessionConfig
 from omnibench.live.wire.attachment import MissedMessages
 from omnibench.live.wire.messages import ODOMETRY, MessageError, Odometry
 from omnibench.live.wire.topics import TOPICS, KeySpace, Profile
+from omnibench.words import plural
 
 ADDRESS: Final = "tcp/127.0.0.1:7447"  # where a node listens by default
 _FIFO_CAPACITY: Final = 10_000  # messages, 100 s at 100 Hz; chosen
@@ -166,7 +167,9 @@ class Subscription(Closing):
         if not self._numbers.take(sample.attachment):
             return None
         if self._lossless and self._numbers.count > before and self._log_limiter.allows("missed"):
-            _log.warning("%d messages of %s were lost on the way; `missed` counts them", self.missed, sample.key_expr)
+            _log.warning(
+                "%s of %s lost on the way; `missed` counts them", plural(self.missed, "message"), sample.key_expr
+            )
         try:
             message = ODOMETRY.decode(sample.payload.to_bytes())
         except MessageError:

@@ -167,3 +167,17 @@ def test_a_client_that_does_not_read_holds_up_nobody(loopback: Loopback, server:
         for _ in range(1500):  # 15 MB: more than the sockets and the backlog of the frozen client hold
             joints.put_encoded(payload)
             assert reader.recv(timeout=PATIENCE)
+
+
+def test_messages_that_never_came_are_counted(loopback: Loopback, server: FoxgloveServer) -> None:
+    odom = GraphNode(loopback.router, KeySpace(), "robot").publisher("apr02", "odom", lossless=True)
+    server.forward(loopback.client(), KeySpace(), ["apr02"])
+    until(lambda: odom.matched, "the server's subscription")
+    odom.put(odometry(0))
+    odom.next_number()  # of a message that is lost
+
+    def counted() -> bool:
+        odom.put(odometry(1))
+        return server.missed == 1
+
+    until(counted, "the count")

@@ -174,3 +174,24 @@ def test_a_recorder_whose_session_has_closed_completes_its_file(loopback: Loopba
         until(lambda: recorder.messages, "the message")
         session.close()
     assert len(messages_of(tmp_path / "run.mcap")["/apr02/odom"]) == 1
+
+
+def test_messages_that_never_came_are_counted(loopback: Loopback, recorder: Recorder) -> None:
+    odom = publishers(loopback)["odom"]
+    wait_for_subscribers(odom)
+    odom.put(sample("odom", 0))
+    for _ in range(7):
+        odom.next_number()  # of a message that is lost
+    odom.put(sample("odom", 8))
+    until(lambda: recorder.messages == 2, "the two messages")
+    assert recorder.missed == {"/apr02/odom": 7}
+
+
+def test_a_message_that_is_sent_again_is_recorded_once(loopback: Loopback, recorder: Recorder) -> None:
+    odom = publishers(loopback)["odom"]
+    wait_for_subscribers(odom)
+    for number in (1, 2, 2, 1, 3):
+        odom.put_numbered(TOPICS["odom"].encode(sample("odom", number)), number)
+    until(lambda: recorder.messages == 3, "the three messages")
+    recorder.stop()
+    assert messages_of(recorder.path) == {"/apr02/odom": [TOPICS["odom"].encode(sample("odom", k)) for k in (1, 2, 3)]}

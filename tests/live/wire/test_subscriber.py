@@ -304,3 +304,14 @@ def test_ctrl_c_ends_a_reader_that_waits_at_once(loopback: Loopback) -> None:
     finally:
         process.kill()
         process.communicate()
+
+
+def test_messages_that_never_came_are_counted_and_told(
+    lossless: Subscription, odom: Publisher[Odometry], caplog: pytest.LogCaptureFixture
+) -> None:
+    odom.put(odometry(0))
+    odom.next_number()  # of a message that is lost
+    odom.put(odometry(2))
+    assert [message.stamp for message in taken(lossless, 2)] == [odometry(k).stamp for k in (0, 2)]
+    assert lossless.missed == 1
+    assert "1 message of apr02/odom lost on the way" in caplog.text

@@ -1,0 +1,285 @@
+"""Delivery of a replay to a real node, whatever befalls it: all is taken, or it is said how much is missing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from drives import drive
+from nodes import Command, asked, write_node
+from recordings import random_dataset
+from replayed import config
+from sessions import free_port, raw_session, until
+
+from omnibench.data.storage import save_dataset
+from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_runs
+from omnibench.live.replay.delivery import WINDOW, DeliveryError
+from omnibench.live.replay.replay_player import Player, PlayReport
+from omnibench.live.wire.attachment import MissedMessages, flow_of, packed
+from omnibench.live.wire.messages import JOINT_STATE
+from omnibench.live.wire.topics import GraphNode, KeySpace
+
+LONG = concatenate_runs(random_dataset(7, 5, samples=2000), pause=0.1)  # 10,000 samples: many times the window
+
+
+def connected(port: int) -> zenoh.Session:
+    """A client of the node there, once it runs its robot."""
+    found: list[zenoh.Session] = []
+
+    def alive() -> bool:
+        try:
+            session = raw_session("client", connect=[f"tcp/127.0.0.1:{port}"])
+        except zenoh.ZError:
+            return False
+        if any(reply.ok for reply in session.liveliness().get("omnibench/apr/alive")):
+            found.append(session)
+            return True
+        session.close()
+        return False
+
+    until(alive, "the node")
+    return found[0]
+
+
+def counts(session: zenoh.Session) -> dict[str, int]:
+    """What the node has counted."""
+    counted: dict[str, int] = asked(session, "omnibench/apr/health")["counts"]
+    return counted
+
+
+def player(session: zenoh.Session, drive: ConcatenatedDrive = LONG, **changes: Any) -> Player:
+    return Player(GraphNode(session, KeySpace(), "replay"), "apr", drive, config(speed="max", **changes))
+
+
+@contextmanager
+def playing(
+    session: zenoh.Session, stop: threading.Event | None = None, **changes: Any
+) -> Iterator[Future[PlayReport]]:
+    """A replay that runs beside the test."""
+    with ThreadPoolExecutor(1) as pool:
+        yield pool.submit(player(session, **changes).play, stop)
+
+
+@pytest.fixture
+def port() -> int:
+    return free_port()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, port: int) -> Path:
+    """A folder with node.yaml, a node of robot apr."""
+    write_node(tmp_path, "apr", port=port)
+    return tmp_path
+
+
+@pytest.fixture
+def node(folder: Path, port: int) -> Iterator[Command]:
+    with Command("live", folder / "node.yaml") as command:
+        connected(port).close()
+        yield command
+
+
+class TestToANode:
+    @pytest.mark.usefixtures("node")
+    def test_the_tail_is_taken_when_the_session_closes_right_after(self, port: int) -> None:
+        session = connected(port)
+        report = player(session).play()
+        session.close()
+        with connected(port) as another:
+            assert counts(another)["samples"] == report.sent["joint_states"]
+        assert report.taken == report.total
+
+    def test_a_node_that_stands_still_is_waited_for_and_misses_nothing(self, node: Command, port: int) -> None:
+        with connected(port) as session, playing(session, wait=600) as replay:
+            until(lambda: counts(session)["samples"] > 1000, "a part of the recording")
+            os.kill(node.process.pid, signal.SIGSTOP)
+            threading.Event().wait(2.0)  # longer than the replay waits until it sends again
+            assert not replay.done()
+            os.kill(node.process.pid, signal.SIGCONT)
+            report = replay.result()
+            counted = counts(session)
+        assert report.taken == report.total
+        assert (counted["samples"], counted["duplicates"], counted["missing"]) == (report.sent["joint_states"], 0, 0)
+
+    def test_no_more_than_the_window_is_under_way(self, node: Command, port: int) -> None:
+        stop = threading.Event()
+        with connected(port) as session, playing(session, stop, wait=600) as replay:
+            until(lambda: counts(session)["samples"] > 1000, "a part of the recording")
+            os.kill(node.process.pid, signal.SIGSTOP)
+            threading.Event().wait(1.0)
+            stop.set()
+            report = replay.result()  # although nothing is taken any more
+            os.kill(node.process.pid, signal.SIGCONT)
+        assert report.taken is not None
+        assert 0 < sum(report.sent.values()) - report.taken <= WINDOW
+
+    def test_a_node_that_starts_again_gets_the_rest(self, node: Command, folder: Path, port: int) -> None:
+        with connected(port) as session, playing(session, wait=600) as replay:
+            until(lambda: counts(session)["samples"] > 1000, "a part of the recording")
+            node.kill()
+            with Command("live", folder / "node.yaml"):
+                report = replay.result()
+                with connected(port) as another:
+                    rest = counts(another)
+        assert (report.taken, report.restarts) == (report.total, 1)
+        assert rest["missing"] == 0
+        assert rest["samples"] < report.sent["joint_states"]
+
+    def test_a_node_that_does_not_come_back_is_one_line_with_the_number_that_is_missing(
+        self, node: Command, port: int
+    ) -> None:
+        with connected(port) as session, playing(session, wait=1) as replay:
+            until(lambda: counts(session)["samples"] > 1000, "a part of the recording")
+            node.kill()
+            with pytest.raises(DeliveryError) as failure:
+                replay.result()
+        words = str(failure.value).replace(",", "").split()
+        assert 0 < int(words[0]) < int(words[2])
+        assert "did not reach robot 'apr': its node has taken nothing for 1 s; `wait` says" in str(failure.value)
+
+    def test_the_command_then_prints_no_table_and_exits_with_1(self, node: Command, folder: Path, port: int) -> None:
+        save_dataset(random_dataset(7, 5, samples=2000), folder / "data")
+        to = ("--robot", "apr", "--connect", f"tcp/127.0.0.1:{port}")
+        with connected(port) as session, Command("replay", folder / "data", *to, "--set", "wait=1") as replay:
+            until(lambda: counts(session)["samples"] > 100, "a part of the recording")
+            node.kill()
+            out, said = replay.ended()
+        assert replay.process.returncode == 1
+        assert not out
+        assert "did not reach robot 'apr'" in said.splitlines()[-1]
+        assert "Traceback" not in said
+
+    def test_a_signal_ends_it_while_the_node_stands_still(self, node: Command, folder: Path, port: int) -> None:
+        save_dataset(random_dataset(7, 5, samples=2000), folder / "data")
+        to = ("--robot", "apr", "--connect", f"tcp/127.0.0.1:{port}", "--set", "wait=3600")
+        with connected(port) as session, Command("replay", folder / "data", *to) as replay:
+            until(lambda: counts(session)["samples"] > 100, "a part of the recording")
+            os.kill(node.process.pid, signal.SIGSTOP)
+            out, _ = replay.stop(signal.SIGTERM)
+            os.kill(node.process.pid, signal.SIGCONT)
+        assert replay.process.returncode == 130
+        assert "taken by the node" in out
+
+    @pytest.mark.usefixtures("node")
+    def test_it_ends_after_the_seconds_that_were_asked_for(self, folder: Path, port: int) -> None:
+        save_dataset(random_dataset(7, 5, samples=2000), folder / "data")
+        to = ("--robot", "apr", "--connect", f"tcp/127.0.0.1:{port}", "--seconds", "0.5")
+        with Command("replay", folder / "data", *to) as replay:
+            out, _ = replay.ended()
+        assert replay.process.returncode == 0
+        assert "all taken by the node" in out
+        assert "stopped after" in out
+
+
+class TestToOthers:
+    def test_that_delivery_is_not_confirmed_is_said(self, tmp_path: Path, port: int) -> None:
+        save_dataset(random_dataset(7), tmp_path / "data")
+        router = raw_session("router", listen=[f"tcp/127.0.0.1:{port}"])
+        came: list[object] = []
+        router.declare_subscriber("apr/joint_states", came.append)
+        to = ("--robot", "apr", "--connect", f"tcp/127.0.0.1:{port}", "--speed", "max")
+        with Command("replay", tmp_path / "data", *to) as replay:
+            out, _ = replay.ended()
+        router.close()
+        assert replay.process.returncode == 0
+        assert "delivery not confirmed, since no omnibench node runs the robot" in out
+        assert f"{len(came):,} wheel samples" in out
+
+    def test_a_router_that_takes_nothing_any_more_is_told(self, tmp_path: Path, port: int) -> None:
+        write_node(tmp_path, port=port)
+        with Command("live", tmp_path / "node.yaml") as router:
+            listener = None
+            while listener is None:
+                try:
+                    listener = raw_session("client", connect=[f"tcp/127.0.0.1:{port}"])
+                except zenoh.ZError:
+                    continue
+            came: list[object] = []
+            listener.declare_subscriber("apr/joint_states", came.append)
+            session = raw_session("client", connect=[f"tcp/127.0.0.1:{port}"])
+            with playing(session, wait=2) as replay:
+                until(lambda: len(came) > 1000, "a part of the recording")
+                os.kill(router.process.pid, signal.SIGSTOP)
+                with pytest.raises(DeliveryError, match=r"did not reach robot 'apr': the (router|link)"):
+                    replay.result()
+                os.kill(router.process.pid, signal.SIGCONT)
+            for each in (session, listener):
+                each.close()
+
+
+class TestMissedMessages:
+    def test_gaps_in_a_publishers_numbers_are_counted(self) -> None:
+        missed = MissedMessages()
+        for number in (5, 6, 9, 10, 20):
+            assert missed.take(numbered(number))
+        assert missed.count == 2 + 9
+
+    def test_one_that_comes_after_all_is_not_missed_and_one_that_comes_again_is_not_new(self) -> None:
+        missed = MissedMessages()
+        assert [missed.take(numbered(number)) for number in (1, 4, 2, 2, 4, 3)] == [
+            True,
+            True,
+            True,
+            False,
+            False,
+            True,
+        ]
+        assert missed.count == 0
+
+    def test_publishers_have_numbers_of_their_own(self) -> None:
+        missed = MissedMessages()
+        for number in (1, 2, 3):
+            assert missed.take(numbered(number))
+            assert missed.take(numbered(100 * number, b"another publisher"[:16]))
+        assert missed.count == 2 * 99
+
+    def test_messages_of_other_programs_tell_nothing(self) -> None:
+        missed = MissedMessages()
+        assert missed.take(None)
+        assert missed.take(zenoh.ZBytes(b"something else"))
+        assert missed.count == 0
+
+
+def test_a_flow_adds_to_an_attachment_what_ros_passes_over() -> None:
+    plain, flow = packed(3, bytes(16)), packed(3, bytes(16), (7, 8, 9))
+    assert (len(plain), flow_of(plain), flow_of(None)) == (33, None, None)
+    assert flow[:8] == plain[:8]
+    assert flow_of(flow) == (7, 8, 9)
+
+
+def numbered(number: int, publisher: bytes = bytes(16)) -> zenoh.ZBytes:
+    return zenoh.ZBytes(packed(number, publisher))
+
+
+def test_two_nodes_for_one_robot_that_start_at_once_do_not_both_run(tmp_path: Path, port: int) -> None:
+    (tmp_path / "router").mkdir()
+    to = {"mode": "client", "connect": [f"tcp/127.0.0.1:{port}"], "wait": 300.0}
+    nodes: list[Command] = []
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        write_node(tmp_path / name, "apr", zenoh=to)
+        nodes.append(Command("live", tmp_path / name / "node.yaml"))
+    ended: Callable[[], list[Command]] = lambda: [each for each in nodes if each.process.poll() is not None]  # noqa: E731
+    # both wait for the router, and so start in the same moment
+    with nodes[0], nodes[1], Command("live", write_node(tmp_path / "router", port=port)):
+        until(ended, "the end of one")
+        (refused,) = ended()
+        _, said = refused.ended()
+        (other,) = (each for each in nodes if each is not refused)
+        with connected(port) as session:
+            publisher = session.declare_publisher("apr/joint_states", congestion_control=zenoh.CongestionControl.BLOCK)
+            until(lambda: publisher.matching_status.matching, "the node's subscription")
+            publisher.put(JOINT_STATE.encode(drive(0.01).samples()[0]))
+            until(lambda: counts(session)["samples"] == 1, "the sample in the node that runs")
+        other.stop()
+    assert refused.process.returncode == 2
+    assert "error: robot 'apr' is " in said
+    assert "by another node" in said
