@@ -22,7 +22,7 @@ SAMPLES = 60
 def sent_while_the_intake_waits(
     tmp_path: Path, attachments: list[bytes | None], period: float
 ) -> tuple[list[Odometry], Health]:
-    """Odometry of samples, one for each attachment, of which all but the first wait for the last; and the health then."""
+    """Odometry of samples, one for each attachment, all but the first of which wait for the last; and the health."""
     path = drive(2.0)
     with running(config_of(tmp_path)) as (node, session):
         heard = ReceivedMessages(session, apr__odom=ODOMETRY)

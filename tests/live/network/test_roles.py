@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -11,11 +12,16 @@ from typing import Any
 import pytest
 import zenoh
 from nodes import Command, write_node
+from recordings import random_dataset
 from sessions import free_port, until
 
 from omnibench.cli.handbook_topics import find_topic
 from omnibench.live.network.session import open_session
 from omnibench.live.network.session_config import SessionConfig, Tls
+from omnibench.live.replay.arrivals import ReplayConfig
+from omnibench.live.replay.concatenated_drive import concatenate_runs
+from omnibench.live.replay.replay_player import Player
+from omnibench.live.wire.topics import GraphNode, KeySpace
 
 ROBOTS = ("apr02", "apr03")
 ROLES = {"robot": "apr02", "viewer": "viewer", "operator": "operator", "node": "remote", "stranger": "stranger"}
@@ -164,3 +170,25 @@ def test_every_role_has_the_rights_that_the_handbook_says_and_no_others(role: st
     expected = rights_in_the_handbook(role)
     assert rights == expected
     assert bool(expected) == (role != "stranger")
+
+
+def test_a_replay_with_the_robots_own_certificate_is_acknowledged(router: str, keys: Path) -> None:
+    drive = concatenate_runs(random_dataset(1))
+    with session_of("apr02", router, keys) as session:
+        report = Player(GraphNode(session, KeySpace(), "replay"), "apr02", drive, ReplayConfig(speed=math.inf)).play()
+    assert report.taken == report.total
+
+
+def test_a_node_elsewhere_claims_its_robots_and_acknowledges_a_replay(router: str, keys: Path, tmp_path: Path) -> None:
+    drive = concatenate_runs(random_dataset(1))
+    tls = {"ca": str(keys / "ca.pem"), "certificate": str(keys / "remote.pem"), "key": str(keys / "remote.key")}
+    elsewhere = {"mode": "client", "connect": router, "tls": tls}
+    with Command("live", write_node(tmp_path, "apr04", zenoh=elsewhere)) as node:
+        until(lambda: "Ctrl-C ends it" in node.said(), "the node")
+        with session_of("node", router, keys) as session:
+            graph = GraphNode(session, KeySpace(), "replay")
+            report = Player(graph, "apr04", drive, ReplayConfig(speed=math.inf)).play()
+    assert report.taken == report.total
+    again = Command("live", write_node(tmp_path, "apr03", zenoh=elsewhere))
+    _, said = again.ended()
+    assert "error: robot 'apr03' is run by another node already" in said
