@@ -110,6 +110,7 @@ def answers_to(session: zenoh.Session, selector: str, replies: list[bytes]) -> N
 def test_every_role_has_the_rights_that_the_handbook_says_and_no_others(role: str, router: str, keys: Path) -> None:
     rights: set[Right] = set()
     topics = [(robot, topic, key) for robot in ROBOTS for topic in TOPICS for key in keys_of(robot, topic)]
+    topics += [(robot, "received", f"omnibench/{robot}/received/0") for robot in ROBOTS]
     services = [(robot, name, f"omnibench/{robot}/{name}") for robot in ROBOTS for name in SERVICES]
     tokens = [(robot, "alive", f"omnibench/{robot}/alive") for robot in ROBOTS]
     calibrations = [each for each in services if each[1] == "calibration"]
