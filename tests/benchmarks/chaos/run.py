@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 import signal
@@ -127,9 +128,11 @@ class Chaos:
             return
         asked = "by itself" if ending.asked is None else f"asked by {signal.Signals(ending.asked).name}"
         full = ending.program == "recorder" and ending.code == 2 and "cannot be written" in ending.said
-        codes = {"replay": (0,) if ending.asked is None else (0, 130)}.get(
-            ending.program, () if ending.asked is None else (0,)
-        )
+        codes = [0] if ending.asked is not None or ending.program == "replay" else []
+        if ending.asked is not None and "interrupted" in ending.said:  # while it was starting
+            codes.append(128 + ending.asked)
+        if ending.asked is not None and ending.program == "replay":
+            codes.append(130)
         if ending.code not in codes and not full:
             last = ending.said.strip().rpartition("\n")[2]
             self.problem(f"{ending.program} ended {asked} with exit code {ending.code}: {last!r}; {log}")
@@ -159,7 +162,9 @@ class Chaos:
                 system.endings.append(ending)
                 if program is not system.replay:
                     program.start()
-        if not restart_only and not system.replay.running and "replay" not in self.faults.targets:
+        # a replay that begins while no node is there confirms nothing
+        quiet = not self.faults.targets & {"replay", "node", "router", "link of node", "link of clients"}
+        if not restart_only and not system.replay.running and quiet and system.witness.alive():
             self.replays += 1
             system.start_replay()
         resident = system.node.resident()
@@ -216,7 +221,6 @@ class Chaos:
         self._endings_before = len(self.system.endings)
         self.system.replays.clear()
         self.system.swaps = self.system.swaps_refused = 0
-        self.system.witness.acknowledged()
 
     def _account_of(self, name: str, parts: list[Heard], now: dict[str, int]) -> None:
         last = self._last.get(name)
@@ -285,16 +289,22 @@ class Chaos:
 
     def _played(self, parts: list[Heard], now: dict[str, int], before: dict[str, int] | None) -> Account:
         system = self.system
-        replays = []
         endings = [each for each in system.endings[self._endings_before :] if each.program == "replay"]
-        for (origin, _), ending in zip(system.replays, endings, strict=True):
-            stamps = origin + np.round(system.times * 1e9).astype(np.int64)
-            replays.append((stamps, ending.code == 0, "not confirmed" not in ending.said))
+        flows = system.witness.flows()
+        ends = [*(replay.since for replay in system.replays[1:]), math.inf]
+        replays = []
+        for replay, ending, end in zip(system.replays, endings, ends, strict=True):
+            stamps = replay.origin + np.round(system.times * 1e9).astype(np.int64)
+            taken = [flow.taken for flow in flows if replay.since <= flow.since < end]
+            replays.append((stamps, ending.code == 0, bool(taken)))
+            if ending.code == 0 and bool(taken) is not ("all taken by the node" in ending.said):
+                self.problem(f"a replay whose messages a node acknowledged says {ending.said.splitlines()[-1]!r}")
         account = account_replays(replays, parts, now, before, _KEPT)
-        flows = system.witness.acknowledged()
-        handled = sum(difference(now, before)[name] for name in ("samples", *POSES)) + refused(difference(now, before))
+        counted = difference(now, before)
+        handled = counted["samples"] + sum(counted[name] for name in POSES) + refused(counted)
         if before is not None and all(confirmed for _, _, confirmed in replays):
-            account.problem(sum(flows.values()) - handled, "messages acknowledged, but neither taken nor refused")
+            taken = sum(flow.taken for flow in flows)
+            account.problem(taken - handled, "messages acknowledged, but neither taken nor refused")
         for part in parts:
             for stamps, _, _ in replays:
                 inside = (part.stamps >= stamps[0]) & (part.stamps <= stamps[-1])

@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -46,6 +47,15 @@ def free_port(rng: random.Random) -> int:
             return port
 
 
+@dataclass(frozen=True)
+class Replay:
+    """One replay. origin: stamp of its first sample, ns; since: when it was started, s, monotonic."""
+
+    origin: int
+    speed: str
+    since: float
+
+
 class System:
     """All programs and robots; ``start`` begins, ``end`` ends them in order."""
 
@@ -54,7 +64,7 @@ class System:
         self.rng = np.random.default_rng(seed)
         self.calibrations = calibrations()
         self.endings: list[Ending] = []
-        self.replays: list[tuple[int, str]] = []  # origin ns and speed of the replays of this round
+        self.replays: list[Replay] = []  # of this round
         self.recordings: list[Path] = []
         self.swaps = self.swaps_refused = 0  # orders that were sent since the round began
         self.times, self.played_path = write_recording(folder / "data", self.rng, self.calibrations[0])
@@ -129,7 +139,7 @@ class System:
         """Play the recording once more, with stamps after those of all before it."""
         speed = str(self.rng.choice(["max", "20", "8"]))
         origin = ORIGIN + (self.replay.starts + 1) * round(1e9 * (RECORDING + 10))
-        self.replays.append((origin, speed))
+        self.replays.append(Replay(origin, speed, time.monotonic()))
         self.replay.start()
 
     def kinds(self) -> list[Fault]:
@@ -189,9 +199,9 @@ class System:
         return PLAYED, NUMBERED, "-o", self.recordings[-1]
 
     def _replay(self) -> tuple[object, ...]:
-        origin, speed = self.replays[-1]
-        settings = ("--set", f"stamp_origin={origin}", "--set", f"wait={_WAIT:g}")
-        return self.folder / "data", "--robot", PLAYED, "--speed", speed, *settings
+        replay = self.replays[-1]
+        settings = ("--set", f"stamp_origin={replay.origin}", "--set", f"wait={_WAIT:g}")
+        return self.folder / "data", "--robot", PLAYED, "--speed", replay.speed, *settings
 
     def _pause(self, program: Program) -> Callable[[], object] | None:
         if not program.running:

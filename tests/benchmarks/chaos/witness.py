@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import struct
 import threading
+import time
 from collections import defaultdict
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -38,6 +38,14 @@ class Heard:
     poses: Array
 
 
+@dataclass
+class Flow:
+    """Messages of a replay that nodes acknowledge. since: when the first was, s, monotonic; taken: how many so far."""
+
+    since: float
+    taken: int = 0
+
+
 class Witness:
     """Listens until ``close``; what it has heard is given out, and forgotten, by ``heard``."""
 
@@ -46,7 +54,7 @@ class Witness:
         self.session = open_session(config, "chaos")
         self.messages = 0
         self._odometry: dict[str, list[tuple[bytes, int, bytes]]] = defaultdict(list)
-        self._flows: dict[str, int] = defaultdict(int)  # flow -> number that the node expects next
+        self._flows: dict[str, Flow] = {}
         self._lock = threading.Lock()
         self._subscribers = [
             self.session.declare_subscriber("*/odom", Callback(self._odom, indirect=False)),
@@ -77,16 +85,20 @@ class Witness:
             for node, part in parts.items()
         ]
 
-    def acknowledged(self) -> Mapping[str, int]:
-        """Flow -> number of messages that a node has acknowledged, since the last call."""
+    def flows(self) -> list[Flow]:
+        """The flows that nodes have acknowledged since the last call, in the order of their beginnings."""
         with self._lock:
-            flows, self._flows = self._flows, defaultdict(int)
-        return flows
+            flows, self._flows = self._flows, {}
+        return list(flows.values())
 
     def counts(self, robot: str, patience: float = 5.0) -> dict[str, int] | None:
         """The node's counters of a robot; None: no answer."""
         answer = self.asked(f"omnibench/{robot}/health", patience=patience)
         return None if answer is None or "counts" not in answer else answer["counts"]
+
+    def alive(self) -> bool:
+        """True if the node runs its robots."""
+        return any(reply.ok is not None for reply in self.session.liveliness().get("omnibench/*/alive", timeout=1.0))
 
     def asked(self, selector: str, payload: bytes | None = None, patience: float = 5.0) -> dict[str, Any] | None:
         """The node's answer to a query, ``error`` in it if it was refused; None: there is none."""
@@ -120,7 +132,8 @@ class Witness:
         flow = str(sample.key_expr).rpartition("/")[2]
         (expected,) = _EXPECTED.unpack_from(sample.payload.to_bytes())
         with self._lock:
-            self._flows[flow] = max(self._flows[flow], expected)
+            known = self._flows.setdefault(flow, Flow(time.monotonic()))
+            known.taken = max(known.taken, expected)
 
 
 def _stamp(kept: bytes) -> int:
