@@ -2,7 +2,8 @@
 
 The rule is go-back-n: a message after a gap is refused, and the sender sends again from the first that is missing. A
 node that does not know a flow, since it has just started, expects the lowest number that the sender has no
-acknowledgement of.
+acknowledgement of. What is sent again to it may have been taken by a node that was killed before it could acknowledge,
+and whose odometry is out: it is integrated, but not published a second time.
 """
 
 from __future__ import annotations
@@ -30,11 +31,16 @@ def read_acknowledgement(payload: bytes) -> tuple[int, bool]:
 
 
 class _ReceivedFlow:
-    """One flow to a robot. expected: number of its next message. gap: one after a gap was refused."""
+    """One flow to a robot.
+
+    expected: number of its next message. gap: one after a gap was refused. inherited: only messages that were sent
+    before have come, perhaps to another node.
+    """
 
     def __init__(self, session: zenoh.Session, robot: str, flow: int, expected: int) -> None:
         self.expected = expected
         self.gap = False
+        self.inherited = True
         self._publisher = session.declare_publisher(
             acknowledgement_key(robot, flow),
             congestion_control=zenoh.CongestionControl.DROP,
@@ -59,7 +65,7 @@ class AcknowledgedFlows:
 
     def accepts(self, place: Flow) -> bool:
         """True if a message at this place is the flow's next one, and is to be taken."""
-        identity, number, unacknowledged = place
+        identity, number, unacknowledged, again = place
         flow = self._flows.get(identity)
         if flow is None:
             flow = self._flows[identity] = _ReceivedFlow(self._session, self._robot, identity, unacknowledged)
@@ -70,7 +76,12 @@ class AcknowledgedFlows:
             flow.gap |= number > flow.expected
             return False
         flow.expected += 1
+        flow.inherited &= again
         return True
+
+    def inherited(self, place: Flow) -> bool:
+        """True if the odometry of a message that was accepted may be out already, published by a node before this."""
+        return self._flows[place[0]].inherited
 
     def acknowledge(self) -> None:
         """Tell the senders of all messages since the last call which number is expected next."""

@@ -125,7 +125,7 @@ class RobotService:
                     continue
                 self._receive_poses()
                 if self._flows.accepts(flow):
-                    self._take(message, late=False)
+                    self._take(message, late=False, published=self._flows.inherited(flow))
             self._late.end_turn(self.tracker.in_real_time)
             self._flows.acknowledge()
             self.tracker.record_backlog(behind, self._late.unpublished - unpublished)
@@ -133,14 +133,16 @@ class RobotService:
                 self._scheduled = True
                 self._intake.ready(self._take_turn)
 
-    def _take(self, message: _Message, *, late: bool) -> None:
-        """Take a message, and publish its updates unless it is late."""
+    def _take(self, message: _Message, *, late: bool, published: bool = False) -> None:
+        """Take a message, and publish its updates unless it is late, or they may be published already."""
         try:
             if message.is_pose:
                 self.tracker.take_pose(message.payload, message.arrival)
                 return
             updates = self.tracker.take_wheels(message.payload, message.arrival)
-            if late:
+            if published:
+                self._late.unpublished += len(updates)
+            elif late:
                 self._late.take(message.arrival, updates)
             elif updates:
                 self._late.on_time(self.tracker.in_real_time)

@@ -42,7 +42,7 @@ class Counts:
     reacquired: int = _anomaly("restart", "of the filter at SLAM's pose")  # it gave up its own
     swaps: int = 0  # calibrations taken
     swaps_refused: int = _anomaly("calibration", "refused")
-    unpublished: int = _anomaly("odometry message", "not published")  # late: the next one's pose was published instead
+    unpublished: int = _anomaly("odometry message", "not published")  # late, or by a killed node already
     overflow: int = _anomaly("message", "not taken")  # too many were waiting
     failures: int = _anomaly("error", "of omnibench")  # while it took a message; each is logged
 

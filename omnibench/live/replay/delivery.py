@@ -28,6 +28,7 @@ from omnibench.live.wire.topics import Publisher
 
 WINDOW: Final = 256  # messages under way at most, some 90 kB: less than Zenoh's queue holds; chosen
 _POLL_PERIOD: Final = 0.05  # s between two looks at whether a signal came; chosen
+_LONGEST_POLL: Final = 0.5  # s; a look that takes longer is one at which this process stood still; chosen
 _FIRST_RETRY: Final = 0.5  # s without an acknowledgement after which messages are sent again; chosen
 _LAST_RETRY: Final = 4.0  # s, to which this time doubles; chosen
 _GAP_RETRY: Final = 0.1  # s in which one gap is reported by many acknowledgements; chosen
@@ -43,7 +44,8 @@ class Delivery(Closing):
     """Publishes messages and waits where too many are under way.
 
     paused: s that it has waited for a receiver. restarts: how often another node went on in the receiver's place.
-    stop: ends any waiting. wait: s without any sign of the receiver after which it is given up.
+    stop: ends any waiting. wait: s without any sign of the receiver after which it is given up, of which those do not
+    count in which this process itself was suspended.
     """
 
     def __init__(self, stop: threading.Event, wait: float) -> None:
@@ -51,6 +53,14 @@ class Delivery(Closing):
         self.restarts = 0
         self._stop, self._patience = stop, wait
         self._heard = threading.Event()
+        self._waited = 0.0  # s without any sign of the receiver
+
+    def _poll(self, sign: threading.Event) -> bool:
+        """Wait for a sign of the receiver for a moment; True if there is one."""
+        began = time.monotonic()
+        there = sign.wait(_POLL_PERIOD)
+        self._waited += min(time.monotonic() - began, _LONGEST_POLL)
+        return there
 
     @property
     @abstractmethod
@@ -97,9 +107,9 @@ class AcknowledgedDelivery(Delivery):
         number = publisher.next_number()
         with self._lock:
             if not self._under_way:
-                self._progress_at = time.monotonic()
+                self._progress_at, self._waited = time.monotonic(), 0.0
             self._under_way.append((publisher, payload, number))
-            place = self._flow, self._sent, self._taken
+            place = self._flow, self._sent, self._taken, False
             self._sent += 1
         publisher.put_numbered(payload, number, place)
         return True
@@ -134,10 +144,10 @@ class AcknowledgedDelivery(Delivery):
 
     def _wait(self) -> None:
         """Wait for an acknowledgement, and send again what seems lost. DeliveryError: none came for too long."""
-        self._heard.wait(_POLL_PERIOD)
+        self._poll(self._heard)
         self._heard.clear()
         silence, now = self._silence(), time.monotonic()
-        if silence > self._patience:
+        if self._waited > self._patience:
             key = acknowledgement_key(self._robot, "*")
             rights = "" if self._taken else f" (may this session read {key}?)"
             raise DeliveryError(f"its node has taken nothing for {silence:.0f} s{rights}; `wait` says how long to wait")
@@ -155,7 +165,7 @@ class AcknowledgedDelivery(Delivery):
         for place, (publisher, payload, number) in enumerate(messages, first):
             if self._stop.is_set():
                 return
-            publisher.put_numbered(payload, number, (self._flow, place, self._taken))
+            publisher.put_numbered(payload, number, (self._flow, place, self._taken, True))
 
     def _acknowledged(self, sample: zenoh.Sample) -> None:
         try:
@@ -168,7 +178,7 @@ class AcknowledgedDelivery(Delivery):
                 for _ in range(expected - self._taken):
                     self._under_way.popleft()
                 self._taken = expected
-                self._progress_at = time.monotonic()
+                self._progress_at, self._waited = time.monotonic(), 0.0
                 self._retry = _FIRST_RETRY
             self._gap |= gap and bool(self._under_way)
             if sample.timestamp is not None and (node := str(sample.timestamp.get_id())) != self._node:
@@ -219,9 +229,9 @@ class UnconfirmedDelivery(Delivery):
         self._session.get(self._key, handler, timeout=2 * self._patience, priority=zenoh.Priority.BACKGROUND)
 
     def _round_trip_over(self) -> None:
-        began = time.monotonic()
-        while not self._arrived.wait(_POLL_PERIOD) and not self._stop.is_set():
-            if time.monotonic() - began > self._patience:
+        began, self._waited = time.monotonic(), 0.0
+        while not self._poll(self._arrived) and not self._stop.is_set():
+            if self._waited > self._patience:
                 raise DeliveryError(f"the router has taken nothing for {self._patience:g} s")
         if self._arrived.is_set() and not self._stop.is_set() and not is_connected(self._session):
             raise DeliveryError("the link to the router was lost")  # which closes a query, too

@@ -1,8 +1,8 @@
 """The attachment of a message: its number and its publisher, by which receivers can tell what they missed.
 
 Its 33 bytes are those of rmw_zenoh: number, time of publishing (ns), and the publisher's identity of 16 bytes. Messages
-whose delivery is acknowledged add 24 bytes, which ROS 2 passes over: the flow's identity, the message's number in the
-flow, and the lowest number that the sender has no acknowledgement of.
+whose delivery is acknowledged add 25 bytes, which ROS 2 passes over: the flow's identity, the message's number in the
+flow, the lowest number that the sender has no acknowledgement of, and whether the message was sent before.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import zenoh
 
 _HEAD: Final = struct.Struct("<qqB16s")
 _IDENTITY_LENGTH: Final = 16  # bytes
-_FLOW: Final = struct.Struct("<QQQ")
+_FLOW: Final = struct.Struct("<QQQ?")
 _MOST_PUBLISHERS: Final = 1000  # whose numbers are remembered; the first to come are forgotten; chosen
 _MOST_MISSING: Final = 10_000  # numbers of a publisher that may still come; chosen
 
-Flow = tuple[int, int, int]
-"""A flow's identity, a message's number in it, and the lowest number without an acknowledgement."""
+Flow = tuple[int, int, int, bool]
+"""A flow's identity, a message's number in it, the lowest number not acknowledged, and if it was sent before."""
 
 
 def packed(number: int, publisher: bytes, flow: Flow | None = None) -> bytes:
@@ -34,8 +34,8 @@ def flow_of(attachment: bytes | None) -> Flow | None:
     """A message's place in its flow; None if its delivery is not acknowledged."""
     if attachment is None or len(attachment) != _HEAD.size + _FLOW.size:
         return None
-    flow, number, unacknowledged = _FLOW.unpack_from(attachment, _HEAD.size)
-    return flow, number, unacknowledged
+    flow, number, unacknowledged, again = _FLOW.unpack_from(attachment, _HEAD.size)
+    return flow, number, unacknowledged, again
 
 
 @dataclass(slots=True)

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import zenoh
 from drives import drive
-from nodes import Command, asked, write_node
+from nodes import Command, asked, config_of, running, write_node
 from recordings import random_dataset
 from replayed import config
 from sessions import free_port, raw_session, until
@@ -161,6 +161,38 @@ class TestToANode:
         assert rest["missing"] == 0
         assert rest["samples"] < report.sent["joint_states"]
 
+    def test_what_a_killed_node_may_have_published_is_taken_and_not_published_again(self, tmp_path: Path) -> None:
+        path, came = drive(1.0), []
+        with running(config_of(tmp_path)) as (node, session):
+            session.declare_subscriber("apr/odom", lambda sample: came.append(sample.payload.to_bytes()[4:12]))
+            wheels = session.declare_publisher("apr/joint_states")
+            until(lambda: wheels.matching_status.matching, "the node's subscription")
+            for number, payload in enumerate(path.payloads()[50:60], 50):  # 50 to 52 were on their way to another node
+                wheels.put(payload, attachment=packed(number, bytes(16), (7, number, 50, number < 53)))
+            until(lambda: node.health("apr").counts["samples"] == 10, "all samples")
+            until(lambda: len(came) == 7, "the odometry of the others")
+            wheels.put(path.payloads()[60], attachment=packed(60, bytes(16), (7, 60, 60, True)))  # a gap, to this node
+            until(lambda: len(came) == 8, "its odometry")
+            assert node.health("apr").counts["unpublished"] == 3
+        assert came == [payload[4:12] for payload in path.payloads()[53:61]]
+
+    def test_a_replay_that_was_suspended_itself_does_not_give_its_node_up(
+        self, node: Command, folder: Path, port: int
+    ) -> None:
+        save_dataset(random_dataset(7, 5, samples=2000), folder / "data")
+        to = ("--robot", "apr", "--connect", f"tcp/127.0.0.1:{port}", "--set", "wait=3", "--speed", "100")
+        with connected(port) as session, Command("replay", folder / "data", *to) as replay:
+            until(lambda: counts(session)["samples"] > 100, "a part of the recording")
+            os.kill(node.process.pid, signal.SIGSTOP)  # so that messages are under way
+            time.sleep(0.2)
+            os.kill(replay.process.pid, signal.SIGSTOP)
+            os.kill(node.process.pid, signal.SIGCONT)
+            time.sleep(4.0)  # longer than `wait`
+            os.kill(replay.process.pid, signal.SIGCONT)
+            out, said = replay.ended()
+        assert replay.process.returncode == 0, said
+        assert "all taken by the node" in out
+
     def test_a_node_that_does_not_come_back_is_one_line_with_the_number_that_is_missing(
         self, node: Command, port: int
     ) -> None:
@@ -279,10 +311,10 @@ class TestMissedMessages:
 
 
 def test_a_flow_adds_to_an_attachment_what_ros_passes_over() -> None:
-    plain, flow = packed(3, bytes(16)), packed(3, bytes(16), (7, 8, 9))
+    plain, flow = packed(3, bytes(16)), packed(3, bytes(16), (7, 8, 9, True))
     assert (len(plain), flow_of(plain), flow_of(None)) == (33, None, None)
     assert flow[:8] == plain[:8]
-    assert flow_of(flow) == (7, 8, 9)
+    assert flow_of(flow) == (7, 8, 9, True)
 
 
 def numbered(number: int, publisher: bytes = bytes(16)) -> zenoh.ZBytes:
