@@ -48,8 +48,7 @@ class Account:
     published: came back as odometry, or its message was lost behind the node, as its number tells. unpublished:
     integrated, and only a newer pose published. refused, missing: so counted by the node. in_gaps: lost in silences
     that the node counts. unconfirmed: of a replay that said so. killed: with a node that was ended or not there.
-    unaccounted: none of these. repeated: stamps that came twice; again: those from a killed node's successor, which
-    the killed one could not acknowledge. worst: difference from the batch odometry, m or rad.
+    unaccounted: none of these. repeated: stamps that came twice. worst: difference from the batch odometry, m or rad.
     """
 
     sent: int = 0
@@ -62,7 +61,6 @@ class Account:
     killed: int = 0
     unaccounted: int = 0
     repeated: int = 0
-    again: int = 0
     compared: int = 0
     worst: float = 0.0
     problems: list[str] = field(default_factory=list)
@@ -96,14 +94,12 @@ def check_published(account: Account, last: Heard, now: Counts) -> None:
 
 
 def check_stamps(account: Account, parts: Sequence[Heard], *, jumps: bool = False) -> None:
-    """No stamp comes twice from one node. jumps: the robot's clock goes back, of which a new node cannot know."""
-    for part in parts:
-        repeated = len(part.stamps) - len(np.unique(part.stamps))
+    """No stamp comes twice. jumps: the robot's clock goes back, and a new node cannot know what others published."""
+    together = [part.stamps for part in parts] if jumps else [np.concatenate([part.stamps for part in parts])]
+    repeated = sum(len(stamps) - len(np.unique(stamps)) for stamps in together)
+    if repeated:
         account.repeated += repeated
-        if repeated:
-            account.problems.append(f"{repeated} stamps repeated by one node")
-    together = np.concatenate([np.unique(part.stamps) for part in parts]) if parts else np.zeros(0)
-    account.again += 0 if jumps else len(together) - len(np.unique(together))
+        account.problems.append(f"{repeated} stamps came twice")
 
 
 def check_path(account: Account, part: Heard, index: NDArray[np.int64], paths: Sequence[Array], swaps: int) -> None:
@@ -211,9 +207,7 @@ def account_replays(
         if len(index) and known[-1]:
             covered[index[-1] + 1 : index[-1] + 1 + end - int(part.numbers[-1])] = True
     begin, refusals = 0, refused(counted)
-    account.unpublished += counted["unpublished"]
-    if all(confirmed for _, _, confirmed in replays):
-        account.problem(counted["unpublished"], "samples of a replay integrated without being published")
+    unpublished = counted["unpublished"]
     for each, whole, confirmed in replays:
         here = slice(begin, begin + len(each))
         begin += len(each)
@@ -221,16 +215,19 @@ def account_replays(
         account.sent += sent
         without = np.flatnonzero(~covered[here][:sent])
         account.published += sent - len(without)
+        lives = owner[here][:sent]
         if not confirmed:
             account.unconfirmed += len(without)
             continue
-        lives = owner[here][:sent]
         for run in np.split(without, np.flatnonzero(np.diff(without) > 1) + 1):
             if not len(run):
                 continue
             around = (lives[run[0] - 1] if run[0] else -1, lives[run[-1] + 1] if run[-1] + 1 < sent else -1)
             if len(parts) > 2 and around[0] != around[1] and len(run) <= kept:
-                account.killed += len(run)
+                told = min(unpublished, len(run))
+                account.unpublished += told
+                account.killed += len(run) - told
+                unpublished -= told
             elif len(run) <= refusals:
                 account.refused += len(run)
                 refusals -= len(run)

@@ -141,10 +141,13 @@ class NumberingRobot(Robot):
 
     def __init__(self, name: str, seed: int, graph: GraphNode) -> None:
         super().__init__(name, seed)
+        self.losing = 0.0  # share of the samples that its radio loses
         self._publisher: Any = graph.publisher(name, "joint_states")
 
     def publish(self, payload: bytes) -> None:
-        self._publisher.put_encoded(payload)
+        number = self._publisher.next_number()
+        if self._rng.random() >= self.losing:
+            self._publisher.put_numbered(payload, number)
 
 
 class PlainRobot(Robot):

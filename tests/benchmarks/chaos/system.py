@@ -162,6 +162,7 @@ class System:
             Fault("processor hog", "", hog, 1.0, 10.0, 2.0),
             Fault("disk of node full", "disk of node", lambda: self._fill_disk(self.node, 0), 1.0, 8.0),
             Fault("disk of recorder full", "disk of recorder", self._fill_recorders_disk, 1.0, 8.0, 0.5),
+            Fault("radio loses", "radio", lambda: self._lose(float(self.rng.choice([0.02, 0.2, 0.5]))), 1.0, 6.0),
             Fault("stamps jump", "", lambda: self.plain.jump(float(self.rng.choice([-30.0, -0.5, 0.5, 2.0, 3600.0])))),
             Fault("junk", "", lambda: self.plain.send_junk(int(self.rng.integers(1, 200)))),
             Fault("flood of queries", "", self._ask_much),
@@ -242,6 +243,10 @@ class System:
     def _fill_recorders_disk(self) -> Callable[[], object]:
         file = self.recordings[-1]
         return self._fill_disk(self.recorder, (file.stat().st_size if file.exists() else 0) + _ROOM)
+
+    def _lose(self, share: float) -> Callable[[], object]:
+        self.numbered.losing = share
+        return lambda: setattr(self.numbered, "losing", 0.0)
 
     def _ask_much(self) -> None:
         for _ in range(_FLOOD):
