@@ -7,7 +7,6 @@ time (a clock that jumped); one after a silence that this machine's clock saw to
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -29,7 +28,8 @@ _CONFIRMATION = 3  # stamps in a row that confirm a new time of the sender's clo
 _REORDERED = 0.2  # s; a sample that is late by less is out of order, or the clock was set back a little
 _SET_BACK = 3  # late samples in a row; so many are of a clock that was set back, and not out of order
 _SLACK = 0.1  # s, by which arrivals may scatter
-_LEARNING = 10  # samples, whose median gives the first period
+_LEARNING = 10  # samples, whose lower quartile gives the first period, so that lost ones do not lengthen it
+_SLOWER = 50  # samples in a row each after a missing one, as of a robot that sends more rarely than before
 _SMOOTHING = 0.02  # share of a new period in the mean
 _IRREGULAR = 0.25  # share of the mean period by which a regular one may be off
 _MEMORY = 0.995  # share of the past in the pace of the stamps, which is 1 of a robot and more of a fast replay
@@ -106,6 +106,7 @@ class WheelInput:
         self._unconfirmed: list[_Sample] = []  # samples of a new time of the clock, until enough of them came
         self._late_in_a_row = 0
         self._learnt: list[float] = []
+        self._after_missing = 0  # samples in a row, each after a missing one
         self._stamped, self._waited = 1.0, 1.0  # s by stamps and by this machine's clock, recent ones weighing most
         self.period = period
         self.last_refusal = ""
@@ -259,13 +260,17 @@ class WheelInput:
         self._waited = _MEMORY * self._waited + waited
         if len(self._learnt) < _LEARNING:
             self._learnt.append(elapsed)
-            self.period = statistics.median(self._learnt)
+            self.period = sorted(self._learnt)[len(self._learnt) // 4]
             return
         periods = elapsed / self.period
         whole = max(math.floor(periods + 0.3), 1)
         self._counts.missing += whole - 1
         self._counts.irregular += abs(periods - whole) > _IRREGULAR
-        self.period += _SMOOTHING * (min(elapsed, 3 * self.period) - self.period)
+        self.period += _SMOOTHING * (elapsed / whole - self.period)
+        self._after_missing = self._after_missing + 1 if whole > 1 else 0
+        if self._after_missing == _SLOWER:
+            self._learnt.clear()
+            self._after_missing = 0
 
     @property
     def pace(self) -> float:

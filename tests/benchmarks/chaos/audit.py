@@ -20,7 +20,7 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import wrapped
 
 EXACT: Final = 1e-9  # m, rad; largest difference of odom from the batch odometry
-_LONG: Final = 99  # samples lost in a row from which on the node counts a gap, which is longer than max_gap, 1 s
+_LONGEST: Final = 100  # periods from sample to sample; beyond it, 1 s, the node counts a gap
 _LEARNING: Final = 12  # samples of a new node, before it knows the period by which it counts missing ones
 # Counters that say what became of a wheel message.
 REFUSED: Final = (
@@ -159,18 +159,21 @@ def account_stream(
         account.refused += refused(counted)
         lost = int(unseen.sum()) - counted["unpublished"] - refused(counted)  # Eq. (C1)
         beyond = lost - counted["missing"]
-        long = int(unseen[unseen >= _LONG].sum()) if counted["gaps"] + counted["clock_jumps"] else 0
+        # In a silence it counts none, and where the clock seems to have jumped those of up to a second.
+        silences = np.diff(samples) > _LONGEST
+        long = int(unseen[silences].sum()) if counted["gaps"] + counted["clock_jumps"] else 0
+        least = long - counted["unpublished"] - _LONGEST * counted["clock_jumps"]
         if before is None:  # it counts what it missed before its first message too, and not while it learns the period
             account.missing += min(counted["missing"], lost)
             early = int(unseen[part.numbers[1:] <= _LEARNING].sum())
             account.killed += min(max(beyond, 0), early)
-            beyond = max(beyond - early, 0)
+            beyond, least = max(beyond - early, 0), 0
         else:
             account.missing += counted["missing"]
-        if 0 < beyond <= long:
+        if beyond == 0 or max(least, 0) <= beyond <= long:
             account.in_gaps += beyond
         else:
-            account.problem(beyond, "samples lost before the node, more than it counts as missing")
+            account.problem(beyond, f"samples lost before the node, more than it counts as missing, {long} in silences")
     return account
 
 
@@ -223,7 +226,7 @@ def account_replays(
             if not len(run):
                 continue
             around = (lives[run[0] - 1] if run[0] else -1, lives[run[-1] + 1] if run[-1] + 1 < sent else -1)
-            if len(parts) > 2 and around[0] != around[1] and len(run) <= kept:
+            if len(parts) > 1 and around[0] != around[1] and len(run) <= kept:
                 told = min(unpublished, len(run))
                 account.unpublished += told
                 account.killed += len(run) - told

@@ -133,6 +133,9 @@ class Chaos:
             codes.append(128 + ending.asked)
         if ending.asked is not None and ending.program == "replay":
             codes.append(130)
+        unconfirmed = "did not reach" in ending.said and "its node has taken nothing" not in ending.said
+        if ending.program == "replay" and unconfirmed:  # it found no node when it began, and its link was lost
+            codes.append(1)
         if ending.code not in codes and not full:
             last = ending.said.strip().rpartition("\n")[2]
             self.problem(f"{ending.program} ended {asked} with exit code {ending.code}: {last!r}; {log}")

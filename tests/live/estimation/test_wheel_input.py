@@ -324,6 +324,23 @@ def test_irregular_periods_are_taken_as_they_are_stamped() -> None:
     assert receiver.counts.irregular > 20
 
 
+@pytest.mark.parametrize("share", [0.02, 0.2, 0.5])
+def test_missing_samples_are_all_counted_however_many_they_are(share: float) -> None:
+    rng = np.random.default_rng(1)
+    kept = [0, *(k for k in range(1, 2999) if k < 20 or rng.random() > share), 2999]
+    receiver = Receiver()
+    receiver.take(*(at(k * PERIOD, 0.01 * k, 0.0, 0.0) for k in kept))
+    assert receiver.counts.missing == 3000 - len(kept)
+
+
+def test_a_robot_that_sends_more_rarely_from_now_on_misses_nothing_after_a_while() -> None:
+    times = [*(k * PERIOD for k in range(200)), *(2.0 + 2 * k * PERIOD for k in range(400))]
+    receiver = Receiver()
+    receiver.take(*(at(time, time, 0.0, 0.0) for time in times))
+    assert receiver.counts.missing <= 50
+    assert receiver.input.period == pytest.approx(2 * PERIOD)
+
+
 def test_even_periods_are_not_irregular_whatever_is_missing() -> None:
     receiver = Receiver()
     receiver.take(*[at(PERIOD * k, k, k, k) for k in range(50) if k not in (20, 31, 32)])
