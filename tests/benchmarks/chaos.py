@@ -6,7 +6,8 @@ A node, a replay, a recorder, a listener, a router and a TCP proxy between them 
 samples that nobody acknowledges. Processor hogs, SIGSTOP, SIGKILL and SIGTERM, links that are cut, stalled and slowed,
 full disks, stamps that jump, junk, floods of queries and calibrations that are swapped come at random. After every
 round the faults end, and each sample sent is accounted for: taken, refused and counted, counted as missing, or lost
-with a killed process. Needs no rights of root. Exits 1 when a check failed; Ctrl-C ends it in order.
+with a killed process. Needs no rights of root. Exits 1 when a check failed; Ctrl-C and SIGTERM end it
+in order.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ import sys
 
 from chaos.run import run
 
+from omnibench.live.stopping import stop_on_signals
+
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -24,7 +27,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
     minutes = arguments.minutes if arguments.hours is None else 60 * arguments.hours
-    return 0 if run(60 * minutes, arguments.seed) else 1
+    with stop_on_signals() as stop:
+        return 0 if run(60 * minutes, arguments.seed, stop=stop) else 1
 
 
 if __name__ == "__main__":

@@ -7,9 +7,11 @@ import re
 import shutil
 import signal
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -43,9 +45,9 @@ _KEPT: Final = 600  # messages of a replay that a node may take and a kill leave
 
 
 class Chaos:
-    """One run. problems: what failed, in words; the rest is for the table."""
+    """One run. problems: what failed, in words. stop: ends it before its time."""
 
-    def __init__(self, system: System, seed: int, say: Callable[[str], object]) -> None:
+    def __init__(self, system: System, seed: int, say: Callable[[str], object], stop: threading.Event) -> None:
         self.system = system
         self.accounts = {name: Account() for name in _ROBOTS}
         self.problems: list[str] = []
@@ -53,7 +55,7 @@ class Chaos:
         self.rounds = self.replays = 0
         self.began = time.monotonic()
         self.faults = Faults(system.kinds(), np.random.default_rng(seed))
-        self._seed, self._say = seed, say
+        self._seed, self._say, self._stop = seed, say, stop
         self._counts: dict[str, dict[str, int]] = {}  # of each robot at the end of the last round
         self._last: dict[str, Heard] = {}  # the last message of each robot in the last round
         self._node_starts = 0  # until the last round
@@ -66,17 +68,13 @@ class Chaos:
         return time.monotonic() - self.began
 
     def run(self, seconds: float, round_seconds: float) -> None:
-        """Rounds until ``seconds`` have passed; in the last third the node is not ended, so that its memory shows.
+        """Rounds until ``seconds`` have passed or ``stop`` is set.
 
-        Ctrl-C ends the faults, takes the account of the round, and ends.
+        In the last third the node is not ended, so that its memory shows.
         """
-        try:
-            while self.elapsed < seconds or not self.rounds:
-                rest = seconds - self.elapsed
-                self.round(min(round_seconds, max(rest, 1.0)), kills=self.elapsed < 2 * seconds / 3)
-        except KeyboardInterrupt:
-            self._say("interrupted: all faults end, and this round's account is taken")
-            self.settle()
+        while (self.elapsed < seconds or not self.rounds) and not self._stop.is_set():
+            rest = seconds - self.elapsed
+            self.round(min(round_seconds, max(rest, 1.0)), kills=self.elapsed < 2 * seconds / 3)
 
     def round(self, seconds: float, *, kills: bool) -> None:
         """Faults for ``seconds``, then peace, and the account."""
@@ -84,7 +82,7 @@ class Chaos:
         end = time.monotonic() + seconds
         said = time.monotonic()
         weights = {} if kills else {"kill node": 0.0, "ask node to end": 0.0}
-        while time.monotonic() < end:
+        while time.monotonic() < end and not self._stop.is_set():
             self.faults.step(self.elapsed, weights)
             self._look_after()
             if time.monotonic() - said > _SAID:
@@ -357,14 +355,23 @@ class Chaos:
         return rows
 
 
-def run(seconds: float, seed: int, say: Callable[[str], object] = print, round_seconds: float = _ROUND) -> bool:
-    """Run the suite for about so long; True if every check held. The folder with its logs stays where one failed."""
+def run(
+    seconds: float,
+    seed: int,
+    say: Callable[[str], object] = partial(print, flush=True),
+    round_seconds: float = _ROUND,
+    stop: threading.Event | None = None,
+) -> bool:
+    """Run the suite for about so long; True if every check held. The folder with its logs stays where one failed.
+
+    stop: ends the faults when it is set; the account of the round is taken all the same.
+    """
     folder = Path(tempfile.mkdtemp(prefix="chaos-"))
     system = System(folder, seed)
     chaos = None
     try:
         system.start()
-        chaos = Chaos(system, seed, say)
+        chaos = Chaos(system, seed, say, stop or threading.Event())
         chaos.run(seconds, round_seconds)
     finally:
         if chaos is not None:
