@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 
 from chaos.run import run
 
@@ -28,7 +29,7 @@ def main() -> int:
     arguments = parser.parse_args()
     minutes = arguments.minutes if arguments.hours is None else 60 * arguments.hours
     with stop_on_signals() as stop:
-        return 0 if run(60 * minutes, arguments.seed, stop=stop) else 1
+        return 0 if run(60 * minutes, arguments.seed, partial(print, flush=True), stop=stop) else 1
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import fields
-from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -358,7 +357,7 @@ class Chaos:
 def run(
     seconds: float,
     seed: int,
-    say: Callable[[str], object] = partial(print, flush=True),
+    say: Callable[[str], object] = print,
     round_seconds: float = _ROUND,
     stop: threading.Event | None = None,
 ) -> bool:
