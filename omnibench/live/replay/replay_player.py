@@ -213,7 +213,7 @@ class Player:
     def _delivery(self, stop: threading.Event) -> Delivery:
         """Delivery to the robot's node, if there is one, or else to whoever subscribes."""
         patience = max(self._config.wait, _LEAST_PATIENCE)
-        if self._robot in alive_robots(self._session):
+        if self._robot in alive_robots(self._session, patience, stop):
             return AcknowledgedDelivery(self._session, self._robot, stop, patience)
         return UnconfirmedDelivery(self._session, self._robot, stop, patience)
 

@@ -176,6 +176,19 @@ class TestToANode:
             assert node.health("apr").counts["unpublished"] == 3
         assert came == [payload[4:12] for payload in path.payloads()[53:61]]
 
+    def test_a_node_that_stands_still_when_the_replay_begins_is_found_all_the_same(
+        self, node: Command, port: int
+    ) -> None:
+        with connected(port) as session, ThreadPoolExecutor(1) as pool:
+            waiting = player(session, wait=600)
+            wheels = session.declare_publisher("apr/joint_states")
+            until(lambda: wheels.matching_status.matching, "the node's subscription")
+            os.kill(node.process.pid, signal.SIGSTOP)
+            report = pool.submit(waiting.play)
+            time.sleep(2.0)
+            os.kill(node.process.pid, signal.SIGCONT)
+            assert report.result().taken == report.result().total
+
     def test_a_replay_that_was_suspended_itself_does_not_give_its_node_up(
         self, node: Command, folder: Path, port: int
     ) -> None:
