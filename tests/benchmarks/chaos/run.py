@@ -329,12 +329,24 @@ class Chaos:
     def growth(self) -> float:
         """Largest growth (MB) of a node's memory from its first 20 s on."""
         grown = [0.0]
-        for start in {start for _, start, _ in self.memory}:
+        for start in self._node_numbers():
             sizes = [(at, size) for at, number, size in self.memory if number == start]
             settled = [size for at, size in sizes if at > sizes[0][0] + _WARM_UP]
             if settled:
                 grown.append((max(settled) - settled[0]) / 1e6)
         return max(grown)
+
+    def _longest_life(self) -> str:
+        """The course of memory in the node that lived longest."""
+        lives = [[(at, size) for at, number, size in self.memory if number == start] for start in self._node_numbers()]
+        life = max(lives, key=lambda life: life[-1][0] - life[0][0])
+        sizes = ", ".join(
+            f"{life[round(share * (len(life) - 1))][1] / 1e6:.0f}" for share in (0.1, 0.25, 0.5, 0.75, 1.0)
+        )
+        return f"in the longest, {life[-1][0] - life[0][0]:.0f} s, after 10, 25, 50, 75 and 100 % of it: {sizes} MB"
+
+    def _node_numbers(self) -> set[int]:
+        return {number for _, number, _ in self.memory}
 
     def table(self) -> list[str]:
         """The account of all samples, faults and ends."""
@@ -349,7 +361,7 @@ class Chaos:
         endings = self.system.endings
         killed = sum(ending.asked == signal.SIGKILL for ending in endings)
         rows.append(f"{self.replays} replays; {len(endings)} ends of processes, {killed} of them killed")
-        rows.append(f"memory of the node: +{self.growth():.1f} MB at most within one life")
+        rows.append(f"memory of the node: +{self.growth():.1f} MB at most within one life; {self._longest_life()}")
         rows.append(f"{self.rounds} rounds in {self.elapsed:.0f} s, seed {self._seed}: {len(self.problems)} problems")
         return rows
 
