@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import shutil
 import signal
@@ -16,22 +15,12 @@ from typing import Final
 
 import numpy as np
 
-from chaos.audit import (
-    POSES,
-    Account,
-    account_replays,
-    account_stream,
-    check_path,
-    check_published,
-    check_stamps,
-    difference,
-    refused,
-)
+from chaos.audit import Account
 from chaos.faults import Faults
+from chaos.ledger import ROBOTS, Ledger
 from chaos.programs import PATIENCE, Ending
-from chaos.robots import ORIGIN, STEP, Robot, batch
-from chaos.system import NUMBERED, PLAIN, PLAYED, System, messages_said, read_recording
-from chaos.witness import Heard
+from chaos.robots import STEP, Robot
+from chaos.system import System, messages_said, read_recording
 
 _ROUND: Final = 25.0  # s of faults until the next account; chosen
 _TICK: Final = 0.05  # s
@@ -39,8 +28,6 @@ _SAID: Final = 5.0  # s between two lines of progress; chosen
 _WARM_UP: Final = 20.0  # s of a node in which its memory grows; chosen
 # MB that a node may grow in its life: messages that wait and published stamps take 10 MB each, for each of 3 robots.
 _MOST_GROWTH: Final = 60.0
-_ROBOTS: Final = (PLAYED, NUMBERED, PLAIN)
-_KEPT: Final = 600  # messages of a replay that a node may take and a kill leave without a trace: its window and a batch
 
 
 class Chaos:
@@ -48,19 +35,16 @@ class Chaos:
 
     def __init__(self, system: System, seed: int, say: Callable[[str], object], stop: threading.Event) -> None:
         self.system = system
-        self.accounts = {name: Account() for name in _ROBOTS}
+        self.ledger = Ledger(system)
         self.problems: list[str] = []
         self.memory: list[tuple[float, int, int]] = []  # s since the beginning, start of the node, bytes
         self.rounds = self.replays = 0
         self.began = time.monotonic()
         self.faults = Faults(system.kinds(), np.random.default_rng(seed))
         self._seed, self._say, self._stop = seed, say, stop
-        self._counts: dict[str, dict[str, int]] = {}  # of each robot at the end of the last round
-        self._last: dict[str, Heard] = {}  # the last message of each robot in the last round
-        self._node_starts = 0  # until the last round
         self._long_stops = 0  # of the node, until the last round
         self._said = 0.0, 0  # time and messages of the last line of progress
-        self._endings_checked = self._endings_before = 0  # of all, and until the last round
+        self._endings_checked = 0
 
     @property
     def elapsed(self) -> float:
@@ -100,7 +84,9 @@ class Chaos:
         self._look_after(restart_only=True)
         self._wait_for(system.numbered)
         self._wait_for(system.plain)
-        self._account()
+        long_stops, self._long_stops = self._long_stops, self.faults.count["stop node for long"]
+        for problem in self.ledger.close_round(away=self._long_stops > long_stops):
+            self.problem(problem)
         self.rounds += 1
 
     def problem(self, what: str) -> None:
@@ -195,125 +181,6 @@ class Chaos:
             robot.driving.set()
             time.sleep(0.2)
 
-    def _settled_counts(self, robot: str) -> dict[str, int] | None:
-        """The node's counters of a robot, once they do not change any more."""
-        deadline, before = time.monotonic() + PATIENCE, None
-        while time.monotonic() < deadline:
-            now = self.system.witness.counts(robot)
-            if now is not None and now == before:
-                return now
-            before = now
-            time.sleep(0.5)
-        return None
-
-    def _account(self) -> None:
-        """Every sample of the round, robot by robot."""
-        for name in _ROBOTS:
-            now = self._settled_counts(name)
-            if now is None:
-                self.problem(f"the node does not answer omnibench/{name}/health after all faults have ended")
-                continue
-            parts = self.system.witness.heard(name)
-            if parts or name in self._last:
-                self._account_of(name, parts, now)
-        self._node_starts = self.system.node.starts
-        self._long_stops = self.faults.count["stop node for long"]
-        self._endings_before = len(self.system.endings)
-        self.system.replays.clear()
-        self.system.swaps = self.system.swaps_refused = 0
-
-    def _account_of(self, name: str, parts: list[Heard], now: dict[str, int]) -> None:
-        last = self._last.get(name)
-        if last is None:  # nothing came before the first sample
-            last = Heard(b"", np.array([0]), np.array([ORIGIN]), np.zeros((1, 3)))
-        if parts and parts[0].node == last.node:
-            parts[0] = Heard(
-                last.node,
-                *(
-                    np.concatenate(pair)
-                    for pair in (
-                        (last.numbers, parts[0].numbers),
-                        (last.stamps, parts[0].stamps),
-                        (last.poses, parts[0].poses),
-                    )
-                ),
-            )
-        else:
-            parts.insert(0, last)
-        if now["samples"] == 0 and parts[-1].numbers[-1]:  # a new node, which has heard nothing of this robot
-            parts.append(Heard(b"new", np.array([0]), np.array([0]), np.zeros((1, 3))))
-        before = self._counts.get(name) if self._node_starts == self.system.node.starts else None
-        account = {PLAYED: self._played, NUMBERED: self._numbered, PLAIN: self._plain}[name](parts, now, before)
-        check_stamps(account, parts, jumps=name == PLAIN)
-        for problem in account.problems:
-            self.problem(f"robot {name}: {problem}")
-        account.problems.clear()
-        self.accounts[name].add(account)
-        end = parts[-1]
-        self._last[name] = Heard(end.node, end.numbers[-1:], end.stamps[-1:], end.poses[-1:])
-        self._counts[name] = now
-
-    def _numbered(self, parts: list[Heard], now: dict[str, int], before: dict[str, int] | None) -> Account:
-        robot = self.system.numbered
-        stamps = [stamp for stamp, _ in robot.sent]
-        angles = np.array([angles for _, angles in robot.sent])
-        index = [(part.stamps - stamps[0]) // STEP for part in parts]
-        account = account_stream(parts, index, now, before)
-        account.sent = len(stamps) - (NUMBERED in self._last)
-        paths = [batch(calibration, stamps, angles) for calibration in self.system.calibrations]
-        for part, samples in zip(parts, index, strict=True):
-            known = (samples >= 0) & (samples < len(stamps))
-            account.problem(int(np.count_nonzero(~known[NUMBERED not in self._last :])), "stamps that were never sent")
-            if known.all() and len(samples) > 1:
-                check_path(account, part, samples, paths, self.system.swaps)
-        check_published(account, parts[-1], now)
-        told = account.published + account.unpublished + account.refused + account.missing + account.in_gaps
-        account.problem(account.sent - told - account.killed - account.unaccounted, "samples in no column")
-        robot.forget()
-        return account
-
-    def _plain(self, parts: list[Heard], now: dict[str, int], before: dict[str, int] | None) -> Account:
-        robot, account = self.system.plain, Account()
-        counted = difference(now, before)
-        account.sent = len(robot.sent) - (PLAIN in self._last) + robot.junk
-        account.published = int(parts[0].numbers[-1] - parts[0].numbers[0]) + sum(int(p.numbers[-1]) for p in parts[1:])
-        account.unpublished, account.refused = counted["unpublished"], refused(counted)
-        check_published(account, parts[-1], now)
-        rest = account.sent - account.published - account.unpublished - account.refused
-        if before is None or self.faults.count["stop node for long"] > self._long_stops:
-            account.killed = rest
-        else:
-            account.problem(rest, "messages neither taken nor refused")
-        robot.forget()
-        return account
-
-    def _played(self, parts: list[Heard], now: dict[str, int], before: dict[str, int] | None) -> Account:
-        system = self.system
-        endings = [each for each in system.endings[self._endings_before :] if each.program == "replay"]
-        flows = system.witness.flows()
-        ends = [*(replay.since for replay in system.replays[1:]), math.inf]
-        replays = []
-        for replay, ending, end in zip(system.replays, endings, ends, strict=True):
-            stamps = replay.origin + np.round(system.times * 1e9).astype(np.int64)
-            taken = [flow.taken for flow in flows if replay.since <= flow.since < end]
-            replays.append((stamps, ending.code == 0, bool(taken)))
-            if ending.code == 0 and bool(taken) is not ("all taken by the node" in ending.said):
-                self.problem(f"a replay whose messages a node acknowledged says {ending.said.splitlines()[-1]!r}")
-        account = account_replays(replays, parts, now, before, _KEPT)
-        counted = difference(now, before)
-        handled = counted["samples"] + sum(counted[name] for name in POSES) + refused(counted)
-        if before is not None and all(confirmed for _, _, confirmed in replays):
-            taken = sum(flow.taken for flow in flows)
-            account.problem(taken - handled, "messages acknowledged, but neither taken nor refused")
-        for part in parts:
-            for stamps, _, _ in replays:
-                inside = (part.stamps >= stamps[0]) & (part.stamps <= stamps[-1])
-                if np.count_nonzero(inside) > 1:
-                    chosen = Heard(part.node, part.numbers[inside], part.stamps[inside], part.poses[inside])
-                    index = np.searchsorted(stamps, chosen.stamps)
-                    check_path(account, chosen, index, [system.played_path], 0)
-        return account
-
     def _report_progress(self) -> None:
         """One line: time, rates, faults so far."""
         witness, robots = self.system.witness, (self.system.numbered, self.system.plain)
@@ -351,12 +218,12 @@ class Chaos:
     def table(self) -> list[str]:
         """The account of all samples, faults and ends."""
         columns = [item.name for item in fields(Account) if item.name not in ("worst", "problems")]
-        rows = [f"{'':>14}" + "".join(f"{name:>12}" for name in _ROBOTS)]
+        rows = [f"{'':>14}" + "".join(f"{name:>12}" for name in ROBOTS)]
         rows += [
-            f"{column:>14}" + "".join(f"{getattr(self.accounts[name], column):>12,}" for name in _ROBOTS)
+            f"{column:>14}" + "".join(f"{getattr(self.ledger.accounts[name], column):>12,}" for name in ROBOTS)
             for column in columns
         ]
-        rows.append(f"{'against batch':>14}" + "".join(f"{self.accounts[n].worst:>12.1e}" for n in _ROBOTS))
+        rows.append(f"{'against batch':>14}" + "".join(f"{self.ledger.accounts[n].worst:>12.1e}" for n in ROBOTS))
         rows.append("faults: " + ", ".join(f"{count} {name}" for name, count in sorted(self.faults.count.items())))
         endings = self.system.endings
         killed = sum(ending.asked == signal.SIGKILL for ending in endings)

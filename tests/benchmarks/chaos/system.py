@@ -66,7 +66,7 @@ class System:
         self.endings: list[Ending] = []
         self.replays: list[Replay] = []  # of this round
         self.recordings: list[Path] = []
-        self.swaps = self.swaps_refused = 0  # orders that were sent since the round began
+        self.swaps = 0  # calibrations that were sent since the round began
         self.times, self.played_path = write_recording(folder / "data", self.rng, self.calibrations[0])
         self._write_configs()
         logs = folder / "logs"
@@ -258,7 +258,6 @@ class System:
         self._flood.put(f"omnibench/{NUMBERED}/calibration", to_yaml(chosen).encode())
 
     def _swap_nonsense(self) -> None:
-        self.swaps_refused += 1
         nonsense = [b"junk: [", b"x" * 10_000_000, to_yaml(self.calibrations[0]).replace("a", "z").encode()]
         self._flood.put(f"omnibench/{NUMBERED}/calibration", nonsense[int(self.rng.integers(3))])
 

@@ -37,6 +37,15 @@ class Heard:
     stamps: Array
     poses: Array
 
+    def joined(self, later: Heard) -> Heard:
+        """This and what came later from the same node."""
+        return Heard(
+            self.node,
+            np.concatenate([self.numbers, later.numbers]),
+            np.concatenate([self.stamps, later.stamps]),
+            np.concatenate([self.poses, later.poses]),
+        )
+
 
 @dataclass
 class Flow:
