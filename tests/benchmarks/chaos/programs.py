@@ -32,14 +32,11 @@ class Ending:
 class Program:
     """A command that is started, and started again, with the same role.
 
-    command: makes the arguments of each start. codes: exit codes in order, when it was asked to end by a signal.
+    command: makes the arguments of each start. logs: folder for what it says.
     """
 
-    def __init__(
-        self, name: str, command: Callable[[], tuple[object, ...]], logs: Path, codes: tuple[int, ...] = (0,)
-    ) -> None:
+    def __init__(self, name: str, command: Callable[[], tuple[object, ...]], logs: Path) -> None:
         self.name = name
-        self.codes = codes
         self.paused = False
         self.starts = 0
         self.started_at = 0.0  # s, monotonic
@@ -89,6 +86,19 @@ class Program:
         """SIGKILL, and its end."""
         self._signal(signal.SIGKILL)
         return self._wait(signal.SIGKILL)
+
+    def end(self, number: int) -> Ending:
+        """Ask it to end by a signal, and its end; one that does not end is killed, as its exit code tells."""
+        self.ask(number)
+        return self.ending()
+
+    def ending(self) -> Ending:
+        """Its end, of a program that was asked to, or has to by itself; one that does not end is killed."""
+        ending = self.ended(PATIENCE)
+        if ending is None:
+            self._signal(signal.SIGKILL)
+            ending = self._wait(self._asked)
+        return ending
 
     def ask(self, number: int) -> None:
         """Ask it to end by a signal, once it has set up how it ends, before which signals act as usual."""

@@ -78,9 +78,8 @@ class Chaos:
         """End all faults, wait until everything that is under way has arrived, and take the account."""
         system = self.system
         self.faults.heal()
-        if system.replay.running and self._end_of_replay(PATIENCE) is None:
-            self.problem(f"a replay does not end within {PATIENCE:g} s after all faults have ended")
-            system.endings.append(system.replay.kill())
+        if system.replay.running:
+            system.endings.append(system.replay.ending())
         self._look_after(restart_only=True)
         self._wait_for(system.numbered)
         self._wait_for(system.plain)
@@ -157,12 +156,6 @@ class Chaos:
         if resident is not None and (not self.memory or self.elapsed - self.memory[-1][0] > 1.0):
             self.memory.append((self.elapsed, system.node.starts, resident))
         self.check_endings()
-
-    def _end_of_replay(self, patience: float) -> Ending | None:
-        ending = self.system.replay.ended(patience)
-        if ending is not None:
-            self.system.endings.append(ending)
-        return ending
 
     def _wait_for(self, robot: Robot) -> None:
         """Let a robot send until its newest sample comes back as odometry, then let it stand."""
@@ -246,14 +239,16 @@ def run(
     """
     folder = Path(tempfile.mkdtemp(prefix="chaos-"))
     system = System(folder, seed)
-    chaos = None
     try:
         system.start()
-        chaos = Chaos(system, seed, say, stop or threading.Event())
+    except BaseException:
+        system.abandon()
+        raise
+    chaos = Chaos(system, seed, say, stop or threading.Event())
+    try:
         chaos.run(seconds, round_seconds)
     finally:
-        if chaos is not None:
-            chaos.faults.heal()
+        chaos.faults.heal()
         system.end()
     chaos.check_endings()
     if chaos.growth() > _MOST_GROWTH:

@@ -39,9 +39,9 @@ _FLOOD: Final = 1500  # questions at once; chosen
 
 
 def free_port(rng: random.Random) -> int:
-    """A port of 127.0.0.1 below those that Linux gives to outgoing connections."""
+    """A port of 127.0.0.1 below those of the tests, and those that Linux gives to outgoing connections."""
     while True:
-        port = rng.randrange(20_000, 32_000)
+        port = rng.randrange(12_000, 20_000)
         with suppress(OSError), socket.socket() as probe:
             probe.bind(("127.0.0.1", port))
             return port
@@ -71,15 +71,14 @@ class System:
         self._write_configs()
         logs = folder / "logs"
         logs.mkdir()
-        omnibench = COMMAND
-        self.router = Program("router", lambda: (*omnibench, "live", folder / "router.yaml"), logs)
-        self.node = Program("node", lambda: (*omnibench, "live", folder / "node.yaml"), logs)
+        self.router = Program("router", lambda: (*COMMAND, "live", folder / "router.yaml"), logs)
+        self.node = Program("node", lambda: (*COMMAND, "live", folder / "node.yaml"), logs)
         client = ("--config", folder / "client.yaml")
-        self.listener = Program("listener", lambda: (*omnibench, "listen", "--json", *client), logs)
-        self.recorder = Program("recorder", lambda: (*omnibench, "record", *self._record(), *client), logs)
-        self.replay = Program("replay", lambda: (*omnibench, "replay", *self._replay(), *client), logs, (130, 0))
+        self.listener = Program("listener", lambda: (*COMMAND, "listen", "--json", *client), logs)
+        self.recorder = Program("recorder", lambda: (*COMMAND, "record", *self._record(), *client), logs)
+        self.replay = Program("replay", lambda: (*COMMAND, "replay", *self._replay(), *client), logs)
         self.programs = (self.router, self.node, self.listener, self.recorder, self.replay)
-        self._links: subprocess.Popen[str]
+        self._links: subprocess.Popen[str] | None = None
 
     def start(self) -> None:
         ports = self._ports
@@ -113,7 +112,7 @@ class System:
             robot.start()
 
     def end(self) -> None:
-        """Ask every program to end, take its end, and leave. Programs that do not end are left to ``remains``."""
+        """Ask every program to end, take its end, and leave."""
         for robot in (self.numbered, self.plain):
             robot.close()
         for session in (self._robots, self._flood):
@@ -121,16 +120,24 @@ class System:
         self.witness.close()
         for program in (self.replay, self.listener, self.recorder, self.node, self.router):
             if program.running:
-                program.ask(int(self.rng.choice([signal.SIGINT, signal.SIGTERM])))
-                if (ending := program.ended(PATIENCE)) is None:
-                    ending = program.kill()
-                self.endings.append(ending)
+                self.endings.append(program.end(int(self.rng.choice([signal.SIGINT, signal.SIGTERM]))))
+        assert self._links is not None
         assert self._links.stdin is not None
         self._links.stdin.close()
         self._links.wait(PATIENCE)
 
+    def abandon(self) -> None:
+        """Kill all that was started, where it could not be started whole."""
+        for program in self.programs:
+            if program.running:
+                program.kill()
+        if self._links is not None:
+            self._links.kill()
+            self._links.wait()
+
     def link(self, number: int, state: str, rate: float | None = None) -> None:
         """Change a link of the proxy."""
+        assert self._links is not None
         assert self._links.stdin is not None
         self._links.stdin.write(json.dumps({"link": number, "state": state, "rate": rate}) + "\n")
         self._links.stdin.flush()
@@ -160,7 +167,7 @@ class System:
             ]
         faults += [
             Fault("processor hog", "", hog, 1.0, 10.0, 2.0),
-            Fault("disk of node full", "disk of node", lambda: self._fill_disk(self.node, 0), 1.0, 8.0),
+            Fault("disk of node full", "disk of node", self._fill_nodes_disk, 1.0, 8.0),
             Fault("disk of recorder full", "disk of recorder", self._fill_recorders_disk, 1.0, 8.0, 0.5),
             Fault("radio loses", "radio", lambda: self._lose(float(self.rng.choice([0.02, 0.2, 0.5]))), 1.0, 6.0),
             Fault("stamps jump", "", lambda: self.plain.jump(float(self.rng.choice([-30.0, -0.5, 0.5, 2.0, 3600.0])))),
@@ -223,10 +230,7 @@ class System:
         program.ask(int(self.rng.choice([signal.SIGINT, signal.SIGTERM])))
 
         def take_end() -> None:
-            ending = program.ended(PATIENCE)
-            if ending is None:
-                ending = program.kill()
-            self.endings.append(ending)
+            self.endings.append(program.ending())
             if program is not self.replay:
                 program.start()
 
@@ -240,9 +244,13 @@ class System:
         program.limit_files(size)
         return lambda: program.limit_files(None)
 
-    def _fill_recorders_disk(self) -> Callable[[], object]:
+    # Only once a process has its session: Zenoh needs room for shared memory when it opens one.
+    def _fill_nodes_disk(self) -> Callable[[], object] | None:
+        return self._fill_disk(self.node, 0) if self.witness.alive() else None
+
+    def _fill_recorders_disk(self) -> Callable[[], object] | None:
         file = self.recordings[-1]
-        return self._fill_disk(self.recorder, (file.stat().st_size if file.exists() else 0) + _ROOM)
+        return self._fill_disk(self.recorder, file.stat().st_size + _ROOM) if file.exists() else None
 
     def _lose(self, share: float) -> Callable[[], object]:
         self.numbered.losing = share
