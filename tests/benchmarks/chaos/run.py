@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import signal
@@ -123,6 +124,10 @@ class Chaos:
             self.problem(f"{ending.program} ended {asked} with exit code {ending.code}: {last!r}; {log}")
         if ending.program == "recorder":
             self._check_recording(ending, full)
+        if ending.program == "listener":
+            damaged = [line for line in ending.said.splitlines() if line != "interrupted" and not _is_status(line)]
+            if damaged:
+                self.problem(f"listener says {damaged[0]!r}; {log}")
 
     def _check_recording(self, ending: Ending, full: bool) -> None:
         file = Path(re.findall(r"\S+\.mcap", ending.said)[-1]) if ".mcap" in ending.said else None
@@ -224,6 +229,14 @@ class Chaos:
         rows.append(f"memory of the node: +{self.growth():.1f} MB at most within one life; {self._longest_life()}")
         rows.append(f"{self.rounds} rounds in {self.elapsed:.0f} s, seed {self._seed}: {len(self.problems)} problems")
         return rows
+
+
+def _is_status(line: str) -> bool:
+    """True if a line is the state of a robot in JSON."""
+    try:
+        return {"robot", "presence", "odom", "health"} <= json.loads(line).keys()
+    except (ValueError, AttributeError):
+        return False
 
 
 def run(
