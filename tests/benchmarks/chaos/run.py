@@ -27,8 +27,8 @@ _ROUND: Final = 25.0  # s of faults until the next account; chosen
 _TICK: Final = 0.05  # s
 _SAID: Final = 5.0  # s between two lines of progress; chosen
 _WARM_UP: Final = 20.0  # s of a node in which its memory grows; chosen
-# MB that a node may grow in its life: messages that wait and published stamps take 10 MB each, for each of 3 robots.
-_MOST_GROWTH: Final = 60.0
+# MB that a node may grow in its life: three robots, each with 11 MB of published stamps and 10 MB of waiting messages.
+_MOST_GROWTH: Final = 65.0
 
 
 class Chaos:
