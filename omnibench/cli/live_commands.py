@@ -281,7 +281,7 @@ def _client(file: Path | None, connect: str | None, profile: Any, purpose: str) 
     """A client's session, and the keys of the profile."""
     from omnibench.config import validate
     from omnibench.live.config import ClientConfig, read_client_config
-    from omnibench.live.network.session import open_session
+    from omnibench.live.network.session import close_session, open_session
     from omnibench.live.network.session_config import SessionConfig
     from omnibench.live.wire.topics import KeySpace
 
@@ -295,7 +295,7 @@ def _client(file: Path | None, connect: str | None, profile: Any, purpose: str) 
     try:
         yield session, KeySpace(profile or chosen.profile, chosen.domain)
     finally:
-        session.close()
+        close_session(session)
 
 
 def _speed(text: str) -> float | str:

@@ -18,7 +18,7 @@ from omnibench.live.estimation.saved_state import RobotMemory
 from omnibench.live.intake import Intake
 from omnibench.live.low_latency import low_latency
 from omnibench.live.network.presence import Claim
-from omnibench.live.network.session import open_session
+from omnibench.live.network.session import close_session, open_session
 from omnibench.live.robot_service import RobotService
 from omnibench.live.robot_setup import make_tracker
 from omnibench.live.wire.foxglove import PORT, FoxgloveServer
@@ -48,7 +48,7 @@ class LiveNode(Closing):
                 robot.name: make_tracker(config, robot, memories.get(robot.name)) for robot in config.robots
             }
             self.session = open_session(config.zenoh, f"node {config.name}")
-            started.callback(self.session.close)
+            started.callback(close_session, self.session)
             self._claim_robots(started)
             intake = Intake()
             started.callback(intake.close)

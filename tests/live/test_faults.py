@@ -94,6 +94,27 @@ def test_a_frozen_subscriber_does_not_delay_the_others(tmp_path: Path) -> None:
     assert max(delays) < 2.5  # s; who waits for the frozen one stalls until Zenoh closes its link, after 5 s
 
 
+def test_a_node_ends_in_order_although_a_subscriber_is_frozen(tmp_path: Path) -> None:
+    port = free_port()
+    with Command("live", write_node(tmp_path, "apr", port=port)) as node:
+        session, endpoint = client(port), f"tcp/127.0.0.1:{port}"
+        frozen = subprocess.Popen([sys.executable, "-c", _FROZEN, endpoint], stdout=subprocess.PIPE, text=True)
+        try:
+            assert frozen.stdout is not None
+            assert frozen.stdout.readline() == "subscribed\n"
+            os.kill(frozen.pid, signal.SIGSTOP)
+            heard, path = heard_odometry(session), drive(30.0)
+            sent(wheels_of(session), path.samples())  # 6 MB of odometry, filtered and tf fill its link
+            until(lambda: heard and heard[-1].stamp == path.stamps[-1], "the last odometry")
+            session.close()
+            _, said = node.stop(signal.SIGTERM)
+        finally:
+            frozen.kill()
+            frozen.wait()
+    assert node.process.returncode == 0, said
+    assert "Traceback" not in said
+
+
 def test_a_killed_router_is_found_again_when_it_is_back(tmp_path: Path) -> None:
     port = free_port()
     (tmp_path / "router").mkdir()

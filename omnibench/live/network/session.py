@@ -54,7 +54,7 @@ def open_session(config: SessionConfig, purpose: str) -> zenoh.Session:
         try:
             _check_connected(session, config)
         except BaseException:
-            session.close()
+            close_session(session)
             raise
     except ConfigError as error:
         raise ConfigError(f"{purpose}: {error}") from None
@@ -65,6 +65,14 @@ def open_session(config: SessionConfig, purpose: str) -> zenoh.Session:
             ", ".join(config.unprotected),
         )
     return session
+
+
+def close_session(session: zenoh.Session) -> None:
+    """Close a session. Where another does not read, Zenoh gives its farewell up after some 10 s, as a warning tells."""
+    try:
+        session.close()
+    except zenoh.ZError as error:
+        LOG.warning("the session ended without a farewell to all: %s", _SOURCE.sub("", str(error)))
 
 
 def zenoh_config(config: SessionConfig) -> zenoh.Config:

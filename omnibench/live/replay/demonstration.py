@@ -14,7 +14,7 @@ import zenoh
 from omnibench.live.config import LiveConfig, client_session, robot_called
 from omnibench.live.estimation.health import Health
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.network.session import open_session
+from omnibench.live.network.session import close_session, open_session
 from omnibench.live.node import LiveNode, load_effects
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_recording, concatenated_truth
 from omnibench.live.replay.delivery import WINDOW, DeliveryError
@@ -167,7 +167,7 @@ def demonstrate(
                     collector.close()
         finally:
             if not guarded:
-                session.close()
+                close_session(session)
         return _evaluated(drive, recording, tracker.calibration, report, odometry, fused, health)
 
 

@@ -17,7 +17,7 @@ from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.live.closing import Closing
 from omnibench.live.network.presence import checked_robot
 from omnibench.live.network.rate_limiter import RateLimiter
-from omnibench.live.network.session import open_session
+from omnibench.live.network.session import close_session, open_session
 from omnibench.live.network.session_config import SessionConfig
 from omnibench.live.wire.attachment import MissedMessages
 from omnibench.live.wire.messages import ODOMETRY, MessageError, Odometry
@@ -146,7 +146,7 @@ class Subscription(Closing):
                 self._closed = True
                 self._subscriber.undeclare()
                 if self._session is not None:
-                    self._session.close()
+                    close_session(self._session)
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
 

@@ -154,7 +154,7 @@ class Chaos:
                     program.start()
         # a replay that begins while no node is there confirms nothing
         quiet = not self.faults.targets & {"replay", "node", "router", "link of node", "link of clients"}
-        if not restart_only and not system.replay.running and quiet and system.witness.alive():
+        if not restart_only and not system.replay.running and quiet and system.node_in_sight():
             self.replays += 1
             system.start_replay()
         resident = system.node.resident()

@@ -26,6 +26,7 @@ from chaos.programs import COMMAND, PATIENCE, Ending, Program
 from chaos.robots import ORIGIN, RECORDING, NumberingRobot, PlainRobot, calibrations, write_recording
 from chaos.witness import Witness
 from omnibench.config import to_yaml
+from omnibench.live.network.presence import alive_robots
 from omnibench.live.network.session import open_session
 from omnibench.live.network.session_config import SessionConfig
 from omnibench.live.wire.topics import GraphNode, KeySpace
@@ -141,6 +142,10 @@ class System:
         assert self._links.stdin is not None
         self._links.stdin.write(json.dumps({"link": number, "state": state, "rate": rate}) + "\n")
         self._links.stdin.flush()
+
+    def node_in_sight(self) -> bool:
+        """True if the network beyond the router knows of the node's robots."""
+        return PLAYED in alive_robots(self._robots)
 
     def start_replay(self) -> None:
         """Play the recording once more, with stamps after those of all before it."""
