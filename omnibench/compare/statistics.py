@@ -164,7 +164,7 @@ def _judged_cost(run: ScoredRun) -> float:
 def _against_best(run: ScoredRun, best: ScoredRun, intervals: RatioIntervals) -> tuple[Interval, bool | None]:
     """The paired difference in judged cost from the best run, and whether the two are practically equal, if known."""
     score, of_best = _judged(run), _judged(best)
-    difference = intervals.mean(score.costs - of_best.costs, score.units)
+    difference = intervals.difference(score.costs - of_best.costs, score.units)
     if difference.known is None:
         return difference, True if run is best else None
     negligible = NEGLIGIBLE_SHARE * _standard_error(of_best)

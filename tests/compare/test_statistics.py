@@ -172,6 +172,16 @@ def test_an_entry_within_the_noise_of_the_best_is_practically_equal() -> None:
     assert entries["close"].practically_equal is True
 
 
+def test_a_difference_of_one_sign_everywhere_is_practically_equal_where_chance_explains_it() -> None:
+    more = np.array([1e-4, 2e-4, 1e-4, 3e-4, 0.05])
+    entries = of([scored("best", np.full(5, 1.0)), scored("other", 1.0 + more)])
+    difference = entries["other"].difference
+    assert difference is not None
+    assert difference.known is not None
+    assert difference.known[0] < 0 < difference.known[1] < 0.1
+    assert entries["other"].practically_equal is True
+
+
 def test_a_certain_difference_is_practically_equal_below_a_tenth_of_the_standard_error_of_the_best() -> None:
     costs = np.random.default_rng(5).uniform(1.0, 2.0, 40)
     limit = NEGLIGIBLE_SHARE * costs.std(ddof=1) / np.sqrt(40)

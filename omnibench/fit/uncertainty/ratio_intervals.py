@@ -148,7 +148,19 @@ class RatioIntervals:
         self._counts: dict[int, Array] = {}
 
     def ratio(self, numerators: Array, denominators: Array, units: Units) -> Interval:
-        """The ratio of two sums over runs (Z,), with its interval. The denominators' sum must not be 0."""
+        """The ratio of two sums of costs over runs (Z,), with its interval. The denominators' sum must not be 0."""
+        return self._interval(numerators, denominators, units, logarithm=True)
+
+    def mean(self, costs: Array, units: Units) -> Interval:
+        """The mean of costs (Z,), one a run."""
+        return self.ratio(costs, np.ones(len(costs)), units)
+
+    def difference(self, differences: Array, units: Units) -> Interval:
+        """The mean of paired differences of costs (Z,), one a run; it may be 0 even where all are positive."""
+        return self._interval(differences, np.ones(len(differences)), units, logarithm=False)
+
+    def _interval(self, numerators: Array, denominators: Array, units: Units, *, logarithm: bool) -> Interval:
+        """The interval of a ratio; logarithm: the function g of Eq. (R6), else the identity."""
         upper, lower = units.sums(numerators), units.sums(denominators)
         ratio = float(numerators.mean() / denominators.mean())  # Eq. (R1)
         if units.count < FEWEST:
@@ -157,14 +169,10 @@ class RatioIntervals:
         if np.abs(left).max() <= _ALIKE * np.abs(numerators).sum():
             return Interval(ratio, ratio, ratio)
         if units.count < BOOTSTRAPPED:
-            return _jackknifed(ratio, upper, lower, logarithm=bool((numerators >= 0).all()))
+            return _jackknifed(ratio, upper, lower, logarithm)
         below, above = self._quantiles(left)
         low, high = _end(upper, lower, above, -1), _end(upper, lower, below, 1)
         return Interval(ratio, None, None) if low is None or high is None else Interval(ratio, low, high)
-
-    def mean(self, values: Array, units: Units) -> Interval:
-        """The mean of values (Z,), one a run."""
-        return self.ratio(values, np.ones(len(values)), units)
 
     def improvement(self, values: Array, before: Array, units: Units) -> Interval | None:
         """The share of the costs ``before`` (Z,) that is gone; None where these are all 0."""

@@ -70,9 +70,26 @@ def test_the_number_of_units_decides_the_method_and_is_said(count: int, words: s
 def test_a_difference_over_few_units_has_the_interval_of_the_paired_t_test() -> None:
     rng = np.random.default_rng(3)
     first, second = rng.normal(1.0, 0.3, 7), rng.normal(0.8, 0.3, 7)
-    found = RatioIntervals(BOOTSTRAP).mean(first - second, units(7))
+    found = RatioIntervals(BOOTSTRAP).difference(first - second, units(7))
     expected = stats.ttest_rel(first, second).confidence_interval(0.95)
     assert found.known == pytest.approx((expected.low, expected.high))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_difference_of_one_sign_everywhere_has_the_interval_of_the_t_test_too(sign: int) -> None:
+    differences = sign * np.array([1e-4, 2e-4, 1e-4, 3e-4, 0.05])
+    found = RatioIntervals(BOOTSTRAP).difference(differences, units(5))
+    expected = stats.ttest_1samp(differences, 0.0).confidence_interval(0.95)
+    assert found.known == pytest.approx((expected.low, expected.high))
+    assert found.holds(0.0)
+
+
+@pytest.mark.parametrize("count", [3, 4, 9])
+def test_a_true_difference_of_zero_is_left_out_in_five_per_cent_of_the_sets(count: int) -> None:
+    rng = np.random.default_rng(count)
+    intervals, of = RatioIntervals(BOOTSTRAP), units(count)
+    left_out = sum(not intervals.difference(rng.standard_normal(count), of).holds(0.0) for _ in range(2000))
+    assert 70 <= left_out <= 130  # binomial: 100 +- 9.7; on the logarithm's scale 288 of 3 units
 
 
 def test_twenty_runs_of_a_command_tell_no_more_than_one_of_their_mean() -> None:
@@ -93,7 +110,7 @@ def test_the_interval_of_an_improvement_leaves_out_zero_where_the_mean_paired_di
         before = rng.uniform(1, 2, 14)
         after = before * rng.normal(0.9, 0.2, 14)
         gain = intervals.improvement(after, before, units(14))
-        difference = intervals.mean(after - before, units(14))
+        difference = intervals.difference(after - before, units(14))
         assert gain is not None
         edge = min(abs(end) for end in gain.known or (1.0,))
         assert gain.holds(0.0) == difference.holds(0.0) or edge < 0.02  # resamples of another statistic, at the edge
