@@ -34,9 +34,8 @@ class Evaluation(Model):
     """Errors of a calibration and of the design values, by split; the split ``all`` is every trajectory.
 
     held_out: the verdict by the runs that the calibration was not fitted to. sessions: a sentence for each session that
-    differs from the others. warnings: one sentence if runs lie outside
-    the training domain of the calibration's effects. What is not excluded is the document of ``omnibench evaluate
-    --json``.
+    differs from the others. warnings: one sentence if runs lie outside the training domain of the calibration's
+    effects. What is not excluded is the document of ``omnibench evaluate --json``.
     """
 
     dataset: str
@@ -78,13 +77,17 @@ def held_out_verdict(calibration: Calibration, dataset: Dataset) -> HeldOutVerdi
     """The verdict on a calibration by the runs of a data set that it was not fitted to, beside the design values.
 
     These are the validation split; of another data set without one, all runs. A data set that has the name of the one
-    that was fitted but not its content may hold the same runs, so that nothing of it counts as held out.
+    that was fitted but not its content or its split may hold the fitted runs anywhere: nothing of it is held out.
     """
     runs, provenance = dataset.split("validation"), calibration.provenance
-    if not runs and (provenance is None or provenance.dataset_hash != dataset.hash):
-        if provenance is None or provenance.dataset == dataset.name:
+    if provenance is None:
+        if not runs:
             return nothing_held_out("which runs the calibration was fitted to is not known, and none is for validation")
-        runs = dataset.trajectories
+    elif provenance.dataset_hash != dataset.hash:
+        if provenance.dataset == dataset.name:
+            changed = f"the data set {dataset.name} or its split was changed after the fit"
+            return nothing_held_out(f"{changed}, so that which runs were fitted is not known")
+        runs = runs or dataset.trajectories
     return verdict_on(calibration.model, runs)
 
 

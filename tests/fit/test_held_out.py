@@ -116,6 +116,17 @@ def test_runs_of_a_recording_that_was_changed_since_do_not_count_as_held_out() -
     assert "is not known" in found.sentence
 
 
+def test_fitted_runs_that_are_made_validation_runs_after_the_fit_are_not_called_held_out() -> None:
+    dataset = recordings(validating=6)
+    calibration = calibrate(dataset).calibration
+    swapped = [
+        replace(run, split="train" if run.split == "validation" else "validation") for run in dataset.trajectories
+    ]
+    found = evaluate(calibration, make_dataset("synthetic", ROBOT, 0.2, swapped, simulated=True)).held_out
+    assert (found.verdict, found.runs) == ("unknown", ())
+    assert "the data set synthetic or its split was changed after the fit" in found.sentence
+
+
 def test_the_design_values_themselves_are_the_same_as_the_design() -> None:
     same = errors([0.02, 0.03, 0.04, 0.05])
     assert judge(same, same, runs(4)).sentence.endswith("the same as the design")
