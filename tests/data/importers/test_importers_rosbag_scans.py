@@ -44,7 +44,7 @@ from scan_samples import (
 )
 
 from omnibench.data.dataset import Dataset
-from omnibench.data.scans import Scanner
+from omnibench.data.scans import Mount, Scanner
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.registry import importers
@@ -222,10 +222,10 @@ def test_a_mount_that_nothing_tells_is_said_and_can_be_given(tmp_path: Path) -> 
     data = read(source)
     assert "it is unknown where the scanner (laser) is mounted" in data.warnings[0]
     assert "set scanner_mount={x: 0.1, y: 0, yaw: 0}" in data.warnings[0]
-    assert scanner_of(data).mount.model_dump() == {"x": 0, "y": 0, "yaw": 0}
+    assert scanner_of(data).mount == Mount()
     given = read(source, scanner_mount={"x": 0.1, "yaw": 3.0})
     assert given.warnings == ()
-    assert scanner_of(given).mount.model_dump() == {"x": 0.1, "y": 0, "yaw": 3.0}
+    assert scanner_of(given).mount == Mount(x=0.1, yaw=3.0)
     with pytest.raises(ConfigError, match=r"unknown key 'scanner_mount\.jaw'; did you mean 'yaw'"):
         read(source, scanner_mount={"jaw": 3.0})
 
