@@ -56,10 +56,14 @@ class _ReceivedFlow:
 
 
 class AcknowledgedFlows:
-    """The flows to one robot. For one thread."""
+    """The flows to one robot. For one thread.
 
-    def __init__(self, session: zenoh.Session, robot: str) -> None:
+    expected: flow -> number of its next message, which outlives the node with the odometry that holds those before it.
+    """
+
+    def __init__(self, session: zenoh.Session, robot: str, expected: dict[int, int]) -> None:
         self._session, self._robot = session, robot
+        self._expected = expected
         self._flows: dict[int, _ReceivedFlow] = {}
         self._heard: set[_ReceivedFlow] = set()  # flows with messages since the last acknowledgement
 
@@ -68,20 +72,28 @@ class AcknowledgedFlows:
         identity, number, unacknowledged, again = place
         flow = self._flows.get(identity)
         if flow is None:
-            flow = self._flows[identity] = _ReceivedFlow(self._session, self._robot, identity, unacknowledged)
+            expected = self._expected.get(identity, 0)
+            flow = self._flows[identity] = _ReceivedFlow(self._session, self._robot, identity, expected)
             if len(self._flows) > _MOST_FLOWS:
                 self._forget(next(iter(self._flows)))
         self._heard.add(flow)
+        flow.expected = max(flow.expected, unacknowledged)  # what another node has taken is not sent again
         if number != flow.expected:
             flow.gap |= number > flow.expected
             return False
         flow.expected += 1
+        self._expected[identity] = flow.expected
         flow.inherited &= again
         return True
 
     def inherited(self, place: Flow) -> bool:
         """True if the odometry of a message that was accepted may be out already, published by a node before this."""
         return self._flows[place[0]].inherited
+
+    @property
+    def heard(self) -> bool:
+        """True if there were messages since the last acknowledgement."""
+        return bool(self._heard)
 
     def acknowledge(self) -> None:
         """Tell the senders of all messages since the last call which number is expected next."""
@@ -91,10 +103,13 @@ class AcknowledgedFlows:
 
     def close(self) -> None:
         """Acknowledge no more."""
-        for identity in list(self._flows):
-            self._forget(identity)
+        self._heard.clear()
+        for flow in self._flows.values():
+            flow.close()
+        self._flows.clear()
 
     def _forget(self, identity: int) -> None:
         flow = self._flows.pop(identity)
+        self._expected.pop(identity, None)
         self._heard.discard(flow)
         flow.close()

@@ -8,14 +8,17 @@ to take it.
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable
 from queue import SimpleQueue
 from typing import Final
 
+from omnibench.errors import one_line
 from omnibench.live.closing import Closing
 
+LOG = logging.getLogger("omnibench.live")
 _PAUSE: Final = 0.002  # s between turns while the thread is busy; chosen
 _BUSY: Final = 0.5  # share of the time in which it works, from which on it pauses; chosen
 _SMOOTHING: Final = 0.1  # share of the latest turn in the mean; chosen
@@ -43,7 +46,10 @@ class Intake(Closing):
         last = time.perf_counter()
         while (work := self._work.get()) is not None:
             began = time.perf_counter()
-            work()
+            try:
+                work()
+            except Exception as error:  # one robot must not silence the others
+                LOG.error("intake: %s: %s", type(error).__name__, one_line(str(error)))
             now = time.perf_counter()
             worked += _SMOOTHING * (now - began - worked)
             spent += _SMOOTHING * (now - last - spent)

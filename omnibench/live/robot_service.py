@@ -57,7 +57,7 @@ class RobotService:
         self._scheduled = False  # a turn is queued, or has not yet looked at what waits
         self._working = threading.Lock()  # held while messages are taken
         self._late = LateUpdates(self._publish)
-        self._flows = AcknowledgedFlows(graph.session, name)
+        self._flows = AcknowledgedFlows(graph.session, name, tracker.flows)
         self._rate_limiter = RateLimiter()
         self._logged_anomalies: dict[str, int] = {}
         self._logged_status = ""
@@ -68,11 +68,12 @@ class RobotService:
         ]
         self._diagnostics = graph.publisher(name, "diagnostics")
         self._graph = graph
+        # before the inputs, by which a replay knows that it may begin, and then looks for the token
+        self._token = graph.session.liveliness().declare_token(f"omnibench/{name}/alive")
         self._inputs: dict[str, zenoh.Subscriber[None]] = {}
         if tracker.fusing:
             self._receive_poses()
         self._inputs["joint_states"] = graph.subscribe(name, "joint_states", partial(self._queue, False))
-        self._token = graph.session.liveliness().declare_token(f"omnibench/{name}/alive")
 
     def publish_diagnostics(self) -> None:
         """Publish the diagnostics and log what has changed; called once a second."""
@@ -87,9 +88,10 @@ class RobotService:
             subscriber.undeclare()
         while self._waiting:
             self._take_turn()
-        self.tracker.close()
+        with self._working:  # a turn that is under way ends first
+            self.tracker.close()
+            self._flows.close()
         self._token.undeclare()
-        self._flows.close()
 
     def _receive_poses(self) -> None:
         """Subscribe to the poses of SLAM: without fusion only because a replay counts them in its flow."""
@@ -127,7 +129,9 @@ class RobotService:
                 if self._flows.accepts(flow):
                     self._take(message, late=False, published=self._flows.inherited(flow))
             self._late.end_turn(self.tracker.in_real_time)
-            self._flows.acknowledge()
+            if self._flows.heard:  # what is acknowledged is not sent again, whatever becomes of this process
+                self.tracker.save()
+                self._flows.acknowledge()
             self.tracker.record_backlog(behind, self._late.unpublished - unpublished)
             if self._waiting and not self._scheduled:
                 self._scheduled = True

@@ -25,7 +25,8 @@ class RobotState:
     fusion: None for odometry alone. guessed_angles: names of the calibration's effects that need wheel angles, while
     nobody has been warned that there are none. arrival: of the last wheel sample, s, monotonic. behind: longest time
     for which a sample had waited when it was taken, s, since the health was last measured. last_refusal: why the last
-    message was refused that was. last_swap: None before the first calibration is sent.
+    message was refused that was. flows: flow of an acknowledged replay -> number of the next message that is not in the
+    odometry. last_swap: None before the first calibration is sent.
     """
 
     name: str
@@ -41,6 +42,7 @@ class RobotState:
     stamps: PublishedStamps = field(default_factory=PublishedStamps)
     arrival: float | None = None
     behind: float = 0.0
+    flows: dict[int, int] = field(default_factory=dict)
     last_refusal: str = ""
     last_swap: SwapRecord | None = None
 

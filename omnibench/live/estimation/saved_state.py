@@ -35,7 +35,8 @@ class SavedState(Model):
     """A robot's state after a wheel sample; poses in m, m, rad, covariances (3, 3) row by row.
 
     sequence: number of the state. stamp: of the sample, ns. wall: unix time of its arrival, s. positions: wheel angles,
-    rad. map_pose: fused pose, once SLAM has located the robot. session_time: s since the session began.
+    rad. map_pose: fused pose, once SLAM has located the robot. session_time: s since the session began. flows: as
+    RobotState's.
     """
 
     sequence: int = Field(0, ge=0)
@@ -47,6 +48,7 @@ class SavedState(Model):
     map_pose: SavedPose | None = None
     map_covariance: SavedCovariance | None = None
     session_time: NonNegative = 0.0
+    flows: dict[int, int] = {}
 
     @model_validator(mode="after")
     def _variances_are_not_negative(self) -> SavedState:

@@ -50,6 +50,7 @@ class StateWriter:
             map_pose=_row(fused[0]),
             map_covariance=_row(fused[1]),
             session_time=state.odometry.session_time,
+            flows=dict(state.flows),
         )
         try:
             self._memory.save(saved)
@@ -82,6 +83,7 @@ def resume_state(state: RobotState, saved: SavedState, now: float, wall: float) 
             f"the state of robot {state.name!r} is of a robot with {plural(len(positions), 'wheel')}; remove it"
         )
     state.wheel_input.resume(saved.stamp, positions, now - (wall - saved.wall))
+    state.flows.update(saved.flows)
     state.odometry.resume(np.array(saved.pose), np.reshape(saved.covariance, (3, 3)), saved.session_time)
     if state.fusion is not None and saved.map_pose is not None and saved.map_covariance is not None:
         state.fusion.begin(np.array(saved.map_pose), np.reshape(saved.map_covariance, (3, 3)))

@@ -182,6 +182,11 @@ class RobotTracker:
         return self._state.fusion is not None
 
     @property
+    def flows(self) -> dict[int, int]:
+        """Flow of an acknowledged replay -> number of the next message that is not in the odometry."""
+        return self._state.flows
+
+    @property
     def in_real_time(self) -> bool:
         """False while wheel samples come much faster than they were measured, as from a replay."""
         return self._state.wheel_input.in_real_time
@@ -233,6 +238,11 @@ class RobotTracker:
         with self._state_lock:
             self._state.behind = max(self._state.behind, behind)
             self.counts.unpublished += unpublished
+
+    def save(self) -> None:
+        """Write the state, where it outlives the node."""
+        with self._state_lock:
+            self._state_writer.save(self._state)
 
     def count_overflow(self) -> None:
         """Count a message that was not taken, because too many were waiting."""

@@ -67,6 +67,11 @@ class Delivery(Closing):
     def taken(self) -> int | None:
         """Messages that the receiver has taken; None where that is not known."""
 
+    @property
+    @abstractmethod
+    def passed(self) -> int:
+        """Messages that are known to have reached the receiver or, where that is not known, the next router."""
+
     @abstractmethod
     def put(self, publisher: Publisher[Any], payload: bytes) -> bool:
         """Publish a payload as soon as there is room for it; False if ``stop`` was set before.
@@ -98,6 +103,10 @@ class AcknowledgedDelivery(Delivery):
 
     @property
     def taken(self) -> int:
+        return self._taken
+
+    @property
+    def passed(self) -> int:
         return self._taken
 
     def put(self, publisher: Publisher[Any], payload: bytes) -> bool:
@@ -196,20 +205,27 @@ class UnconfirmedDelivery(Delivery):
         self._key = acknowledgement_key(robot, "nobody")
         self._arrived = threading.Event()  # the round trip under way has come back
         self._arrived.set()
-        self._since = 0  # messages since the last round trip began
+        self._linked = is_connected(session)  # otherwise all subscribers are in this session
+        self._sent = 0
+        self._before = 0  # messages before the last round trip
+        self._passed = 0
 
     @property
     def taken(self) -> None:
         return None
 
+    @property
+    def passed(self) -> int:
+        return self._passed
+
     def put(self, publisher: Publisher[Any], payload: bytes) -> bool:
-        if self._since >= WINDOW:
+        if self._sent - self._before >= WINDOW:
             self._round_trip_over()
             self._begin_round_trip()
         if self._stop.is_set():
             return False
         publisher.put_encoded(payload)
-        self._since += 1
+        self._sent += 1
         return True
 
     def finish(self) -> None:
@@ -222,7 +238,7 @@ class UnconfirmedDelivery(Delivery):
 
     def _begin_round_trip(self) -> None:
         """Query a key that nobody answers: the router closes the query once all messages before it have passed."""
-        self._since = 0
+        self._before = self._sent
         self._arrived.clear()
         handler: Any = zenoh.handlers.Callback(lambda _: None, self._arrived.set, indirect=False)
         # Zenoh closes the query at its timeout too, which must come after our patience
@@ -233,7 +249,9 @@ class UnconfirmedDelivery(Delivery):
         while not self._poll(self._arrived) and not self._stop.is_set():
             if self._waited > self._patience:
                 raise DeliveryError(f"the router has taken nothing for {self._patience:g} s")
-        if self._arrived.is_set() and not self._stop.is_set() and not is_connected(self._session):
+        if self._arrived.is_set() and not self._stop.is_set() and self._linked and not is_connected(self._session):
             raise DeliveryError("the link to the router was lost")  # which closes a query, too
+        if self._arrived.is_set():
+            self._passed = self._before
         waited = time.monotonic() - began
         self.paused += waited if waited > _FIRST_RETRY else 0.0

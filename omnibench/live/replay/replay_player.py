@@ -200,7 +200,7 @@ class Player:
             if not stop.is_set():  # otherwise the session was closed after stopping
                 raise OmnibenchError(f"replay of {self._robot}: cannot publish any more: {error}") from None
         except DeliveryError as error:
-            raise self._not_delivered(error, sum(sent.values()), delivery) from None
+            raise self._not_delivered(error, delivery) from None
         finally:
             if delivery is not None:
                 delivery.close()
@@ -217,11 +217,10 @@ class Player:
             return AcknowledgedDelivery(self._session, self._robot, stop, patience)
         return UnconfirmedDelivery(self._session, self._robot, stop, patience)
 
-    def _not_delivered(self, error: DeliveryError, sent: int, delivery: Delivery | None) -> DeliveryError:
-        """The error with the number of messages that are missing."""
+    def _not_delivered(self, error: DeliveryError, delivery: Delivery | None) -> DeliveryError:
+        """The error with the number of messages that are not known to have arrived."""
         total = len(self._messages)
-        taken = None if delivery is None else delivery.taken
-        missing = f"{total - (sent if taken is None else taken):,} of {plural(total, 'message')}"
+        missing = f"{total - (0 if delivery is None else delivery.passed):,} of {plural(total, 'message')}"
         return DeliveryError(f"{missing} did not reach robot {self._robot!r}: {error}")
 
     def _progress(self, sent: int, seconds: float) -> Progress:

@@ -32,18 +32,23 @@ def packed(number: int, publisher: bytes, flow: Flow | None = None) -> bytes:
 
 def flow_of(attachment: bytes | None) -> Flow | None:
     """A message's place in its flow; None if its delivery is not acknowledged."""
-    if attachment is None or len(attachment) != _HEAD.size + _FLOW.size:
+    if attachment is None or len(attachment) != _HEAD.size + _FLOW.size or not _is_numbered(attachment):
         return None
     flow, number, unacknowledged, again = _FLOW.unpack_from(attachment, _HEAD.size)
     return flow, number, unacknowledged, again
 
 
+def _is_numbered(attachment: bytes) -> bool:
+    """True for an attachment of rmw_zenoh's form, with a flow or without; those of other programs tell nothing."""
+    return len(attachment) in (_HEAD.size, _HEAD.size + _FLOW.size) and attachment[16] == _IDENTITY_LENGTH
+
+
 @dataclass(slots=True)
 class _Numbers:
-    """Numbers of one publisher: the highest that came, and those below it that did not."""
+    """Numbers of one publisher: the highest that came, and those below it that did not, in increasing order."""
 
     highest: int
-    missing: set[int] = field(default_factory=set)
+    missing: dict[int, None] = field(default_factory=dict)
 
 
 class MissedMessages:
@@ -58,10 +63,11 @@ class MissedMessages:
         self._publishers: dict[bytes, _Numbers] = {}
 
     def take(self, attachment: zenoh.ZBytes | None) -> bool:
-        """True if a message is new, False if it came before and was sent again."""
-        if attachment is None or len(attachment) < _HEAD.size:
+        """True if a message is new, False if it is of an acknowledged flow and came before."""
+        content = b"" if attachment is None else attachment.to_bytes()
+        if not _is_numbered(content):
             return True
-        number, _, _, publisher = _HEAD.unpack_from(attachment.to_bytes())
+        number, _, _, publisher = _HEAD.unpack_from(content)
         numbers = self._publishers.get(publisher)
         if numbers is None:
             self._publishers[publisher] = _Numbers(number)
@@ -73,12 +79,12 @@ class MissedMessages:
             numbers.highest = number
             if gap:
                 self.count += gap
-                numbers.missing.update(range(number - min(gap, _MOST_MISSING), number))
+                numbers.missing.update(dict.fromkeys(range(number - min(gap, _MOST_MISSING), number)))
                 while len(numbers.missing) > _MOST_MISSING:
-                    numbers.missing.remove(min(numbers.missing))
+                    del numbers.missing[next(iter(numbers.missing))]
             return True
         if number not in numbers.missing:
-            return False
-        numbers.missing.remove(number)
+            return len(content) == _HEAD.size  # only what is acknowledged is ever sent again
+        del numbers.missing[number]
         self.count -= 1
         return True

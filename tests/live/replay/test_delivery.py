@@ -316,11 +316,20 @@ class TestMissedMessages:
             assert missed.take(numbered(100 * number, b"another publisher"[:16]))
         assert missed.count == 2 * 99
 
-    def test_messages_of_other_programs_tell_nothing(self) -> None:
+    @pytest.mark.parametrize("length", [0, 14, 33, 58, 90])
+    def test_messages_of_other_programs_tell_nothing(self, length: int) -> None:
         missed = MissedMessages()
         assert missed.take(None)
-        assert missed.take(zenoh.ZBytes(b"something else"))
+        for _ in range(2):
+            assert missed.take(zenoh.ZBytes(b"x" * length))
         assert missed.count == 0
+        assert flow_of(b"x" * length) is None
+
+    def test_many_that_are_missed_are_counted_at_once(self) -> None:
+        missed = MissedMessages()
+        for number in range(1, 50_000_000, 50_000):
+            assert missed.take(numbered(number))
+        assert missed.count == 999 * 49_999
 
 
 def test_a_flow_adds_to_an_attachment_what_ros_passes_over() -> None:
