@@ -1,5 +1,6 @@
 """The commands of the live runtime: the node, and the programs that work with a running one."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -99,7 +100,7 @@ def replay(
     from omnibench.live.replay.concatenated_drive import concatenate_recording
     from omnibench.live.replay.played_recording import load_recording
     from omnibench.live.replay.replay_player import Player
-    from omnibench.live.stopping import set_after, stop_on_signals
+    from omnibench.live.stopping import stop_on_signals
     from omnibench.live.wire.topics import GraphNode
     from omnibench.robot.calibration import read_calibration
 
@@ -112,10 +113,10 @@ def replay(
     drive = concatenate_recording(recording, pause=chosen.pause, split=chosen.split)
     with _client(config, connect, profile, "replay") as (session, keys), stop_on_signals() as stop:
         player = Player(GraphNode(session, keys, "replay"), robot, drive, chosen, noise=noise)
-        with ProgressDisplay() as watch, set_after(stop, seconds) as time_is_up:
-            report = player.play(stop, watch)
+        with ProgressDisplay() as watch:
+            report = player.play(stop, watch, seconds=math.inf if seconds is None else seconds)
     print_played(make_console(), report, recording.dataset.simulated)
-    if not report.complete and not time_is_up():
+    if report.interrupted:
         raise typer.Exit(130)
 
 
@@ -252,7 +253,7 @@ def _replay_to_node(
     from omnibench.live.replay.arrivals import ReplayConfig
     from omnibench.live.replay.demonstration import demonstrate
     from omnibench.live.replay.played_recording import load_recording
-    from omnibench.live.stopping import set_after, stop_on_signals
+    from omnibench.live.stopping import stop_on_signals
 
     source = dataset or config.replay.dataset
     if source is None:
@@ -268,11 +269,10 @@ def _replay_to_node(
         node_log(watch.console, warnings_only=True),
         stop_on_signals() as stop,
         log_refused_access(config.zenoh),
-        set_after(stop, seconds) as time_is_up,
     ):
-        shown = demonstrate(config, recording, stop, watch)
+        shown = demonstrate(config, recording, stop, watch, math.inf if seconds is None else seconds)
     print_demonstration(make_console(), shown)
-    if not shown.report.complete and not time_is_up():
+    if shown.report.interrupted:
         raise typer.Exit(130)
 
 

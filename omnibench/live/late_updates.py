@@ -22,35 +22,33 @@ class LateUpdates:
     def __init__(self, publish: Callable[[Update], None]) -> None:
         self.unpublished = 0
         self._publish = publish
-        self._waiting: list[tuple[float, Update]] = []
-        self._on_time = True  # no update was late before those that wait
+        self._waiting: list[Update] = []
+        self._first: tuple[float, int] | None = None  # arrival (s) and stamp (ns) of the first since one was on time
+        self._replayed = False  # since then samples have come much faster than they were measured
 
     def take(self, arrival: float, updates: list[Update]) -> None:
         """Keep the updates of a late sample. arrival: s, monotonic."""
-        self._waiting += [(arrival, update) for update in updates]
+        for update in updates:
+            if self._first is None:
+                self._first = arrival, update.stamp
+            measured = (update.stamp - self._first[1]) / _SECOND
+            self._replayed = measured > _FAST * (arrival - self._first[0])
+            self._waiting.append(update)
 
-    def on_time(self, in_real_time: bool) -> None:
+    def on_time(self) -> None:
         """Publish what waits before an update that is on time."""
-        self._publish_waiting(in_real_time, newer_follows=True)
-        self._on_time = True
+        self._publish_waiting(newer_follows=True)
+        self._first = None
 
-    def end_turn(self, in_real_time: bool) -> None:
-        """Publish what waits. in_real_time: the samples came about as fast as they were measured, for some seconds."""
-        if self._waiting:
-            self._publish_waiting(in_real_time, newer_follows=False)
-            self._on_time = False
+    def end_turn(self) -> None:
+        """Publish what waits."""
+        self._publish_waiting(newer_follows=False)
 
-    def _publish_waiting(self, in_real_time: bool, *, newer_follows: bool) -> None:
+    def _publish_waiting(self, *, newer_follows: bool) -> None:
         waiting, self._waiting = self._waiting, []
-        if waiting and in_real_time and not (self._on_time and _came_at_once(waiting)):
+        if waiting and not self._replayed:
             last = len(waiting) - (not newer_follows)
             self.unpublished += last
             waiting = waiting[last:]
-        for _, update in waiting:
+        for update in waiting:
             self._publish(update)
-
-
-def _came_at_once(waiting: list[tuple[float, Update]]) -> bool:
-    """True if samples came much faster than they were measured."""
-    (first_arrival, first), (last_arrival, last) = waiting[0], waiting[-1]
-    return (last.stamp - first.stamp) / _SECOND > _FAST * (last_arrival - first_arrival)

@@ -128,7 +128,7 @@ class RobotService:
                 self._receive_poses()
                 if self._flows.accepts(flow):
                     self._take(message, late=False, published=self._flows.inherited(flow))
-            self._late.end_turn(self.tracker.in_real_time)
+            self._late.end_turn()
             if self._flows.heard:  # what is acknowledged is not sent again, whatever becomes of this process
                 self.tracker.save()
                 self._flows.acknowledge()
@@ -149,7 +149,7 @@ class RobotService:
             elif late:
                 self._late.take(message.arrival, updates)
             elif updates:
-                self._late.on_time(self.tracker.in_real_time)
+                self._late.on_time()
                 for update in updates:
                     self._publish(update)
         except Exception as error:  # the stream has to go on

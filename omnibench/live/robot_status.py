@@ -25,7 +25,7 @@ class OdometryStatus:
     age: float
     stamp_age: float | None
     undecodable: int
-    missed: int
+    missed: int = 0
 
     @property
     def position_sigma(self) -> float:

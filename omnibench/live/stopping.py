@@ -37,25 +37,6 @@ def stop_on_signals() -> Iterator[threading.Event]:
         restore()
 
 
-@contextmanager
-def set_after(stop: threading.Event, seconds: float | None) -> Iterator[Callable[[], bool]]:
-    """Set ``stop`` after ``seconds`` (None: never) of the context; a function that tells whether it was set so."""
-    passed = threading.Event()
-
-    def time_is_up() -> None:
-        passed.set()
-        stop.set()
-
-    timer = None if seconds is None else threading.Timer(seconds, time_is_up)
-    if timer is not None:
-        timer.start()
-    try:
-        yield passed.is_set
-    finally:
-        if timer is not None:
-            timer.cancel()
-
-
 def wait_until(
     condition: Callable[[], bool], seconds: float, stop: threading.Event | None = None, period: float = 0.01
 ) -> bool:

@@ -72,6 +72,8 @@ def _delivered(report: PlayReport) -> str:
 def print_demonstration(console: Console, shown: Demonstration) -> None:
     """Print what was played to a node, its errors against the reference, and its agreement with the batch odometry."""
     print_played(console, shown.report, shown.simulated)
+    if shown.report.taken != sum(shown.report.sent.values()):
+        return  # after a signal; what the node would have made of the rest is not known
     print_table(console, _deviation_table(shown))
     console.print(
         f"odom against the batch odometry: {shown.batch_difference:.1e} (m, rad) at most; 0 messages of odom lost",

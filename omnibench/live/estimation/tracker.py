@@ -186,11 +186,6 @@ class RobotTracker:
         """Flow of an acknowledged replay -> number of the next message that is not in the odometry."""
         return self._state.flows
 
-    @property
-    def in_real_time(self) -> bool:
-        """False while wheel samples come much faster than they were measured, as from a replay."""
-        return self._state.wheel_input.in_real_time
-
     def health(self, now: float) -> Health:
         """The robot's health. now: s, monotonic."""
         with self._state_lock:

@@ -33,7 +33,6 @@ _SLOWER = 50  # samples in a row each after a missing one, as of a robot that se
 _SMOOTHING = 0.02  # share of a new period in the mean
 _IRREGULAR = 0.25  # share of the mean period by which a regular one may be off
 _MEMORY = 0.995  # share of the past in the pace of the stamps, which is 1 of a robot and more of a fast replay
-_FAST = 2.0  # pace from which on the samples are those of a replay
 
 
 class WheelSettings(Model):
@@ -272,20 +271,11 @@ class WheelInput:
             self._learnt.clear()
             self._after_missing = 0
 
-    @property
-    def pace(self) -> float:
-        """Time by the stamps per time by this machine's clock, of the latest samples."""
-        return self._stamped / self._waited if self._waited > 1e-6 else 1e6
-
-    @property
-    def in_real_time(self) -> bool:
-        """False while samples come much faster than they were measured, as from a replay."""
-        return self.pace < _FAST
-
     def _waited_for(self, sample: _Sample) -> float:
         """Time since the last sample by this machine's clock, s, at the pace of the stamps."""
         assert self._last is not None
-        return (sample.arrival - self._last.arrival) * (self.pace if not 1 / _FAST < self.pace < _FAST else 1.0)
+        pace = self._stamped / self._waited if self._waited > 1e-6 else 1e6
+        return (sample.arrival - self._last.arrival) * (pace if not 0.5 < pace < 2 else 1.0)
 
     def _confirmed(self, sample: _Sample) -> list[WheelStep]:
         """The steps of samples at a new time of the clock, once enough follow each other; till then none."""

@@ -81,7 +81,7 @@ class Delivery(Closing):
 
     @abstractmethod
     def finish(self) -> None:
-        """Wait until all has arrived, or ``stop`` is set. DeliveryError: the receiver is given up."""
+        """Wait until all has arrived, or a short time if ``stop`` is set. DeliveryError: the receiver is given up."""
 
 
 class AcknowledgedDelivery(Delivery):

@@ -122,6 +122,7 @@ def demonstrate(
     recording: Recording,
     stop: threading.Event | None = None,
     watch: Reporter = no_progress,
+    seconds: float = math.inf,
 ) -> Demonstration:
     """Run the node of ``config``, replay ``recording`` to it as the config's ``replay`` says, and evaluate its output.
 
@@ -159,7 +160,7 @@ def demonstrate(
                 watch(replace(event, note=f"{event.note}, {health.rate_hz:.0f} samples/s, {fused} fused"))
 
             results = _Results(tracker, [each for each in (odometry, fused) if each is not None])
-            report = player.play(stop, with_health, hold=results.behind)
+            report = player.play(stop, with_health, results.behind, seconds)
             results.wait_for_the_last()
             health = node.health(robot.name)
             for collector in (odometry, fused):

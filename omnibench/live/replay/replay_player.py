@@ -108,8 +108,8 @@ class PlayReport:
     """Result of a replay.
 
     sent: messages by topic; total: messages in all; taken: messages that a node acknowledged, None where nobody does.
-    restarts: how often another node went on in the place of one that had gone, and whose odometry begins anew. late:
-    largest delay in sending, s, in which a pause for a receiver that was gone does not count.
+    restarts: how often another node went on in the place of one that had gone; without `state` its odometry begins anew.
+    interrupted: by a signal. late: largest delay in sending, s, in which a pause for a receiver that was gone does not count.
     """
 
     sent: dict[str, int]
@@ -119,6 +119,7 @@ class PlayReport:
     data_seconds: float
     wall_seconds: float
     late: float
+    interrupted: bool
 
     @property
     def complete(self) -> bool:
@@ -160,15 +161,16 @@ class Player:
         stop: threading.Event | None = None,
         watch: Reporter = no_progress,
         hold: Callable[[], bool] = lambda: False,
+        seconds: float = math.inf,
     ) -> PlayReport:
-        """Send all messages, or stop when ``stop`` is set or Ctrl-C is pressed.
+        """Send all messages, or those of the first ``seconds``, or stop when ``stop`` is set or Ctrl-C is pressed.
 
         Waits for a subscriber first; ConfigError: none comes in time. DeliveryError: the robot's node, or the next
         router to other subscribers, does not take the messages any more. watch: told the messages sent ten times a
         second and at the end. hold: while it is true, nothing is sent.
         """
         stop = stop or threading.Event()
-        sent = dict.fromkeys(TOPICS_PLAYED, 0)
+        sent, interrupted = dict.fromkeys(TOPICS_PLAYED, 0), False
         begin, arrival, late = time.perf_counter(), 0.0, 0.0
         delivery: Delivery | None = None
         try:
@@ -179,8 +181,10 @@ class Player:
                 due = begin + delivery.paused + event.arrival / self._config.speed
                 now = time.perf_counter()
                 if due > now:
-                    stop.wait(due - now)
+                    stop.wait(min(due, begin + seconds) - now)
                     now = time.perf_counter()
+                if now - begin >= seconds:
+                    break
                 while hold() and not stop.is_set():
                     stop.wait(_HOLDING)
                 if stop.is_set():
@@ -195,7 +199,7 @@ class Player:
                     watch(self._progress(number, arrival))
             delivery.finish()
         except KeyboardInterrupt:
-            pass
+            interrupted = True
         except zenoh.ZError as error:
             if not stop.is_set():  # otherwise the session was closed after stopping
                 raise OmnibenchError(f"replay of {self._robot}: cannot publish any more: {error}") from None
@@ -204,11 +208,11 @@ class Player:
         finally:
             if delivery is not None:
                 delivery.close()
-        seconds = time.perf_counter() - begin
+        wall, interrupted = time.perf_counter() - begin, interrupted or stop.is_set()
         watch(self._progress(sum(sent.values()), arrival))
         taken, restarts = (None, 0) if delivery is None else (delivery.taken, delivery.restarts)
         late = 0.0 if math.isinf(self._config.speed) else late
-        return PlayReport(sent, len(self._messages), taken, restarts, arrival, seconds, late)
+        return PlayReport(sent, len(self._messages), taken, restarts, arrival, wall, late, interrupted)
 
     def _delivery(self, stop: threading.Event) -> Delivery:
         """Delivery to the robot's node, if there is one, or else to whoever subscribes."""

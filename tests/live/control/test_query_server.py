@@ -153,13 +153,13 @@ def test_more_requests_than_the_server_holds_are_refused_and_the_stream_goes_on(
         wheels = session.declare_publisher("bob/joint_states")
         until(lambda: wheels.matching_status.matching, "the node's subscription")
         with node.trackers["apr"]._state_lock:  # the query server is held up by the first
-            waiting = [session.get("omnibench/apr/health", timeout=PATIENCE) for _ in range(100)]
+            waiting = [session.get("omnibench/apr/health", timeout=PATIENCE) for _ in range(200)]
             sent(wheels, path.samples())
             until(lambda: len(received["bob__odom"]) == 101, "the odometry")
         replies = [reply for each in waiting for reply in each]
     refused = [json.loads(reply.err.payload.to_bytes())["error"] for reply in replies if reply.err is not None]
-    assert len(replies) == 100
-    assert 30 <= len(refused) <= 40
+    assert len(replies) == 200
+    assert 200 - 2 * 64 <= len(refused) < 200 - 64  # 64 wait, and as many may be under way
     assert set(refused) == {"omnibench/apr/health: 64 requests are waiting; ask again later"}
 
 
