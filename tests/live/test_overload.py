@@ -61,7 +61,7 @@ def test_samples_of_a_replay_are_all_published_however_late(tmp_path: Path) -> N
 
 
 def test_samples_whose_sender_waits_are_all_published_and_are_no_backlog(tmp_path: Path) -> None:
-    flow = [packed(number + 1, bytes(16), (1, number, 0)) for number in range(SAMPLES)]
+    flow = [packed(number + 1, bytes(16), (1, number, 0, False)) for number in range(SAMPLES)]
     odometry, health = sent_while_the_intake_waits(tmp_path, flow, 0.01)
     assert len(odometry) == SAMPLES
     assert (health.counts["unpublished"], health.behind_s) == (0, 0.0)

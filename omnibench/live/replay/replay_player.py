@@ -108,8 +108,9 @@ class PlayReport:
     """Result of a replay.
 
     sent: messages by topic; total: messages in all; taken: messages that a node acknowledged, None where nobody does.
-    restarts: how often another node went on in the place of one that had gone; without `state` its odometry begins anew.
-    interrupted: by a signal. late: largest delay in sending, s, in which a pause for a receiver that was gone does not count.
+    restarts: how often another node went on in the place of one that had gone; without ``state`` its odometry begins
+    anew. interrupted: by a signal. late: largest delay in sending, s, in which a pause for a receiver that was gone
+    does not count.
     """
 
     sent: dict[str, int]
