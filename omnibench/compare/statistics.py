@@ -78,11 +78,12 @@ def held_out_verdicts(
 
 
 def sessions_that_differ(datasets: Mapping[str, Dataset], integration: Integration) -> dict[str, tuple[str, ...]]:
-    """By data set, a sentence for each session that differs from the others; by the design values, as any would do."""
-    return {
-        name: compare_sessions(OdometryModel.of_design(dataset.robot, integration), dataset.trajectories).sentences
+    """By data set, sentences on sessions that differ or could not be compared by the design values (any would do)."""
+    found = {
+        name: compare_sessions(OdometryModel.of_design(dataset.robot, integration), dataset.trajectories)
         for name, dataset in datasets.items()
     }
+    return {name: (*comparison.sentences, *comparison.doubts) for name, comparison in found.items()}
 
 
 def is_mean(run: ScoredRun) -> bool:

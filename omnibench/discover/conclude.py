@@ -68,9 +68,9 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
     fit, effects, limits = extended.fit, findings.effects, findings.detectability
     where, left = findings.dependences.where, findings.dependences.left
     of_sessions = sessions_in_words(findings.verdict, findings.sessions, held_out, findings.eq6_of_sessions)
-    few, differ = few_in_words(fit.runs), bool(of_sessions)
-    of_model = headline_of(findings.verdict, effects, where, left, few, differ=differ)
-    headline = " ".join([*of_sessions, of_model, *_warnings(findings)])
+    few, differ, doubts = few_in_words(fit.runs), bool(of_sessions), findings.sessions.doubts
+    of_model = headline_of(findings.verdict, effects, where, left, few, differ=differ, untested=bool(doubts))
+    headline = " ".join([*of_sessions, of_model, *(doubts if findings.verdict == "none" else ()), *_warnings(findings)])
     needs_session = any("session" in term.effect.needs for term in fit.model.terms)
     return Discovery(
         dataset=replace(dataset, trajectories=(*fit.runs, *findings.validation.kept)),
@@ -140,7 +140,7 @@ def _notes(findings: Findings) -> Iterator[str]:
     fit = findings.extended.fit
     few = few_in_words(fit.runs)
     if findings.verdict != "none":  # else the headline says it
-        yield from findings.sessions.of_other_commands
+        yield from (*findings.sessions.of_other_commands, *findings.sessions.doubts)
     if few and findings.verdict != "none":
         yield f"These are {few}: so little can show hardly anything."
     yield f"Noise: {fit.noise.description}."

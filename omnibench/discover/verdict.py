@@ -60,36 +60,34 @@ def headline_of(
     few: str = "",
     *,
     differ: bool = False,
+    untested: bool = False,
 ) -> str:
     """One or two sentences for the top of a report.
 
     few: the training runs in words if they can show hardly anything. differ: True if sentences on sessions that deviate
-    stand before these.
+    stand before these. untested: True if sessions could not be compared.
     """
     names = "; ".join(" or ".join((effect.name, *effect.confusable_with)) for effect in effects)
     with_weights = " and ".join(f"{effect.name} ({_percent(effect.weight)})" for effect in effects)
     where, left = [each for each in where if _counts(each)], [each for each in left if _counts(each)]
     of_odometry = [each for each in where if each.stage != "actuator"]
     surest = _places(of_odometry or where)
+    found = "Nothing else was found" if differ else "Nothing was found"
+    odometry = "Nothing is missing in the odometry that these recordings could show"
+    if differ or untested:
+        odometry = f"{found} in the odometry of the training runs"
     if verdict == "none" and where:
-        return (
-            "Nothing is missing in the odometry that these recordings could show. How the motors follow their targets "
-            f"has no name: {surest}."
-        )
+        return f"{odometry}. How the motors follow their targets has no name: {surest}."
     if verdict == "none" and few:
-        found = "Nothing else was found" if differ else "Nothing was found"
         return f"{found}, but {few} can show hardly anything: that nothing was found says little."
-    if verdict == "none" and differ:
-        return "Nothing else was found: what the matrix leaves of the training runs looks like its noise."
+    if verdict == "none" and (differ or untested):
+        return f"{found}: what the matrix leaves of the training runs looks like its noise."
     if verdict == "none":
         return "Nothing is missing that these recordings could show: what the matrix leaves looks like its noise."
     remains = f" Something else is left: {_places(left)}." if left else ""
     if verdict == "named" and all(effect.stage == "actuator" for effect in effects):
         more = f" Beyond that, {_places(left)}." if left else ""
-        return (
-            "Nothing is missing in the odometry that these recordings could show. Between targets and measured wheel "
-            f"rates: {with_weights}.{more}"
-        )
+        return f"{odometry}. Between targets and measured wheel rates: {with_weights}.{more}"
     if verdict == "named":
         return f"Missing: {with_weights}. With it the model predicts the training runs to within their noise."
     if verdict == "incomplete":

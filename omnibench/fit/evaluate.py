@@ -34,8 +34,9 @@ class Evaluation(Model):
     """Errors of a calibration and of the design values, by split; the split ``all`` is every trajectory.
 
     held_out: the verdict by the runs that the calibration was not fitted to. sessions: a sentence for each session that
-    differs from the others. warnings: one sentence if runs lie outside the training domain of the calibration's
-    effects. What is not excluded is the document of ``omnibench evaluate --json``.
+    differs from the others, or on those that could not be compared. warnings: one sentence if runs lie outside the
+    training domain of the calibration's effects. Fields that are not excluded are the document of ``omnibench evaluate
+    --json``.
     """
 
     dataset: str
@@ -60,6 +61,7 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
     groups: dict[str, tuple[Trajectory, ...]] = {str(name): group for name, group in present.items()}
     groups["all"] = dataset.trajectories
     model, design = calibration.model, OdometryModel.of_design(dataset.robot, calibration.integration)
+    sessions = compare_sessions(model, dataset.trajectories)
     warning = extrapolation_warning(calibration, dataset.trajectories)
     return Evaluation(
         dataset=dataset.name,
@@ -68,7 +70,7 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
         splits={name: split_errors(model, group) for name, group in groups.items()},
         design={name: split_errors(design, group) for name, group in groups.items()},
         held_out=held_out_verdict(calibration, dataset),
-        sessions=compare_sessions(model, dataset.trajectories).sentences,
+        sessions=(*sessions.sentences, *sessions.doubts),
         warnings=() if warning is None else (warning,),
     )
 

@@ -53,6 +53,20 @@ def test_nothing_is_not_said_to_be_missing_where_the_held_out_session_has_other_
     assert "residuals of the plain matrix are what the noise leaves" not in page(found).text
 
 
+def test_nothing_is_not_said_to_be_missing_where_sessions_cannot_be_compared() -> None:
+    dataset = session_set("small", 3, change=0.02)
+    found = discover_effects(
+        replace(dataset, trajectories=tuple(replace(t, command=None) for t in dataset.trajectories))
+    )
+    assert found.verdict == "none"
+    assert "Whether the sessions differ cannot be said: no session repeats a command" in found.headline
+    told, report = printed(found), page(found).text
+    for words in (found.headline, verdict_in_words(found), told, report):
+        assert "othing is missing" not in words
+    assert "whether the sessions differ cannot be said" in " ".join(told.split())
+    assert "none, sessions not compared" in report
+
+
 def test_a_change_of_the_radii_closes_the_gap_to_the_held_out_session() -> None:
     found = worn()
     gap = held_out(found, "session").eq6

@@ -69,6 +69,17 @@ def test_of_few_runs_the_headline_says_that_they_can_show_hardly_anything() -> N
     assert "Nothing is missing" not in headline
 
 
+@pytest.mark.parametrize(("effects", "where"), [((), ()), ((), (MOTORS,)), ((LAG,), (MOTORS,))])
+@pytest.mark.parametrize("doubt", ["differ", "untested"])
+def test_where_sessions_differ_or_could_not_be_compared_no_headline_says_that_nothing_is_missing(
+    effects: tuple[NamedEffect, ...], where: tuple[CovariateDependence, ...], doubt: str
+) -> None:
+    verdict: Verdict = "named" if effects else "none"
+    headline = headline_of(verdict, effects, where, (), differ=doubt == "differ", untested=doubt == "untested")
+    assert headline.startswith("Nothing else was found" if doubt == "differ" else "Nothing was found")
+    assert "Nothing is missing" not in headline
+
+
 def test_a_name_is_lacking_where_something_is_left_or_nothing_explains_it() -> None:
     assert [name for name in ("none", "named", "class", "incomplete", "unknown") if lacks_a_name(name)] == [
         "incomplete",

@@ -106,6 +106,12 @@ def test_a_calibration_with_effects_is_judged_by_what_its_reference_reports() ->
     assert evaluate(calibration(), reported).splits["all"].cost > 0.05
 
 
+def test_sessions_that_cannot_be_compared_are_said_with_the_reason() -> None:
+    (sentence,) = evaluate(calibration(), dataset()).sessions
+    assert sentence.startswith("Whether the sessions differ cannot be said: no session repeats a command")
+    assert evaluate(calibration(), dataset(validating=0)).sessions == ()
+
+
 def test_a_data_set_that_lacks_what_an_effect_needs_is_refused_in_one_line() -> None:
     drifting = (EffectTerm(name="thermal_radius_drift", parameters={"k": 1e-5}),)
     with pytest.raises(DataError, match=r"^effect 'thermal_radius_drift' needs the time since the session's start"):

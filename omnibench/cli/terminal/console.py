@@ -51,7 +51,7 @@ def print_json(document: Mapping[str, Any] | BaseModel) -> None:
 def print_verdict(verdict: HeldOutVerdict, subject: str = "", sessions: Iterable[str] = ()) -> None:
     """The last lines of ``calibrate``, ``evaluate`` and ``compare``: what held-out runs say, and which these are.
 
-    sessions: a sentence for each session that differs from the others.
+    sessions: sentences on sessions that differ from the others or could not be compared.
     """
     typer.echo(f"{subject}{verdict.sentence}")
     typer.echo(verdict.detail)

@@ -41,7 +41,7 @@ class DatasetView:
     warnings: warnings of the whole comparison. styles: styles by label, the same in the whole report. design_costs:
     mean cost of the design values on each split that has trajectories. design_errors: final pose errors (Z, 3) of the
     design matrix on each such split, m, m, rad. units: what the intervals of each such split rest on. held_out: what
-    held-out runs say of the best calibration, if there is one. sessions: a sentence for each that differs from others.
+    held-out runs say of the best calibration, if there is one. sessions: sentences on those that differ.
     """
 
     name: str

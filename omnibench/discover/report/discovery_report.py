@@ -81,8 +81,9 @@ def _answer(discovery: Discovery) -> Iterator[Block]:
 
 
 def _tiles(discovery: Discovery) -> Iterator[Fact]:
-    differ = ", sessions differ" if discovery.sessions.differences else ""
-    yield Fact("Verdict", f"{discovery.verdict}{differ}", verdict_in_words(discovery))
+    sessions = ", sessions not compared" if discovery.sessions.doubts else ""
+    sessions = ", sessions differ" if discovery.sessions.differences else sessions
+    yield Fact("Verdict", f"{discovery.verdict}{sessions}", verdict_in_words(discovery))
     for effect in discovery.effects:
         values = "; ".join(parameter_in_words(each) for each in effect.parameters[:2])
         more = f" and {len(effect.parameters) - 2} more" if len(effect.parameters) > 2 else ""

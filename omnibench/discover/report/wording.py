@@ -40,6 +40,7 @@ VERDICTS_AT_LENGTH: Mapping[Verdict, str] = {
 _FEW = "nothing was found, but so few runs can show hardly anything"
 _DIFFER = "nothing is missing in the training runs, but the sessions differ"
 _OTHER_COMMANDS = "nothing is missing in the training runs, but the validation runs, of other commands, deviate"
+_UNTESTED = "nothing was found in the training runs, but whether the sessions differ cannot be said"
 STAGES: Mapping[Stage, str] = {
     "actuator": "target to wheel rate",
     "wheel": "wheel rate to motion of the wheel",
@@ -128,7 +129,9 @@ def verdict_in_words(discovery: Discovery) -> str:
         return _DIFFER
     if discovery.sessions.other_commands is not None:
         return _OTHER_COMMANDS
-    return _FEW if discovery.few else VERDICTS["none"]
+    if discovery.few:
+        return _FEW
+    return _UNTESTED if discovery.sessions.doubts else VERDICTS["none"]
 
 
 def verdict_at_length(discovery: Discovery) -> str:

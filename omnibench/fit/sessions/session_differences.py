@@ -44,6 +44,7 @@ _NUISANCES = 1e-4
 _ALL = 0.01
 # Names of sessions, or of wheels, that a sentence lists (chosen).
 _LISTED = 3
+_ALONE = "all runs are of one session"
 Kind = Literal["all wheels", "one wheel", "wheels", "matrix"]
 
 
@@ -80,7 +81,8 @@ class SessionComparison:
     """Comparison of the sessions of a data set, or of its splits where sessions are not known.
 
     differences: of those that differ, surest first. other_commands: chance of the deviation of a validation split that
-    drives none of the training's commands, if it is below CHANCE. untested: why nothing could be compared, or empty.
+    drives none of the training's commands, if it is below CHANCE. untested: why some or all sessions could not be
+    compared, or empty.
     """
 
     differences: tuple[SessionDifference, ...] = ()
@@ -91,6 +93,13 @@ class SessionComparison:
     def sentences(self) -> tuple[str, ...]:
         """A sentence for each session that differs, or for a validation split that drives other commands."""
         return (*(_in_words(each) for each in self.differences), *self.of_other_commands)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """The sentence on sessions that could not be compared; none where there is one session only."""
+        if self.untested in ("", _ALONE):
+            return ()
+        return (f"Whether the sessions differ cannot be said: {self.untested}.",)
 
     @property
     def of_other_commands(self) -> tuple[str, ...]:
@@ -107,12 +116,15 @@ class SessionComparison:
 
 def compare_sessions(model: OdometryModel, trajectories: Sequence[Trajectory]) -> SessionComparison:
     """Compare the sessions of recordings by a model; noise and nuisances are estimated from their repetitions."""
+    if len(set(sessions_of(trajectories))) < 2:
+        return SessionComparison(untested=_ALONE)
     try:
-        runs = usable_runs(trajectories, "recordings")
+        runs = usable_runs(trajectories, "all")
     except DataError as error:
         return SessionComparison(untested=str(error))
     if untested := _untested(runs):
-        return SessionComparison(untested=untested)
+        few = "the runs of all sessions but one have no reference poses after their start"
+        return SessionComparison(untested=few if untested == _ALONE else untested)
     fit = TrajectoryFit(model, runs, Nuisances(np.zeros((len(runs), 3)), np.zeros(3)))
     return session_comparison(fit, noise_of_fit(fit, range(3), None, _NUISANCES))
 
@@ -126,9 +138,10 @@ def session_comparison(fit: TrajectoryFit, noise: FitNoise) -> SessionComparison
         data = SessionScores.of(fit, noise.estimate.noise)
     except DataError as error:
         return SessionComparison(untested=str(error))
-    other_commands = _with_other_commands(data)
-    untested = "" if data.comparable or other_commands else "the sessions share no command"
-    return SessionComparison(tuple(_differences(data)), other_commands, untested)
+    chance = _with_other_commands(data)
+    untested = "" if chance is not None else _uncomparable(sessions_of(fit.runs), data.comparable)
+    deviates = chance is not None and chance < CHANCE
+    return SessionComparison(tuple(_differences(data)), chance if deviates else None, untested)
 
 
 def _centred(fit: TrajectoryFit, noise: FitNoise) -> TrajectoryFit:
@@ -142,11 +155,19 @@ def _untested(runs: Sequence[Trajectory]) -> str:
     """Why sessions cannot be compared; empty if they can."""
     names = sessions_of(runs)
     if len(set(names)) < 2:
-        return "all runs are of one session"
+        return _ALONE
     driven = [(name, run.command) for name, run in zip(names, runs, strict=True) if run.command is not None]
     if not any(len(members) > 1 for members in grouped(driven)):
         return "no session repeats a command, so that nothing says how much its runs scatter"
     return ""
+
+
+def _uncomparable(names: Sequence[str], comparable: Sequence[str]) -> str:
+    """The sessions that share no command with another one, in words; empty if there are none."""
+    left = [name for name in dict.fromkeys(names) if name not in comparable]
+    if not comparable:
+        return "the sessions share no command"
+    return f"no run of {_listed(left)} drives a command of another session" if left else ""
 
 
 def _differences(data: SessionScores) -> Iterator[SessionDifference]:
@@ -217,17 +238,15 @@ def _explains(contrast: Contrast, directions: Array) -> bool:
 
 
 def _with_other_commands(data: SessionScores) -> float | None:
-    """The chance of the validation split's deviation, where it drives no command of the training and deviates."""
+    """The chance of the validation split's deviation, where it drives no command of the training."""
     driven = [{run.command for run in data.runs if run.split == split} for split in ("train", "validation")]
     if not all(driven) or driven[0] & driven[1]:
         return None
-    chance = 3 * _least_chance(data, data.between_splits())
-    return chance if chance < CHANCE else None
+    return 3 * _least_chance(data, data.between_splits())
 
 
 def _in_words(difference: SessionDifference) -> str:
-    names = difference.others
-    others = ", ".join(names[:_LISTED]) + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
+    others = _listed(difference.others)
     changes = " and ".join(
         f"{f'the radius of wheel {each.wheel} looks' if each.wheel else 'the radii of all wheels look'} {_size(each)}"
         for each in difference.radii
@@ -237,6 +256,10 @@ def _in_words(difference: SessionDifference) -> str:
         f"The sessions differ: in {difference.session} against {others}, {plural(difference.commands, 'command')} that "
         f"they share, {what}; repetitions do not explain it (chance {difference.chance:.1g})."
     )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:_LISTED]) + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
 
 
 def _size(change: RadiusChange) -> str:

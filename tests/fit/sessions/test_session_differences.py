@@ -57,6 +57,11 @@ def test_of_other_commands_it_is_said_that_sessions_and_commands_cannot_be_told_
     assert "sessions differ, or" in found.sentences[0]
 
 
+def test_other_commands_from_which_nothing_deviates_leave_no_doubt() -> None:
+    found = compared(session_set("small", 1, validation="flower"))
+    assert found == SessionComparison()
+
+
 def test_splits_stand_for_sessions_that_were_not_recorded() -> None:
     found = compared(session_set("small", 3, change=0.01), session=None)
     assert [(each.session, each.others) for each in found.differences] == [("validation", ("train",))]
@@ -75,6 +80,17 @@ def test_what_cannot_be_compared_is_said_with_the_reason(changes: dict[str, obje
         found = compared(dataset, **changes)
     assert reason in found.untested
     assert found.sentences == ()
+    one_session = "session" in changes
+    assert found.doubts == (() if one_session else (f"Whether the sessions differ cannot be said: {found.untested}.",))
+
+
+def test_a_session_that_shares_no_command_with_the_others_is_named() -> None:
+    dataset = session_set("small_sessions", 5)
+    renamed = [
+        replace(run, command=f"{run.command}, other") if run.session == "s2" else run for run in dataset.trajectories
+    ]
+    (sentence,) = compared(replace(dataset, trajectories=tuple(renamed))).doubts
+    assert sentence == "Whether the sessions differ cannot be said: no run of s2 drives a command of another session."
 
 
 def test_repetitions_that_agree_exactly_show_what_differs_and_nothing_else() -> None:
