@@ -125,7 +125,7 @@ def certify_optimum(
 
     def foretell(event: Progress) -> None:
         watch(event)
-        if event.done == _TIMED and (parts or math.inf) > _TIMED:
+        if event.done == _TIMED and (parts or math.inf) > _TIMED and gap > 0:  # to a gap of 0 the limits end it
             each = (time.perf_counter() - began) / _TIMED
             watch(Progress("duration", result=_duration_in_words(gap, each, seconds, parts)))
 

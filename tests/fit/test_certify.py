@@ -239,6 +239,14 @@ def test_about_how_long_a_proof_takes_is_said_after_its_first_parts() -> None:
     assert words.endswith("it ends after 1e+09 s or 2000 parts at the latest")
 
 
+def test_a_proof_without_a_gap_goes_on_to_its_limit_and_foretells_nothing() -> None:
+    seen: list[Progress] = []
+    dataset = make_dataset("noisy", synthetic_robot(), PERIOD, list(noisy_trajectories()), simulated=True)
+    certified = certify_optimum(calibrate(dataset).calibration, dataset, gap=0.0, parts=20, watch=seen.append)
+    assert 20 <= certified.proof.boxes <= 21
+    assert [event for event in seen if event.task == "duration"] == []
+
+
 def test_where_nothing_is_left_but_rounding_there_is_nothing_to_gain() -> None:
     runs = synthetic_trajectories(synthetic_robot(), "arc")[:2]
     dataset = make_dataset("exact", synthetic_robot(), 0.2, runs, simulated=True)
