@@ -108,7 +108,7 @@ def summary(result: ComparisonResult) -> dict[str, Any]:
 
 
 def _interval_units(result: ComparisonResult) -> dict[str, dict[str, Any]]:
-    """What the intervals of each data set and split rest on."""
+    """The units and the method of the intervals of each data set and split."""
     designs = {run.record.dataset: run.design for run in result.runs}
     return {
         name: {

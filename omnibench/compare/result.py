@@ -164,7 +164,7 @@ class EntryStatistics:
 
 @dataclass(frozen=True)
 class EntryVerdict:
-    """What held-out runs say of an entry."""
+    """The verdict of held-out runs on an entry."""
 
     label: str
     verdict: HeldOutVerdict
@@ -176,7 +176,7 @@ class ComparisonResult:
 
     design_costs: mean cost of the design values, by data set and split. uncertainties: of the entries' typical runs, by
     data set and label. held_out: the verdict on the best calibration of each data set that has one. sessions: by data
-    set, a sentence for each session that differs from the others.
+    set, sentences on sessions that differ from the others or could not be compared.
     """
 
     config: CompareConfig

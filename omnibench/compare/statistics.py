@@ -55,7 +55,7 @@ def design_costs(runs: Sequence[ScoredRun], bootstrap: Bootstrap) -> dict[str, d
 def held_out_verdicts(
     statistics: Sequence[EntryStatistics], datasets: Mapping[str, Dataset], bootstrap: Bootstrap
 ) -> dict[str, EntryVerdict]:
-    """What the validation runs of each data set say of its best calibration, if a calibrator gave an answer.
+    """The verdict of each data set's validation runs on its best calibration, if a calibrator gave an answer.
 
     The best calibration is the best entry, or, where that is not fitted, the fitted one of lowest judged cost.
     """

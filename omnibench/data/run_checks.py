@@ -21,14 +21,14 @@ _MOST_PERIODS = 1001.0
 
 
 def wheel_times_flaw(times: Array, _: str) -> Flaw | None:
-    """What is wrong with the ends of a run's wheel samples (F,), s; None if nothing is."""
+    """The flaw in the ends of a run's wheel samples (F,), s; None if there is none."""
     for row in np.flatnonzero(times <= 0)[:1]:
         return int(row), f"t is {times[row]:g}; wheel samples start after t = 0 (a row holds the rate up to its t)"
     return _increase_flaw(times)
 
 
 def pose_times_flaw(times: Array, run: str) -> Flaw | None:
-    """What is wrong with the times of a run's reference poses (K,), s; None if nothing is. run: its id."""
+    """The flaw in the times of a run's reference poses (K,), s; None if there is none. run: its id."""
     for row in np.flatnonzero(times < 0)[:1]:
         return int(row), f"t is {times[row]:g}; it must not be negative"
     if (flaw := _increase_flaw(times)) is not None:

@@ -43,7 +43,7 @@ class Noise(Model):
 
 
 class HeldOutVerdict(Model):
-    """What held-out runs say of a calibration, beside the design values.
+    """Verdict on a calibration by held-out runs, beside the design values.
 
     verdict: of the errors of the final pose, Eq. (6). Better or worse: the 95 % interval of the improvement leaves out
     0; undecided: it does not, or the units are too few for one; unknown: nothing was held out. Positions (m) and

@@ -41,7 +41,7 @@ def _blocks(view: DatasetView) -> tuple[Block, ...]:
 
 
 def _held_out(view: DatasetView) -> tuple[Block, ...]:
-    """What held-out runs say of the best calibration, in the words of ``calibrate`` and ``evaluate``."""
+    """The verdict of held-out runs on the best calibration, in the words of ``calibrate`` and ``evaluate``."""
     sessions = (Callout("Sessions", view.sessions, "warning"),) if view.sessions else ()
     if view.held_out is None:
         return sessions

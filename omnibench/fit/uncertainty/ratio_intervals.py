@@ -69,7 +69,7 @@ _ALIKE = 1e-12  # share of the numerators: differences between units below it ar
 
 
 class Bootstrap(Model):
-    """What intervals rest on, and the resamples that they are drawn from where there are ten units or more."""
+    """The units that intervals rest on, and the resamples that are drawn of them from ten units on."""
 
     resamples: int = Field(2000, ge=100, le=100_000)
     seed: int = Field(0, ge=0)
