@@ -26,7 +26,8 @@ from omnibench.live.wire.outputs import OUTPUTS
 from omnibench.live.wire.topics import GraphNode
 
 LOG = logging.getLogger("omnibench.live")
-_LONGEST_QUEUE: Final = 20_000  # messages that wait for one robot, 200 s at 100 Hz, some 10 MB; chosen
+_LONGEST_QUEUE: Final = 20_000  # messages that wait for one robot, 200 s at 100 Hz; chosen
+_LARGEST_QUEUE: Final = 32_000_000  # bytes that wait for one robot: 20,000 messages of 60 wheels; chosen
 _BATCH: Final = 500  # messages of one robot until the others have their turn; chosen
 
 
@@ -54,6 +55,8 @@ class RobotService:
         self.tracker = tracker
         self._intake = intake
         self._waiting: deque[_Message] = deque()
+        self._waiting_bytes = 0
+        self._counting = threading.Lock()  # held while those bytes change
         self._scheduled = False  # a turn is queued, or has not yet looked at what waits
         self._working = threading.Lock()  # held while messages are taken
         self._late = LateUpdates(self._publish)
@@ -102,7 +105,11 @@ class RobotService:
 
     def _queue(self, is_pose: bool, sample: zenoh.Sample) -> None:
         """Queue a message; in Zenoh's thread."""
-        if len(self._waiting) >= _LONGEST_QUEUE:
+        size = len(sample.payload)
+        with self._counting:
+            full = len(self._waiting) >= _LONGEST_QUEUE or self._waiting_bytes + size > _LARGEST_QUEUE
+            self._waiting_bytes += 0 if full else size
+        if full:
             self.tracker.count_overflow()
             return
         attachment = sample.attachment
@@ -119,6 +126,8 @@ class RobotService:
             behind, unpublished = 0.0, self._late.unpublished
             for _ in range(min(len(self._waiting), _BATCH)):
                 message = self._waiting.popleft()
+                with self._counting:
+                    self._waiting_bytes -= len(message.payload)
                 flow = flow_of(message.attachment)
                 if flow is None:
                     waited = time.monotonic() - message.arrival

@@ -79,3 +79,18 @@ def test_what_came_when_too_many_waited_is_counted(tmp_path: Path) -> None:
                 wheels.put(payload)
             until(lambda: node.health("apr").counts["overflow"] == 100, "the samples that had no place")
         until(lambda: node.health("apr").counts["samples"] == 20_000, "the others")
+
+
+def test_large_messages_that_wait_are_bounded_by_their_bytes(tmp_path: Path) -> None:
+    megabyte = bytes(1_000_000)
+    with running(config_of(tmp_path)) as (node, session):
+        service = node._services[0]
+        wheels = session.declare_publisher("apr/joint_states", congestion_control=zenoh.CongestionControl.BLOCK)
+        until(lambda: wheels.matching_status.matching, "the node's subscription")
+        with service._working:
+            for _ in range(50):
+                wheels.put(megabyte)
+            until(lambda: node.health("apr").counts["overflow"] == 18, "the messages that had no place")
+        until(lambda: node.health("apr").counts["undecodable"] == 32, "the messages that had")
+        wheels.put(JOINT_STATE.encode(drive(1.0).samples()[0]))  # and there is room again
+        until(lambda: node.health("apr").counts["samples"] == 1, "a sample")
