@@ -12,9 +12,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import zenoh
-from drives import drive
+from drives import calibration, drive
 from nodes import Command, asked, config_of, running, write_node
 from recordings import random_dataset
 from replayed import config
@@ -27,6 +28,7 @@ from omnibench.live.replay.replay_player import Player
 from omnibench.live.wire.attachment import MissedMessages, flow_of, packed
 from omnibench.live.wire.messages import JOINT_STATE
 from omnibench.live.wire.topics import GraphNode, KeySpace
+from omnibench.robot.planar import relative
 
 LONG = concatenate_runs(random_dataset(7, 5, samples=2000), pause=0.1)  # 10,000 samples: many times the window
 PART = 1000  # messages that are played before the test does something
@@ -161,6 +163,30 @@ class TestToANode:
         assert rest["missing"] == 0
         assert rest["samples"] < report.sent["joint_states"]
 
+    def test_nodes_with_a_state_that_are_killed_integrate_all_of_it_once(self, tmp_path: Path, port: int) -> None:
+        config = write_node(tmp_path, "apr", port=port, state="state", fusion="none")
+        batch = calibration().model.poses([LONG.log()])[0]
+        with ThreadPoolExecutor(1) as pool:
+            node = Command("live", config)
+            session, stop = connected(port), threading.Event()
+            replay = player(session, wait=600, wheels={"use": "velocities"})  # from rates nothing lost can be made good
+            report = pool.submit(replay.play, stop)
+            try:
+                for _ in range(2):
+                    with connected(port) as client:
+                        until(lambda: counts(client)["samples"] > PART, "a part of the recording")
+                        node.kill()
+                    node = Command("live", config)
+                assert report.result().restarts == 2
+                with connected(port) as client:
+                    pose = asked(client, "omnibench/apr/pose")["odom"]
+            finally:
+                stop.set()
+                node.kill()
+                session.close()
+        assert report.result().taken == report.result().total
+        np.testing.assert_allclose([pose["x"], pose["y"]], relative(batch[0], batch[-1])[:2], atol=1e-6)
+
     def test_what_a_killed_node_may_have_published_is_taken_and_not_published_again(self, tmp_path: Path) -> None:
         path, came = drive(1.0), []
         with running(config_of(tmp_path)) as (node, session):
@@ -219,13 +245,18 @@ class TestToANode:
         assert 0 < int(words[0]) < int(words[2])
         assert "did not reach robot 'apr': its node has taken nothing for " in str(failure.value)
 
-    def test_the_command_then_prints_no_table_and_exits_with_1(self, node: Command, folder: Path, port: int) -> None:
+    @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+    def test_the_command_then_prints_no_table_and_exits_with_1(
+        self, node: Command, folder: Path, port: int, number: int
+    ) -> None:
         save_dataset(random_dataset(7, 5, samples=2000), folder / "data")
-        to = ("--robot", "apr", "--connect", f"tcp/127.0.0.1:{port}")
-        with connected(port) as session, Command("replay", folder / "data", *to, "--set", "wait=1") as replay:
+        to = ("--robot", "apr", "--connect", f"tcp/127.0.0.1:{port}", "--speed", "20", "--set", "wait=2")
+        with connected(port) as session, Command("replay", folder / "data", *to) as replay:
             until(lambda: counts(session)["samples"] > 100, "a part of the recording")
-            node.kill()
+            os.kill(node.process.pid, number)
             out, said = replay.ended()
+            if number == signal.SIGSTOP:
+                os.kill(node.process.pid, signal.SIGCONT)
         assert replay.process.returncode == 1
         assert not out
         assert "did not reach robot 'apr'" in said.splitlines()[-1]
