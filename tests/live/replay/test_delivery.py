@@ -25,7 +25,7 @@ from omnibench.data.storage import save_dataset
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_runs
 from omnibench.live.replay.delivery import WINDOW, DeliveryError
 from omnibench.live.replay.replay_player import Player
-from omnibench.live.wire.attachment import MissedMessages, flow_of, packed
+from omnibench.live.wire.attachment import Flow, MissedMessages, flow_of, packed
 from omnibench.live.wire.messages import JOINT_STATE
 from omnibench.live.wire.topics import GraphNode, KeySpace
 from omnibench.robot.planar import relative
@@ -328,16 +328,13 @@ class TestMissedMessages:
             assert missed.take(numbered(number))
         assert missed.count == 2 + 9
 
-    def test_one_that_comes_after_all_is_not_missed_and_one_that_comes_again_is_not_new(self) -> None:
+    @pytest.mark.parametrize("flow", [None, (1, 2, 3, False)])
+    def test_one_that_comes_after_all_is_not_missed_and_of_a_flow_one_that_comes_again_is_not_new(
+        self, flow: Flow | None
+    ) -> None:
         missed = MissedMessages()
-        assert [missed.take(numbered(number)) for number in (1, 4, 2, 2, 4, 3)] == [
-            True,
-            True,
-            True,
-            False,
-            False,
-            True,
-        ]
+        came = [missed.take(numbered(number, flow=flow)) for number in (1, 4, 2, 2, 4, 3)]
+        assert came == [True, True, True, flow is None, flow is None, True]
         assert missed.count == 0
 
     def test_publishers_have_numbers_of_their_own(self) -> None:
@@ -370,8 +367,8 @@ def test_a_flow_adds_to_an_attachment_what_ros_passes_over() -> None:
     assert flow_of(flow) == (7, 8, 9, True)
 
 
-def numbered(number: int, publisher: bytes = bytes(16)) -> zenoh.ZBytes:
-    return zenoh.ZBytes(packed(number, publisher))
+def numbered(number: int, publisher: bytes = bytes(16), flow: Flow | None = None) -> zenoh.ZBytes:
+    return zenoh.ZBytes(packed(number, publisher, flow))
 
 
 def test_two_nodes_for_one_robot_that_start_at_once_do_not_both_run(tmp_path: Path, port: int) -> None:
