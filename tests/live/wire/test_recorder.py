@@ -191,7 +191,7 @@ def test_a_message_that_is_sent_again_is_recorded_once(loopback: Loopback, recor
     odom = publishers(loopback)["odom"]
     wait_for_subscribers(odom)
     for number in (1, 2, 2, 1, 3):
-        odom.put_numbered(TOPICS["odom"].encode(sample("odom", number)), number)
+        odom.put_numbered(TOPICS["odom"].encode(sample("odom", number)), number, (7, number, 1, False))
     until(lambda: recorder.messages == 3, "the three messages")
     recorder.stop()
     assert messages_of(recorder.path) == {"/apr02/odom": [TOPICS["odom"].encode(sample("odom", k)) for k in (1, 2, 3)]}
