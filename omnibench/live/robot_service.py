@@ -53,6 +53,7 @@ class RobotService:
     def __init__(self, graph: GraphNode, tracker: RobotTracker, intake: Intake) -> None:
         name = tracker.name
         self.tracker = tracker
+        tracker.waiting_since = self._waiting_since
         self._intake = intake
         self._waiting: deque[_Message] = deque()
         self._waiting_bytes = 0
@@ -118,6 +119,14 @@ class RobotService:
         if not self._scheduled:
             self._scheduled = True
             self._intake.ready(self._take_turn)
+
+    def _waiting_since(self) -> float | None:
+        """When the oldest message that waits came, s, monotonic; None if none waits, or if its sender waits, too."""
+        try:
+            oldest = self._waiting[0]
+        except IndexError:
+            return None
+        return oldest.arrival if flow_of(oldest.attachment) is None else None
 
     def _take_turn(self) -> None:
         """Take the messages that wait, at most a batch."""

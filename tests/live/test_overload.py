@@ -21,8 +21,11 @@ SAMPLES = 60
 
 def sent_while_the_intake_waits(
     tmp_path: Path, attachments: list[bytes | None], period: float
-) -> tuple[list[Odometry], Health]:
-    """Odometry of samples, one for each attachment, all but the first of which wait for the last; and the health."""
+) -> tuple[list[Odometry], Health, Health]:
+    """Odometry of samples, one for each attachment, all but the first of which wait for the last.
+
+    And the health, while they wait and afterwards.
+    """
     path = drive(2.0)
     with running(config_of(tmp_path)) as (node, session):
         heard = ReceivedMessages(session, apr__odom=ODOMETRY)
@@ -38,31 +41,33 @@ def sent_while_the_intake_waits(
                 time.sleep(period)
             until(lambda: len(service._waiting) == last, "all samples in the queue")
             time.sleep(0.15)  # all of them are late now
+            meanwhile = node.health("apr")
         until(lambda: heard["apr__odom"][-1].stamp == path.stamps[last], "the newest odometry")
         health = node.health("apr")
         np.testing.assert_allclose(heard["apr__odom"][-1].pose, path.poses[last], atol=1e-9)
-        return list(heard["apr__odom"]), health
+        return list(heard["apr__odom"]), meanwhile, health
 
 
 def test_late_samples_are_all_integrated_and_only_the_newest_pose_is_published(tmp_path: Path) -> None:
-    odometry, health = sent_while_the_intake_waits(tmp_path, [None] * SAMPLES, 0.01)
+    odometry, meanwhile, health = sent_while_the_intake_waits(tmp_path, [None] * SAMPLES, 0.01)
     assert len(odometry) < SAMPLES / 2
     assert health.counts["samples"] == SAMPLES
     assert health.counts["unpublished"] == SAMPLES - len(odometry)
-    assert health.status == "degraded"
-    assert health.message.startswith("behind by ")
-    assert health.behind_s > 0.15
+    for each in (meanwhile, health):  # not "stale" while samples wait
+        assert each.status == "degraded"
+        assert each.message.startswith("behind by ")
+        assert each.behind_s > 0.7
 
 
 def test_samples_of_a_replay_are_all_published_however_late(tmp_path: Path) -> None:
-    odometry, health = sent_while_the_intake_waits(tmp_path, [None] * SAMPLES * 3, 0.0)
+    odometry, _, health = sent_while_the_intake_waits(tmp_path, [None] * SAMPLES * 3, 0.0)
     assert len(odometry) == 3 * SAMPLES
     assert health.counts["unpublished"] == 0
 
 
 def test_samples_whose_sender_waits_are_all_published_and_are_no_backlog(tmp_path: Path) -> None:
     flow = [packed(number + 1, bytes(16), (1, number, 0, False)) for number in range(SAMPLES)]
-    odometry, health = sent_while_the_intake_waits(tmp_path, flow, 0.01)
+    odometry, _, health = sent_while_the_intake_waits(tmp_path, flow, 0.01)
     assert len(odometry) == SAMPLES
     assert (health.counts["unpublished"], health.behind_s) == (0, 0.0)
 

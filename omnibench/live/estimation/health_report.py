@@ -24,9 +24,11 @@ class HealthReporter:
         self._rate = 0.0  # Hz
         self._behind = 0.0  # s, in the last whole window
 
-    def report(self, state: RobotState, now: float) -> Health:
-        """The health at ``now`` (s, monotonic)."""
+    def report(self, state: RobotState, now: float, waiting_since: float | None = None) -> Health:
+        """The health at ``now`` (s, monotonic). waiting_since: when the oldest message that waits came."""
         self._measure(state, now)
+        if waiting_since is not None:
+            state.behind = max(state.behind, now - waiting_since)
         age = None if state.arrival is None else now - state.arrival
         status, message = self._status(state, now, age)
         covariance = _covariance(state, age if status == "stale" else None)

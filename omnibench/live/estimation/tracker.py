@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Callable
 
 import numpy as np
 
@@ -65,6 +66,7 @@ class RobotTracker:
         self._health = HealthReporter(stale_after)
         self._state_lock = threading.Lock()  # held while the state is read or changed
         self._closed = False
+        self.waiting_since: Callable[[], float | None] = lambda: None  # when the oldest that waits came, s, monotonic
 
     def take_wheels(self, payload: bytes, arrival: float) -> list[Update]:
         """Take a sensor_msgs/JointState in CDR; its updates, in order.
@@ -189,7 +191,7 @@ class RobotTracker:
     def health(self, now: float) -> Health:
         """The robot's health. now: s, monotonic."""
         with self._state_lock:
-            return self._health.report(self._state, now)
+            return self._health.report(self._state, now, self.waiting_since())
 
     def pose_at(self, stamp: int | None = None) -> PoseAt:
         """The pose at a time (ns; default: of the last sample). DataError: nothing is remembered of that time."""
