@@ -1,9 +1,12 @@
-"""Processor time of a call, which other processes do not lengthen as they do wall time, and how long to wait."""
+"""Processor time of a call, which other processes do not lengthen as they do wall time, how long to wait, and load."""
 
 from __future__ import annotations
 
+import os
+import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 PATIENCE = 300.0  # s: who waits longer for an event waits in vain, however busy the machine is (chosen)
 
@@ -16,3 +19,15 @@ def processor_time(call: Callable[[], object], repetitions: int = 3) -> float:
         call()
         times.append(time.thread_time() - began)
     return min(times)
+
+
+@contextmanager
+def load(loops: int) -> Iterator[None]:
+    """So many loops for each core, which keep the machine busy."""
+    running = [subprocess.Popen(["/bin/sh", "-c", "while :; do :; done"]) for _ in range(loops * (os.cpu_count() or 1))]
+    try:
+        yield
+    finally:
+        for each in running:
+            each.kill()
+            each.wait()

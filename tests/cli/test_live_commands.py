@@ -17,7 +17,7 @@ from commands import Command as InProcess
 from drives import calibration
 from nodes import Command, write_node
 from sessions import free_port, raw_session, until
-from timing import PATIENCE
+from timing import PATIENCE, load
 
 import omnibench as package
 from omnibench.data.storage import load_dataset
@@ -44,8 +44,12 @@ def endpoint(config: Path) -> str:
     return str(yaml.safe_load(config.read_text())["zenoh"]["listen"])
 
 
-def test_a_replay_to_a_node_is_one_command_and_shows_that_odom_is_the_batch_odometry(workplace: Path) -> None:
-    run = omnibench("live", workplace / "node.yaml", "--replay")
+@pytest.mark.parametrize("loops", [0, 2])
+def test_a_replay_to_a_node_is_one_command_and_shows_that_odom_is_the_batch_odometry(
+    workplace: Path, loops: int
+) -> None:
+    with load(loops):
+        run = omnibench("live", workplace / "node.yaml", "--replay")
     assert run.returncode == 0, run.stderr
     assert "against the simulated truth" in run.stdout
     difference = re.search(r"batch odometry: (\S+) \(m, rad\) at most; 0 messages of odom lost", run.stdout)

@@ -20,6 +20,7 @@ from nodes import Command, asked, config_of, running, write_node
 from recordings import random_dataset
 from replayed import config
 from sessions import free_port, raw_session, until
+from timing import load
 
 from omnibench.data.storage import save_dataset
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_runs
@@ -117,10 +118,12 @@ def node(folder: Path, port: int) -> Iterator[Command]:
 
 class TestToANode:
     @pytest.mark.usefixtures("node")
-    def test_the_tail_is_taken_when_the_session_closes_right_after(self, port: int) -> None:
+    @pytest.mark.parametrize("loops", [0, 2])
+    def test_the_tail_is_taken_when_the_session_closes_right_after(self, port: int, loops: int) -> None:
         session = connected(port)
-        report = player(session).play()
-        session.close()
+        with load(loops):
+            report = player(session).play()
+            session.close()
         with connected(port) as another:
             assert counts(another)["samples"] == report.sent["joint_states"]
         assert report.taken == report.total
