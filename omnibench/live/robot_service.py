@@ -20,7 +20,7 @@ from omnibench.live.estimation.update import Update
 from omnibench.live.intake import Intake
 from omnibench.live.late_updates import LATE, LateUpdates
 from omnibench.live.network.rate_limiter import RateLimiter
-from omnibench.live.wire.attachment import flow_of
+from omnibench.live.wire.attachment import MissedMessages, flow_of
 from omnibench.live.wire.messages import Diagnostics
 from omnibench.live.wire.outputs import OUTPUTS
 from omnibench.live.wire.topics import GraphNode
@@ -61,6 +61,7 @@ class RobotService:
         self._scheduled = False  # a turn is queued, or has not yet looked at what waits
         self._working = threading.Lock()  # held while messages are taken
         self._late = LateUpdates(self._publish)
+        self._missed = MissedMessages()  # of wheels that nobody acknowledges
         self._flows = AcknowledgedFlows(graph.session, name, tracker.flows)
         self._rate_limiter = RateLimiter()
         self._logged_anomalies: dict[str, int] = {}
@@ -141,7 +142,8 @@ class RobotService:
                 if flow is None:
                     waited = time.monotonic() - message.arrival
                     behind = max(behind, waited)
-                    self._take(message, late=waited > LATE)
+                    skipped = 0 if message.is_pose else self._missed.skipped(message.attachment)
+                    self._take(message, late=waited > LATE, skipped=skipped)
                     continue
                 self._receive_poses()
                 if self._flows.accepts(flow):
@@ -155,13 +157,16 @@ class RobotService:
                 self._scheduled = True
                 self._intake.ready(self._take_turn)
 
-    def _take(self, message: _Message, *, late: bool, published: bool = False) -> None:
-        """Take a message, and publish its updates unless it is late, or they may be published already."""
+    def _take(self, message: _Message, *, late: bool, published: bool = False, skipped: int = 0) -> None:
+        """Take a message, and publish its updates unless it is late, or they may be published already.
+
+        skipped: messages before it that never came, by the sender's numbers.
+        """
         try:
             if message.is_pose:
                 self.tracker.take_pose(message.payload, message.arrival)
                 return
-            updates = self.tracker.take_wheels(message.payload, message.arrival)
+            updates = self.tracker.take_wheels(message.payload, message.arrival, skipped)
             if published:
                 self._late.unpublished += len(updates)
             elif late:

@@ -19,7 +19,7 @@ class Counts:
     """Counters since the start, in the order in which diagnostics show them."""
 
     samples: int = 0  # wheel samples taken
-    missing: int = _anomaly("wheel sample", "missing")  # it never came, by the stamps of those that did
+    missing: int = _anomaly("wheel sample", "missing")  # it never came, by the numbers or stamps of those that did
     irregular: int = _anomaly("wheel sample", "at irregular times")  # off the mean period by a quarter or more
     duplicates: int = _anomaly("wheel sample", "twice")  # its stamp was taken already
     late: int = _anomaly("wheel sample", "out of order")  # a newer one had been taken

@@ -68,15 +68,16 @@ class RobotTracker:
         self._closed = False
         self.waiting_since: Callable[[], float | None] = lambda: None  # when the oldest that waits came, s, monotonic
 
-    def take_wheels(self, payload: bytes, arrival: float) -> list[Update]:
+    def take_wheels(self, payload: bytes, arrival: float, skipped: int = 0) -> list[Update]:
         """Take a sensor_msgs/JointState in CDR; its updates, in order.
 
-        Mostly there is one; none while a sample is refused or has to be confirmed. arrival: s, monotonic.
+        Mostly there is one; none while a sample is refused or has to be confirmed. arrival: s, monotonic. skipped:
+        messages before it that never came, by the sender's numbers.
         """
         with self._state_lock:
             message = self._decode(payload)
             updates = []
-            for step in self._order_and_repair(message, arrival):
+            for step in self._order_and_repair(message, arrival, skipped):
                 motion = self._integrate(step)
                 self._fuse(motion)
                 updates.append(self._update(motion.stamp))
@@ -107,13 +108,13 @@ class RobotTracker:
             self._state.last_refusal = str(error)
             return None
 
-    def _order_and_repair(self, message: JointState | None, arrival: float) -> list[WheelStep]:
+    def _order_and_repair(self, message: JointState | None, arrival: float, skipped: int) -> list[WheelStep]:
         """Step 2: how the wheels turned since the last sample; late, doubled and impossible samples are refused."""
         if message is None:
             return []
         state = self._state
         state.wheel_input.last_refusal = ""
-        steps = state.wheel_input.take(message, arrival)
+        steps = state.wheel_input.take(message, arrival, skipped)
         state.last_refusal = state.wheel_input.last_refusal or state.last_refusal
         if steps:
             state.arrival = arrival

@@ -78,12 +78,16 @@ class WheelStep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sample:
-    """A checked message, its joints in the order of the wheels. stamp: ns. arrival: s."""
+    """A checked message, its joints in the order of the wheels. stamp: ns. arrival: s.
+
+    skipped: messages before it that never came, by the sender's numbers; 0 also of a sender without numbers.
+    """
 
     stamp: int
     arrival: float
     positions: Array | None
     velocities: Array | None
+    skipped: int = 0
 
 
 class WheelInput:
@@ -121,13 +125,14 @@ class WheelInput:
         self._counting = positions is not None and self._settings.use != "velocities"
         self._angles.begin(positions if self._counting else None)
 
-    def take(self, message: JointState, arrival: float) -> list[WheelStep]:
+    def take(self, message: JointState, arrival: float, skipped: int = 0) -> list[WheelStep]:
         """The steps that a message makes: mostly one; none while it is refused or has to be confirmed.
 
-        arrival: s, by a clock of this machine that never jumps.
+        arrival: s, by a clock of this machine that never jumps. skipped: messages before it that never came, by the
+        sender's numbers.
         """
         try:
-            sample = self._read(message, arrival)
+            sample = self._read(message, arrival, skipped)
         except MessageError as error:
             self.last_refusal = str(error)
             return []
@@ -149,7 +154,7 @@ class WheelInput:
             return [self._after_silence(sample, elapsed)]
         return self._confirmed(sample)
 
-    def _read(self, message: JointState, arrival: float) -> _Sample:
+    def _read(self, message: JointState, arrival: float, skipped: int) -> _Sample:
         """Check a message and take the wheels' values from it. MessageError: why it is refused."""
         places = self._places.get(message.names)
         if places is None:
@@ -171,7 +176,7 @@ class WheelInput:
                     f"wheel rates {velocities.tolist()} rad/s exceed max_rate {self._settings.max_rate:g}"
                 )
             velocities = None
-        return _Sample(message.stamp, arrival, positions, velocities)
+        return _Sample(message.stamp, arrival, positions, velocities, skipped)
 
     def _find(self, names: tuple[str, ...]) -> NDArray[np.intp]:
         """Places (N,) of the wheels among a message's joints. MessageError: one is not there."""
@@ -201,12 +206,12 @@ class WheelInput:
         assert self._last is not None
         waited = self._waited_for(sample)
         set_back = self._late_in_a_row >= _SET_BACK and waited > elapsed + 2 * self.period
-        set_ahead = elapsed > max(waited + _SLACK, 3 * self.period)
+        set_ahead = elapsed > max(waited + _SLACK, (3 + sample.skipped) * self.period)
         if set_back or set_ahead:  # the clock jumped within the limits of a next sample: this machine's clock counts
             self._counts.clock_jumps += 1
             elapsed = min(max(waited, self.period), self._settings.max_gap)
         else:
-            self._learn(elapsed, sample.arrival - self._last.arrival)
+            self._learn(elapsed, sample.arrival - self._last.arrival, sample.skipped)
         self._late_in_a_row = 0
         if self._counting and sample.positions is not None and self._angles.known is not None:
             rates = self._rates if sample.velocities is None else sample.velocities
@@ -253,12 +258,16 @@ class WheelInput:
         self._last, self._rates = sample, rates
         return WheelStep(sample.stamp, elapsed, angles, rates, blind, counted, restarted, self._angles.known)
 
-    def _learn(self, elapsed: float, waited: float) -> None:
-        """Update the mean period and the pace of the stamps, and count missing and irregular samples."""
+    def _learn(self, elapsed: float, waited: float, skipped: int) -> None:
+        """Update the mean period and the pace of the stamps, and count missing and irregular samples.
+
+        skipped: samples of the period that never came, by their numbers.
+        """
         self._stamped = _MEMORY * self._stamped + elapsed
         self._waited = _MEMORY * self._waited + waited
         if len(self._learnt) < _LEARNING:
-            self._learnt.append(elapsed)
+            self._counts.missing += skipped
+            self._learnt.append(elapsed / (1 + skipped))
             self.period = sorted(self._learnt)[len(self._learnt) // 4]
             return
         periods = elapsed / self.period
@@ -266,7 +275,7 @@ class WheelInput:
         self._counts.missing += whole - 1
         self._counts.irregular += abs(periods - whole) > _IRREGULAR
         self.period += _SMOOTHING * (elapsed / whole - self.period)
-        self._after_missing = self._after_missing + 1 if whole > 1 else 0
+        self._after_missing = self._after_missing + 1 if whole > 1 + skipped else 0
         if self._after_missing == _SLOWER:
             self._learnt.clear()
             self._after_missing = 0

@@ -64,7 +64,19 @@ class MissedMessages:
 
     def take(self, attachment: zenoh.ZBytes | None) -> bool:
         """True if a message is new, False if it is of an acknowledged flow and came before."""
-        content = b"" if attachment is None else attachment.to_bytes()
+        return self.take_bytes(b"" if attachment is None else attachment.to_bytes())
+
+    def skipped(self, content: bytes | None) -> int:
+        """Take a message by the bytes of its attachment; how many its publisher published before it that never came.
+
+        One that comes after all skips none.
+        """
+        before = self.count
+        self.take_bytes(content or b"")
+        return max(self.count - before, 0)
+
+    def take_bytes(self, content: bytes) -> bool:
+        """The same as ``take``, of the attachment's bytes."""
         if not _is_numbered(content):
             return True
         number, _, _, publisher = _HEAD.unpack_from(content)

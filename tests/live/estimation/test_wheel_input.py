@@ -25,11 +25,13 @@ class Receiver:
         self.input = WheelInput(NAMES, WheelSettings.model_validate(settings), PERIOD, self.counts)
         self.steps: list[WheelStep] = []
 
-    def take(self, *messages: JointState, arrivals: list[float] | None = None) -> list[WheelStep]:
+    def take(
+        self, *messages: JointState, arrivals: list[float] | None = None, skipped: list[int] | None = None
+    ) -> list[WheelStep]:
         made: list[WheelStep] = []
         for index, message in enumerate(messages):
             arrival = (message.stamp - ORIGIN) / SECOND if arrivals is None else arrivals[index]
-            made += self.input.take(message, arrival)
+            made += self.input.take(message, arrival, 0 if skipped is None else skipped[index])
         self.steps += made
         return made
 
@@ -339,6 +341,26 @@ def test_a_robot_that_sends_more_rarely_from_now_on_misses_nothing_after_a_while
     receiver.take(*(at(time, time, 0.0, 0.0) for time in times))
     assert receiver.counts.missing <= 50
     assert receiver.input.period == pytest.approx(2 * PERIOD)
+
+
+def test_of_a_link_that_loses_every_second_sample_all_are_counted_where_they_are_numbered() -> None:
+    receiver, kept = Receiver(), range(0, 1000, 2)
+    receiver.take(*(at(k * PERIOD, 0.01 * k, 0.0, 0.0) for k in kept), skipped=[0, *[1] * (len(kept) - 1)])
+    assert receiver.counts.missing == len(kept) - 1
+    assert receiver.input.period == pytest.approx(PERIOD)
+
+
+def test_numbered_samples_that_are_lost_from_a_burst_are_missing_and_no_clock_has_jumped() -> None:
+    kept = [*range(100), *range(150, 200)]
+    arrivals = [PERIOD * min(k, 100) for k in kept]  # the link stood still, and then delivered all at once
+    receiver = Receiver()
+    receiver.take(
+        *(at(PERIOD * k, 0.01 * k, 0.0, 0.0) for k in kept),
+        arrivals=arrivals,
+        skipped=[50 if k == 150 else 0 for k in kept],
+    )
+    assert (receiver.counts.missing, receiver.counts.clock_jumps) == (50, 0)
+    assert receiver.driven[0] == pytest.approx(1.99)
 
 
 def test_even_periods_are_not_irregular_whatever_is_missing() -> None:

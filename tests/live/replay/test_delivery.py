@@ -363,6 +363,18 @@ class TestMissedMessages:
         assert missed.count == 999 * 49_999
 
 
+def test_a_node_counts_the_numbered_samples_of_a_robot_that_never_came(tmp_path: Path) -> None:
+    payloads = drive(4.0).payloads()
+    with running(config_of(tmp_path)) as (node, session):
+        wheels = session.declare_publisher("apr/joint_states", congestion_control=zenoh.CongestionControl.BLOCK)
+        until(lambda: wheels.matching_status.matching, "the node's subscription")
+        for number in [*range(100), *range(150, 400, 2)]:
+            wheels.put(payloads[number], attachment=packed(number, bytes(16)))
+        until(lambda: node.health("apr").counts["samples"] == 225, "all samples")
+        counted = node.health("apr").counts
+    assert (counted["missing"], counted["clock_jumps"]) == (50 + 124, 0)
+
+
 def test_a_flow_adds_to_an_attachment_what_ros_passes_over() -> None:
     plain, flow = packed(3, bytes(16)), packed(3, bytes(16), (7, 8, 9, True))
     assert (len(plain), flow_of(plain), flow_of(None)) == (33, None, None)
