@@ -14,6 +14,7 @@ from omnibench.discover.covariate_dependence import Dependences
 from omnibench.discover.experiments import experiments_for
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit
+from omnibench.discover.held_out.gaps import training_gap
 from omnibench.discover.held_out.validation_runs import ValidationRuns
 from omnibench.discover.result import (
     Discovery,
@@ -87,7 +88,7 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
         not_looked_for=tuple(NotLookedFor(name, missing.value) for name, missing in limits.not_looked_for),
         classes=limits.classes,
         hidden=limits.hidden,
-        gap=held_out[0 if needs_session else -1].eq6,
+        gap=held_out[0 if needs_session else -1].eq6 if held_out else training_gap(baseline, extended),
         held_out=held_out,
         steps=findings.steps,
         extrapolations=findings.extrapolations,

@@ -67,6 +67,8 @@ def write_discovery(
     for stale in chosen.glob("experiment-*.yaml"):  # files of an earlier discovery
         if stale.name not in map(experiment_file, range(1, len(discovery.experiments) + 1)):
             remove(stale)
+    if not discovery.extends:
+        remove(chosen / CALIBRATION_FILES["extended"])
     if folder is None:
         link_latest(chosen)
     return chosen
@@ -77,9 +79,10 @@ def _contents(discovery: Discovery, options: DiscoverOptions, folder: Path) -> d
         "config.yaml": _config(options),
         "discovery.json": to_json(discovery_document(discovery, folder)) + "\n",
         "report.html": render(discovery_report(discovery, to_yaml(options))),
-        CALIBRATION_FILES["extended"]: to_yaml(discovery.extended),
         CALIBRATION_FILES["plain"]: to_yaml(discovery.plain),
     }
+    if discovery.extends:
+        texts[CALIBRATION_FILES["extended"]] = to_yaml(discovery.extended)
     texts |= {experiment_file(number): each.config for number, each in enumerate(discovery.experiments, 1)}
     contents = {folder / name: text.encode("utf-8") for name, text in texts.items()}
     contents[folder / "residuals.parquet"] = encode_table(residual_table(discovery), "parquet")

@@ -138,15 +138,16 @@ class Hidden:
 class Gap:
     """Errors of the plain matrix (before) and of the extended model (after), and what repetitions allow (floor).
 
-    metric: "eq6" (m and rad, final poses) or "chi2" (whitened, all poses, per number). closed: the share of before -
-    floor that is gone; None where that is not larger than two standard errors, or no command is repeated.
+    metric: "eq6" (m and rad, final poses) or "chi2" (whitened, all poses, per number). floor: None where no command is
+    repeated, or where a model errs less than repetitions scatter. closed: the share of before - floor that is gone, at
+    most all; None where before - floor is not larger than two standard errors, or no command is repeated.
     standard_error: standard error of before - floor.
     """
 
     metric: Literal["eq6", "chi2"]
     before: float
     after: float
-    floor: float
+    floor: float | None
     closed: float | None
     standard_error: float
 
@@ -234,12 +235,13 @@ class Discovery:
 
     where, left: what the residuals depend on before and after the effects that were found. absorbed: names of effects
     that the matrix reproduces; measurements: what would identify them. extended, plain: calibrations with and without
-    the effects; their files are written in their place. dataset: the data set without outliers; dataset_hash: that of
-    the whole data set. outliers: number of reference poses that were left out of the fits. sessions: comparison of the
-    sessions by the extended model; eq6_of_sessions: Eq. (6) on the validation split, m and rad, once the matrices of
-    those that differ are changed. trajectories: names of the training runs. before, after: residuals (K, 3) of each of
-    these, reference minus odometry in m, m, rad, at pose_times[1:]. whitened_before, whitened_after: these, independent
-    and of unit variance under the noise.
+    the effects; their files are written in their place, None for the extended one where nothing was added. held_out:
+    empty, written as None, where no run could be held out. gap: on the training runs then. dataset: the data set
+    without outliers; dataset_hash: that of the whole data set. outliers: number of reference poses that were left out
+    of the fits. sessions: comparison of the sessions by the extended model; eq6_of_sessions: Eq. (6) on the validation
+    split, m and rad, once the matrices of those that differ are changed. trajectories: names of the training runs.
+    before, after: residuals (K, 3) of each of these, reference minus odometry in m, m, rad, at pose_times[1:].
+    whitened_before, whitened_after: these, independent and of unit variance under the noise.
     """
 
     verdict: Verdict
@@ -297,11 +299,13 @@ class Discovery:
         return few_in_words([run for run in self.dataset.trajectories if run.id in names])
 
     @field_serializer("held_out")
-    def _by_data(self, held_out: tuple[HeldOut, ...]) -> dict[str, HeldOut]:
-        return {held.data: held for held in held_out}
+    def _by_data(self, held_out: tuple[HeldOut, ...]) -> dict[str, HeldOut] | None:
+        return {held.data: held for held in held_out} or None
 
     @field_serializer("extended", "plain")
-    def _file(self, _: Calibration, info: FieldSerializationInfo) -> str:
+    def _file(self, _: Calibration, info: FieldSerializationInfo) -> str | None:
+        if info.field_name == "extended" and not self.extends:
+            return None
         return str(Path(info.context or "", CALIBRATION_FILES[info.field_name]).resolve())
 
     @field_serializer("dataset")

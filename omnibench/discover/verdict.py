@@ -124,11 +124,12 @@ def sessions_in_words(
     kinds = {difference.kind for difference in comparison.differences}
     of_split = [held.eq6 for held in held_out if held.data == "session"]
     if eq6_of_sessions is not None and of_split:
+        least = of_split[0].floor
+        floor = "" if least is None or least > eq6_of_sessions else f" (floor {least:.3g})"
         wear = " (tyre_wear, which is an effect of the model if both sessions train)" if "all wheels" in kinds else ""
         sentences.append(
             f"With {'these changes' if len(comparison.differences) > 1 else 'this change'}{wear}, fitted to the same "
-            f"runs, Eq. (6) of the held-out runs goes from {of_split[0].after:.3g} to {eq6_of_sessions:.3g} (floor "
-            f"{of_split[0].floor:.3g})."
+            f"runs, Eq. (6) of the held-out runs goes from {of_split[0].after:.3g} to {eq6_of_sessions:.3g}{floor}."
         )
     return sentences
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
-from discovery_samples import held_out, nothing, shorn, simulated
+from discovery_samples import held_out, named, nothing, shorn, simulated
 from hidden.session_sets import session_set
 from report_page import Page
 from rich.console import Console
@@ -15,6 +15,7 @@ from shared_results import made_once
 from omnibench.cli.terminal.discovery_summary import print_discovery
 from omnibench.data.dataset import Dataset
 from omnibench.discover.discover import discover_effects
+from omnibench.discover.output import DiscoverOptions, write_discovery
 from omnibench.discover.report.discovery_report import discovery_report
 from omnibench.discover.report.wording import VERDICTS, verdict_in_words
 from omnibench.discover.result import Discovery, discovery_document
@@ -109,6 +110,29 @@ def test_of_two_runs_headline_and_verdict_say_that_they_show_hardly_anything() -
     found = discover_effects(with_few_runs(session_set("small", 3)))
     assert "2 runs of 1 command can show hardly anything" in found.headline
     assert "hardly anything" in verdict_in_words(found)
+
+
+def test_where_nothing_was_added_programs_are_offered_no_extended_calibration(tmp_path: Path) -> None:
+    found = nothing()
+    assert discovery_document(found, tmp_path)["model"] is None
+    options = DiscoverOptions(dataset="data")
+    write_discovery(named(), options, tmp_path / "found")
+    assert (tmp_path / "found" / "model.yaml").exists()
+    write_discovery(found, options, tmp_path / "found")
+    assert not (tmp_path / "found" / "model.yaml").exists()
+    assert "model.yaml" not in page(found).text
+    assert (tmp_path / "found" / "plain.yaml").exists()
+
+
+def test_of_one_run_nothing_is_held_out_and_there_is_no_floor() -> None:
+    dataset = session_set("small", 3)
+    found = discover_effects(replace(dataset, trajectories=dataset.split("train")[:1]))
+    document = discovery_document(found, Path("found"))
+    assert document["held_out"] is None
+    assert document["gap"]["floor"] is None
+    for words in (printed(found), page(found).text):
+        assert "held-out" not in words
+        assert "held out" not in words
 
 
 def test_what_is_left_over_is_looked_for_again_once_a_smooth_term_is_added() -> None:

@@ -5,7 +5,8 @@ repetitions of a command leave to any model, the floor. The gap, its standard er
 
     G = mean b - mean f,    sigma = sqrt(var b / Z + var f / D),    (mean b - mean a) / G.                          (1)
 
-Where G is within two standard errors of nothing, no share is closed.
+Where G is within two standard errors of nothing, no share is closed. Where a model errs less than the differences
+scatter, by chance or because the repetitions were no repetitions, their mean is no floor, and all of a gap is closed.
 """
 
 from __future__ import annotations
@@ -34,16 +35,30 @@ def compare_held_out(
 ) -> tuple[HeldOut, ...]:
     """Errors of plain and extended model on held-out repetitions, and on the validation split if it has runs.
 
-    folds (Z,): the fold in which each training run is held out.
+    folds (Z,): the fold in which each training run is held out. If all are in one, none is: no other run predicts it.
     """
     floor = floor_of(extended.fit)
-    before, after = (errors_of_repetitions(model, folds) for model in (plain, extended))
-    held_out = [_compared("repetitions", before, after, floor)]
+    held_out = []
+    if len(np.unique(folds)) > 1:
+        before, after = (errors_of_repetitions(model, folds) for model in (plain, extended))
+        held_out.append(_compared("repetitions", before, after, floor))
     if validation.kept:
         before, after = (errors_on(model, validation.runs, validation.kept) for model in (plain, extended))
         of_session = floor_of(at_runs(extended.fit, validation.kept))
         held_out.append(_compared("session", before, after, of_session or floor))
     return tuple(held_out)
+
+
+def training_gap(plain: Extended, extended: Extended) -> Gap:
+    """The gap in Eq. (6) on the runs of the fit, as fitted to them."""
+    before, after = (_norms([each[-1] for each in model.fit.nuisance_free_residuals]) for model in (plain, extended))
+    floor = floor_of(extended.fit)
+    return gap_between("eq6", before, after, None if floor is None else floor.eq6)
+
+
+def _norms(finals: Sequence[Array]) -> Array:
+    norms: Array = np.linalg.norm(finals, axis=1)
+    return norms
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +120,7 @@ def floor_of(fit: Fit) -> Floor | None:
 
 def _compared(data: Literal["repetitions", "session"], before: Errors, after: Errors, floor: Floor | None) -> HeldOut:
     """The gaps in Eq. (6) of the final poses and in whitened chi-square."""
-    norms = [np.linalg.norm(errors.finals, axis=1) for errors in (before, after)]
+    norms = [_norms(list(errors.finals)) for errors in (before, after)]
     position = [float(np.hypot(errors.finals[:, 0], errors.finals[:, 1]).mean()) for errors in (before, after)]
     heading = [float(np.abs(errors.finals[:, 2]).mean()) for errors in (before, after)]
     return HeldOut(
@@ -122,8 +137,8 @@ def gap_between(metric: Literal["eq6", "chi2"], before: Array, after: Array, flo
     """The gap between errors (Z,) and a floor (D,); without a floor no share is closed."""
     first, last = float(before.mean()), float(after.mean())
     if floor is None:
-        return Gap(metric, first, last, min(first, last), None, float(before.std() / np.sqrt(len(before))))
-    error = float(np.sqrt(before.var() / len(before) + floor.var() / len(floor)))
-    gap = first - float(floor.mean())
-    closed = (first - last) / gap if gap > STANDARD_ERRORS * error else None  # Eq. (1)
-    return Gap(metric, first, last, float(floor.mean()), closed, error)
+        return Gap(metric, first, last, None, None, float(before.std() / np.sqrt(len(before))))
+    error, least = float(np.sqrt(before.var() / len(before) + floor.var() / len(floor))), float(floor.mean())
+    gap = first - least
+    closed = min((first - last) / gap, 1.0) if gap > STANDARD_ERRORS * error else None  # Eq. (1)
+    return Gap(metric, first, last, least if least <= min(first, last) else None, closed, error)

@@ -114,7 +114,8 @@ def _gap_fact(discovery: Discovery, gap: Gap, where: str) -> Fact:
     if discovery.extends:
         return Fact("Gap closed, Eq. (6)", closed_in_words(gap), where)
     decimals = gap_decimals(gap)
-    return Fact("Eq. (6)", fixed(gap.before, decimals), f"floor {fixed(gap.floor, decimals)}; {where}")
+    floor = "" if gap.floor is None else f"floor {fixed(gap.floor, decimals)}; "
+    return Fact("Eq. (6)", fixed(gap.before, decimals), f"{floor}{where}")
 
 
 def what_blocks(discovery: Discovery) -> Iterator[Block]:
@@ -270,7 +271,7 @@ def _basis(discovery: Discovery, options: str) -> Iterator[Block]:
     yield Callout("Warnings on reading the data", dataset.warnings, "warning")
     files = "model.yaml is the extended calibration and plain.yaml the matrix alone, both"
     if not discovery.extends:
-        files = "plain.yaml is the matrix alone, to which nothing was added, and model.yaml the same,"
+        files = "plain.yaml is the matrix alone, to which nothing was added,"
     yield Paragraph(
         f"Beside this report: {files} ready for omnibench evaluate, simulate and live; discovery.json holds all "
         "figures, residuals.parquet every residual before and after."

@@ -197,9 +197,10 @@ def gap_grid(discovery: Discovery) -> FigureGrid:
         )
         for name, gap in gaps
     )
+    line = (_FLOOR,) if any(gap.floor is not None for _, gap in gaps) else ()
     return FigureGrid(
         figures,
-        (PLAIN, EXTENDED, _FLOOR) if discovery.extends else (ALONE, _FLOOR),
+        (*((PLAIN, EXTENDED) if discovery.extends else (ALONE,)), *line),
         2 if len(figures) > 1 else 1,
         floor_in_words(discovery),
     )
@@ -214,10 +215,10 @@ def _gap_title(discovery: Discovery, gap: Gap, name: str) -> str:
 
 def _gap_values(gap: Gap, extends: bool) -> tuple[tuple[str, float, LegendItem], ...]:
     """Names, values and legend of the bars: the plain matrix alone and the floor where nothing was added."""
-    floor = ("floor", gap.floor, _FLOOR)
+    floor = () if gap.floor is None else (("floor", gap.floor, _FLOOR),)
     if not extends:
-        return ("plain matrix", gap.before, ALONE), floor
-    return ("before", gap.before, PLAIN), ("after", gap.after, EXTENDED), floor
+        return ("plain matrix", gap.before, ALONE), *floor
+    return ("before", gap.before, PLAIN), ("after", gap.after, EXTENDED), *floor
 
 
 def _gap_bars(gap: Gap, extends: bool) -> go.Figure:

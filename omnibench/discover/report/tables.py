@@ -128,7 +128,8 @@ def _gap_note(discovery: Discovery) -> str:
 
 def _gap_row(discovery: Discovery, gap: Gap) -> Row:
     decimals = gap_decimals(gap)
-    before, after, floor = (fixed(value, decimals) for value in (gap.before, gap.after, gap.floor))
+    before, after = fixed(gap.before, decimals), fixed(gap.after, decimals)
+    floor = NOTHING if gap.floor is None else fixed(gap.floor, decimals)
     cells = (before, after, floor, closed_in_words(gap)) if discovery.extends else (before, floor)
     return Row.of(METRICS[gap.metric], *cells, significant(gap.standard_error, 2))
 

@@ -184,15 +184,16 @@ def closed_in_words(gap: Gap) -> str:
 
 def gap_decimals(*gaps: Gap) -> int:
     """The decimals that show before, after and floor of these gaps to three significant digits."""
-    smallest = min((value for gap in gaps for value in (gap.before, gap.after, gap.floor) if value > 0), default=0.0)
+    values = [value for gap in gaps for value in (gap.before, gap.after, gap.floor or 0.0)]
+    smallest = min((value for value in values if value > 0), default=0.0)
     return min(6, max(2, decimals_for(smallest, 3)))
 
 
 def gap_in_words(gap: Gap) -> str:
     """``0.0412 → 0.0213 (floor 0.0205), 96.1 %``."""
     decimals = gap_decimals(gap)
-    before, after, floor = (fixed(value, decimals) for value in (gap.before, gap.after, gap.floor))
-    return f"{before} → {after} (floor {floor}), {closed_in_words(gap)}"
+    floor = "" if gap.floor is None else f" (floor {fixed(gap.floor, decimals)})"
+    return f"{fixed(gap.before, decimals)} → {fixed(gap.after, decimals)}{floor}, {closed_in_words(gap)}"
 
 
 def final_errors_in_words(discovery: Discovery, held: HeldOut) -> tuple[str, str]:
@@ -217,9 +218,12 @@ def held_out_in_words(discovery: Discovery, held: HeldOut) -> str:
 
 def floor_in_words(discovery: Discovery) -> str:
     """The meaning of the floor of a gap, in a sentence."""
-    if discovery.noise.source == "repetitions":
-        return "The floor is what the scatter between repetitions of a command leaves to any model."
-    return "No command is repeated: the floor is what the residuals within the runs say of the noise."
+    if discovery.noise.source != "repetitions":
+        return "No command is repeated: there is no floor."
+    above = any(gap.floor is None for gap in (discovery.gap, *(g for h in discovery.held_out for g in (h.eq6, h.chi2))))
+    return "The floor is what the scatter between repetitions of a command leaves to any model." + (
+        " None stands where a model errs less than repetitions scatter." if above else ""
+    )
 
 
 def decisive(discovery: Discovery) -> HeldOut | None:

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from extended_samples import FORWARD, TURN, extended_of, run_of
 
-from omnibench.discover.held_out.gaps import compare_held_out, errors_of_repetitions, floor_of, gap_between
+from omnibench.discover.held_out.gaps import (
+    compare_held_out,
+    errors_of_repetitions,
+    floor_of,
+    gap_between,
+    training_gap,
+)
 from omnibench.discover.held_out.validation_runs import ValidationRuns
 
 RUNS = [
@@ -33,10 +39,23 @@ def test_of_a_gap_within_two_standard_errors_no_share_is_closed() -> None:
     assert gap_between("eq6", before + 0.1, before, floor).closed == pytest.approx(0.1 / 2.1)
 
 
-def test_without_a_floor_the_better_model_stands_for_it_and_nothing_is_closed() -> None:
+def test_without_repetitions_there_is_no_floor_and_nothing_is_closed() -> None:
     gap = gap_between("chi2", np.array([3.0, 5.0]), np.array([2.0, 2.0]), None)
-    assert (gap.floor, gap.closed) == (2.0, None)
+    assert (gap.floor, gap.closed) == (None, None)
     assert gap.standard_error == pytest.approx(1 / np.sqrt(2))
+
+
+def test_what_a_model_errs_less_than_is_no_floor() -> None:
+    before, floor = np.full(4, 5.0), np.full(4, 3.0)
+    gap = gap_between("eq6", before, np.full(4, 2.0), floor)
+    assert (gap.floor, gap.closed) == (None, 1.0)
+    assert gap_between("eq6", before, np.full(4, 3.5), floor).floor == 3.0
+
+
+def test_where_all_runs_are_in_one_fold_nothing_is_held_out() -> None:
+    model = extended_of(RUNS, left(4, 6, 4, 6))
+    assert compare_held_out(model, model, NO_VALIDATION, np.zeros(4, dtype=np.intp)) == ()
+    assert training_gap(model, model).before == 5.0
 
 
 def test_a_model_with_nothing_to_fit_errs_by_its_residuals() -> None:
