@@ -68,7 +68,9 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
     baseline, extended, held_out = findings.baseline, findings.extended, findings.held_out
     fit, effects, limits = extended.fit, findings.effects, findings.detectability
     where, left = findings.dependences.where, findings.dependences.left
-    of_sessions = sessions_in_words(findings.verdict, findings.sessions, held_out, findings.eq6_of_sessions)
+    of_sessions = sessions_in_words(
+        findings.verdict, findings.sessions, held_out, findings.eq6_of_sessions, {run.session for run in fit.runs}
+    )
     few, differ, doubts = few_in_words(fit.runs), bool(of_sessions), findings.sessions.doubts
     of_model = headline_of(findings.verdict, effects, where, left, few, differ=differ, untested=bool(doubts))
     headline = " ".join([*of_sessions, of_model, *(doubts if findings.verdict == "none" else ()), *_warnings(findings)])

@@ -22,7 +22,7 @@ from omnibench.discover.fitting.model_fit import Fit
 from omnibench.discover.held_out.cross_validation import random_folds_of_repetitions
 from omnibench.discover.held_out.gaps import compare_held_out
 from omnibench.discover.held_out.sessions import compare_with_validation, eq6_with_changes
-from omnibench.discover.held_out.validation_runs import validation_runs
+from omnibench.discover.held_out.validation_runs import noise_runs, validation_runs
 from omnibench.discover.held_out.waterfall import waterfall_steps
 from omnibench.discover.result import Discovery
 from omnibench.discover.selection.candidate_groups import check_names
@@ -65,10 +65,10 @@ def discover_effects(
     """Find where the odometry of a data set's training split disagrees with its reference, and which effect is missing.
 
     without: effects that are not to be tried. unknown_term: where no effect explains what is missing, add a smooth term
-    over the covariate that the residuals depend on. calibration: the plain
-    matrix is fitted from this one's matrix on, by default from the robot's design values. The validation split is used
-    when all is decided, and only to say how well the models predict it. watch: told of every step as it begins and
-    ends.
+    over the covariate that the residuals depend on. calibration: the plain matrix is fitted from this one's matrix on,
+    by default from the robot's design values. The validation split is used when all is decided, and only to say how
+    well the models predict it; but where no session of the training split repeats a command, runs of the validation
+    split that do are used for the noise, and a note says so. watch: told of every step as it begins and ends.
 
     Raises UnknownNameError for a name in ``without`` that is no effect's, DataError for a training split without
     reference poses or another robot's calibration.
@@ -83,7 +83,7 @@ def discover_effects(
     start = _start_matrix(dataset, calibration)
 
     progress.begin("fitting the plain matrix")
-    plain = fit_matrix(runs, dataset.robot, dataset.sample_period, start)
+    plain = fit_matrix(runs, dataset.robot, dataset.sample_period, start, noise_runs(runs, dataset))
 
     progress.begin("looking where it fails, and at the catalogue")
     screening = screen_plain(plain, without)

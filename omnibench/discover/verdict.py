@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from omnibench.discover.result import CovariateDependence, HeldOut, NamedEffect, Verdict
 from omnibench.discover.selection.model_selection import CHANCE, SURE
@@ -112,16 +112,22 @@ def _places(dependences: _Dependences) -> str:
 
 
 def sessions_in_words(
-    verdict: Verdict, comparison: SessionComparison, held_out: Sequence[HeldOut], eq6_of_sessions: float | None
+    verdict: Verdict,
+    comparison: SessionComparison,
+    held_out: Sequence[HeldOut],
+    eq6_of_sessions: float | None,
+    trained: Collection[str | None] = (),
 ) -> list[str]:
     """Sentences on sessions that differ, and on what their own matrices make of the validation split.
 
-    Where other commands may be the cause, a verdict that something is missing says it already.
+    Where other commands may be the cause, a verdict that something is missing says it already. trained: the sessions
+    of the training runs.
     """
     sentences = list(comparison.sentences)
     if verdict != "none":
         sentences = sentences[: len(comparison.differences)]
-    kinds = {difference.kind for difference in comparison.differences}
+    untrained = [each for each in comparison.differences if not {each.session, *each.others} <= set(trained)]
+    kinds = {difference.kind for difference in untrained}
     of_split = [held.eq6 for held in held_out if held.data == "session"]
     if eq6_of_sessions is not None and of_split:
         least = of_split[0].floor

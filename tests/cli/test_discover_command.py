@@ -147,7 +147,7 @@ def test_an_earlier_discovery_is_replaced_with_all_its_files(written: Path, tmp_
     folder = shutil.copytree(written, tmp_path / "out")
     assert (folder / "experiment-2.yaml").read_text(encoding="utf-8") == EXPERIMENT.config
     write_discovery(replace(nothing(), experiments=(EXPERIMENT,)), OPTIONS, folder)
-    assert {path.name for path in folder.iterdir()} == {*FILES, "experiment-1.yaml"}
+    assert {path.name for path in folder.iterdir()} == {*FILES, "experiment-1.yaml"} - {"model.yaml"}
     assert json.loads((folder / "discovery.json").read_text(encoding="utf-8"))["verdict"] == "none"
 
 

@@ -87,6 +87,29 @@ def test_sessions_that_both_train_give_tyre_wear_its_name() -> None:
     assert found.sessions.differences == ()
 
 
+def halved(dataset: Dataset, *, validate: bool) -> Dataset:
+    """Of two repetitions in every session the first trains, and the second validates or is left out."""
+    halves = [replace(run, split="train" if run.repetition == 1 else "validation") for run in dataset.trajectories]
+    kept = [run for run in halves if validate or run.split == "train"]
+    return replace(dataset, trajectories=tuple(kept))
+
+
+def test_sessions_that_train_on_one_run_a_command_each_give_tyre_wear_its_name() -> None:
+    found = discover_effects(halved(session_set("small", 3, change=0.02, repetitions=2), validate=True))
+    assert [effect.name for effect in found.effects] == ["tyre_wear"]
+    assert found.sessions.differences == ()
+    assert "if both sessions train" not in found.headline
+    assert "so that the noise has seen validation runs" in found.noise.description
+    assert all(held.eq6.floor is None or held.eq6.floor <= held.eq6.after for held in found.held_out)
+
+
+def test_without_repetitions_in_a_session_the_runs_of_another_are_none() -> None:
+    found = discover_effects(halved(session_set("small", 3, change=0.02, repetitions=2), validate=False))
+    assert found.noise.source == "within runs"
+    assert "no session repeats a command" in found.noise.description
+    assert all(held.eq6.floor is None for held in found.held_out)
+
+
 def test_where_nothing_was_added_the_report_draws_no_two_models_and_offers_none() -> None:
     found = nothing()
     report, told = page(found), printed(found)

@@ -66,9 +66,18 @@ class Extended:
         ]
 
 
-def fit_matrix(runs: Sequence[Trajectory], robot: Robot, sample_period: float, start: Array) -> Fit:
-    """Fit the plain matrix from a start (3, N), and with it noise, nuisances and the poses that jump."""
-    return _in_turn(first_fit(runs, robot, sample_period, start), (), _ROUNDS)[0]
+def fit_matrix(
+    runs: Sequence[Trajectory],
+    robot: Robot,
+    sample_period: float,
+    start: Array,
+    noise_runs: Sequence[Trajectory] = (),
+) -> Fit:
+    """Fit the plain matrix from a start (3, N), and with it noise, nuisances and the poses that jump.
+
+    noise_runs: repetitions of the runs that the noise alone sees.
+    """
+    return _in_turn(first_fit(runs, robot, sample_period, start, noise_runs), (), _ROUNDS)[0]
 
 
 def extend(plain: Fit, groups: Sequence[Group]) -> Extended:

@@ -33,10 +33,23 @@ _CHANCE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Fit(TrajectoryFit):
-    """A fitted model at runs without poses that jump, and its noise. jumps: the number of poses that were left out."""
+    """A fitted model at runs without poses that jump, and its noise.
+
+    jumps: the number of poses that were left out. noise_runs: runs that the noise alone sees, as repetitions of these.
+    """
 
     noise: NoiseEstimate
     jumps: int = 0
+    noise_runs: tuple[Trajectory, ...] = ()
+
+    @property
+    def with_noise_runs(self) -> Fit:
+        """The fit's model at its runs and at those that the noise alone sees."""
+        if not self.noise_runs:
+            return self
+        values = np.vstack([self.nuisances.values, np.zeros((len(self.noise_runs), 3))])
+        runs, nuisances = (*self.runs, *self.noise_runs), replace(self.nuisances, values=values)
+        return replace(self, runs=runs, noise_runs=(), nuisances=nuisances).with_likeliest_nuisances()
 
     @property
     def velocities(self) -> list[Array]:
@@ -72,23 +85,32 @@ def _velocities(log: WheelLog, poses: Array) -> Array:
     return velocities
 
 
-def first_fit(runs: Sequence[Trajectory], robot: Robot, sample_period: float, start: Array) -> Fit:
+def first_fit(
+    runs: Sequence[Trajectory],
+    robot: Robot,
+    sample_period: float,
+    start: Array,
+    noise_runs: Sequence[Trajectory] = (),
+) -> Fit:
     """The plain matrix (3, N) to start from, whose noise is not known yet.
 
     The model drives exact arcs: Euler steps would leave what looks like centripetal slip.
     """
     model = OdometryModel(robot, start, "arc", (), sample_period)
-    return Fit(model, tuple(runs), Nuisances(np.zeros((len(runs), 3)), np.zeros(3)), _UNKNOWN_NOISE)
+    nuisances = Nuisances(np.zeros((len(runs), 3)), np.zeros(3))
+    return Fit(model, tuple(runs), nuisances, _UNKNOWN_NOISE, noise_runs=tuple(noise_runs))
 
 
 def with_noise(fit: Fit) -> Fit:
     """The fit with noise, nuisances and jumping poses estimated anew from its residuals."""
     near = fit.noise.noise if fit.noise is not _UNKNOWN_NOISE else None
-    turned = in_start_frames(fit.runs, fit.residuals)
-    noise = estimate_noise(differences_between_repetitions(fit.runs, turned), near)
-    runs, jumps = without_jumps(fit.runs, turned, noise.noise)
-    fit = replace(fit, runs=runs, jumps=fit.jumps + jumps)
-    found = noise_of_fit(fit, range(3), noise.noise, _CHANCE)
+    seen, count = fit.with_noise_runs, len(fit.runs)
+    turned = in_start_frames(seen.runs, seen.residuals)
+    noise = estimate_noise(differences_between_repetitions(seen.runs, turned), near)
+    runs, jumps = without_jumps(fit.runs, turned[:count], noise.noise)
+    noise_runs, _ = without_jumps(fit.noise_runs, turned[count:], noise.noise)
+    fit = replace(fit, runs=runs, jumps=fit.jumps + jumps, noise_runs=noise_runs)
+    found = noise_of_fit(fit.with_noise_runs, range(3), noise.noise, _CHANCE)
     values = np.where(found.deviations > 0, fit.nuisances.values, 0.0)
     fit = replace(fit, nuisances=Nuisances(values, found.deviations), noise=found.estimate)
     return fit.with_likeliest_nuisances()
@@ -122,7 +144,7 @@ def at_model(fit: Fit, model: OdometryModel) -> Fit:
 def at_runs(fit: Fit, runs: Sequence[Trajectory]) -> Fit:
     """The fit's model at other runs, their nuisances 0: only the sizes of these are known."""
     nothing_known = Nuisances(np.zeros((len(runs), 3)), fit.nuisances.deviations)
-    return replace(fit, runs=tuple(runs), nuisances=nothing_known, jumps=0)
+    return replace(fit, runs=tuple(runs), nuisances=nothing_known, jumps=0, noise_runs=())
 
 
 def model_with(model: OdometryModel, matrix: Array, terms: Sequence[Term]) -> OdometryModel:

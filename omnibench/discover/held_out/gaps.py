@@ -101,7 +101,7 @@ class Floor:
 def floor_of(fit: Fit) -> Floor | None:
     """The floor of a fit's runs; None where no command is repeated."""
     known = np.flatnonzero(fit.nuisances.estimated)
-    differences = differences_without_nuisances(fit, list(known))
+    differences = differences_without_nuisances(fit.with_noise_runs, list(known))
     if differences.source != "repetitions":
         return None
     each = differences.each

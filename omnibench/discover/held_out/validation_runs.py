@@ -9,6 +9,7 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.fitting.model_fit import Fit, at_runs
 from omnibench.discover.fitting.outliers import without_jumps
 from omnibench.errors import DataError
+from omnibench.fit.least_squares.repetitions import repeating_runs
 from omnibench.fit.least_squares.start_frames import in_start_frames
 from omnibench.fit.least_squares.usable_runs import usable_runs
 from omnibench.robot.model import OdometryModel
@@ -47,6 +48,14 @@ def validation_runs(dataset: Dataset, fit: Fit) -> ValidationRuns:
     if jumps:
         warnings.append(f"{jumps} validation poses contradict their neighbours; chi2 is without them.")
     return ValidationRuns(runs, kept, tuple(warnings))
+
+
+def noise_runs(runs: Sequence[Trajectory], dataset: Dataset) -> tuple[Trajectory, ...]:
+    """Runs of the validation split that repeat training runs in their session, where no training run does."""
+    try:
+        return usable_runs(repeating_runs(runs, dataset.split("validation")), "validation")
+    except DataError:
+        return ()
 
 
 def _lacks_inputs(model: OdometryModel, run: Trajectory) -> bool:

@@ -219,7 +219,7 @@ def held_out_in_words(discovery: Discovery, held: HeldOut) -> str:
 def floor_in_words(discovery: Discovery) -> str:
     """The meaning of the floor of a gap, in a sentence."""
     if discovery.noise.source != "repetitions":
-        return "No command is repeated: there is no floor."
+        return "No command is repeated within a session: there is no floor."
     above = any(gap.floor is None for gap in (discovery.gap, *(g for h in discovery.held_out for g in (h.eq6, h.chi2))))
     return "The floor is what the scatter between repetitions of a command leaves to any model." + (
         " None stands where a model errs less than repetitions scatter." if above else ""

@@ -55,10 +55,10 @@ def differences_between_repetitions(
 ) -> Differences:
     """Independent differences of residuals (K, 3), odometry minus reference or the reverse, at all pose_times[1:].
 
-    Repetitions are runs of one command within a session (within a split if no session repeats a command). Runs with
-    different stamps are compared at the nearest ones; interpolation would reduce white noise. Without repeated commands
-    the residuals themselves stand in for the differences. slopes (K, 3, m): derivatives of every trajectory's poses by
-    its nuisances, averaged alongside; default none.
+    Repetitions are those of ``repetitions_of_commands``. Runs with different stamps are compared at the nearest ones;
+    interpolation would reduce white noise. Without repeated commands the residuals themselves stand in for the
+    differences. slopes (K, 3, m): derivatives of every trajectory's poses by its nuisances, averaged alongside; default
+    none.
     """
     slopes = [np.zeros((*residual.shape, 0)) for residual in residuals] if slopes is None else slopes
     runs = [
@@ -70,12 +70,12 @@ def differences_between_repetitions(
     if contrasts := tuple(contrast for members in measured for contrast in _contrasts(members)):
         words = (
             f"{len(contrasts)} independent {noun_for(len(contrasts), 'difference')} between repetitions "
-            f"({repeated.description}, each within one {repeated.within})"
+            f"({repeated.description}, {repeated.words})"
         )
         return Differences(contrasts, "repetitions", words)
     whole = tuple(Difference(stamps, values[..., 0], values[..., 1:]) for stamps, values in runs if len(stamps))
     words = (
-        f"the residuals within {len(whole)} {noun_for(len(whole), 'run')}: no command is repeated, so what the model "
+        f"the residuals within {len(whole)} {noun_for(len(whole), 'run')}: {repeated.words}, so what the model "
         "cannot express counts as noise"
     )
     return Differences(whole, "within runs", words)
@@ -83,24 +83,58 @@ def differences_between_repetitions(
 
 @dataclass(frozen=True)
 class Repetitions:
-    """Groups of run indices, one for every command driven more than once within one session or one split."""
+    """Groups of run indices, one for every command driven more than once within one session.
+
+    commands: number of different commands. words: from where the repetitions are, or why there are none.
+    """
 
     groups: tuple[tuple[int, ...], ...]
-    within: Literal["session", "split"]
+    commands: int
+    words: str
 
     @property
     def description(self) -> str:
-        return f"{sum(map(len, self.groups))} runs of {len(self.groups)} {noun_for(len(self.groups), 'command')}"
+        return f"{sum(map(len, self.groups))} runs of {self.commands} {noun_for(self.commands, 'command')}"
 
 
 def repetitions_of_commands(trajectories: Sequence[Trajectory]) -> Repetitions:
-    """The repetitions within sessions; if no session repeats a command, those within splits. Runs need a command."""
-    for within in ("session", "split"):
-        keys = [(run.split, run.session if within == "session" else None, run.command) for run in trajectories]
+    """The repetitions within sessions, of one split or, if none repeats a command, of both. Runs need a command.
+
+    Runs of different sessions are no repetitions: what differs between the sessions would count as noise. Where
+    sessions are not known, those of a split are taken for one.
+    """
+    of_splits = [(run.split, run.session, run.command) for run in trajectories]
+    of_sessions = [(run.split if run.session is None else "", run.session, run.command) for run in trajectories]
+    known = any(run.session is not None for run in trajectories)
+    for keys, words in (
+        (of_splits, f"each within one {'session' if known else 'split'}"),
+        (
+            of_sessions,
+            "each within one session, across both splits, so that the noise has seen validation runs",
+        ),
+    ):
         repeated = [group for group in grouped(keys) if len(group) > 1 and trajectories[group[0]].command is not None]
         if repeated:
-            return Repetitions(tuple(repeated), within)
-    return Repetitions((), "split")
+            return Repetitions(tuple(repeated), len({trajectories[group[0]].command for group in repeated}), words)
+    driven = [run.command for run in trajectories if run.command is not None]
+    alone = len(set(driven)) == len(driven) or not known
+    return Repetitions((), 0, "no command is repeated" if alone else "no session repeats a command")
+
+
+def repeating_runs(runs: Sequence[Trajectory], others: Sequence[Trajectory]) -> list[Trajectory]:
+    """Those of other runs that repeat a command of the runs in the same session, where the runs themselves repeat none.
+
+    They have all that was recorded of the runs.
+    """
+    if repetitions_of_commands(runs).groups:
+        return []
+    driven = {(run.session, run.command) for run in runs if None not in (run.session, run.command)}
+    needed = [name for name in ("angles", "started_at") if any(getattr(run, name) is not None for run in runs)]
+    return [
+        run
+        for run in others
+        if (run.session, run.command) in driven and all(getattr(run, name) is not None for name in needed)
+    ]
 
 
 def grouped(keys: Sequence[Hashable]) -> list[tuple[int, ...]]:

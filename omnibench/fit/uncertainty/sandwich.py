@@ -208,7 +208,7 @@ def sandwich(scores: Scores) -> Sandwich:
     )
     repeated = repetitions_of_commands(runs)
     if not repeated.groups:
-        words = f"the scatter between {count} runs: no command is repeated, so what the model cannot express counts too"
+        words = f"the scatter between {count} runs: {repeated.words}, so what the model cannot express counts too"
         return whitened.between([(index,) for index in range(count)]).sandwich(roots, words)
     within = whitened.within(repeated.groups)
     clusterings = _clusterings(runs)
