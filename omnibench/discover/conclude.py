@@ -31,7 +31,7 @@ from omnibench.discover.selection.detectability import Detectability
 from omnibench.discover.selection.model_selection import Selection
 from omnibench.discover.selection.named_effects import candidates_of
 from omnibench.discover.selection.screening import Screening
-from omnibench.discover.verdict import headline_of, sessions_in_words
+from omnibench.discover.verdict import headline_of, sessions_in_words, worn
 from omnibench.fit.sessions.session_differences import SessionComparison
 from omnibench.robot.kinematics import Array
 
@@ -68,9 +68,10 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
     baseline, extended, held_out = findings.baseline, findings.extended, findings.held_out
     fit, effects, limits = extended.fit, findings.effects, findings.detectability
     where, left = findings.dependences.where, findings.dependences.left
-    of_sessions = sessions_in_words(
-        findings.verdict, findings.sessions, held_out, findings.eq6_of_sessions, {run.session for run in fit.runs}
-    )
+    trained = {run.session for run in fit.runs}
+    of_sessions = sessions_in_words(findings.verdict, findings.sessions, held_out, findings.eq6_of_sessions, trained)
+    named = ("tyre_wear",) if worn(findings.sessions, trained) else ()  # in the headline
+    absorbed = tuple(each for each in limits.absorbed if each.name not in named)
     few, differ, doubts = few_in_words(fit.runs), bool(of_sessions), findings.sessions.doubts
     of_model = headline_of(findings.verdict, effects, where, left, few, differ=differ, untested=bool(doubts))
     headline = " ".join([*of_sessions, of_model, *(doubts if findings.verdict == "none" else ()), *_warnings(findings)])
@@ -85,8 +86,8 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
         candidates=candidates_of(findings.selection),
         where=where,
         left=left,
-        absorbed=tuple(effect.name for effect in limits.absorbed),
-        measurements=limits.absorbed,
+        absorbed=tuple(effect.name for effect in absorbed),
+        measurements=absorbed,
         not_looked_for=tuple(NotLookedFor(name, missing.value) for name, missing in limits.not_looked_for),
         classes=limits.classes,
         hidden=limits.hidden,

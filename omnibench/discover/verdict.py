@@ -111,6 +111,14 @@ def _places(dependences: _Dependences) -> str:
     return f"{first.description} ({_percent(first.weight)}) or {other}"
 
 
+def worn(comparison: SessionComparison, trained: Collection[str | None]) -> bool:
+    """True if all wheels differ, as by tyre_wear, between sessions that do not all train."""
+    return any(
+        each.kind == "all wheels" and not {each.session, *each.others} <= set(trained)
+        for each in comparison.differences
+    )
+
+
 def sessions_in_words(
     verdict: Verdict,
     comparison: SessionComparison,
@@ -126,13 +134,13 @@ def sessions_in_words(
     sentences = list(comparison.sentences)
     if verdict != "none":
         sentences = sentences[: len(comparison.differences)]
-    untrained = [each for each in comparison.differences if not {each.session, *each.others} <= set(trained)]
-    kinds = {difference.kind for difference in untrained}
     of_split = [held.eq6 for held in held_out if held.data == "session"]
     if eq6_of_sessions is not None and of_split:
         least = of_split[0].floor
         floor = "" if least is None or least > eq6_of_sessions else f" (floor {least:.3g})"
-        wear = " (tyre_wear, which is an effect of the model if both sessions train)" if "all wheels" in kinds else ""
+        wear = (
+            " (tyre_wear, which is an effect of the model if both sessions train)" if worn(comparison, trained) else ""
+        )
         sentences.append(
             f"With {'these changes' if len(comparison.differences) > 1 else 'this change'}{wear}, fitted to the same "
             f"runs, Eq. (6) of the held-out runs goes from {of_split[0].after:.3g} to {eq6_of_sessions:.3g}{floor}."

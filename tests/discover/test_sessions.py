@@ -74,6 +74,7 @@ def test_a_change_of_the_radii_closes_the_gap_to_the_held_out_session() -> None:
     assert found.eq6_of_sessions is not None
     assert found.eq6_of_sessions < gap.floor + 0.05 * (gap.before - gap.floor)
     assert "tyre_wear" in found.headline
+    assert "tyre_wear" not in found.absorbed
     document = discovery_document(found, Path("found"))
     assert document["sessions"]["differences"][0]["session"] == "s2"
 

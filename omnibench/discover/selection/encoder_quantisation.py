@@ -9,6 +9,11 @@ chi-square that the changes make by at most
     (sum over commands, wheels, start and rest of |R' X' q|)^2,                                                     (1)
 
 which they reach if all of these happen to push into one direction.
+
+An angle of n ticks is known to n e ticks, e being the relative error of rates as written. Any angle is that near to a
+whole number of ticks with a probability of 2 n e, at most 1, so that angles n_i are multiples of a tick by chance with
+
+    P = product of min(1, 2 n_i e).                                                                                 (2)
 """
 
 from __future__ import annotations
@@ -24,10 +29,11 @@ from omnibench.fit.least_squares.whitened import given
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import rotated
 
-_FEWEST = 50  # samples in which a wheel turns: that so many are multiples by chance has a probability below 0.002^50
+_FEWEST = 50  # samples in which a wheel turns (chosen): with fewer, the smallest gap need not be one tick
+_DECADES = 20.0  # -log10 of the chance, Eq. (2), that angles are multiples: no set of recordings has so many (chosen)
 _FINEST = 10_000  # ticks in the largest sample: a finer one is 0.01 % of the motion, less than a wheel slips
 _MEAN = 0.25  # ticks: mean size of an error that is uniform within half a tick
-_WHOLE = 1e-3  # ticks by which multiples may differ from whole ones: rates written with four digits differ by 1e-4
+_WHOLE = 1e-3  # e, share by which angles may differ from whole ticks: rates written with four digits differ by 1e-4
 
 
 def quantisation_steps(runs: Sequence[Trajectory]) -> Array:
@@ -51,7 +57,10 @@ def _tick(steps: Array) -> float:
     if not near.any():
         return 0.0
     tick = float(turning @ near / (near @ near))  # least squares over all samples: more exact than the smallest gap
-    return tick if (np.abs(turning / tick - np.round(turning / tick)) < _WHOLE * np.maximum(near, 1)).all() else 0.0
+    near = np.maximum(np.round(turning / tick), 1)
+    if -np.log10(np.minimum(2 * _WHOLE * near, 1)).sum() < _DECADES:  # Eq. (2)
+        return 0.0
+    return tick if (np.abs(turning / tick - near) < _WHOLE * near).all() else 0.0
 
 
 class EncoderQuantisation:

@@ -42,6 +42,8 @@ CHANCE = 0.001
 _NUISANCES = 1e-4
 # Chance of what is left from which on a change of radii counts as all that differs: chosen; words alone hang on it.
 _ALL = 0.01
+# Chance below which none is printed: tails that thin are not those of real noise (chosen).
+_LEAST = 1e-9
 # Names of sessions, or of wheels, that a sentence lists (chosen).
 _LISTED = 3
 _ALONE = "all runs are of one session"
@@ -108,8 +110,8 @@ class SessionComparison:
             return ()
         return (
             "The validation runs deviate from what the training runs fit by more than their repetitions explain "
-            f"(chance {self.other_commands:.1g}), and they drive other commands: whether the sessions differ, or the "
-            "model lacks what these commands show, cannot be told. Drive some of the training's commands in that "
+            f"(chance {_chance(self.other_commands)}), and they drive other commands: whether the sessions differ, or "
+            "the model lacks what these commands show, cannot be told. Drive some of the training's commands in that "
             "session, too.",
         )
 
@@ -254,8 +256,13 @@ def _in_words(difference: SessionDifference) -> str:
     what = changes or "more than the wheels' radii is another (floor, load, or the mount of wheels or reference)"
     return (
         f"The sessions differ: in {difference.session} against {others}, {plural(difference.commands, 'command')} that "
-        f"they share, {what}; repetitions do not explain it (chance {difference.chance:.1g})."
+        f"they share, {what}; repetitions do not explain it (chance {_chance(difference.chance)})."
     )
+
+
+def _chance(value: float) -> str:
+    """A chance; of the least ones their order alone means anything, and it hangs on the model that compares."""
+    return f"{value:.1g}" if value >= _LEAST else f"< 10^{math.log10(_LEAST):.0f}"
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -265,7 +272,7 @@ def _listed(names: Sequence[str]) -> str:
 def _size(change: RadiusChange) -> str:
     """``2.04 % larger (95 %: 1.95 to 2.13 %)``."""
     value, low, high = (100 * each for each in (change.value, change.low, change.high))
-    decimals = max(0, math.ceil(0.3 - math.log10(max((high - low) / 2, 1e-9))))  # of half a width of 0.05 to 0.5: 1
+    decimals = max(0, math.ceil(0.7 - math.log10(max((high - low) / 2, 1e-9))))  # of half a width of 0.05 to 0.5: 2
     low, high = sorted((low, high) if value >= 0 else (-low, -high))
     than = "larger" if value >= 0 else "smaller"
     return f"{abs(value):.{decimals}f} % {than} (95 %: {low:.{decimals}f} to {high:.{decimals}f} %)"

@@ -3,18 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from extended_samples import FORWARD, MATRIX, extended_of, run_of
 
-from omnibench.discover.selection.encoder_quantisation import EncoderQuantisation
+from omnibench.data.dataset import Trajectory
+from omnibench.discover.selection.encoder_quantisation import EncoderQuantisation, quantisation_steps
 
 ALONG = np.zeros((2, 3, 1))
 ALONG[:, 0] = 1.0  # both poses of a run, 1 m along x
 TICKS = 0.1 * np.abs(FORWARD)  # rad: what the wheels turn in each sample of 0.1 s
 QUARTER_TICKS = 0.25 * float((TICKS * np.abs(MATRIX[0])).sum())  # m along x, of all wheels in the same direction
 OF_RUN = (2 + 1) * QUARTER_TICKS  # at the start they move both poses, at rest the last one
+
+
+def turning(angles: np.ndarray) -> Trajectory:
+    """A run whose wheels turn by angles (F, N), rad, in samples of 0.02 s."""
+    times = 0.02 * np.arange(1, len(angles) + 1)
+    return replace(run_of(FORWARD, "go", "run"), times=times, rates=angles / 0.02)
+
+
+def test_wheels_with_gaussian_noise_have_no_ticks() -> None:
+    rng = np.random.default_rng(5)
+    for speed in (0.005, 0.03, 0.1):
+        angles = speed * np.array([1.0, -0.3, 0.5]) + 3e-4 * rng.standard_normal((800, 3))
+        assert not quantisation_steps([turning(np.round(angles / 0.02, 6) * 0.02)]).any()
+
+
+@pytest.mark.parametrize("tick", [1e-4, 1e-3])
+def test_ticks_are_found_in_wheel_rates_that_are_written_with_six_digits(tick: float) -> None:
+    rng = np.random.default_rng(6)
+    counts = np.floor(np.cumsum(0.03 + 3e-4 * rng.standard_normal((800, 3)), axis=0) / tick)
+    angles = tick * np.diff(counts, axis=0, prepend=0.0)
+    steps = quantisation_steps([turning(np.round(angles / 0.02, 6) * 0.02)])
+    assert steps == pytest.approx(tick, rel=1e-3)
 
 
 def bound(commands: Sequence[str], columns: Sequence[np.ndarray], beyond: Sequence[int] = ()) -> float:
