@@ -92,7 +92,7 @@ def replay(
 
     An omnibench node acknowledges what it takes, and is waited for; other programs do not, which is said.
     """
-    from omnibench.cli.terminal.live_tables import print_played
+    from omnibench.cli.terminal.live_tables import print_counted, print_played
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings, validate
     from omnibench.live.network.presence import checked_robot
@@ -116,6 +116,7 @@ def replay(
         with ProgressDisplay() as watch:
             report = player.play(stop, watch, seconds=math.inf if seconds is None else seconds)
     print_played(make_console(), report, recording.dataset.simulated)
+    print_counted(make_console(), report)
     if report.interrupted:
         raise typer.Exit(130)
 
@@ -229,7 +230,7 @@ def _run(config: "LiveConfig", seconds: float | None) -> None:
         node_log(make_console(error=True)) as log,
         stop_on_signals() as stop,
         log_refused_access(config.zenoh),
-        LiveNode(config) as node,
+        LiveNode(config, stop=stop) as node,
     ):
         for robot in config.robots:
             fused = "fused with SLAM" if config.fusion_of(robot) else "without fusion"

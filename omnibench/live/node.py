@@ -21,6 +21,7 @@ from omnibench.live.network.presence import Claim
 from omnibench.live.network.session import close_session, open_session
 from omnibench.live.robot_service import RobotService
 from omnibench.live.robot_setup import make_tracker
+from omnibench.live.stopping import Stop
 from omnibench.live.wire.foxglove import PORT, FoxgloveServer
 from omnibench.live.wire.recorder import Recorder, free_path
 from omnibench.live.wire.topics import GraphNode, KeySpace
@@ -34,11 +35,12 @@ _PRESENCE_TIMEOUT = 2.0  # s, at most, for the tokens of other nodes' robots, wh
 class LiveNode(Closing):
     """Runs from its construction until ``close``; does all that its config says, ``record`` and ``foxglove`` included.
 
-    remember: use the config's ``state``, if it has one; a replay starts afresh. ConfigError or DataError: it cannot
+    remember: use the config's ``state``, if it has one; a replay starts afresh. stop: ends the waiting for a router.
+    ConfigError or DataError: it cannot
     start; what was started before the error is closed again.
     """
 
-    def __init__(self, config: LiveConfig, *, remember: bool = True) -> None:
+    def __init__(self, config: LiveConfig, *, remember: bool = True, stop: Stop | None = None) -> None:
         self.config = config
         self.keys = KeySpace(config.profile, config.domain)
         load_effects(config)
@@ -47,7 +49,7 @@ class LiveNode(Closing):
             self.trackers = {
                 robot.name: make_tracker(config, robot, memories.get(robot.name)) for robot in config.robots
             }
-            self.session = open_session(config.zenoh, f"node {config.name}")
+            self.session = open_session(config.zenoh, f"node {config.name}", stop)
             started.callback(close_session, self.session)
             self._claim_robots(started)
             intake = Intake()

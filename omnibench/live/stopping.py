@@ -10,13 +10,23 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 
+class Stop(threading.Event):
+    """An event that signals set. number: the first of them."""
+
+    number: int = signal.SIGINT
+
+    def interrupt(self) -> None:
+        """Act as that signal usually does: where what waits has nothing yet that could end in order."""
+        signal.raise_signal(self.number)
+
+
 @contextmanager
-def stop_on_signals() -> Iterator[threading.Event]:
+def stop_on_signals() -> Iterator[Stop]:
     """An event that Ctrl-C and SIGTERM set instead of ending the process. For the main thread.
 
     A second signal acts as usual, in case the command does not end.
     """
-    stop = threading.Event()
+    stop = Stop()
     signals = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.getsignal(number) for number in signals}
 
@@ -24,7 +34,8 @@ def stop_on_signals() -> Iterator[threading.Event]:
         for number in signals:
             signal.signal(number, before[number])
 
-    def handle(_number: int, _frame: object) -> None:
+    def handle(number: int, _frame: object) -> None:
+        stop.number = number
         # In a thread: the signal may interrupt a method of the event, which holds the lock that set() needs.
         threading.Thread(target=stop.set).start()
         restore()

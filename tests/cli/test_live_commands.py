@@ -21,6 +21,7 @@ from timing import PATIENCE, load
 
 import omnibench as package
 from omnibench.data.storage import load_dataset
+from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY, JointState
 from omnibench.robot.calibration import read_calibration, write_calibration
 
 
@@ -67,6 +68,33 @@ def test_a_replay_can_name_another_recording(workplace: Path) -> None:
     # a data set's folder has no truth beside it
     assert "against the reference poses of the recording" in run.stdout
     assert "simulated" in run.stdout
+
+
+def test_a_demonstration_of_which_nothing_is_played_shows_no_errors(workplace: Path) -> None:
+    run = omnibench("live", workplace / "node.yaml", "--replay", "--seconds", "0")
+    assert run.returncode == 0, run.stderr
+    assert "0 wheel samples" in run.stdout
+    assert "nan" not in run.stdout
+
+
+def test_a_demonstration_to_which_another_sender_writes_is_one_line_and_no_table(workplace: Path) -> None:
+    config = workplace / "node.yaml"
+    with Command("live", config, "--replay", "--speed", "20") as demonstration:
+        session = wait_for(endpoint(config))
+        wheels, came = session.declare_publisher("apr/joint_states"), list[zenoh.Sample]()
+        _subscriber = session.declare_subscriber("apr/odom", came.append)
+        until(lambda: came and wheels.matching_status.matching, "odometry of the replay")
+        stamp = ODOMETRY.decode(came[-1].payload.to_bytes()).stamp
+        names = calibration().robot.wheel_names
+        until(lambda: len(came) > 3, "more of it")
+        for number in range(1, 20):  # a robot whose clock is a day ahead
+            ahead = JointState(stamp + 86_400_000_000_000 + number * 10_000_000, names, np.zeros(3))
+            wheels.put(JOINT_STATE.encode(ahead))
+        out, said = demonstration.ended()
+        session.close()
+    assert demonstration.process.returncode == 1, out + said
+    assert not out
+    assert "error: another sender wrote to robot 'apr'" in said
 
 
 def test_ctrl_c_ends_a_replay_with_what_it_has_shown(workplace: Path) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 import zenoh
 from drives import SECOND, calibration, drive, slam
 from nodes import Command, as_text, asked, config_of, running, sent, write_node
@@ -321,6 +322,34 @@ def test_a_port_that_is_taken_is_told_in_one_line(tmp_path: Path) -> None:
         assert out == ""
     finally:
         router.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("command", ["listen", "live"])
+def test_a_signal_ends_the_wait_for_a_router_that_stands_still(tmp_path: Path, command: str, number: int) -> None:
+    port = free_port()
+    (tmp_path / "node").mkdir()
+    to = {"mode": "client", "connect": [f"tcp/127.0.0.1:{port}"], "wait": 600.0}
+    node = write_node(tmp_path / "node", "apr", zenoh=to)
+    (tmp_path / "client.yaml").write_text(yaml.safe_dump({"zenoh": to}))
+    with Command("live", write_node(tmp_path, port=port)) as router:
+        client(port).close()
+        os.kill(router.process.pid, signal.SIGSTOP)
+        what = ("live", node) if command == "live" else ("listen", "apr", "--config", tmp_path / "client.yaml")
+        with Command(*what) as waiting:
+            until(lambda: linked(waiting.process.pid, port), "its link")
+            _, said = waiting.stop(number)
+        os.kill(router.process.pid, signal.SIGCONT)
+    assert waiting.process.returncode == 128 + number
+    assert "interrupted" in said
+
+
+def linked(pid: int, port: int) -> bool:
+    """True if a process has a TCP connection to a port of this machine."""
+    rows = [line.split() for line in Path(f"/proc/{pid}/net/tcp").read_text().splitlines()[1:]]
+    links = {f"socket:[{row[9]}]" for row in rows if int(row[2].rpartition(":")[2], 16) == port and row[3] == "01"}
+    files = Path(f"/proc/{pid}/fd").iterdir()
+    return any(str(file.readlink()) in links for file in files if file.is_symlink())
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from omnibench.cli.terminal.tables import print_table
+from omnibench.live.estimation.counts import anomalies_in_words
 from omnibench.report.blocks import Column, Row, Table
 from omnibench.words import plural
 
@@ -60,6 +61,12 @@ def print_played(console: Console, report: PlayReport, simulated: bool) -> None:
         console.print(f"stopped after {sum(report.sent.values())} of {plural(report.total, 'message')}", soft_wrap=True)
 
 
+def print_counted(console: Console, report: PlayReport) -> None:
+    """Print what the node could not use of what it took, or of what others sent it meanwhile."""
+    if report.anomalies:
+        console.print(f"meanwhile the node counted {anomalies_in_words(report.anomalies)}", soft_wrap=True)
+
+
 def _delivered(report: PlayReport) -> str:
     """How many of the messages sent are known to have arrived."""
     if report.taken is None:
@@ -72,7 +79,7 @@ def _delivered(report: PlayReport) -> str:
 def print_demonstration(console: Console, shown: Demonstration) -> None:
     """Print what was played to a node, its errors against the reference, and its agreement with the batch odometry."""
     print_played(console, shown.report, shown.simulated)
-    if shown.report.taken != sum(shown.report.sent.values()):
+    if shown.report.taken != sum(shown.report.sent.values()) or not shown.report.sent["joint_states"]:
         return  # after a signal; what the node would have made of the rest is not known
     print_table(console, _deviation_table(shown))
     console.print(

@@ -58,6 +58,11 @@ class Counts:
 _WORDS = {item.name: item.metadata["words"] for item in fields(Counts) if item.metadata}
 
 
+def is_anomaly(name: str) -> bool:
+    """True for a counter of what should not happen."""
+    return name in _WORDS
+
+
 def anomalies_in_words(anomalies: Mapping[str, int]) -> str:
     """Anomalies by their counters' names as a list in words: ``3 wheel samples missing, 1 pose invalid``."""
     worded = ((count, *_WORDS[name]) for name, count in anomalies.items())

@@ -71,7 +71,10 @@ def _elsewhere(config: SessionConfig) -> str:
 def _refused(config: SessionConfig) -> str:
     if config.user is not None:
         return f"refuses user {config.user.name!r}: wrong name or password; compare with the router's users_file"
-    return "refuses us: it may ask for a user and password (user: name, password_file), or it is not a Zenoh router"
+    return (
+        "refuses us, or does not answer: it may ask for a user and password (user: name, password_file), stand still, "
+        "or not be a Zenoh router"
+    )
 
 
 def _why_not_tls(connection: socket.socket, host: str, tls: Tls) -> str | None:

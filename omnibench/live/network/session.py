@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any, Final
 
 import zenoh
@@ -17,7 +20,7 @@ from omnibench.live.network.access import access_control
 from omnibench.live.network.diagnosis import why_not_connected, why_not_listening
 from omnibench.live.network.session_config import Access, SessionConfig, Tls, User
 from omnibench.live.network.tls_files import check_files, common_name
-from omnibench.live.stopping import wait_until
+from omnibench.live.stopping import Stop, wait_until
 
 LOG = logging.getLogger("omnibench.live")
 
@@ -36,11 +39,12 @@ _SETTINGS: Final[dict[str, Any]] = {
 }
 _SCOUTING_DELAY: Final = 500  # ms; Zenoh's default
 _CONNECT_TIMEOUT: Final = 3.0  # s for a router or peer to reach an endpoint it connects to; chosen
+_GRACE: Final = 0.5  # s after a signal for a session that is about to be open; chosen
 _SOURCE = re.compile(r"\s+at /\S+\.rs:\d+\.?")  # the place in Zenoh's source at the end of its errors
 
 
-def open_session(config: SessionConfig, purpose: str) -> zenoh.Session:
-    """Open a session. purpose: who opens it or what for; an error's message begins with it.
+def open_session(config: SessionConfig, purpose: str, stop: Stop | None = None) -> zenoh.Session:
+    """Open a session. purpose: who opens it or what for; an error's message begins with it. stop: ends the waiting.
 
     A client reconnects by itself after its router was away. ConfigError in one line: a file is missing or wrong, the
     address is in use, nothing listens at the endpoint to connect to, or it refuses us.
@@ -48,7 +52,7 @@ def open_session(config: SessionConfig, purpose: str) -> zenoh.Session:
     try:
         settings = zenoh_config(config)
         try:
-            session = zenoh.open(settings)
+            session = _opened(settings, stop)
         except zenoh.ZError as error:
             raise ConfigError(_why_not_open(config, error)) from None
         try:
@@ -65,6 +69,27 @@ def open_session(config: SessionConfig, purpose: str) -> zenoh.Session:
             ", ".join(config.unprotected),
         )
     return session
+
+
+def _opened(settings: zenoh.Config, stop: Stop | None) -> zenoh.Session:
+    """Zenoh's session, opened in a thread, so that a signal ends the wait for a router that stands still."""
+    outcome: SimpleQueue[zenoh.Session | zenoh.ZError] = SimpleQueue()
+
+    def run() -> None:
+        try:
+            outcome.put(zenoh.open(settings))
+        except zenoh.ZError as error:
+            outcome.put(error)
+
+    Thread(target=run, name="open session", daemon=True).start()
+    # in steps: Zenoh's own handler of SIGINT wakes no waiting thread
+    ready = lambda: not outcome.empty()  # noqa: E731
+    if not wait_until(ready, math.inf, stop) and not wait_until(ready, _GRACE) and stop is not None:
+        stop.interrupt()
+    opened = outcome.get()
+    if isinstance(opened, zenoh.ZError):
+        raise opened
+    return opened
 
 
 def close_session(session: zenoh.Session) -> None:

@@ -127,7 +127,8 @@ def demonstrate(
     """Run the node of ``config``, replay ``recording`` to it as the config's ``replay`` says, and evaluate its output.
 
     The node starts without saved state. DataError: the recording has other wheels than the robot's calibration.
-    DeliveryError: samples, or the odometry of some, were lost. Other errors as from LiveNode and Player.
+    DeliveryError: samples, or the odometry of some, were lost, or another sender wrote to the robot. Other errors as
+    from LiveNode and Player.
     """
     stop = stop or threading.Event()
     robot = robot_called(config, config.replay.robot)
@@ -163,6 +164,7 @@ def demonstrate(
             report = player.play(stop, with_health, results.behind, seconds)
             results.wait_for_the_last()
             health = node.health(robot.name)
+            _check_alone(robot.name, report, health, tracker)
             for collector in (odometry, fused):
                 if collector is not None:
                     collector.close()
@@ -170,6 +172,16 @@ def demonstrate(
             if not guarded:
                 close_session(session)
         return _evaluated(drive, recording, tracker.calibration, report, odometry, fused, health)
+
+
+def _check_alone(robot: str, report: PlayReport, health: Health, tracker: RobotTracker) -> None:
+    """DeliveryError: the node also took samples that the replay did not send."""
+    others = health.counts["samples"] - report.sent["joint_states"]
+    if others > 0 or len(tracker.flows) > 1:
+        raise DeliveryError(
+            f"another sender wrote to robot {robot!r} meanwhile: its odometry is not that of the recording; end the "
+            "other one, or listen at another port"
+        )
 
 
 def _evaluated(

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
 from omnibench.errors import ConfigError, OmnibenchError
+from omnibench.live.control.request_queue import source_of
+from omnibench.live.estimation.counts import is_anomaly
 from omnibench.live.estimation.wheel_input import check_joints
 from omnibench.live.network.presence import alive_robots, checked_robot
 from omnibench.live.replay.arrivals import (
@@ -37,6 +42,7 @@ MAP = "map"
 _LEAST_DEVIATION = 1e-4  # m, rad; least standard deviation, so that no covariance is singular; chosen
 _SLAM_WAIT = 0.5  # s for a node to subscribe to slam_pose after joint_states; chosen
 _LEAST_PATIENCE = 1.0  # s without an acknowledgement until a node is given up, where `wait` is less; chosen
+_HEALTH_WAIT = 1.0  # s for the node to answer; chosen
 _HOLDING = 0.002  # s between two looks at whether to go on; chosen
 _PROGRESS_PERIOD = 0.1  # s between two reports of progress; chosen
 
@@ -110,7 +116,8 @@ class PlayReport:
     sent: messages by topic; total: messages in all; taken: messages that a node acknowledged, None where nobody does.
     restarts: how often another node went on in the place of one that had gone; without ``state`` its odometry begins
     anew. interrupted: by a signal. late: largest delay in sending, s, in which a pause for a receiver that was gone
-    does not count.
+    does not count. anomalies: what the node counted meanwhile of what should not happen, by counter; of irregular
+    samples, which recordings have, it is silent.
     """
 
     sent: dict[str, int]
@@ -121,6 +128,7 @@ class PlayReport:
     wall_seconds: float
     late: float
     interrupted: bool
+    anomalies: Counter[str]
 
     @property
     def complete(self) -> bool:
@@ -174,9 +182,11 @@ class Player:
         sent, interrupted = dict.fromkeys(TOPICS_PLAYED, 0), False
         begin, arrival, late = time.perf_counter(), 0.0, 0.0
         delivery: Delivery | None = None
+        before, anomalies = Counter[str](), Counter[str]()
         try:
             self._wait_for_subscriber(stop)
             delivery = self._delivery(stop)
+            before = self._anomalies(delivery, stop)
             begin = reported_at = time.perf_counter()
             for number, event in enumerate(self._messages.stamped_from(None), 1):
                 due = begin + delivery.paused + event.arrival / self._config.speed
@@ -199,6 +209,8 @@ class Player:
                     reported_at = now
                     watch(self._progress(number, arrival))
             delivery.finish()
+            if not delivery.restarts:
+                anomalies = self._anomalies(delivery, stop) - before
         except KeyboardInterrupt:
             interrupted = True
         except zenoh.ZError as error:
@@ -213,7 +225,7 @@ class Player:
         watch(self._progress(sum(sent.values()), arrival))
         taken, restarts = (None, 0) if delivery is None else (delivery.taken, delivery.restarts)
         late = 0.0 if math.isinf(self._config.speed) else late
-        return PlayReport(sent, len(self._messages), taken, restarts, arrival, wall, late, interrupted)
+        return PlayReport(sent, len(self._messages), taken, restarts, arrival, wall, late, interrupted, anomalies)
 
     def _delivery(self, stop: threading.Event) -> Delivery:
         """Delivery to the robot's node, if there is one, or else to whoever subscribes."""
@@ -221,6 +233,24 @@ class Player:
         if self._robot in alive_robots(self._session, patience, stop):
             return AcknowledgedDelivery(self._session, self._robot, stop, patience)
         return UnconfirmedDelivery(self._session, self._robot, stop, patience)
+
+    def _anomalies(self, delivery: Delivery, stop: threading.Event) -> Counter[str]:
+        """The counters of the robot's node above 0 of what should not happen; none if there is none, or no answer."""
+        if delivery.taken is None:
+            return Counter()
+        answers: list[bytes] = []
+        over = threading.Event()
+
+        def take(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                answers.append(reply.ok.payload.to_bytes())
+
+        handler: Any = zenoh.handlers.Callback(take, over.set, indirect=False)
+        key = f"omnibench/{self._robot}/health"
+        self._session.get(key, handler, timeout=_HEALTH_WAIT, source_info=source_of(self._session))
+        wait_until(over.is_set, 2 * _HEALTH_WAIT, stop)
+        counts = json.loads(answers[0]).get("counts", {}) if answers else {}
+        return Counter({name: n for name, n in counts.items() if n and is_anomaly(name) and name != "irregular"})
 
     def _not_delivered(self, error: DeliveryError, delivery: Delivery | None) -> DeliveryError:
         """The error with the number of messages that are not known to have arrived."""

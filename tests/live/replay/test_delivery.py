@@ -141,6 +141,14 @@ class TestToANode:
         assert report.taken == report.total
         assert (counted["samples"], counted["duplicates"], counted["missing"]) == (report.sent["joint_states"], 0, 0)
 
+    @pytest.mark.usefixtures("node")
+    def test_two_replays_to_one_robot_say_what_the_node_could_not_use(self, folder: Path, port: int) -> None:
+        save_dataset(random_dataset(7, 5, samples=2000), folder / "data")
+        to = ("--robot", "apr", "--connect", f"tcp/127.0.0.1:{port}", "--speed", "20")
+        with Command("replay", folder / "data", *to) as first, Command("replay", folder / "data", *to) as second:
+            said = [first.ended()[0], second.ended()[0]]
+        assert any("meanwhile the node counted" in out and "wheel sample" in out.split("counted")[1] for out in said)
+
     def test_no_more_than_the_window_is_under_way(self, node: Command, port: int) -> None:
         with connected(port) as session, playing(session, wait=600) as replay:
             until(lambda: counts(session)["samples"] > PART / 2, "a part of the recording")
