@@ -72,8 +72,8 @@ def _refused(config: SessionConfig) -> str:
     if config.user is not None:
         return f"refuses user {config.user.name!r}: wrong name or password; compare with the router's users_file"
     return (
-        "refuses us, or does not answer: it may ask for a user and password (user: name, password_file), stand still, "
-        "or not be a Zenoh router"
+        "refuses us, or does not answer: it may ask for a user and password (user: name, password_file), it stands "
+        "still, or it is not a Zenoh router"
     )
 
 
