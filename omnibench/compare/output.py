@@ -67,24 +67,47 @@ def prepare_output(config: CompareConfig, folder: Path | None, *, force: bool = 
 def _check_name(folder: Path, config: CompareConfig) -> None:
     if not (folder / "config.yaml").is_file():
         return
-    name = read_yaml(folder / "config.yaml").get("name")
+    earlier = read_yaml(folder / "config.yaml")
+    name, others = earlier.get("name"), earlier.get("datasets", {})
     if name != config.name:
         raise DataError(f"{folder}: holds the comparison {name!r}; name another folder for {config.name!r}, or --force")
+    if not set(others) & set(config.datasets):
+        raise DataError(
+            f"{folder}: holds a comparison on {', '.join(map(repr, others))}; name another folder for "
+            f"{', '.join(map(repr, config.datasets))}, or --force"
+        )
 
 
 def write_results(result: ComparisonResult) -> None:
     """Write summary.json, the tables and the calibration of every entry's typical run."""
+    stale = _earlier_calibrations(result.output)  # of entries that the config may no longer have
     write_text(result.output / "summary.json", to_json(summary(result)) + "\n")
     for name, table in _tables(result).items():
         write_table(result.output / f"{name}.parquet", table)
     written: set[str] = set()
-    for stale in (result.output / "calibrations").glob("*.yaml"):  # files of entries that the config may no longer have
-        remove(stale)
+    for calibration_file in stale:
+        remove(calibration_file)
     for entry in result.statistics:
         if entry.typical is not None and entry.calibrator != "theoretical":
             file = _file_name(f"{entry.dataset}-{entry.label}", written)
             calibration = calibration_of(entry.typical, result)
             write_calibration(calibration, result.output / "calibrations" / f"{file}.yaml")
+
+
+def _earlier_calibrations(folder: Path) -> list[Path]:
+    """The calibration files of the comparison whose summary stands in a folder."""
+    try:
+        rows = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["statistics"]
+        written: set[str] = set()
+        names = [_file_name(f"{row['dataset']}-{row['label']}", written) for row in rows if _is_written(row)]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    return [folder / "calibrations" / f"{name}.yaml" for name in names]
+
+
+def _is_written(row: Mapping[str, Any]) -> bool:
+    """True for the statistics of an entry whose calibration is written."""
+    return bool(row["answers"]) and row["calibrator"] != "theoretical"
 
 
 def summary(result: ComparisonResult) -> dict[str, Any]:

@@ -248,6 +248,23 @@ def test_the_folder_of_another_comparison_is_left_alone(command: Command, output
     assert summary(output) == before
 
 
+def test_a_comparison_of_that_name_on_other_data_is_left_alone(command: Command, output: Path, tmp_path: Path) -> None:
+    before = summary(output)
+    run = command("compare", write_config(tmp_path, datasets={"d": {"simulate": flower()}}), "--output", output)
+    assert_refused(run, "holds a comparison on 'flower'; name another folder for 'd', or --force")
+    assert summary(output) == before
+
+
+def test_a_file_of_somebody_else_among_the_calibrations_is_left_alone_even_by_force(tmp_path: Path) -> None:
+    mine = tmp_path / "calibrations" / "closed_form.yaml"
+    mine.parent.mkdir()
+    mine.write_text("precious")
+    compared(write_config(tmp_path / "c"), tmp_path, "--force")
+    compared(write_config(tmp_path / "c", calibrators=["closed_form"]), tmp_path)
+    assert mine.read_text() == "precious"
+    assert {file.name for file in mine.parent.iterdir()} == {"closed_form.yaml", "flower-closed_form.yaml"}
+
+
 def test_a_file_in_place_of_a_folder_is_refused(command: Command, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     run = command("compare", write_config(tmp_path / "c"), "--output", tmp_path / "file")

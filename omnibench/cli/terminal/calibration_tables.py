@@ -77,6 +77,8 @@ def _matrix_table(run: CalibrationRun) -> Table:
     if run.kept:
         motions = " and ".join(f"{each.words} ({each.motion})" for each in run.kept)
         note = f"* only if the design values are right along {motions}: these data say nothing of it, and they are kept"
+        if not any(True for _ in _intervals(run)):
+            note = f"the design values are kept along {motions}, of which these data say nothing"
     rows = []
     for number, (label, values) in enumerate(zip(labels, calibration.matrix, strict=True)):
         design = calibration.robot.inverse_kinematic_matrix[number]

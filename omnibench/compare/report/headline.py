@@ -74,8 +74,9 @@ def _verdict(view: DatasetView, best: EntryStatistics) -> str:
         interval = best.improvement(split)
         if interval is not None:
             fell, sure = improvement_in_words(best, split, 1)
-            words += f": the error fell by {fell} ({_with_interval(sure)}), {view.units[split].words}"
-            words += ", which the noise alone could explain" if interval.holds(0.0) else ""
+            words += f": the error fell by {fell}{_with_interval(sure)}, {view.units[split].words}"
+            chance = interval.known is not None and interval.holds(0.0)
+            words += ", which the noise alone could explain" if chance else ""
         words += "."
     return words
 
@@ -84,7 +85,7 @@ def _standing(view: DatasetView, best: EntryStatistics) -> str:
     """The best entry, in words; where several are level, the lowest training cost decides."""
     if len(view.calibrated) == 1:
         return f"{best.label} is the only calibrator with an answer"
-    if any(entry.practically_equal is None and entry.answers for entry in view.statistics):
+    if view.undecided:
         return (
             f"Which entry is best cannot be said ({view.units[view.scored].words}); {best.label} has the lowest "
             "training cost"
@@ -138,7 +139,7 @@ def _tiles(view: DatasetView, best: EntryStatistics) -> tuple[Fact, ...]:
 
 
 def _with_interval(words: str) -> str:
-    return words if words == NO_INTERVAL else f"95 % interval {words}"
+    return "" if words == NO_INTERVAL else f" (95 % interval {words})"
 
 
 def _doubts(view: DatasetView, best: EntryStatistics) -> list[str]:

@@ -155,7 +155,7 @@ def _verdict(view: DatasetView, entry: EntryStatistics) -> Cell:
     if entry.typical is None:
         return Cell("no answer")
     if entry.is_best:
-        return Cell("best", level_in_words(view))
+        return Cell("lowest training cost" if view.undecided else "best", level_in_words(view))
     if entry.practically_equal is None or entry.difference is None:
         return Cell("undecided", interval_basis(view, view.scored))
     if entry.practically_equal:

@@ -79,6 +79,11 @@ class DatasetView:
         return [entry for entry in self.statistics if entry.practically_equal or entry.is_best]
 
     @property
+    def undecided(self) -> bool:
+        """True if some entries cannot be compared with the best: there is no interval."""
+        return any(entry.practically_equal is None and entry.answers for entry in self.statistics)
+
+    @property
     def calibrated(self) -> list[tuple[EntryStatistics, ScoredRun]]:
         """Entries with an answer, and their typical run; without the design values."""
         return [
