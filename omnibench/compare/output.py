@@ -158,6 +158,7 @@ def calibration_of(run: ScoredRun, result: ComparisonResult) -> Calibration:
         provenance=Provenance(
             dataset=dataset.name,
             dataset_hash=dataset.hash,
+            fitted=dataset.fingerprints("train"),
             simulated=dataset.simulated,
             calibrator=run.record.calibrator,
             options=run.record.options,

@@ -21,6 +21,7 @@ from omnibench.words import plural
 
 Split = Literal["train", "validation"]
 SPLITS: tuple[Split, ...] = ("train", "validation")
+WHEEL_DIGITS = 8  # of a fingerprint: a run is taken for one of 1000 others by chance in 1 of 4 million cases
 _ARRAYS = ("times", "rates", "pose_times", "poses", "angles", "targets", "pose_covariances")
 
 
@@ -62,6 +63,18 @@ class Trajectory:
         """The last reference pose."""
         return self.poses[-1]
 
+    @cached_property
+    def fingerprint(self) -> str:
+        """Sixteen hex digits of the run's content, whatever its name, split and file format.
+
+        The first 8 begin the SHA-256 of the wheel samples, the others that of the reference poses.
+        """
+        wheels, reference = hashlib.sha256(), hashlib.sha256()
+        for digest, arrays in ((wheels, (self.times, self.rates)), (reference, (self.pose_times, self.poses))):
+            for array in arrays:
+                digest.update(np.ascontiguousarray(array, dtype=float).tobytes())
+        return wheels.hexdigest()[:WHEEL_DIGITS] + reference.hexdigest()[:8]
+
     def log(self, stamps: Sequence[float] | Array) -> WheelLog:
         """The wheel rates from the start pose, with poses wanted at ``stamps`` (s)."""
         wanted = np.asarray(stamps, dtype=float)
@@ -101,6 +114,10 @@ class Dataset:
     def split(self, name: Split) -> tuple[Trajectory, ...]:
         """The trajectories of one split; may be empty."""
         return tuple(trajectory for trajectory in self.trajectories if trajectory.split == name)
+
+    def fingerprints(self, split: Split) -> tuple[str, ...]:
+        """The fingerprints of the trajectories of one split."""
+        return tuple(trajectory.fingerprint for trajectory in self.split(split))
 
     @cached_property
     def hash(self) -> str:

@@ -59,6 +59,7 @@ def calibration_of(
         provenance=Provenance(
             dataset=dataset.name,
             dataset_hash=dataset.hash,
+            fitted=dataset.fingerprints("train"),
             simulated=dataset.simulated,
             calibrator="discover",
             options={"without": list(request.without), "unknown_term": request.unknown_term},

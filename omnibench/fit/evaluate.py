@@ -11,7 +11,7 @@ from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory
 from omnibench.data.domain_check import extrapolation_warning
 from omnibench.errors import require_type
-from omnibench.fit.held_out import judge, nothing_held_out
+from omnibench.fit.held_out import judge, nothing_held_out, unfitted_runs
 from omnibench.fit.sessions.session_differences import compare_sessions
 from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
@@ -78,13 +78,20 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
 def held_out_verdict(calibration: Calibration, dataset: Dataset) -> HeldOutVerdict:
     """The verdict on a calibration by the runs of a data set that it was not fitted to, beside the design values.
 
-    These are the validation split; of another data set without one, all runs. A data set that has the name of the one
-    that was fitted but not its content or its split may hold the fitted runs anywhere: nothing of it is held out.
+    Runs are known by their fingerprints, whatever their names and splits. Of a calibration without them, the validation
+    split is held out; of another data set without one, all runs; of a data set that has the name of the one that was
+    fitted but not its content or its split, nothing: it may hold the fitted runs anywhere.
     """
     runs, provenance = dataset.split("validation"), calibration.provenance
     if provenance is None:
         if not runs:
             return nothing_held_out("which runs the calibration was fitted to is not known, and none is for validation")
+    elif provenance.fitted is not None:
+        same = provenance.dataset_hash == dataset.hash
+        runs = unfitted_runs(dataset, provenance.fitted, same=same)
+        if not runs and not same:
+            samples = "the wheel samples of a run that the calibration was fitted to"
+            return nothing_held_out(f"every run of {dataset.name} has {samples}")
     elif provenance.dataset_hash != dataset.hash:
         if provenance.dataset == dataset.name:
             changed = f"the data set {dataset.name} or its split was changed after the fit"

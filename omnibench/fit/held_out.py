@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Literal
 
 import numpy as np
 
-from omnibench.data.dataset import Trajectory
+from omnibench.data.dataset import WHEEL_DIGITS, Dataset, Trajectory
 from omnibench.fit.uncertainty.ratio_intervals import FEWEST, Bootstrap, Interval, RatioIntervals, Units, units_of
 from omnibench.robot.calibration import HeldOutVerdict
 from omnibench.robot.kinematics import Array
@@ -26,6 +26,17 @@ def nothing_held_out(reason: str = "no run was held out") -> HeldOutVerdict:
     """The verdict where no run was held out."""
     sentence = f"{reason}: whether the calibration is better than the design on other runs cannot be said"
     return HeldOutVerdict(verdict="unknown", sentence=sentence, detail=f"to have it said, {_HOLD_OUT}")
+
+
+def unfitted_runs(dataset: Dataset, fitted: Collection[str], *, same: bool) -> tuple[Trajectory, ...]:
+    """The runs of a data set that are not among the fitted ones, which are given by their fingerprints.
+
+    same: the data set is the one that was fitted. In another one, a run with the wheel samples of a fitted run is that
+    run with a reference made anew; but simulations without noise of the wheels differ by their poses alone.
+    """
+    digits = None if same or dataset.simulated else WHEEL_DIGITS
+    known = {fingerprint[:digits] for fingerprint in fitted}
+    return tuple(run for run in dataset.trajectories if run.fingerprint[:digits] not in known)
 
 
 def judge(

@@ -21,6 +21,7 @@ from omnibench.words import plural
 FORMAT: Final = "omnibench-calibration/1"
 _LARGEST_ELEMENT = 1e3  # m or rad per rad of wheel: no wheel is so large
 Row = tuple[FiniteFloat, ...]
+Fingerprint = Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
 Deviation = Annotated[NonNegative, Field(le=1e3)]
 
 
@@ -68,10 +69,14 @@ class HeldOutVerdict(Model):
 
 
 class Provenance(Model):
-    """Origin of a calibration: data set, calibrator with options, versions, costs, outcome, what held-out runs say."""
+    """Origin of a calibration: data set, calibrator with options, versions, costs, outcome, what held-out runs say.
+
+    fitted: None in files of versions that did not write it.
+    """
 
     dataset: str
     dataset_hash: str
+    fitted: tuple[Fingerprint, ...] | None = Field(None, description="fingerprints of the runs that it was fitted to")
     simulated: bool = False
     calibrator: str
     options: dict[str, Any] = {}

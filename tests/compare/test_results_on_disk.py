@@ -186,6 +186,7 @@ def test_the_calibrations_evaluate_to_the_costs_in_the_summary(output: Path, tmp
                 assert errors.heading_mean_rad == pytest.approx(run[f"{split}_heading_rad"], rel=1e-12)
         assert calibration.provenance is not None
         assert calibration.provenance.training_cost == run["train_cost"]
+        assert calibration.provenance.fitted == dataset.fingerprints("train")
 
 
 def test_calibrations_of_labels_that_look_alike_do_not_overwrite_each_other(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.fitting.extend import fit_matrix
 from omnibench.errors import DataError
+from omnibench.fit.evaluate import evaluate
 from omnibench.fit.least_squares.usable_runs import usable_runs
 
 
@@ -74,6 +75,7 @@ def test_errors_are_those_that_evaluate_finds() -> None:
     assert found.held_out[-1].eq6.after == pytest.approx(float(np.mean(np.linalg.norm(finals, axis=1))), rel=1e-6)
     assert found.extended.provenance is not None
     assert found.extended.provenance.validation_cost == pytest.approx(found.held_out[-1].eq6.after, rel=1e-6)
+    assert evaluate(found.extended, dataset).held_out.runs == tuple(run.id for run in dataset.split("validation"))
 
 
 def test_a_warm_up_that_ends_is_not_carried_on_without_a_warning() -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +15,9 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.held_out import judge
-from omnibench.robot.calibration import Calibration, HeldOutVerdict
+from omnibench.robot.calibration import Calibration, HeldOutVerdict, read_calibration, write_calibration
 from omnibench.robot.kinematics import Array
+from omnibench.slam.import_dataset import import_dataset
 from omnibench.testing.synthetic import synthetic_robot
 
 ROBOT = synthetic_robot()
@@ -107,24 +110,97 @@ def test_all_runs_of_another_recording_are_held_out() -> None:
     assert len(evaluate(calibration, other).held_out.runs) == 12
 
 
-def test_runs_of_a_recording_that_was_changed_since_do_not_count_as_held_out() -> None:
+def without_fingerprints(calibration: Calibration) -> Calibration:
+    """A calibration as versions wrote it that did not know of fingerprints."""
+    assert calibration.provenance is not None
+    return calibration.model_copy(update={"provenance": calibration.provenance.model_copy(update={"fitted": None})})
+
+
+def swapped(dataset: Dataset) -> Dataset:
+    """A data set whose training runs validate and whose validation runs train."""
+    every = [replace(run, split="train" if run.split == "validation" else "validation") for run in dataset.trajectories]
+    return make_dataset(dataset.name, ROBOT, 0.2, every, simulated=dataset.simulated)
+
+
+@pytest.mark.parametrize("name", ["synthetic", "again"])
+def test_fitted_runs_whose_reference_was_made_anew_are_not_held_out(name: str) -> None:
+    calibration = calibrate(recordings(validating=0)).calibration
+    again = [replace(run, poses=run.poses + 0.001) for run in noisy_trajectories()]
+    found = evaluate(calibration, make_dataset(name, ROBOT, 0.2, again)).held_out
+    assert found.verdict == "unknown"
+    assert f"every run of {name} has the wheel samples of a run that the calibration was fitted to" in found.sentence
+
+
+def test_simulations_of_the_same_wheel_samples_are_known_apart_by_their_poses() -> None:
     dataset = recordings(validating=0)
     calibration = calibrate(dataset).calibration
-    changed = [replace(run, poses=run.poses + 0.001) for run in dataset.trajectories]
-    found = evaluate(calibration, make_dataset("synthetic", ROBOT, 0.2, changed, simulated=True)).held_out
-    assert found.verdict == "unknown"
-    assert "is not known" in found.sentence
+    again = [replace(run, poses=run.poses + 0.001) for run in dataset.trajectories]
+    other = make_dataset("synthetic", ROBOT, 0.2, again, simulated=True)
+    assert len(evaluate(calibration, other).held_out.runs) == 12
 
 
 def test_fitted_runs_that_are_made_validation_runs_after_the_fit_are_not_called_held_out() -> None:
     dataset = recordings(validating=6)
     calibration = calibrate(dataset).calibration
-    swapped = [
-        replace(run, split="train" if run.split == "validation" else "validation") for run in dataset.trajectories
-    ]
-    found = evaluate(calibration, make_dataset("synthetic", ROBOT, 0.2, swapped, simulated=True)).held_out
+    assert evaluate(calibration, swapped(dataset)).held_out == verdict(calibration)
+
+
+def test_a_fitted_run_that_also_validates_under_another_name_is_not_held_out() -> None:
+    dataset = recordings(validating=6)
+    (first, *_) = dataset.split("train")
+    twice = [*dataset.trajectories, replace(first, id="copy", split="validation")]
+    calibration = calibrate(make_dataset("twice", ROBOT, 0.2, twice)).calibration
+    assert verdict(calibration).runs == tuple(run.id for run in dataset.split("validation"))
+
+
+def test_of_a_changed_data_set_nothing_is_held_out_where_a_calibration_knows_no_runs() -> None:
+    dataset = recordings(validating=6)
+    calibration = without_fingerprints(calibrate(dataset).calibration)
+    found = evaluate(calibration, swapped(dataset)).held_out
     assert (found.verdict, found.runs) == ("unknown", ())
     assert "the data set synthetic or its split was changed after the fit" in found.sentence
+    assert "is not known" in found.sentence
+    assert evaluate(calibration, dataset).held_out.verdict == "better"
+
+
+def record(folder: Path, seed: int) -> None:
+    """Write twelve runs into a folder, two CSV files each."""
+    folder.mkdir()
+    for run in noisy_trajectories(seed=seed):
+        wheels, poses = np.column_stack([run.times, run.rates]), np.column_stack([run.pose_times, run.poses])
+        for kind, header, rows in (("wheels", "t,omega_a,omega_b,omega_c", wheels), ("poses", "t,x,y,theta", poses)):
+            np.savetxt(folder / f"{run.id}_{kind}.csv", rows, delimiter=",", header=header, comments="")
+
+
+def imported(folder: Path, **options: Any) -> Dataset:
+    """The recording of a folder, imported."""
+    return import_dataset("csv", folder, {"robot": ROBOT.model_dump(mode="json"), **options})
+
+
+def test_the_runs_of_a_second_recording_are_held_out_though_both_data_sets_have_one_name(tmp_path: Path) -> None:
+    record(tmp_path / "day1", seed=1)
+    record(tmp_path / "day2", seed=2)
+    first, second = imported(tmp_path / "day1"), imported(tmp_path / "day2")
+    assert first.name == second.name
+    write_calibration(calibrate(first).calibration, tmp_path / "c.yaml")
+    found = evaluate(read_calibration(tmp_path / "c.yaml"), second).held_out
+    assert found.runs == tuple(run.id for run in second.trajectories)
+    assert found.sentence.startswith("held out (12 runs): ")
+    assert found.verdict == "better"
+
+
+def test_fitted_runs_imported_again_under_another_name_and_split_are_not_held_out(tmp_path: Path) -> None:
+    record(tmp_path / "day1", seed=1)
+    first = imported(tmp_path / "day1")
+    calibration, fitted = calibrate(first).calibration, [run.id for run in first.split("train")]
+    again = imported(tmp_path / "day1", name="again", validation=fitted)
+    assert [run.id for run in again.split("validation")] == fitted
+    assert evaluate(calibration, again).held_out == verdict(calibration)
+    for run in first.split("validation"):
+        (tmp_path / "day1" / f"{run.id}_wheels.csv").unlink()
+        (tmp_path / "day1" / f"{run.id}_poses.csv").unlink()
+    found = evaluate(calibration, imported(tmp_path / "day1", name="again", validation=["*"])).held_out
+    assert (found.verdict, found.runs) == ("unknown", ())
 
 
 def test_the_design_values_themselves_are_the_same_as_the_design() -> None:

@@ -36,6 +36,7 @@ from omnibench.robot.signals import Signals
 PROVENANCE = Provenance(
     dataset="flower",
     dataset_hash="0123abcd",
+    fitted=("89abcdef01234567", "0123456701234567", "1234567812345678", "123456789012e456"),  # some look like numbers
     simulated=True,
     calibrator="closed_form",
     options={"tolerance": 1e-9, "programs": 50},
@@ -127,6 +128,22 @@ def test_the_covariance_has_the_parameters_of_the_effects_after_the_matrix() -> 
     content = a_calibration(effects=TERMS).model_dump(mode="json") | {"covariance": np.eye(9).tolist()}
     with pytest.raises(ConfigError, match="covariance is not 24 x 24"):
         validate(Calibration, content, "calibration.yaml")
+
+
+def test_the_fingerprints_of_hundreds_of_fitted_runs_are_few_lines_of_the_file(tmp_path: Path) -> None:
+    fitted = tuple(f"{run:016x}" for run in range(360))
+    provenance = PROVENANCE.model_copy(update={"fitted": fitted})
+    write_calibration(a_calibration(provenance=provenance), tmp_path / "calibration.yaml")
+    assert read_calibration(tmp_path / "calibration.yaml").provenance == provenance
+    assert len((tmp_path / "calibration.yaml").read_text().splitlines()) < 150
+
+
+def test_a_fingerprint_that_cannot_be_one_is_refused(tmp_path: Path) -> None:
+    write_calibration(a_calibration(provenance=PROVENANCE), tmp_path / "calibration.yaml")
+    text = (tmp_path / "calibration.yaml").read_text().replace("89abcdef01234567", "run1")
+    (tmp_path / "calibration.yaml").write_text(text)
+    with pytest.raises(DataError, match="fitted"):
+        read_calibration(tmp_path / "calibration.yaml")
 
 
 def test_the_model_of_a_calibration_has_its_effects() -> None:
