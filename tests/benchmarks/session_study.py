@@ -23,11 +23,9 @@ from hidden.session_sets import session_set
 
 from omnibench.data.dataset import Dataset
 from omnibench.discover.fitting.extend import extend, fit_matrix
-from omnibench.discover.fitting.model_fit import at_runs
 from omnibench.discover.regressors.column_group import Group
-from omnibench.fit.least_squares.nuisance_noise import FitNoise
 from omnibench.fit.least_squares.usable_runs import usable_runs
-from omnibench.fit.sessions.session_differences import SessionComparison, compare_sessions, session_comparison
+from omnibench.fit.sessions.session_differences import SessionComparison, compare_sessions
 from omnibench.processes import one_thread
 from omnibench.registry import effects
 from omnibench.robot.model import OdometryModel
@@ -123,7 +121,7 @@ def _with_effect(dataset: Dataset, name: str) -> SessionComparison:
     linear = tuple(each for each in effect.parameters(dataset.robot) if not each.choices)
     fit = extend(plain, [Group("effect", name, (), effect, linear)]).fit
     held_out = usable_runs(dataset.split("validation"), "validation")
-    return session_comparison(at_runs(fit, [*runs, *held_out]), FitNoise(fit.noise, fit.nuisances.deviations))
+    return compare_sessions(fit.model, [*runs, *held_out])
 
 
 def carried_out(wanted: Sequence[Case], sets: int, path: Path | None) -> list[Answer]:

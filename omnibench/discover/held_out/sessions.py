@@ -12,18 +12,15 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.extend import Extended
-from omnibench.discover.fitting.model_fit import at_runs, model_with
+from omnibench.discover.fitting.model_fit import model_with
 from omnibench.discover.held_out.validation_runs import ValidationRuns
-from omnibench.fit.least_squares.nuisance_noise import FitNoise
 from omnibench.fit.sessions.session_contrast import sessions_of
-from omnibench.fit.sessions.session_differences import SessionComparison, session_comparison
+from omnibench.fit.sessions.session_differences import SessionComparison, compare_sessions
 
 
 def compare_with_validation(extended: Extended, validation: ValidationRuns) -> SessionComparison:
-    """Comparison of all sessions by the extended model, under its noise."""
-    fit = extended.fit
-    runs = [*fit.runs, *validation.kept]
-    return session_comparison(at_runs(fit, runs), FitNoise(fit.noise, fit.nuisances.deviations))
+    """Comparison of all sessions by the extended model, as ``evaluate`` compares them."""
+    return compare_sessions(extended.fit.model, [*extended.fit.runs, *validation.kept])
 
 
 def eq6_with_changes(extended: Extended, runs: Sequence[Trajectory], comparison: SessionComparison) -> float | None:

@@ -43,7 +43,7 @@ _NUISANCES = 1e-4
 # Chance of what is left from which on a change of radii counts as all that differs: chosen; words alone hang on it.
 _ALL = 0.01
 # Chance below which none is printed: tails that thin are not those of real noise (chosen).
-_LEAST = 1e-9
+_LEAST = 1e-9  # as ``_chance`` prints it
 # Names of sessions, or of wheels, that a sentence lists (chosen).
 _LISTED = 3
 _ALONE = "all runs are of one session"
@@ -128,13 +128,7 @@ def compare_sessions(model: OdometryModel, trajectories: Sequence[Trajectory]) -
         few = "the runs of all sessions but one have no reference poses after their start"
         return SessionComparison(untested=few if untested == _ALONE else untested)
     fit = TrajectoryFit(model, runs, Nuisances(np.zeros((len(runs), 3)), np.zeros(3)))
-    return session_comparison(fit, noise_of_fit(fit, range(3), None, _NUISANCES))
-
-
-def session_comparison(fit: TrajectoryFit, noise: FitNoise) -> SessionComparison:
-    """Compare the sessions of a fit's runs under a noise; the nuisances' deviations are the noise's."""
-    if untested := _untested(fit.runs):
-        return SessionComparison(untested=untested)
+    noise = noise_of_fit(fit, range(3), None, _NUISANCES)
     fit = _centred(replace(fit, nuisances=Nuisances(fit.nuisances.values, noise.deviations)), noise)
     try:
         data = SessionScores.of(fit, noise.estimate.noise)
@@ -261,8 +255,8 @@ def _in_words(difference: SessionDifference) -> str:
 
 
 def _chance(value: float) -> str:
-    """A chance; of the least ones their order alone means anything, and it hangs on the model that compares."""
-    return f"{value:.1g}" if value >= _LEAST else f"< 10^{math.log10(_LEAST):.0f}"
+    """A chance in words."""
+    return f"{value:.1g}" if value >= _LEAST else "< 10⁻⁹"
 
 
 def _listed(names: Sequence[str]) -> str:

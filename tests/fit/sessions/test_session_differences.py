@@ -34,7 +34,7 @@ def test_a_session_with_larger_wheels_is_said_to_differ_and_by_how_much(wheels: 
 
 def test_a_chance_so_small_that_no_noise_is_known_so_well_is_not_given_as_a_figure() -> None:
     (sentence,) = compared(session_set("small", 3, change=0.02)).sentences
-    assert "(chance < 10^-9)" in sentence
+    assert "(chance < 10⁻⁹)" in sentence
 
 
 def test_of_several_sessions_the_one_that_differs_is_named() -> None:
