@@ -141,7 +141,7 @@ class Gap:
     metric: "eq6" (m and rad, final poses) or "chi2" (whitened, all poses, per number). floor: None where no command is
     repeated, or where a model errs less than repetitions scatter. closed: the share of before - floor that is gone, at
     most all; None where before - floor is not larger than two standard errors, or no command is repeated.
-    standard_error: standard error of before - floor.
+    standard_error: standard error of before - floor; None of a single run.
     """
 
     metric: Literal["eq6", "chi2"]
@@ -149,7 +149,7 @@ class Gap:
     after: float
     floor: float | None
     closed: float | None
-    standard_error: float
+    standard_error: float | None
 
 
 @dataclass(frozen=True)

@@ -137,7 +137,8 @@ def gap_between(metric: Literal["eq6", "chi2"], before: Array, after: Array, flo
     """The gap between errors (Z,) and a floor (D,); without a floor no share is closed."""
     first, last = float(before.mean()), float(after.mean())
     if floor is None:
-        return Gap(metric, first, last, None, None, float(before.std() / np.sqrt(len(before))))
+        scatter = float(before.std() / np.sqrt(len(before))) if len(before) > 1 else None
+        return Gap(metric, first, last, None, None, scatter)
     error, least = float(np.sqrt(before.var() / len(before) + floor.var() / len(floor))), float(floor.mean())
     gap = first - least
     closed = min((first - last) / gap, 1.0) if gap > STANDARD_ERRORS * error else None  # Eq. (1)
