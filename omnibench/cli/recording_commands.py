@@ -50,6 +50,9 @@ def import_(
     entry, options = importers.entry(importer, "import"), parse_settings(settings)
     check_dataset_folder(output)
     refuse_existing(output, force=force, folders=True)
+    folder = output.resolve().name
+    if "name" in entry.cls.Options.model_fields and folder.isprintable() and folder:
+        options.setdefault("name", folder)
     dataset = import_dataset(importer, source, options)
     save_dataset(dataset, output, table_format, overwrite=force)
     warn(dataset.warnings)

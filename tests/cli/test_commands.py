@@ -28,6 +28,7 @@ from timing import PATIENCE
 from omnibench.data.storage import load_dataset
 from omnibench.robot.calibration import read_calibration
 from omnibench.robot.published_matrices import published_matrix
+from omnibench.testing.synthetic import synthetic_robot
 
 pytestmark = pytest.mark.usefixtures("registries_as_before")
 
@@ -266,6 +267,18 @@ def test_import_turns_recordings_into_a_data_set(command: Command, tmp_path: Pat
     assert division in printed.stderr
     dataset = load_dataset(tmp_path / "data")
     assert (len(dataset.split("train")), len(dataset.split("validation"))) == (44, 23)
+
+
+def test_a_data_set_has_the_name_of_its_folder_unless_another_is_given(command: Command, tmp_path: Path) -> None:
+    recording = tmp_path / "recording"
+    recording.mkdir()
+    (recording / "r_wheels.csv").write_text("t,omega_a,omega_b,omega_c\n0.1,1,0,-1\n0.2,1,0,-1\n")
+    (recording / "r_poses.csv").write_text("t,x,y,theta\n0,0,0,0\n0.2,0.02,0,0\n")
+    Path("robot.yaml").write_text(yaml.safe_dump(synthetic_robot().model_dump(mode="json")))
+    given = ("--set", "robot=robot.yaml")
+    assert command("import", "csv", recording, "-o", "data/day1", *given).returncode == 0
+    assert command("import", "csv", recording, "-o", "day2", *given, "--set", "name=lab").returncode == 0
+    assert (load_dataset("data/day1").name, load_dataset("day2").name) == ("day1", "lab")
 
 
 def test_a_new_plugin_is_checked_and_compared(command: Command, tmp_path: Path) -> None:
