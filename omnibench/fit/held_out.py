@@ -32,11 +32,12 @@ def unfitted_runs(dataset: Dataset, fitted: Collection[str], *, same: bool) -> t
     """The runs of a data set that are not among the fitted ones, which are given by their fingerprints.
 
     same: the data set is the one that was fitted. In another one, a run with the wheel samples of a fitted run is that
-    run with a reference made anew; but simulations without noise of the wheels differ by their poses alone.
+    run with a reference made anew, unless fitted runs share theirs (commanded rates, or simulated ones without noise).
     """
-    digits = None if same or dataset.simulated else WHEEL_DIGITS
-    known = {fingerprint[:digits] for fingerprint in fitted}
-    return tuple(run for run in dataset.trajectories if run.fingerprint[:digits] not in known)
+    runs, wheels = set(fitted), {fingerprint[:WHEEL_DIGITS] for fingerprint in fitted}
+    if same or len(wheels) < len(runs):
+        return tuple(run for run in dataset.trajectories if run.fingerprint not in runs)
+    return tuple(run for run in dataset.trajectories if run.fingerprint[:WHEEL_DIGITS] not in wheels)
 
 
 def judge(
