@@ -124,7 +124,8 @@ def parse_settings(settings: Iterable[str] | None) -> dict[str, Any]:
         key, equals, value = setting.partition("=")
         if not equals or not key:
             raise ConfigError(f"--set {setting}: expected KEY=VALUE")
-        options[key] = parse_yaml(value, f"--set {setting}")
+        # a pattern such as *_1 would be a reference to another value
+        options[key] = value if value.startswith("*") else parse_yaml(value, f"--set {setting}")
     return options
 
 

@@ -12,7 +12,7 @@ from typing import Any, get_type_hints
 import polars as pl
 
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.result import ComparisonResult, EntryStatistics, RunRecord, ScoredRun
+from omnibench.compare.result import THEORETICAL_NAME, ComparisonResult, EntryStatistics, RunRecord, ScoredRun
 from omnibench.config import read_yaml, to_json, to_yaml
 from omnibench.data.dataset import SPLITS, Dataset
 from omnibench.errors import DataError
@@ -80,34 +80,34 @@ def _check_name(folder: Path, config: CompareConfig) -> None:
 
 def write_results(result: ComparisonResult) -> None:
     """Write summary.json, the tables and the calibration of every entry's typical run."""
-    stale = _earlier_calibrations(result.output)  # of entries that the config may no longer have
+    earlier = _earlier_calibrations(result.output)
     write_text(result.output / "summary.json", to_json(summary(result)) + "\n")
     for name, table in _tables(result).items():
         write_table(result.output / f"{name}.parquet", table)
+    for file in earlier:  # the config may have other entries now
+        remove(file)
+    fitted = [entry for entry in result.statistics if entry.answers and entry.calibrator != THEORETICAL_NAME]
+    files = _calibration_files(result.output, [(entry.dataset, entry.label) for entry in fitted])
+    for entry, file in zip(fitted, files, strict=True):
+        assert entry.typical is not None  # an entry with an answer has a typical run
+        write_calibration(calibration_of(entry.typical, result), file)
+
+
+def _calibration_files(folder: Path, entries: Iterable[tuple[str, str]]) -> list[Path]:
+    """The calibration files of entries, which are given by data set and label."""
     written: set[str] = set()
-    for calibration_file in stale:
-        remove(calibration_file)
-    for entry in result.statistics:
-        if entry.typical is not None and entry.calibrator != "theoretical":
-            file = _file_name(f"{entry.dataset}-{entry.label}", written)
-            calibration = calibration_of(entry.typical, result)
-            write_calibration(calibration, result.output / "calibrations" / f"{file}.yaml")
+    names = [_file_name(f"{dataset}-{label}", written) for dataset, label in entries]
+    return [folder / "calibrations" / f"{name}.yaml" for name in names]
 
 
 def _earlier_calibrations(folder: Path) -> list[Path]:
     """The calibration files of the comparison whose summary stands in a folder."""
     try:
         rows = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["statistics"]
-        written: set[str] = set()
-        names = [_file_name(f"{row['dataset']}-{row['label']}", written) for row in rows if _is_written(row)]
+        fitted = [row for row in rows if row["answers"] and row["calibrator"] != THEORETICAL_NAME]
+        return _calibration_files(folder, [(row["dataset"], row["label"]) for row in fitted])
     except (OSError, ValueError, KeyError, TypeError):
         return []
-    return [folder / "calibrations" / f"{name}.yaml" for name in names]
-
-
-def _is_written(row: Mapping[str, Any]) -> bool:
-    """True for the statistics of an entry whose calibration is written."""
-    return bool(row["answers"]) and row["calibrator"] != "theoretical"
 
 
 def summary(result: ComparisonResult) -> dict[str, Any]:
@@ -165,6 +165,7 @@ def calibration_of(run: ScoredRun, result: ComparisonResult) -> Calibration:
             seed=run.record.seed,
             cost=result.config.cost.name,
             box=run.record.box,
+            on_bounds=run.record.at_bounds,
             versions=result.environment.versions,
             training_cost=run.record.train_cost,
             validation_cost=run.record.validation_cost,

@@ -23,6 +23,8 @@ from omnibench.registry import calibrators
 from omnibench.robot.calibration import HeldOutVerdict, Row
 from omnibench.robot.kinematics import Array
 
+THEORETICAL_NAME = "theoretical"  # the calibrator that leaves the design values
+
 
 class RunRecord(Model):
     """One run as a flat row of summary.json. Costs and matrix are None where the run gave no answer.

@@ -12,7 +12,7 @@ from omnibench.compare.config import CompareConfig
 from omnibench.compare.effective_config import effective_config, load_calibrators
 from omnibench.compare.execute import PRELOAD, execute
 from omnibench.compare.output import check_output, prepare_output, write_results
-from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
+from omnibench.compare.plan import UNBOUNDED, PlannedRun, load_datasets, make_plan
 from omnibench.compare.report.comparison_report import comparison_document
 from omnibench.compare.result import ComparisonResult, ScoredRun
 from omnibench.compare.scoring import score
@@ -28,6 +28,7 @@ from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
 from omnibench.errors import ConfigError, Interrupted, UnknownNameError
 from omnibench.fit.calibrator import RunResult
+from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
 from omnibench.jobs.result_store import ResultStore
 from omnibench.processes import one_thread_processes
 from omnibench.progress import Reporter, no_progress
@@ -75,7 +76,7 @@ def run_comparison(
             held_out=held_out_verdicts(statistics, datasets, config.bootstrap),
             sessions=sessions_that_differ(datasets, config.integration),
             environment=environment(),
-            warnings=tuple(_warnings(failures, datasets, runs)),
+            warnings=tuple(_warnings(failures, datasets, plan, runs)),
         )
         write_results(result)
         write_document(comparison_document(result), folder / "report.html")
@@ -109,11 +110,21 @@ def _resumable(plan: Sequence[PlannedRun], store: ResultStore[RunResult], folder
 
 
 def _warnings(
-    failures: Iterable[PluginFailure], datasets: Mapping[str, Dataset], runs: Iterable[ScoredRun]
+    failures: Iterable[PluginFailure],
+    datasets: Mapping[str, Dataset],
+    plan: Sequence[PlannedRun],
+    runs: Iterable[ScoredRun],
 ) -> Iterator[str]:
     yield from map(_described, failures)
     for name, dataset in datasets.items():
         yield from (f"data set {name}: {warning}" for warning in dataset.warnings)
+    fitted = [run for run in plan if run.box_name != UNBOUNDED]
+    for name, parameterisation in dict.fromkeys((run.dataset_name, run.parameterisation) for run in fitted):
+        dataset = datasets[name]
+        undetermined = warnings_of_calibration(
+            dataset.robot, dataset.split("train"), parameterisation, fitted[0].config.unidentified
+        )
+        yield from (f"data set {name}, fit of the {parameterisation}: {warning}" for warning in undetermined)
     if not all(is_mean(run) for run in runs):
         yield "the cost is no mean over trajectories: intervals and differences are of the mean of their own costs"
 

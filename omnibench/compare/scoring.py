@@ -14,7 +14,7 @@ from omnibench.compare.result import RunRecord, ScoredRun, SplitScore
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.errors import PluginError
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error
-from omnibench.fit.cost import Cost
+from omnibench.fit.cost import NO_ERROR, Cost
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.fit.parameterisation import FittedParameter, fitted_parameters, make_bounds
 from omnibench.fit.uncertainty.ratio_intervals import UnitName, units_of
@@ -183,8 +183,9 @@ def _with_gap(run: PlannedRun, scored: ScoredRun, exact: Sequence[tuple[PlannedR
     if cost is None or matrix is None:
         return scored
     for other, optimum in exact:
-        if optimum.record.train_cost is not None and is_comparable(run, matrix, other):
-            gap = cost / optimum.record.train_cost - 1
+        lowest = optimum.record.train_cost or 0.0
+        if lowest >= NO_ERROR and is_comparable(run, matrix, other):  # no share of rounding means anything
+            gap = cost / lowest - 1
             return replace(scored, record=scored.record.model_copy(update={"gap": gap, "gap_box": other.box_name}))
     return scored
 

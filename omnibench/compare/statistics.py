@@ -9,7 +9,7 @@ import numpy as np
 
 from omnibench.compare.result import EntryStatistics, EntryVerdict, ScoredRun, SplitScore, SplitStatistics
 from omnibench.data.dataset import Dataset, Split
-from omnibench.fit.held_out import judge, nothing_held_out
+from omnibench.fit.held_out import judge, nothing_held_out, unfitted_runs
 from omnibench.fit.sessions.session_differences import compare_sessions
 from omnibench.fit.uncertainty.ratio_intervals import Bootstrap, Interval, RatioIntervals
 from omnibench.registry import calibrators
@@ -57,7 +57,8 @@ def held_out_verdicts(
 ) -> dict[str, EntryVerdict]:
     """The verdict of each data set's validation runs on its best calibration, if a calibrator gave an answer.
 
-    The best calibration is the best entry, or, where that is not fitted, the fitted one of lowest judged cost.
+    The best calibration is the best entry, or, where that is not fitted, the fitted one of lowest judged cost. Copies
+    of training runs do not count.
     """
     verdicts = {}
     for name, dataset in datasets.items():
@@ -68,11 +69,14 @@ def held_out_verdicts(
         ]
         if fitted:
             _, _, label, run = min(fitted, key=itemgetter(0, 1))
-            held_out = dataset.split("validation")
+            unfitted = {each.id for each in unfitted_runs(dataset, dataset.fingerprints("train"), same=True)}
+            validation = dataset.split("validation")
+            held_out = [index for index, each in enumerate(validation) if each.id in unfitted]
             verdict = nothing_held_out()
             if held_out:
                 design, calibrated = run.design["validation"].errors, run.scores["validation"].errors
-                verdict = judge(design, calibrated, held_out, bootstrap)
+                runs = [validation[index] for index in held_out]
+                verdict = judge(design[held_out], calibrated[held_out], runs, bootstrap)
             verdicts[name] = EntryVerdict(label, verdict)
     return verdicts
 

@@ -21,7 +21,8 @@ from omnibench.words import plural
 
 Split = Literal["train", "validation"]
 SPLITS: tuple[Split, ...] = ("train", "validation")
-WHEEL_DIGITS = 8  # of a fingerprint: a run is taken for one of 1000 others by chance in 1 of 4 million cases
+# Digits of a fingerprint that tell the wheel samples: a run is taken for one of 1000 others in 1 of 4 million cases.
+WHEEL_DIGITS = 8
 _ARRAYS = ("times", "rates", "pose_times", "poses", "angles", "targets", "pose_covariances")
 
 
@@ -171,7 +172,7 @@ def make_dataset(
             f"headings of {plural(len(ambiguous), 'trajectory')} may be unwrapped wrongly (reference too sparse): "
             f"{shown}"
         ]
-    warnings += _late_references(raw) + _other_periods(median, sample_period)
+    warnings += _standing(raw) + _late_references(raw) + _other_periods(median, sample_period)
     unwrapped = (
         replace(trajectory, poses=np.column_stack([trajectory.poses[:, :2], heading]))
         for trajectory, heading in zip(raw, headings, strict=True)
@@ -223,6 +224,14 @@ def _check_shapes(where: str, robot: Robot, trajectory: Trajectory) -> None:
             raise DataError(f"{where}: {item} has shape {given}, expected {shape}")
     if not samples[0] or not poses[0]:
         raise DataError(f"{where}: it has no {'reference poses' if samples[0] else 'wheel samples'}")
+
+
+def _standing(trajectories: Sequence[Trajectory]) -> list[str]:
+    standing = [trajectory.id for trajectory in trajectories if not trajectory.rates.any()]
+    if not 0 < len(standing) < len(trajectories):
+        return []  # that no run drives is another warning
+    shown = ", ".join(standing[:5])
+    return [f"no wheel turns in {plural(len(standing), 'trajectory')}, which says nothing of the robot, e.g. {shown}"]
 
 
 def _late_references(trajectories: Sequence[Trajectory]) -> list[str]:

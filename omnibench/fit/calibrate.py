@@ -129,6 +129,7 @@ def calibrate(
             seed=seed,
             cost=cost,
             box=problem.box,
+            on_bounds=result.at_bounds,
             versions=package_versions(),
             training_cost=result.cost,
             validation_cost=objective.of_model(model, validation) if validation else None,

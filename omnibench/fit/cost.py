@@ -16,6 +16,8 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
 
+NO_ERROR = 1e-9  # m, rad: a smaller cost is rounding
+
 
 class Cost(ABC):
     """One number for the pose errors of a set of trajectories.

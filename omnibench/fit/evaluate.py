@@ -33,10 +33,10 @@ class SplitErrors(Model):
 class Evaluation(Model):
     """Errors of a calibration and of the design values, by split; the split ``all`` is every trajectory.
 
-    held_out: the verdict by the runs that the calibration was not fitted to. sessions: a sentence for each session that
-    differs from the others, or on those that could not be compared. warnings: one sentence if runs lie outside the
-    training domain of the calibration's effects. Fields that are not excluded are the document of ``omnibench evaluate
-    --json``.
+    held_out: the verdict by the runs that the calibration was not fitted to; unfitted: their number by split. sessions:
+    a sentence for each session that differs from the others, or on those that could not be compared. warnings: one
+    sentence if runs lie outside the training domain of the calibration's effects. Fields that are not excluded are the
+    document of ``omnibench evaluate --json``.
     """
 
     dataset: str
@@ -44,6 +44,7 @@ class Evaluation(Model):
     trajectories: int
     splits: dict[str, SplitErrors]
     design: dict[str, SplitErrors] = Field(exclude=True)
+    unfitted: dict[str, int] = Field(exclude=True)
     held_out: HeldOutVerdict
     sessions: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -62,6 +63,7 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
     groups["all"] = dataset.trajectories
     model, design = calibration.model, OdometryModel.of_design(dataset.robot, calibration.integration)
     sessions = compare_sessions(model, dataset.trajectories)
+    verdict = held_out_verdict(calibration, dataset)
     warning = extrapolation_warning(calibration, dataset.trajectories)
     return Evaluation(
         dataset=dataset.name,
@@ -69,7 +71,8 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
         trajectories=len(dataset.trajectories),
         splits={name: split_errors(model, group) for name, group in groups.items()},
         design={name: split_errors(design, group) for name, group in groups.items()},
-        held_out=held_out_verdict(calibration, dataset),
+        unfitted={name: sum(run.id in verdict.runs for run in group) for name, group in groups.items()},
+        held_out=verdict,
         sessions=(*sessions.sentences, *sessions.doubts),
         warnings=() if warning is None else (warning,),
     )

@@ -77,7 +77,7 @@ class AcknowledgedFlows:
             if len(self._flows) > _MOST_FLOWS:
                 self._forget(next(iter(self._flows)))
         self._heard.add(flow)
-        flow.expected = max(flow.expected, unacknowledged)  # what another node has taken is not sent again
+        flow.expected = max(flow.expected, unacknowledged)  # the sender does not repeat what another node took
         if number != flow.expected:
             flow.gap |= number > flow.expected
             return False

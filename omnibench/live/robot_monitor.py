@@ -6,16 +6,15 @@ import json
 import math
 import time
 from collections import deque
-from dataclasses import fields
 from threading import Event, Lock
-from typing import Any, Final
+from typing import Final
 
 import zenoh
 
 from omnibench.errors import DataError
 from omnibench.live.closing import Closing
 from omnibench.live.control.request_queue import source_of
-from omnibench.live.estimation.counts import Counts
+from omnibench.live.estimation.counts import anomalies_among
 from omnibench.live.network.callbacks import direct
 from omnibench.live.network.presence import Presence, checked_robot, nothing_received
 from omnibench.live.robot_status import HealthSummary, OdometryStatus, RobotStatus
@@ -30,7 +29,6 @@ _QUERY_PERIOD: Final = 1.0  # s between queries for the health; chosen
 _HEALTH_LIFETIME: Final = 3.5  # s after which an answer no longer counts: three queries without a reply
 _LARGEST_LAG: Final = 10.0  # s from stamp to arrival; beyond it, or below 0, the two clocks differ
 _LEVELS: Final = ("ok", "warning", "error", "stale")  # names of DiagnosticStatus's levels 0 to 3
-_COUNTERS: Final = frozenset(item.name for item in fields(Counts))
 
 
 class RobotMonitor(Closing):
@@ -115,7 +113,7 @@ class RobotMonitor(Closing):
             return
         try:
             answer = json.loads(reply.ok.payload.to_string())
-            health = HealthSummary(str(answer["status"]), str(answer["message"]), _anomalies(answer["counts"]))
+            health = HealthSummary(str(answer["status"]), str(answer["message"]), anomalies_among(answer["counts"]))
         except (ValueError, TypeError, KeyError, AttributeError):
             return  # the answer of another program or another version
         with self._lock:
@@ -133,7 +131,7 @@ class RobotMonitor(Closing):
             return  # the robot answers queries, which hold more than diagnostics
         worst = max(statuses, key=lambda status: status.level)
         level = _LEVELS[worst.level] if worst.level < len(_LEVELS) else str(worst.level)
-        health = HealthSummary(level, worst.message, _anomalies(dict(worst.values)))
+        health = HealthSummary(level, worst.message, anomalies_among(dict(worst.values)))
         with self._lock:
             self._answers[name] = time.monotonic(), health
 
@@ -157,7 +155,7 @@ class _Stream:
     def take(self, sample: zenoh.Sample) -> None:
         payload = sample.payload.to_bytes()
         with self._lock:
-            if not self._numbers.take(sample.attachment):
+            if self._numbers.take(sample.attachment) is None:
                 return
             self._count += 1
             self._arrived_at, self._arrived_at_by_clock = time.monotonic(), time.time()
@@ -185,8 +183,3 @@ class _Stream:
     def _rate(self) -> float | None:
         (first, count_before), (last, count) = self._history[0], self._history[-1]
         return (count - count_before) / (last - first) if last > first else None
-
-
-def _anomalies(counts: dict[str, Any]) -> dict[str, int]:
-    """The counters of anomalies that are not 0, from all of a node's counters."""
-    return Counts(**{name: int(value) for name, value in counts.items() if name in _COUNTERS}).anomalies()

@@ -61,10 +61,11 @@ class RobotService:
         self._scheduled = False  # a turn is queued, or has not yet looked at what waits
         self._working = threading.Lock()  # held while messages are taken
         self._late = LateUpdates(self._publish)
-        self._missed = MissedMessages()  # of wheels that nobody acknowledges
+        self._missed = MissedMessages()  # among the robot's own wheel messages, which are in no flow
         self._flows = AcknowledgedFlows(graph.session, name, tracker.flows)
         self._rate_limiter = RateLimiter()
         self._logged_anomalies: dict[str, int] = {}
+        self._logged_refusal = ""
         self._logged_status = ""
         self._outputs = [
             (graph.publisher(name, output.topic), output.encoding(tracker.frames))
@@ -142,14 +143,14 @@ class RobotService:
                 if flow is None:
                     waited = time.monotonic() - message.arrival
                     behind = max(behind, waited)
-                    skipped = 0 if message.is_pose else self._missed.skipped(message.attachment)
+                    skipped = 0 if message.is_pose else self._missed.take(message.attachment) or 0
                     self._take(message, late=waited > LATE, skipped=skipped)
                     continue
                 self._receive_poses()
                 if self._flows.accepts(flow):
                     self._take(message, late=False, published=self._flows.inherited(flow))
             self._late.end_turn()
-            if self._flows.heard:  # what is acknowledged is not sent again, whatever becomes of this process
+            if self._flows.heard:  # the sender forgets what is acknowledged: the state has to hold it before
                 self.tracker.save()
                 self._flows.acknowledge()
             self.tracker.record_backlog(behind, self._late.unpublished - unpublished)
@@ -197,5 +198,6 @@ class RobotService:
         in_words = anomalies_in_words({kind: count for kind, count in new.items() if count})
         if in_words and self._rate_limiter.allows("anomalies"):
             self._logged_anomalies = anomalies
-            last = f"; the last: {health.last_refusal}" if health.last_refusal else ""
+            last = f"; the last: {health.last_refusal}" if health.last_refusal not in ("", self._logged_refusal) else ""
+            self._logged_refusal = health.last_refusal
             LOG.warning("%s: %s%s", health.robot, in_words, last)

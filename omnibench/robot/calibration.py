@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, FiniteFloat, ValidationError, model_validator
 
-from omnibench.config import Model, NonNegative, Positive, parse_yaml, printable, read_yaml, to_yaml, validate
+from omnibench.config import Model, NonNegative, parse_yaml, printable, read_yaml, to_yaml, validate
 from omnibench.errors import ConfigError, DataError, require_type
 from omnibench.files import write_text
 from omnibench.robot.effects.term import make_term
@@ -71,7 +71,7 @@ class HeldOutVerdict(Model):
 class Provenance(Model):
     """Origin of a calibration: data set, calibrator with options, versions, costs, outcome, what held-out runs say.
 
-    fitted: None in files of versions that did not write it.
+    fitted: None in files of versions that did not write it. on_bounds: no interval is stated of what depends on these.
     """
 
     dataset: str
@@ -83,6 +83,7 @@ class Provenance(Model):
     seed: int
     cost: str
     box: str
+    on_bounds: tuple[str, ...] = Field((), description="fitted numbers on a bound of the box")
     versions: dict[str, str] = {}
     training_cost: float | None = None
     validation_cost: float | None = None
@@ -98,7 +99,7 @@ class Calibration(Model):
     name: Annotated[str, AfterValidator(printable)]
     created: datetime = Field(default_factory=lambda: datetime.now(UTC).replace(microsecond=0))
     robot: Robot
-    sample_period: Positive = Field(description="s")
+    sample_period: float = Field(ge=1e-6, le=3600, description="s")
     matrix: tuple[Row, Row, Row] = Field(description="3 x N: m (rows 1, 2) and rad (row 3) per rad of wheel")
     integration: Integration
     effects: tuple[EffectTerm, ...] = ()
@@ -123,6 +124,8 @@ class Calibration(Model):
             raise ValueError(
                 f"matrix holds {np.abs(self.matrix).max():g}, which no wheel can drive in m or rad per rad"
             )
+        if not self.matrix_array.any():
+            raise ValueError("matrix holds zeros only: no wheel would move the robot")
         if self.covariance is not None:
             size = 3 * wheels + sum(len(term.parameters) for term in self.effects)
             if [len(row) for row in self.covariance] != [size] * size:

@@ -70,6 +70,13 @@ def test_evaluate_shows_the_design_values_beside_the_calibration(command: Comman
     assert "(simulated data)" in shown
 
 
+def test_evaluate_says_of_every_split_how_many_runs_were_held_out(command: Command, prepared: Prepared) -> None:
+    shown = command("evaluate", prepared.calibration, prepared.data).stdout.splitlines()
+    assert [line for line in shown if ": 6 runs" in line or ": 12 runs" in line] == [
+        *("train: 6 runs, none held out", "validation: 6 runs, all held out", "all: 12 runs, 6 held out")
+    ]
+
+
 def test_calibrate_prints_what_it_would_write(command: Command, prepared: Prepared, tmp_path: Path) -> None:
     found = document(command("calibrate", prepared.data, "--json", "-o", tmp_path / "c.yaml"))
     assert found == json.loads(read_calibration(tmp_path / "c.yaml").model_dump_json())
@@ -265,6 +272,8 @@ def test_import_turns_recordings_into_a_data_set(command: Command, tmp_path: Pat
     assert printed.stdout == f"67 trajectories: {tmp_path / 'data'}\n"
     division = "training 44 runs of 20 commands, validation 23 runs of 5 commands, by train=circular, validation=square"
     assert division in printed.stderr
+    again = command("import", "optiodom", source, "-o", tmp_path / "again", "--set", "validation=*quare")
+    assert "validation 23 runs of 5 commands, by validation=*quare" in again.stderr
     dataset = load_dataset(tmp_path / "data")
     assert (len(dataset.split("train")), len(dataset.split("validation"))) == (44, 23)
 

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from commands import compared_here, small, write_plugin
+from commands import compared_here, flower, small, write_plugin
 from numpy.typing import NDArray
 
 from omnibench.compare.config import CompareConfig
 from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
 from omnibench.compare.result import RunRecord
 from omnibench.compare.scoring import SplitScorer, heading_error, position_error, score
+from omnibench.data.dataset import make_dataset
+from omnibench.data.storage import save_dataset
 from omnibench.errors import PluginError
 from omnibench.fit.calibrator import Outcome, RunResult
 from omnibench.fit.cost import Cost
@@ -50,6 +53,13 @@ def test_a_gap_is_the_share_of_cost_above_the_optimum() -> None:
     assert rows["closed_form"].train_cost is not None
     assert rows["crs"].gap == pytest.approx(rows["crs"].train_cost / rows["closed_form"].train_cost - 1)
     assert rows["crs"].gap_box == "row"
+
+
+def test_no_gap_is_measured_from_an_optimum_without_error() -> None:
+    exact = {"flower": {"simulate": flower(noise={}, validation=None)}}
+    rows = records(["closed_form", "crs"], {"closed_form": 0.0, "crs": 0.1}, datasets=exact)
+    assert rows["closed_form"].train_cost == pytest.approx(0.0, abs=1e-12)
+    assert (rows["closed_form"].gap, rows["crs"].gap) == (None, None)
 
 
 def test_an_optimum_in_another_box_gives_no_gap() -> None:
@@ -176,3 +186,22 @@ def test_a_cost_that_is_no_mean_over_trajectories_is_warned_of(tmp_path: Path) -
     )
     assert [warning for warning in result.warnings if "the cost is no mean over trajectories" in warning]
     assert compared_here(tmp_path / "other", calibrators=["theoretical"]).warnings == ()
+
+
+def test_what_the_runs_do_not_identify_is_warned_of_for_everything_that_is_fitted(tmp_path: Path) -> None:
+    straight = flower(commands={"speeds": [0.2], "directions_deg": [0, 120, 240], "turn_rates": [0.0]})
+    entries = ["theoretical", "closed_form"]
+    result = compared_here(tmp_path / "out", datasets={"flower": {"simulate": straight}}, calibrators=entries)
+    (warning,) = result.warnings
+    assert warning.startswith("data set flower, fit of the matrix: these data do not identify what wheel rates along")
+    assert "(turning on the spot)" in warning
+
+
+def test_copies_of_training_runs_are_not_held_out(tmp_path: Path) -> None:
+    dataset = load_datasets(CompareConfig.model_validate(small()))["flower"]
+    train = dataset.split("train")
+    copies = [replace(run, id=f"copy-{run.id}", split="validation") for run in train]
+    save_dataset(make_dataset("copied", dataset.robot, dataset.sample_period, [*train, *copies]), tmp_path / "data")
+    entries = ["theoretical", "closed_form"]
+    result = compared_here(tmp_path / "out", datasets={"copied": {"path": tmp_path / "data"}}, calibrators=entries)
+    assert result.held_out["copied"].verdict.verdict == "unknown"

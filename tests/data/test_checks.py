@@ -182,6 +182,13 @@ def test_wheels_that_never_turn_are_told() -> None:
     assert warning == "the wheels never turn; check the omega_* columns"
 
 
+def test_runs_in_which_no_wheel_turns_beside_others_that_drive_are_named() -> None:
+    first, second, *_ = (run.id for run in recorded().trajectories)
+    still: Change = lambda run: replace(run, rates=0 * run.rates) if run.id in (first, second) else run  # noqa: E731
+    expected = f"no wheel turns in 2 trajectories, which says nothing of the robot, e.g. {first}, {second}"
+    assert expected in warnings_of(recorded(), still)
+
+
 @pytest.mark.parametrize("sparse", [False, True])
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_sound_recordings_give_no_warning(motion: str, sparse: bool) -> None:

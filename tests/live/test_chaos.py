@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chaos.audit import Account, account_replays, account_stream, check_path, check_stamps
+from chaos.audit import Account, account_replays, account_stream, check_going_on, check_path, check_stamps
 from chaos.robots import ORIGIN, STEP, batch, calibrations
 from chaos.run import run
 from chaos.witness import Heard
@@ -52,6 +52,15 @@ def test_a_replay_that_was_not_taken_whole_is_noticed() -> None:
     part = heard([0, 1, 2, 3, 4, 7, 8, 9])
     account = account_replays([(stamps, True, True)], [before, part], COUNTS | {"samples": 8}, COUNTS, 5)
     assert (account.published, account.unaccounted) == (8, 2)
+
+
+def test_a_node_that_leaves_out_what_the_one_before_had_taken_is_noticed() -> None:
+    rng = np.random.default_rng(1)
+    path = np.cumsum(rng.normal(0.01, 0.005, (50, 3)), axis=0)
+    for later, problems in ((30, 0), (31, 1)):
+        account = Account()
+        check_going_on(account, path[[20]], np.array([20]), path[[30]], np.array([later]), path)
+        assert len(account.problems) == problems
 
 
 def test_a_stamp_that_comes_twice_is_noticed() -> None:

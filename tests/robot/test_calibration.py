@@ -76,7 +76,7 @@ number = st.floats(-1e3, 1e3)  # larger ones are refused
 row = st.tuples(number, number, number)
 
 
-@given(matrix=st.tuples(row, row, row), period=st.floats(min_value=0, exclude_min=True, allow_infinity=False))
+@given(matrix=st.tuples(row, row, row).filter(np.any), period=st.floats(1e-6, 3600))
 def test_matrix_and_period_come_back_to_the_last_bit(
     tmp_path_factory: pytest.TempPathFactory, matrix: Any, period: float
 ) -> None:
@@ -236,6 +236,9 @@ REFUSED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "negative noise": (put("noise", {"walk_heading": -0.1}), "noise.walk_heading: "),
     "a period of zero": (put("sample_period", 0), "sample_period: "),
     "an infinite period": (put("sample_period", math.inf), "sample_period: "),
+    "a period of hardly anything": (put("sample_period", 1e-300), "sample_period: "),
+    "a period of centuries": (put("sample_period", 1e10), "sample_period: "),
+    "a matrix of zeros": (put("matrix", [[0.0] * 3] * 3), "matrix holds zeros only: no wheel would move the robot"),
     "an unknown integration": (put("integration", "runge_kutta"), "integration: "),
     "an unknown effect": (put("effects", [{"name": "sllip"}]), "unknown effect 'sllip'; "),
     "an infinite parameter of an effect": (

@@ -73,25 +73,27 @@ def _matrix_table(run: CalibrationRun) -> Table:
     labels = ("x (m/rad)", "y (m/rad)", "w (rad/rad)")
     touched = np.any([np.abs(each.rates) > _TOUCHED for each in run.kept], axis=0) if run.kept else []
     marks = ["*" if touch else "" for touch in touched] or [""] * len(calibration.matrix[0])
-    note = ""
+    note, listed = "", list(_intervals(run))
     if run.kept:
         motions = " and ".join(f"{each.words} ({each.motion})" for each in run.kept)
         note = f"* only if the design values are right along {motions}: these data say nothing of it, and they are kept"
-        if not any(True for _ in _intervals(run)):
+        if not listed:
             note = f"the design values are kept along {motions}, of which these data say nothing"
     rows = []
     for number, (label, values) in enumerate(zip(labels, calibration.matrix, strict=True)):
         design = calibration.robot.inverse_kinematic_matrix[number]
         cells = (Cell(f"{value:+.7f}", _deviation(value, first)) for value, first in zip(values, design, strict=True))
         rows.append(Row.of(label, *cells))
-        for name, intervals in _intervals(run):
+        for name, intervals in listed:
             bounds = zip(intervals.low[number], intervals.high[number], marks, strict=True)
-            rows.append(
-                Row.of(f"  {name}", *(Cell("", f"{low:+.7f} to {high:+.7f}{mark}") for low, high, mark in bounds))
-            )
+            rows.append(Row.of(f"  {name}", *(Cell("", _interval(*each)) for each in bounds)))
     wheels = (Column(f"wheel {wheel}") for wheel in calibration.robot.wheel_names)
     caption = f"{calibration.name}{' (simulated data)' if simulated else ''}"
     return Table(caption, (Column("", numeric=False), *wheels), tuple(rows), note)
+
+
+def _interval(low: float, high: float, mark: str) -> str:
+    return "on a bound: no interval" if math.isnan(low) else f"{low:+.7f} to {high:+.7f}{mark}"
 
 
 def _intervals(run: CalibrationRun) -> Iterator[tuple[str, ElementIntervals]]:
@@ -105,7 +107,7 @@ def _parameter_table(robot: Robot, parameters: Sequence[ParameterEstimate]) -> T
     rows = []
     for parameter, start in zip(parameters, WheelGeometry(robot).start, strict=True):
         factor, decimals, unit = (math.degrees(1.0), 3, "deg") if parameter.unit == "rad" else (1.0, 5, "m")
-        interval = Cell("", "not identified by these data")
+        interval = Cell("", parameter.untold)
         if parameter.low is not None and parameter.high is not None:
             low, high = (f"{factor * bound:.{decimals}f}" for bound in (parameter.low, parameter.high))
             interval = Cell("", f"{low} to {high} {unit}")
@@ -122,7 +124,9 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     """Print cost and final errors on every split, beside those of the design values."""
     rows = []
     for split in evaluation.splits:
-        rows.append(Row.of(f"{split}: {plural(evaluation.splits[split].trajectories, 'run')}", role="group"))
+        count, unfitted = evaluation.splits[split].trajectories, evaluation.unfitted[split]
+        shown = {0: "none", count: "all"}.get(unfitted, f"{unfitted:,}")
+        rows.append(Row.of(f"{split}: {plural(count, 'run')}, {shown} held out", role="group"))
         for label, errors in (("calibration", evaluation.splits[split]), ("design", evaluation.design[split])):
             figures = (
                 f"{errors.cost:.4f}",

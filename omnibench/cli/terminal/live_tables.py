@@ -90,6 +90,10 @@ def print_demonstration(console: Console, shown: Demonstration) -> None:
     console.print("counted: " + ", ".join(f"{value} {name}" for name, value in counts.items()), soft_wrap=True)
 
 
+def _figure(value: float, decimals: int) -> str:
+    return "–" if math.isnan(value) else f"{value:.{decimals}f}"  # nothing was compared yet
+
+
 def _deviation_table(shown: Demonstration) -> Table:
     estimates = (
         ("odometry of the design matrix", shown.theoretical),
@@ -97,7 +101,7 @@ def _deviation_table(shown: Demonstration) -> Table:
         ("odometry/filtered: fused with SLAM", shown.fused),
     )
     rows = (
-        Row.of(label, f"{of.position:.4f}", f"{math.degrees(of.heading):.2f}", f"{of.final_position:.4f}")
+        Row.of(label, _figure(of.position, 4), _figure(math.degrees(of.heading), 2), _figure(of.final_position, 4))
         for label, of in estimates
         if of is not None
     )

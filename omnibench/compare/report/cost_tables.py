@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from omnibench.compare.report.published_tables import published_blocks
-from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_NAME, DatasetView
+from omnibench.compare.report.view import SPLIT_NAMES, DatasetView
 from omnibench.compare.report.wording import (
     cost_decimals,
     cost_in_words,
@@ -12,7 +12,7 @@ from omnibench.compare.report.wording import (
     interval_basis,
     interval_in_words,
 )
-from omnibench.compare.result import EntryStatistics
+from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
 from omnibench.data.dataset import Split
 from omnibench.report.blocks import Cell, Column, Row, Section, Table
 from omnibench.report.numbers import NOTHING, fixed, percent

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_NAME, DatasetView
+from omnibench.compare.report.view import SPLIT_NAMES, DatasetView
 from omnibench.compare.report.wording import (
     NO_INTERVAL,
     cost_decimals,
@@ -16,7 +16,7 @@ from omnibench.compare.report.wording import (
     on_bounds,
     position_unit,
 )
-from omnibench.compare.result import EntryStatistics
+from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.report.blocks import Block, Callout, Fact, Facts, Paragraph, Section
 from omnibench.report.numbers import fixed, listing, percent, span

@@ -62,7 +62,7 @@ def entry_table(view: DatasetView) -> Table:
         ),
         rows=tuple(rows),
         note="Spread: interquartile range over seeds. Gap: training cost relative to that of closed_form in the same "
-        f"box, minus one; {NOTHING} where it has no answer. Proven: what share of the "
+        f"box, minus one; {NOTHING} where it has no answer or leaves no error. Proven: what share of the "
         "cost any optimiser could still save in that box, at most. "
         f"Difference: paired by {view.units[view.scored].name}, with its 95 % interval, "
         f"{interval_basis(view, view.scored)}. Practically equal: that interval contains zero, "

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_NAME, DatasetView
+from omnibench.compare.report.view import SPLIT_NAMES, DatasetView
 from omnibench.compare.report.wording import NO_INTERVAL, cost_decimals
-from omnibench.compare.result import EntryStatistics
+from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
 from omnibench.data.dataset import SPLITS, Split, Trajectory
 from omnibench.fit.uncertainty.ratio_intervals import Interval
 from omnibench.report.blocks import Block, Callout, Cell, Column, Row, Table

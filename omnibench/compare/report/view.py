@@ -6,7 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from omnibench.compare.config import CompareConfig
-from omnibench.compare.result import BoxCertificate, ComparisonResult, EntryStatistics, EntryVerdict, ScoredRun
+from omnibench.compare.result import (
+    THEORETICAL_NAME,
+    BoxCertificate,
+    ComparisonResult,
+    EntryStatistics,
+    EntryVerdict,
+    ScoredRun,
+)
 from omnibench.data.dataset import SPLITS, Dataset, Split
 from omnibench.fit.evaluate import final_errors
 from omnibench.fit.uncertainty.ratio_intervals import Interval, Units, units_of
@@ -16,7 +23,6 @@ from omnibench.report.style import REFERENCE, SYMBOLS, THEORETICAL, colours
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 
-THEORETICAL_NAME = "theoretical"
 SPLIT_NAMES: Mapping[Split, str] = {"train": "training", "validation": "validation"}
 
 # Colours by calibrator. The paper draws its non-parametric (genetic) result in magenta, the parametric one in brown.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from omnibench.compare.plan import UNBOUNDED
-from omnibench.compare.report.view import THEORETICAL_NAME, THEORETICAL_STYLE, DatasetView
-from omnibench.compare.result import EntryStatistics, RunRecord
+from omnibench.compare.report.view import THEORETICAL_STYLE, DatasetView
+from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics, RunRecord
 from omnibench.data.dataset import Split
 from omnibench.fit.uncertainty.ratio_intervals import Interval
 from omnibench.registry import costs

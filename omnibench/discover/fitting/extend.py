@@ -7,7 +7,7 @@ The covariance of matrix elements and parameters is that of every trajectory fit
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,7 +77,8 @@ def fit_matrix(
 
     noise_runs: repetitions of the runs that the noise alone sees.
     """
-    return _in_turn(first_fit(runs, robot, sample_period, start, noise_runs), (), _ROUNDS)[0]
+    first = replace(first_fit(runs, robot, sample_period, start), noise_runs=tuple(noise_runs))
+    return _in_turn(first, (), _ROUNDS)[0]
 
 
 def extend(plain: Fit, groups: Sequence[Group]) -> Extended:

@@ -85,20 +85,13 @@ def _velocities(log: WheelLog, poses: Array) -> Array:
     return velocities
 
 
-def first_fit(
-    runs: Sequence[Trajectory],
-    robot: Robot,
-    sample_period: float,
-    start: Array,
-    noise_runs: Sequence[Trajectory] = (),
-) -> Fit:
+def first_fit(runs: Sequence[Trajectory], robot: Robot, sample_period: float, start: Array) -> Fit:
     """The plain matrix (3, N) to start from, whose noise is not known yet.
 
     The model drives exact arcs: Euler steps would leave what looks like centripetal slip.
     """
     model = OdometryModel(robot, start, "arc", (), sample_period)
-    nuisances = Nuisances(np.zeros((len(runs), 3)), np.zeros(3))
-    return Fit(model, tuple(runs), nuisances, _UNKNOWN_NOISE, noise_runs=tuple(noise_runs))
+    return Fit(model, tuple(runs), Nuisances(np.zeros((len(runs), 3)), np.zeros(3)), _UNKNOWN_NOISE)
 
 
 def with_noise(fit: Fit) -> Fit:

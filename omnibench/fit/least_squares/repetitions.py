@@ -122,9 +122,9 @@ def repetitions_of_commands(trajectories: Sequence[Trajectory]) -> Repetitions:
 
 
 def repeating_runs(runs: Sequence[Trajectory], others: Sequence[Trajectory]) -> list[Trajectory]:
-    """Those of other runs that repeat a command of the runs in the same session, where the runs themselves repeat none.
+    """The other runs that repeat a command of the runs in the same session, where the runs themselves repeat none.
 
-    They have all that was recorded of the runs.
+    An other run counts if it has all that was recorded of the runs.
     """
     if repetitions_of_commands(runs).groups:
         return []

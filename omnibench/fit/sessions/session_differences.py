@@ -42,8 +42,8 @@ CHANCE = 0.001
 _NUISANCES = 1e-4
 # Chance of what is left from which on a change of radii counts as all that differs: chosen; words alone hang on it.
 _ALL = 0.01
-# Chance below which none is printed: tails that thin are not those of real noise (chosen).
-_LEAST = 1e-9  # as ``_chance`` prints it
+# Chance below which no figure is printed but "< 10⁻⁹": tails that thin are not those of real noise (chosen).
+_LEAST = 1e-9
 # Names of sessions, or of wheels, that a sentence lists (chosen).
 _LISTED = 3
 _ALONE = "all runs are of one session"
@@ -266,7 +266,7 @@ def _listed(names: Sequence[str]) -> str:
 def _size(change: RadiusChange) -> str:
     """``2.04 % larger (95 %: 1.95 to 2.13 %)``."""
     value, low, high = (100 * each for each in (change.value, change.low, change.high))
-    decimals = max(0, math.ceil(0.7 - math.log10(max((high - low) / 2, 1e-9))))  # of half a width of 0.05 to 0.5: 2
+    decimals = max(0, math.ceil(0.7 - math.log10(max((high - low) / 2, 1e-9))))  # 2 for a half width of 0.05 to 0.5
     low, high = sorted((low, high) if value >= 0 else (-low, -high))
     than = "larger" if value >= 0 else "smaller"
     return f"{abs(value):.{decimals}f} % {than} (95 %: {low:.{decimals}f} to {high:.{decimals}f} %)"

@@ -25,14 +25,14 @@ from omnibench.fit.calibrators.closed_form import cone_program
 from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.fit.uncertainty.intervals import INTERVAL
+from omnibench.fit.uncertainty.intervals import INTERVAL, depending
 from omnibench.fit.uncertainty.ratio_intervals import BOOTSTRAPPED, FEWEST, Units, units_of
 from omnibench.robot.kinematics import Array
 
 
 @dataclass(frozen=True, eq=False)
 class ElementIntervals:
-    """95 % intervals (3, N) of the matrix elements."""
+    """95 % intervals (3, N) of the matrix elements; nan where there is none, on a bound of the box."""
 
     low: Array
     high: Array
@@ -49,7 +49,8 @@ def bootstrap_intervals(
     """Intervals of the matrix elements about closed_form's ``optimum`` (n,), from three units or more.
 
     units: what is resampled; default: the runs. The optimum of every resample is found with the poses linearised about
-    ``optimum``: the error of that is far below the width of the intervals. ConfigError for another parameterisation,
+    ``optimum``: the error of that is far below the width of the intervals. Elements that depend on a number on a bound
+    of the box have none. ConfigError for another parameterisation,
     another cost than a sum of norms, or fewer units.
     """
     objective = problem.objective
@@ -68,7 +69,10 @@ def bootstrap_intervals(
     quantile = float(stdtrit(count - 1, (1 + INTERVAL) / 2))
     if few:
         reach = quantile * np.sqrt((count - 1) * moved.var(axis=0))  # Eq. (2)
-        return ElementIntervals(problem.matrix(optimum) - reach, problem.matrix(optimum) + reach)
-    outside = 100 * float(ndtr(-np.sqrt(count / (count - 1)) * quantile))  # Eq. (1)
-    low, high = np.percentile(moved, [outside, 100 - outside], axis=0)
-    return ElementIntervals(low, high)
+        low, high = problem.matrix(optimum) - reach, problem.matrix(optimum) + reach
+    else:
+        outside = 100 * float(ndtr(-np.sqrt(count / (count - 1)) * quantile))  # Eq. (1)
+        low, high = np.percentile(moved, [outside, 100 - outside], axis=0)
+    on_bound = np.isin(problem.names, problem.at_bounds(optimum))
+    bounded = depending(problem.parameterisation.slopes(optimum), on_bound).reshape(low.shape)
+    return ElementIntervals(np.where(bounded, np.nan, low), np.where(bounded, np.nan, high))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from omnibench.robot.kinematics import Array
@@ -12,6 +13,7 @@ from omnibench.robot.kinematics import Array
 INTERVAL = 0.95  # probability of the intervals, by convention; every table of the program says 95 %
 # Degrees of freedom that stand for infinity: the quantile of Student's t differs from the normal one by 2e-9 there.
 MANY = 1e9
+_ROUNDING = 1e-12  # share of the largest derivative: a smaller one is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,3 +44,8 @@ class EstimatedCovariance:
         """Half-widths (n,) of the 95 % intervals."""
         quantile = stdtrit(np.minimum(self.degrees_of_freedom, MANY), (1 + INTERVAL) / 2)
         return np.asarray(quantile * self.standard_deviations)
+
+
+def depending(slopes: Array, inputs: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which functions (q,) with derivatives (q, n) depend on one of the n inputs that are marked."""
+    return np.asarray((np.abs(slopes[:, inputs]) > _ROUNDING * np.abs(slopes).max()).any(axis=1))

@@ -20,7 +20,8 @@ _NO_CHANGE = 1e-6  # share of the largest singular value below which a change of
 class ParameterEstimate:
     """A physical parameter of a wheel: value, standard deviation and 95 % interval, m, or rad for angles.
 
-    standard_deviation, low and high are None if the data do not identify the parameter.
+    standard_deviation, low and high are None where ``untold`` says why: the data do not identify the parameter, or it
+    depends on a number on a bound of the box.
     """
 
     name: str
@@ -29,6 +30,7 @@ class ParameterEstimate:
     standard_deviation: float | None
     low: float | None
     high: float | None
+    untold: str = ""
 
 
 def unit_of(name: str) -> str:

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import RunResult
-from omnibench.fit.cost import SumOfNorms
+from omnibench.fit.cost import NO_ERROR, SumOfNorms
 from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.span import driven_span, unidentified_directions
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals
 from omnibench.fit.uncertainty.information import noise_of_matrix
-from omnibench.fit.uncertainty.intervals import EstimatedCovariance
+from omnibench.fit.uncertainty.intervals import EstimatedCovariance, depending
 from omnibench.fit.uncertainty.physical import (
     ParameterEstimate,
     geometry_of,
@@ -37,7 +37,6 @@ _NO_GAIN = 1e-4  # relative decrease of the cost that ends the steps
 # it nothing changes; with twice, deviations from four runs are 29 % smaller, and of the 95 % intervals from four and
 # five runs 99.5 % hold the truth in the place of 99.8 %, in 60 sets each (tests/benchmarks/constants_fit.py).
 _LEAST_LEFT = 0.25
-_NO_ERROR = 1e-9  # m, rad: a smaller cost is rounding
 
 
 class NoCovarianceError(DataError):
@@ -51,10 +50,11 @@ class Uncertainty:
     covariance (3N, 3N): the elements' covariance, row by row, m and rad per rad of wheel. Rows and columns of elements
     that are held at their start are zero, with scatter as the basis also of those on a bound, and so is the variance
     along directions of wheel rates that were kept at the design values.
-    standard_deviations (3, N). intervals: 95 %, by Student's t. parameters: the wheels'
-    geometry, if it was searched or follows from the matrix (three omni wheels); a parameter that the data do not
-    identify has no standard deviation. noise: the reference poses'. basis: likelihood (the calibrator's own covariance)
-    or scatter of the runs. source: the data behind it, in words.
+    standard_deviations (3, N). intervals: 95 %, by Student's t; nan where an element depends on a number on a bound of
+    the box, about which the answers of other recordings do not scatter evenly. parameters: the wheels' geometry, if it
+    was searched or follows from the matrix (three omni wheels); without standard deviation where the data do not
+    identify a parameter, or it depends on a number on a bound. noise: the reference poses'. basis: likelihood (the
+    calibrator's own covariance) or scatter of the runs. source: the data behind it, in words.
     """
 
     covariance: Array
@@ -71,7 +71,8 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
 
     The covariance is the calibrator's own if it gives one (trajectory_ml), otherwise the sandwich of an estimate that
     minimises a sum of norms (sandwich.py). Physical parameters that need directions of wheel rates which the data do
-    not identify have no standard deviation, whether or not these directions were fitted.
+    not identify have no standard deviation, whether or not these directions were fitted. Neither has an element or
+    parameter that depends on a number on a bound of the box.
 
     NoCovarianceError, with the reason, when there is no answer, the cost is no sum of norms, the answer is no minimum
     (a published matrix, a search that stopped too early), or the runs are too few.
@@ -86,13 +87,15 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
         assert result.covariance is not None
         freedom = np.inf if result.degrees_of_freedom is None else result.degrees_of_freedom
         of_vector = EstimatedCovariance(result.covariance, freedom)
-    of_elements = of_vector.of(problem.parameterisation.slopes(result.vector))
-    reach = of_elements.reach.reshape(result.matrix.shape)
+    slopes = problem.parameterisation.slopes(result.vector)
+    of_elements = of_vector.of(slopes)
+    bounded = depending(slopes, np.isin(problem.names, result.at_bounds))
+    reach = np.where(bounded, np.nan, of_elements.reach).reshape(result.matrix.shape)
     return Uncertainty(
         covariance=of_elements.matrix,
         standard_deviations=of_elements.standard_deviations.reshape(result.matrix.shape),
         intervals=ElementIntervals(result.matrix - reach, result.matrix + reach),
-        parameters=_parameters(problem, result, of_vector, of_elements),
+        parameters=_parameters(problem, result, of_vector, of_elements, bounded),
         noise=noise,
         basis="likelihood" if scatter is None else "scatter",
         source="the calibrator's own (see its reason)" if scatter is None else scatter.words,
@@ -110,7 +113,7 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult, noise: Noise) ->
         raise NoCovarianceError(
             "no covariance: no number was free to be fitted; each is kept at its design value or lies on a bound"
         )
-    if result.cost is not None and result.cost < _NO_ERROR:
+    if result.cost is not None and result.cost < NO_ERROR:
         raise NoCovarianceError(
             "no covariance: the answer fits the runs exactly, and their scatter about it is what a covariance rests on"
         )
@@ -179,40 +182,52 @@ def _check_minimum(
 
 
 def _parameters(
-    problem: CalibrationProblem, result: RunResult, of_vector: EstimatedCovariance, of_elements: EstimatedCovariance
+    problem: CalibrationProblem,
+    result: RunResult,
+    of_vector: EstimatedCovariance,
+    of_elements: EstimatedCovariance,
+    bounded: NDArray[np.bool_],
 ) -> tuple[ParameterEstimate, ...] | None:
     """The physical parameters with their intervals; None where the matrix does not determine them.
 
-    of_vector, of_elements: covariances of the searched vector and of the matrix elements.
+    of_vector, of_elements: covariances of the searched vector and of the matrix elements. bounded (3N,): the elements
+    that depend on a number on a bound of the box.
     """
     robot = problem.robot
     assert result.vector is not None and result.matrix is not None  # noqa: PT018 (uncertainty_of has checked)
     if problem.parameterisation.name == "geometry":
         values, covariance = result.vector, of_vector
+        bounded = np.isin(problem.names, result.at_bounds)
     elif is_invertible(robot):
         try:
             values = geometry_of(result.matrix, robot)
-            covariance = of_elements.of(np.linalg.inv(WheelGeometry(robot).slopes(values)))
+            inverse = np.linalg.inv(WheelGeometry(robot).slopes(values))
+            covariance, bounded = of_elements.of(inverse), depending(inverse, bounded)
         except (DataError, np.linalg.LinAlgError):
             return None
     else:
         return None
     kept = unidentified_directions(robot, driven_span(problem.trajectories))
+    untold = [
+        "on a bound: no interval" if touching else "" if identified else "not identified by these data"
+        for identified, touching in zip(identified_parameters(robot, kept), bounded, strict=True)
+    ]
     return tuple(
         ParameterEstimate(
             name=name,
             value=float(value),
             unit=unit_of(name),
-            standard_deviation=float(deviation) if identified else None,
-            low=float(value - reach) if identified else None,
-            high=float(value + reach) if identified else None,
+            standard_deviation=None if untold else float(deviation),
+            low=None if untold else float(value - reach),
+            high=None if untold else float(value + reach),
+            untold=untold,
         )
-        for name, value, deviation, reach, identified in zip(
+        for name, value, deviation, reach, untold in zip(
             WheelGeometry(robot).names,
             values,
             covariance.standard_deviations,
             covariance.reach,
-            identified_parameters(robot, kept),
+            untold,
             strict=True,
         )
     )

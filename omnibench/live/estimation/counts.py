@@ -58,9 +58,9 @@ class Counts:
 _WORDS = {item.name: item.metadata["words"] for item in fields(Counts) if item.metadata}
 
 
-def is_anomaly(name: str) -> bool:
-    """True for a counter of what should not happen."""
-    return name in _WORDS
+def anomalies_among(counts: Mapping[str, Any]) -> dict[str, int]:
+    """The counters of anomalies that are not 0, from all counters of a node, be it of another version."""
+    return {name: int(value) for name, value in counts.items() if name in _WORDS and int(value)}
 
 
 def anomalies_in_words(anomalies: Mapping[str, int]) -> str:

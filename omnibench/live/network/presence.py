@@ -12,19 +12,17 @@ import re
 import time
 from collections.abc import Collection
 from threading import Event, Lock
-from typing import Any, Final
+from typing import Final
 
 import zenoh
 
 from omnibench.errors import ConfigError, nearest
-from omnibench.live.network.callbacks import direct
-from omnibench.live.stopping import wait_until
+from omnibench.live.network.callbacks import answers, direct
 
 _ALIVE: Final = "omnibench/*/alive"
 _CLAIMS: Final = "omnibench/*/claim-$*"
 _PATIENCE: Final = 10.0  # s for a node that starts at the same moment to run its robots, or to give way; chosen
 _LOOKING: Final = 0.05  # s between two looks at another node's claim; chosen
-_LOOK: Final = 0.002  # s between two looks at whether the router has answered; chosen
 _NAME = re.compile(r"[^\s/*$?#@]+")
 
 
@@ -37,17 +35,8 @@ def checked_robot(name: str) -> str:
 
 def alive_robots(session: zenoh.Session, timeout: float = 1.0, stop: Event | None = None) -> tuple[str, ...]:
     """The names of the robots whose tokens are declared now, sorted. timeout: s for the router; ``stop`` ends it."""
-    names: set[str] = set()
-    over = Event()
-
-    def take(reply: zenoh.Reply) -> None:
-        if reply.ok is not None:
-            names.add(_robot(reply.ok.key_expr))
-
-    handler: Any = zenoh.handlers.Callback(take, over.set, indirect=False)
-    session.liveliness().get(_ALIVE, handler, timeout=timeout)
-    wait_until(over.is_set, 2 * timeout, stop, _LOOK)
-    return tuple(sorted(names))
+    tokens = answers(lambda handler, s: session.liveliness().get(_ALIVE, handler, timeout=s), timeout, stop)
+    return tuple(sorted({_robot(token.key_expr) for token in tokens}))
 
 
 class Claim:

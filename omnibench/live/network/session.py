@@ -8,8 +8,8 @@ import math
 import os
 import re
 from collections.abc import Iterator, Mapping
+from concurrent.futures import Future
 from pathlib import Path
-from queue import SimpleQueue
 from threading import Thread
 from typing import Any, Final
 
@@ -73,23 +73,19 @@ def open_session(config: SessionConfig, purpose: str, stop: Stop | None = None) 
 
 def _opened(settings: zenoh.Config, stop: Stop | None) -> zenoh.Session:
     """Zenoh's session, opened in a thread, so that a signal ends the wait for a router that stands still."""
-    outcome: SimpleQueue[zenoh.Session | zenoh.ZError] = SimpleQueue()
+    opened: Future[zenoh.Session] = Future()
 
     def run() -> None:
         try:
-            outcome.put(zenoh.open(settings))
-        except zenoh.ZError as error:
-            outcome.put(error)
+            opened.set_result(zenoh.open(settings))
+        except Exception as error:
+            opened.set_exception(error)
 
     Thread(target=run, name="open session", daemon=True).start()
     # in steps: Zenoh's own handler of SIGINT wakes no waiting thread
-    ready = lambda: not outcome.empty()  # noqa: E731
-    if not wait_until(ready, math.inf, stop) and not wait_until(ready, _GRACE) and stop is not None:
+    if not wait_until(opened.done, math.inf, stop) and not wait_until(opened.done, _GRACE) and stop is not None:
         stop.interrupt()
-    opened = outcome.get()
-    if isinstance(opened, zenoh.ZError):
-        raise opened
-    return opened
+    return opened.result()
 
 
 def close_session(session: zenoh.Session) -> None:

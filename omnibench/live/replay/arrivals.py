@@ -22,13 +22,14 @@ _SAME_TIME = 1e-6  # s; times that differ by less are equal
 _LATEST_ORIGIN = (2**31 - 10**8) * 10**9  # ns; ROS 2's stamps end at 2^31 s
 
 Share = Annotated[float, Field(ge=0, le=1)]
+Delay = Annotated[float, Field(ge=0, le=3600)]  # s; an hour is longer than any network's; chosen
 
 
 class Channel(Model):
     """The network from sensor to node: delays and losses of messages, in s of the recording at any speed."""
 
-    delay: NonNegative = Field(0.0, description="of each message, s")
-    jitter: NonNegative = Field(0.0, description="additional delay of each message, half-normal: |N(0, jitter)|, s")
+    delay: Delay = Field(0.0, description="of each message, s")
+    jitter: Delay = Field(0.0, description="additional delay of each message, half-normal: |N(0, jitter)|, s")
     drop: Share = Field(0.0, description="share of the messages that never arrive")
     duplicate: Share = Field(0.0, description="share of the messages that arrive twice, each time with its own jitter")
 
@@ -49,9 +50,9 @@ class PoseDeviation(Model):
 class SlamChannel(Channel):
     """The network that SLAM poses take."""
 
-    delay: NonNegative = Field(0.2, description="of each message, s")
-    jitter: NonNegative = Field(0.02, description="additional delay of each message, half-normal: |N(0, jitter)|, s")
-    period: NonNegative = Field(0.25, description="least time between two poses, s")
+    delay: Delay = Field(0.2, description="of each message, s")
+    jitter: Delay = Field(0.02, description="additional delay of each message, half-normal: |N(0, jitter)|, s")
+    period: Delay = Field(0.25, description="least time between two poses, s")
     covariance: PoseDeviation | None = Field(
         None, description="for poses without covariance in the data set; default: the noise model's, else 0.02 m, rad"
     )
@@ -65,7 +66,9 @@ class ReplayConfig(Model):
     """Settings of a replay of a recording."""
 
     speed: Annotated[float, BeforeValidator(_speed, json_schema_input_type=float | Literal["max"])] = Field(
-        1.0, gt=0, description="1: real time; 10: ten times as fast; max: as fast as possible without losing messages"
+        1.0,
+        ge=1e-3,
+        description="1: real time; 10: ten times as fast; max: as fast as possible without losing messages",
     )
     pause: float = Field(1.0, ge=0, le=LONGEST_PAUSE, description="standstill between two runs, s")
     split: Split | None = Field(None, description="replay only the runs of this split")

@@ -9,7 +9,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import zenoh
@@ -17,8 +16,9 @@ from numpy.typing import NDArray
 
 from omnibench.errors import ConfigError, OmnibenchError
 from omnibench.live.control.request_queue import source_of
-from omnibench.live.estimation.counts import is_anomaly
+from omnibench.live.estimation.counts import anomalies_among
 from omnibench.live.estimation.wheel_input import check_joints
+from omnibench.live.network.callbacks import answers
 from omnibench.live.network.presence import alive_robots, checked_robot
 from omnibench.live.replay.arrivals import (
     TOPICS_PLAYED,
@@ -238,19 +238,10 @@ class Player:
         """The counters of the robot's node above 0 of what should not happen; none if there is none, or no answer."""
         if delivery.taken is None:
             return Counter()
-        answers: list[bytes] = []
-        over = threading.Event()
-
-        def take(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                answers.append(reply.ok.payload.to_bytes())
-
-        handler: Any = zenoh.handlers.Callback(take, over.set, indirect=False)
-        key = f"omnibench/{self._robot}/health"
-        self._session.get(key, handler, timeout=_HEALTH_WAIT, source_info=source_of(self._session))
-        wait_until(over.is_set, 2 * _HEALTH_WAIT, stop)
-        counts = json.loads(answers[0]).get("counts", {}) if answers else {}
-        return Counter({name: n for name, n in counts.items() if n and is_anomaly(name) and name != "irregular"})
+        key, source = f"omnibench/{self._robot}/health", source_of(self._session)
+        healths = answers(lambda do, s: self._session.get(key, do, timeout=s, source_info=source), _HEALTH_WAIT, stop)
+        counts = json.loads(healths[0].payload.to_bytes()).get("counts", {}) if healths else {}
+        return Counter({name: n for name, n in anomalies_among(counts).items() if name != "irregular"})
 
     def _not_delivered(self, error: DeliveryError, delivery: Delivery | None) -> DeliveryError:
         """The error with the number of messages that are not known to have arrived."""

@@ -62,30 +62,21 @@ class MissedMessages:
         self.count = 0
         self._publishers: dict[bytes, _Numbers] = {}
 
-    def take(self, attachment: zenoh.ZBytes | None) -> bool:
-        """True if a message is new, False if it is of an acknowledged flow and came before."""
-        return self.take_bytes(b"" if attachment is None else attachment.to_bytes())
+    def take(self, attachment: zenoh.ZBytes | bytes | None) -> int | None:
+        """The number of messages right before a new one that were published and have not come.
 
-    def skipped(self, content: bytes | None) -> int:
-        """Take a message by the bytes of its attachment; how many its publisher published before it that never came.
-
-        One that comes after all skips none.
+        None if the message is of an acknowledged flow and came before.
         """
-        before = self.count
-        self.take_bytes(content or b"")
-        return max(self.count - before, 0)
-
-    def take_bytes(self, content: bytes) -> bool:
-        """The same as ``take``, of the attachment's bytes."""
+        content = attachment.to_bytes() if isinstance(attachment, zenoh.ZBytes) else attachment or b""
         if not _is_numbered(content):
-            return True
+            return 0
         number, _, _, publisher = _HEAD.unpack_from(content)
         numbers = self._publishers.get(publisher)
         if numbers is None:
             self._publishers[publisher] = _Numbers(number)
             if len(self._publishers) > _MOST_PUBLISHERS:
                 del self._publishers[next(iter(self._publishers))]
-            return True
+            return 0
         gap = number - numbers.highest - 1
         if gap >= 0:
             numbers.highest = number
@@ -94,9 +85,9 @@ class MissedMessages:
                 numbers.missing.update(dict.fromkeys(range(number - min(gap, _MOST_MISSING), number)))
                 while len(numbers.missing) > _MOST_MISSING:
                     del numbers.missing[next(iter(numbers.missing))]
-            return True
+            return gap
         if number not in numbers.missing:
-            return len(content) == _HEAD.size  # only what is acknowledged is ever sent again
+            return 0 if len(content) == _HEAD.size else None  # only what is acknowledged is ever sent again
         del numbers.missing[number]
         self.count -= 1
-        return True
+        return 0

@@ -163,10 +163,10 @@ class Subscription(Closing):
     def _decoded(self, sample: zenoh.Sample) -> Odometry | None:
         if sample.kind != zenoh.SampleKind.PUT:
             return None
-        before = self._numbers.count
-        if not self._numbers.take(sample.attachment):
+        skipped = self._numbers.take(sample.attachment)
+        if skipped is None:
             return None
-        if self._lossless and self._numbers.count > before and self._log_limiter.allows("missed"):
+        if self._lossless and skipped and self._log_limiter.allows("missed"):
             _log.warning(
                 "%s of %s lost on the way; `missed` counts them", plural(self.missed, "message"), sample.key_expr
             )

@@ -74,7 +74,7 @@ class TopicListener:
             return
         payload = sample.payload.to_bytes()
         with self._lock:
-            if not self._missed[name].take(sample.attachment):
+            if self._missed[name].take(sample.attachment) is None:
                 return
             self._time = max(self._time, time.time_ns())  # readers of recordings expect increasing times
             self._consume(Arrival(name, topic, self._time, payload))

@@ -135,6 +135,19 @@ def check_path(account: Account, part: Heard, index: NDArray[np.int64], paths: S
         account.problems.append(f"odom is off the batch odometry by {account.worst:.1e} (m, rad)")
 
 
+def check_going_on(
+    account: Account, pose: Array, index: NDArray[np.int64], after: Array, later: NDArray[np.int64], path: Array
+) -> None:
+    """Odometry of a node that takes the place of another one goes on where that one was, with nothing left out.
+
+    pose (1, 3), index (1,): last of the node before, and its sample; after, later: first of the next one.
+    """
+    off = float(np.abs(_off(_moves(pose, after), _moves(path[index], path[later]))).max())
+    if off > EXACT:
+        account.worst = max(account.worst, off)
+        account.problems.append(f"odom goes on {off:.1e} (m, rad) off the batch odometry after its node was killed")
+
+
 def account_stream(
     parts: Sequence[Heard], index: Sequence[NDArray[np.int64]], now: Counts, before: Counts | None
 ) -> Account:
@@ -159,10 +172,10 @@ def account_stream(
         account.refused += refused(counted)
         lost = int(unseen.sum()) - counted["unpublished"] - refused(counted)  # Eq. (C1)
         beyond = lost - counted["missing"]
-        # In a silence it counts none, and where the clock seems to have jumped those of up to a second.
+        # In a silence, which is longer than a second, it counts none, nor where the clock seems to have jumped.
         silences = np.diff(samples) > _LONGEST
         long = int(unseen[silences].sum()) if counted["gaps"] + counted["clock_jumps"] else 0
-        least = long - counted["unpublished"] - _LONGEST * counted["clock_jumps"]
+        least = _LONGEST * counted["gaps"] - refused(counted)
         if before is None:  # it counts what it missed before its first message too, and not while it learns the period
             account.missing += min(counted["missing"], lost)
             early = int(unseen[part.numbers[1:] <= _LEARNING].sum())
@@ -170,7 +183,7 @@ def account_stream(
             beyond, least = max(beyond - early, 0), 0
         else:
             account.missing += counted["missing"]
-        if beyond == 0 or max(least, 0) <= beyond <= long:
+        if max(least, 0) <= beyond <= long:
             account.in_gaps += beyond
         else:
             account.problem(beyond, f"samples lost before the node, more than it counts as missing, {long} in silences")
@@ -183,7 +196,8 @@ def account_replays(
     """The account of the replays of a round: a node takes all messages of one that ended well.
 
     replays: of each the stamps (F,) ns, whether it played to its end, and whether its delivery was confirmed. parts:
-    begin with the last message before. kept: samples that a node which is killed may have acknowledged without trace.
+    begin with the last message before. kept: samples at a replay's end that a node which is killed may have taken
+    without a trace; that those before are in the path of the next node, ``check_going_on`` tells.
     """
     account = Account()
     stamps = np.concatenate([each for each, _, _ in replays]) if replays else np.zeros(0, dtype=np.int64)
@@ -226,11 +240,15 @@ def account_replays(
             if not len(run):
                 continue
             around = (lives[run[0] - 1] if run[0] else -1, lives[run[-1] + 1] if run[-1] + 1 < sent else -1)
-            if len(parts) > 1 and around[0] != around[1] and len(run) <= kept:
+            # of a killed node: what it had taken but not yet sent out, and the next one's path must hold that
+            if len(parts) > 1 and around[0] != around[1] and (min(around) >= 0 or len(run) <= kept):
                 told = min(unpublished, len(run))
                 account.unpublished += told
                 account.killed += len(run) - told
                 unpublished -= told
+            elif len(run) <= unpublished:  # as another node may have done it, for all that this one knows
+                account.unpublished += len(run)
+                unpublished -= len(run)
             elif len(run) <= refusals:
                 account.refused += len(run)
                 refusals -= len(run)

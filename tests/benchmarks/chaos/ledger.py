@@ -13,6 +13,7 @@ from chaos.audit import (
     Account,
     account_replays,
     account_stream,
+    check_going_on,
     check_path,
     check_published,
     check_stamps,
@@ -23,9 +24,10 @@ from chaos.programs import PATIENCE
 from chaos.robots import ORIGIN, STEP, batch
 from chaos.system import NUMBERED, PLAIN, PLAYED, System
 from chaos.witness import Heard
+from omnibench.live.replay.delivery import WINDOW
 
 ROBOTS: Final = (PLAYED, NUMBERED, PLAIN)
-_KEPT: Final = 600  # messages of a replay that a node may take and a kill leave without a trace: its window and a batch
+_KEPT: Final = 600  # messages at a replay's end that a kill may leave without a trace: a window and a batch
 
 
 class Ledger:
@@ -39,11 +41,8 @@ class Ledger:
         self._node_starts = 0  # until the last round
         self._endings = 0  # of processes, until the last round
 
-    def close_round(self, *, away: bool) -> list[str]:
-        """Add the account of a round, in which everything has come to rest; its problems.
-
-        away: the node stood still for so long that links to it were given up.
-        """
+    def close_round(self) -> list[str]:
+        """Add the account of a round, in which everything has come to rest; its problems."""
         system, problems = self._system, []
         for name in ROBOTS:
             now = self._settled_counts(name)
@@ -52,11 +51,12 @@ class Ledger:
                 continue
             parts = system.witness.heard(name)
             if parts or name in self._last:
-                problems += [f"robot {name}: {problem}" for problem in self._account_of(name, parts, now, away)]
+                problems += [f"robot {name}: {problem}" for problem in self._account_of(name, parts, now)]
         self._node_starts = system.node.starts
         self._endings = len(system.endings)
         system.replays.clear()
         system.swaps = 0
+        system.disk_was_full = False
         return problems
 
     def _settled_counts(self, robot: str) -> dict[str, int] | None:
@@ -70,7 +70,7 @@ class Ledger:
             time.sleep(0.5)
         return None
 
-    def _account_of(self, name: str, parts: list[Heard], now: dict[str, int], away: bool) -> list[str]:
+    def _account_of(self, name: str, parts: list[Heard], now: dict[str, int]) -> list[str]:
         """Add the account of one robot; its problems. now: the node's counters."""
         last = self._last.get(name)
         if last is None:  # nothing came before the first sample
@@ -83,7 +83,7 @@ class Ledger:
             parts.append(Heard(b"new", np.array([0]), np.array([0]), np.zeros((1, 3))))
         before = self._counts.get(name) if self._node_starts == self._system.node.starts else None
         if name == PLAIN:
-            account = self._plain(parts, now, before, away)
+            account = self._plain(parts, now, before)
         else:
             account = {PLAYED: self._played, NUMBERED: self._numbered}[name](parts, now, before)
         check_stamps(account, parts, jumps=name == PLAIN)
@@ -112,7 +112,7 @@ class Ledger:
         robot.forget()
         return account
 
-    def _plain(self, parts: list[Heard], now: dict[str, int], before: dict[str, int] | None, away: bool) -> Account:
+    def _plain(self, parts: list[Heard], now: dict[str, int], before: dict[str, int] | None) -> Account:
         robot, account = self._system.plain, Account()
         counted = difference(now, before)
         account.sent = len(robot.sent) - (PLAIN in self._last) + robot.junk
@@ -120,7 +120,7 @@ class Ledger:
         account.unpublished, account.refused = counted["unpublished"], refused(counted)
         check_published(account, parts[-1], now)
         rest = account.sent - account.published - account.unpublished - account.refused
-        if before is None or away:
+        if before is None or robot.lost_link:
             account.killed = rest
         else:
             account.problem(rest, "messages neither taken nor refused")
@@ -131,13 +131,15 @@ class Ledger:
         system = self._system
         endings = [each for each in system.endings[self._endings :] if each.program == "replay"]
         flows = system.witness.flows()
-        ends = [*(replay.since for replay in system.replays[1:]), math.inf]
+        ends = [*(replay.since for replay in system.replays), math.inf][1:]
         replays, contradictions = [], []
         for replay, ending, end in zip(system.replays, endings, ends, strict=True):
             stamps = replay.origin + np.round(system.times * 1e9).astype(np.int64)
             taken = [flow.taken for flow in flows if replay.since <= flow.since < end]
-            replays.append((stamps, ending.code == 0, bool(taken)))
-            if ending.code == 0 and bool(taken) is not ("all taken by the node" in ending.said):
+            confirmed = "all taken by the node" in ending.said if ending.code == 0 else bool(taken)
+            replays.append((stamps, ending.code == 0, confirmed))
+            # a window of a replay that was killed can come late, while the next one finds no node
+            if ending.code == 0 and ((confirmed and not taken) or (not confirmed and max(taken, default=0) > WINDOW)):
                 contradictions.append(
                     f"acknowledged {sum(taken)}, and the replay says {ending.said.splitlines()[-1]!r}"
                 )
@@ -148,11 +150,17 @@ class Ledger:
         if before is not None and all(confirmed for _, _, confirmed in replays):
             taken = sum(flow.taken for flow in flows)
             account.problem(taken - handled, "messages acknowledged, but neither taken nor refused")
-        for part in parts:
-            for stamps, _, _ in replays:
+        for stamps, _, _ in replays:
+            previous = None
+            for part in parts:
                 inside = (part.stamps >= stamps[0]) & (part.stamps <= stamps[-1])
-                if np.count_nonzero(inside) > 1:
-                    chosen = Heard(part.node, part.numbers[inside], part.stamps[inside], part.poses[inside])
-                    index = np.searchsorted(stamps, chosen.stamps)
+                if not inside.any():
+                    continue
+                chosen = Heard(part.node, part.numbers[inside], part.stamps[inside], part.poses[inside])
+                index = np.searchsorted(stamps, chosen.stamps)
+                if len(index) > 1:
                     check_path(account, chosen, index, [system.played_path], 0)
+                if previous is not None and not system.disk_was_full:
+                    check_going_on(account, *previous, chosen.poses[:1], index[:1], system.played_path)
+                previous = chosen.poses[-1:], index[-1:]
         return account

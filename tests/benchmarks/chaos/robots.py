@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -13,6 +14,7 @@ import zenoh
 
 from omnibench.data.dataset import Trajectory, make_dataset
 from omnibench.data.storage import load_dataset, save_dataset
+from omnibench.live.network.session import is_connected
 from omnibench.live.replay.concatenated_drive import concatenate_runs
 from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 from omnibench.live.wire.topics import GraphNode
@@ -69,7 +71,7 @@ def write_recording(folder: Path, rng: np.random.Generator, calibration: Calibra
     return drive.wheel_times, calibration.model.poses([drive.log()])[0]
 
 
-class Robot(threading.Thread):
+class Robot(threading.Thread, ABC):
     """A robot that sends a wheel sample every 10 ms, whatever becomes of it, while ``driving`` is set.
 
     Its stamps go on by 10 ms from sample to sample, also where this process comes late. jump: moves the stamps from now
@@ -89,9 +91,9 @@ class Robot(threading.Thread):
         self._stamp, self._angles = ORIGIN, np.zeros(3)
         self._phase = self._rng.uniform(0, 6, 3)
 
+    @abstractmethod
     def publish(self, payload: bytes) -> None:
         """Put a sample on the network."""
-        raise NotImplementedError
 
     def jump(self, seconds: float) -> None:
         with self._lock:
@@ -159,8 +161,11 @@ class PlainRobot(Robot):
         self._wheels = session.declare_publisher(f"{name}/joint_states", congestion_control=block)
         self._slam = session.declare_publisher(f"{name}/slam_pose", congestion_control=block)
         self.junk = 0  # messages of junk on joint_states since ``forget``
+        self.lost_link = False  # since ``forget``: what it then sent, nobody can count
+        self._session = session
 
     def publish(self, payload: bytes) -> None:
+        self.lost_link |= not is_connected(self._session)
         self._wheels.put(payload)
         if self.total % 25 == 0:
             pose = PoseEstimate(self._stamp - 200_000_000, "map", np.zeros(3), 1e4 * np.eye(3))
@@ -177,4 +182,4 @@ class PlainRobot(Robot):
 
     def forget(self) -> None:
         super().forget()
-        self.junk = 0
+        self.junk, self.lost_link = 0, False

@@ -43,7 +43,6 @@ class Chaos:
         self.began = time.monotonic()
         self.faults = Faults(system.kinds(), np.random.default_rng(seed))
         self._seed, self._say, self._stop = seed, say, stop
-        self._long_stops = 0  # of the node, until the last round
         self._said = 0.0, 0  # time and messages of the last line of progress
         self._endings_checked = 0
 
@@ -84,8 +83,7 @@ class Chaos:
         self._look_after(restart_only=True)
         self._wait_for(system.numbered)
         self._wait_for(system.plain)
-        long_stops, self._long_stops = self._long_stops, self.faults.count["stop node for long"]
-        for problem in self.ledger.close_round(away=self._long_stops > long_stops):
+        for problem in self.ledger.close_round():
             self.problem(problem)
         self.rounds += 1
 
@@ -153,7 +151,7 @@ class Chaos:
                 if program is not system.replay:
                     program.start()
         # a replay that begins while no node is there confirms nothing
-        quiet = not self.faults.targets & {"replay", "node", "router", "link of node", "link of clients"}
+        quiet = not self.faults.targets & {"replay", "node", "router", "links", "link of node", "link of clients"}
         if not restart_only and not system.replay.running and quiet and system.node_in_sight():
             self.replays += 1
             system.start_replay()

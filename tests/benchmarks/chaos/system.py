@@ -67,6 +67,7 @@ class System:
         self.endings: list[Ending] = []
         self.replays: list[Replay] = []  # of this round
         self.recordings: list[Path] = []
+        self.disk_was_full = False  # of the node, since the round began
         self.swaps = 0  # calibrations that were sent since the round began
         self.times, self.played_path = write_recording(folder / "data", self.rng, self.calibrations[0])
         self._write_configs()
@@ -83,22 +84,7 @@ class System:
 
     def start(self) -> None:
         ports = self._ports
-        self._links = subprocess.Popen(
-            [
-                sys.executable,
-                proxy.__file__,
-                *(
-                    f"127.0.0.1:{port}:{ports['router']}"
-                    for port in (ports["to_node"], ports["to_clients"], ports["to_robots"])
-                ),
-            ],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
-        assert self._links.stdout is not None
-        self._links.stdout.readline()
+        self._start_links()
         for program in (self.router, self.node, self.listener, self.recorder):
             program.start()
         self.witness = Witness(ports["node"])
@@ -111,6 +97,20 @@ class System:
         )
         for robot in (self.numbered, self.plain):
             robot.start()
+
+    def _start_links(self) -> None:
+        """Start the proxy, all links open."""
+        ports = self._ports
+        links = (f"127.0.0.1:{ports[port]}:{ports['router']}" for port in ("to_node", "to_clients", "to_robots"))
+        self._links = subprocess.Popen(
+            [sys.executable, proxy.__file__, *links],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        assert self._links.stdout is not None
+        self._links.stdout.readline()
 
     def end(self) -> None:
         """Ask every program to end, take its end, and leave."""
@@ -140,8 +140,9 @@ class System:
         """Change a link of the proxy."""
         assert self._links is not None
         assert self._links.stdin is not None
-        self._links.stdin.write(json.dumps({"link": number, "state": state, "rate": rate}) + "\n")
-        self._links.stdin.flush()
+        with suppress(BrokenPipeError):  # it was killed; the next one begins with open links
+            self._links.stdin.write(json.dumps({"link": number, "state": state, "rate": rate}) + "\n")
+            self._links.stdin.flush()
 
     def node_in_sight(self) -> bool:
         """True if the network beyond the router knows of the node's robots."""
@@ -162,6 +163,8 @@ class System:
             faults.append(Fault(f"stop {name}", name, lambda p=program: self._pause(p), 0.2, 6.0))
             faults.append(Fault(f"kill {name}", name, lambda p=program: self._kill(p), 0.0, 3.0, 0.5))
             faults.append(Fault(f"ask {name} to end", name, lambda p=program: self._ask(p), 0.0, 1.0, 0.3))
+        faults.append(Fault("stop proxy", "links", self._pause_links, 0.2, 6.0, 0.5))
+        faults.append(Fault("kill proxy", "links", self._kill_links, 0.0, 3.0, 0.5))
         faults.append(Fault("stop node for long", "node", lambda: self._pause(self.node), 11.0, 15.0, 0.1))
         for number, name in enumerate(("node", "clients", "robots")):
             target = f"link of {name}"
@@ -228,6 +231,18 @@ class System:
         self.endings.append(program.kill())
         return None if program is self.replay else program.start
 
+    def _pause_links(self) -> Callable[[], object]:
+        links = self._links
+        assert links is not None
+        links.send_signal(signal.SIGSTOP)
+        return lambda: links.send_signal(signal.SIGCONT)
+
+    def _kill_links(self) -> Callable[[], object]:
+        assert self._links is not None
+        self._links.kill()
+        self._links.wait()
+        return self._start_links
+
     def _ask(self, program: Program) -> Callable[[], object] | None:
         """Ask a program to end, which it must, and start it again."""
         if not program.running or not program.can_end:
@@ -251,7 +266,10 @@ class System:
 
     # Only once a process has its session: Zenoh needs room for shared memory when it opens one.
     def _fill_nodes_disk(self) -> Callable[[], object] | None:
-        return self._fill_disk(self.node, 0) if self.witness.alive() else None
+        if not self.witness.alive():
+            return None
+        self.disk_was_full = True
+        return self._fill_disk(self.node, 0)
 
     def _fill_recorders_disk(self) -> Callable[[], object] | None:
         file = self.recordings[-1]

@@ -18,14 +18,14 @@ from motions import FLOWER, RING, driven
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import RunResult, run_calibrator
-from omnibench.fit.parameterisation import WheelGeometry
+from omnibench.fit.parameterisation import ExplicitBox, WheelGeometry
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.fit.uncertainty.bootstrap import bootstrap_intervals
 from omnibench.fit.uncertainty.information import information_of_run, information_of_runs
 from omnibench.fit.uncertainty.physical import geometry_of, identified_parameters
 from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 from omnibench.registry import calibrators, costs
-from omnibench.robot.calibration import Noise
+from omnibench.robot.calibration import Noise, matrix_rows
 from omnibench.robot.kinematics import Array, inverse_kinematic_matrices
 from omnibench.robot.odometry import OdometryBatch
 from omnibench.simulate.simulate import simulate_dataset
@@ -149,6 +149,24 @@ class TestCovariance:
         uncertainty = found(driven(FLOWER), box="paper")
         assert uncertainty.standard_deviations[0, 1] == 0
         assert np.count_nonzero(uncertainty.standard_deviations) == 8
+
+    def test_what_depends_on_an_element_on_a_bound_has_no_interval(self) -> None:
+        truth, wide = TRUTH[1, 2], np.abs(ROBOT.inverse_kinematic_matrix)
+        lower, upper = ROBOT.inverse_kinematic_matrix - wide - 0.1, ROBOT.inverse_kinematic_matrix + wide + 0.1
+        design = ROBOT.inverse_kinematic_matrix[1, 2]
+        (upper if truth > design else lower)[1, 2] = (truth + design) / 2
+        box = ExplicitBox(lower=matrix_rows(lower), upper=matrix_rows(upper))
+        problem = make_problem(driven(FLOWER), box=box)
+        result = solved(problem)
+        assert result.at_bounds == ("m23",)
+        drawn = bootstrap_intervals(problem, result.vector, rng=np.random.default_rng(1))
+        uncertainty = uncertainty_of(problem, result)
+        for intervals in (uncertainty.intervals, drawn):
+            assert np.argwhere(np.isnan(intervals.low)).tolist() == [[1, 2]]
+            assert np.argwhere(np.isnan(intervals.high)).tolist() == [[1, 2]]
+        assert uncertainty.parameters is not None
+        told = {each.untold for each in uncertainty.parameters}
+        assert told == {"on a bound: no interval"}
 
     def test_directions_that_are_kept_have_no_variance_and_their_parameters_none_at_all(self) -> None:
         uncertainty = found(driven(RING, slip=0.02))

@@ -26,7 +26,7 @@ from omnibench.data.storage import save_dataset
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive, concatenate_runs
 from omnibench.live.replay.delivery import WINDOW, DeliveryError
 from omnibench.live.replay.replay_player import Player
-from omnibench.live.wire.attachment import Flow, MissedMessages, flow_of, packed
+from omnibench.live.wire.attachment import packed
 from omnibench.live.wire.messages import JOINT_STATE
 from omnibench.live.wire.topics import GraphNode, KeySpace
 from omnibench.robot.planar import relative
@@ -332,45 +332,6 @@ class TestToOthers:
                 each.close()
 
 
-class TestMissedMessages:
-    def test_gaps_in_a_publishers_numbers_are_counted(self) -> None:
-        missed = MissedMessages()
-        for number in (5, 6, 9, 10, 20):
-            assert missed.take(numbered(number))
-        assert missed.count == 2 + 9
-
-    @pytest.mark.parametrize("flow", [None, (1, 2, 3, False)])
-    def test_one_that_comes_after_all_is_not_missed_and_of_a_flow_one_that_comes_again_is_not_new(
-        self, flow: Flow | None
-    ) -> None:
-        missed = MissedMessages()
-        came = [missed.take(numbered(number, flow=flow)) for number in (1, 4, 2, 2, 4, 3)]
-        assert came == [True, True, True, flow is None, flow is None, True]
-        assert missed.count == 0
-
-    def test_publishers_have_numbers_of_their_own(self) -> None:
-        missed = MissedMessages()
-        for number in (1, 2, 3):
-            assert missed.take(numbered(number))
-            assert missed.take(numbered(100 * number, b"another publisher"[:16]))
-        assert missed.count == 2 * 99
-
-    @pytest.mark.parametrize("length", [0, 14, 33, 58, 90])
-    def test_messages_of_other_programs_tell_nothing(self, length: int) -> None:
-        missed = MissedMessages()
-        assert missed.take(None)
-        for _ in range(2):
-            assert missed.take(zenoh.ZBytes(b"x" * length))
-        assert missed.count == 0
-        assert flow_of(b"x" * length) is None
-
-    def test_many_that_are_missed_are_counted_at_once(self) -> None:
-        missed = MissedMessages()
-        for number in range(1, 50_000_000, 50_000):
-            assert missed.take(numbered(number))
-        assert missed.count == 999 * 49_999
-
-
 def test_a_node_counts_the_numbered_samples_of_a_robot_that_never_came(tmp_path: Path) -> None:
     payloads = drive(4.0).payloads()
     with running(config_of(tmp_path)) as (node, session):
@@ -381,17 +342,6 @@ def test_a_node_counts_the_numbered_samples_of_a_robot_that_never_came(tmp_path:
         until(lambda: node.health("apr").counts["samples"] == 225, "all samples")
         counted = node.health("apr").counts
     assert (counted["missing"], counted["clock_jumps"]) == (50 + 124, 0)
-
-
-def test_a_flow_adds_to_an_attachment_what_ros_passes_over() -> None:
-    plain, flow = packed(3, bytes(16)), packed(3, bytes(16), (7, 8, 9, True))
-    assert (len(plain), flow_of(plain), flow_of(None)) == (33, None, None)
-    assert flow[:8] == plain[:8]
-    assert flow_of(flow) == (7, 8, 9, True)
-
-
-def numbered(number: int, publisher: bytes = bytes(16), flow: Flow | None = None) -> zenoh.ZBytes:
-    return zenoh.ZBytes(packed(number, publisher, flow))
 
 
 def test_two_nodes_for_one_robot_that_start_at_once_do_not_both_run(tmp_path: Path, port: int) -> None:

@@ -179,12 +179,13 @@ class TestConfig:
     @pytest.mark.parametrize(
         ("changes", "message"),
         [
-            ({"speed": 0}, "speed: Input should be greater than 0"),
-            ({"speed": math.nan}, "speed: Input should be greater than 0"),
+            ({"speed": 1e-300}, "speed: Input should be greater than or equal to 0.001"),
+            ({"speed": math.nan}, "speed: Input should be greater than or equal to 0.001"),
             ({"speed": "fast"}, "speed: Input should be a valid number"),
             ({"pause": -1}, "pause: Input should be greater than or equal to 0"),
             ({"wheels": {"drop": 1.5}}, "wheels.drop: Input should be less than or equal to 1"),
-            ({"slam": {"delay": math.inf}}, "slam.delay: Input should be a finite number"),
+            ({"slam": {"delay": math.inf}}, "slam.delay: Input should be less than or equal to 3600"),
+            ({"slam": {"period": 1e300}}, "slam.period: Input should be less than or equal to 3600"),
             ({"slam": {"covariance": {"position": 0}}}, "slam.covariance.position: Input should be greater than 0"),
             ({"wheels": {"periot": 1}}, "unknown key 'wheels.periot'"),
             ({"sped": 1}, "did you mean 'speed'"),
