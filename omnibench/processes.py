@@ -10,7 +10,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import wait
 from types import ModuleType
 from typing import Any
@@ -57,7 +57,8 @@ def one_thread_processes(preload: Sequence[str]) -> Iterator[Any]:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__, *preload])
     try:
-        with _interrupts_ignored():  # the processes inherit this: the parent decides what Ctrl-C ends
+        resource_tracker.ensure_running()  # the fork server would start it, and unblock what is blocked
+        with interrupts_deferred(), _interrupts_blocked():  # processes inherit the block: the parent ends them
             forkserver.ensure_running()
         yield context
     finally:
@@ -69,15 +70,12 @@ def one_thread_processes(preload: Sequence[str]) -> Iterator[Any]:
 
 
 @contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():  # signal handlers belong to the main thread
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _interrupts_blocked() -> Iterator[None]:
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
