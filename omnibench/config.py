@@ -53,6 +53,9 @@ def _from_folder(path: Path, info: ValidationInfo) -> Path:
 RelativePath = Annotated[Path, AfterValidator(_from_folder)]
 
 
+_PATTERN = re.compile(r"\s*([*!&@%`]|\[[^\]]*\].)")
+
+
 class _Loader(yaml.SafeLoader):
     """YAML 1.1 without its traps: a key given twice is refused, ``1e-6`` is a number."""
 
@@ -124,8 +127,8 @@ def parse_settings(settings: Iterable[str] | None) -> dict[str, Any]:
         key, equals, value = setting.partition("=")
         if not equals or not key:
             raise ConfigError(f"--set {setting}: expected KEY=VALUE")
-        # a pattern such as *_1 would be a reference to another value
-        options[key] = value if value.startswith("*") else parse_yaml(value, f"--set {setting}")
+        # a pattern of names such as *_1 or [0-4]* has a meaning of its own in YAML, or none
+        options[key] = value if _PATTERN.match(value) else parse_yaml(value, f"--set {setting}")
     return options
 
 

@@ -86,13 +86,14 @@ class SplitScore:
     """Costs and errors of a matrix on one split.
 
     costs (Z,): the cost of each trajectory. errors (Z, 3): odometry minus reference at the last reference pose of each
-    trajectory, m, m, rad. units: what intervals of the costs rest on.
+    trajectory, m, m, rad. units: what intervals of the costs rest on. rounding: costs that are not above it are that.
     """
 
     cost: float
     costs: Array
     errors: Array
     units: Units
+    rounding: float
 
 
 @dataclass(frozen=True, eq=False)

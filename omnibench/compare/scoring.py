@@ -14,7 +14,7 @@ from omnibench.compare.result import RunRecord, ScoredRun, SplitScore
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.errors import PluginError
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error
-from omnibench.fit.cost import NO_ERROR, Cost
+from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.fit.parameterisation import FittedParameter, fitted_parameters, make_bounds
 from omnibench.fit.uncertainty.ratio_intervals import UnitName, units_of
@@ -53,7 +53,9 @@ class SplitScorer:
 
     def score(self, matrix: Array) -> SplitScore:
         """All of these of a matrix (3, N). PluginError when the cost raises or is not a finite number."""
-        return SplitScore(self.cost(matrix), self.costs(matrix), self.final_errors(matrix), self._units)
+        return SplitScore(
+            self.cost(matrix), self.costs(matrix), self.final_errors(matrix), self._units, self._cost.rounding
+        )
 
     def _errors(self, matrix: Array) -> Array:
         return self._odometry.poses(matrix[None])[0] - self._reference
@@ -85,7 +87,7 @@ def score(
         _scored(run, result, _scores(scorers[run.dataset_name], result.matrix), design[run.dataset_name])
         for run, result in zip(plan, results, strict=True)
     ]
-    exact = [(run, done) for run, done in zip(plan, scored, strict=True) if _is_exact(run, done.record)]
+    exact = [(run, done) for run, done in zip(plan, scored, strict=True) if _is_exact(run, done)]
     return tuple(_with_gap(run, done, exact) for run, done in zip(plan, scored, strict=True))
 
 
@@ -162,7 +164,9 @@ def _columns(split: Split, scores: Mapping[Split, SplitScore], design: Mapping[S
 
 
 def _improvement(score: SplitScore | None, theoretical: SplitScore | None) -> float | None:
-    return 1 - score.cost / theoretical.cost if score and theoretical and theoretical.cost else None
+    if score is None or theoretical is None or theoretical.cost <= theoretical.rounding:
+        return None
+    return 1 - score.cost / theoretical.cost
 
 
 def _parameters(run: PlannedRun, result: RunResult) -> tuple[FittedParameter, ...] | None:
@@ -171,10 +175,11 @@ def _parameters(run: PlannedRun, result: RunResult) -> tuple[FittedParameter, ..
     return fitted_parameters(run.dataset.robot, result.vector)
 
 
-def _is_exact(run: PlannedRun, record: RunRecord) -> bool:
+def _is_exact(run: PlannedRun, scored: ScoredRun) -> bool:
     """True if a run converged to what should be the optimum in its box of matrix elements, with a cost to divide by."""
-    exact = calibrators.entry(record.calibrator).cls.exact and run.element_box is not None
-    return exact and record.outcome is Outcome.CONVERGED and bool(record.train_cost)
+    exact = calibrators.entry(scored.record.calibrator).cls.exact and run.element_box is not None
+    score = scored.scores.get("train")
+    return exact and scored.record.outcome is Outcome.CONVERGED and score is not None and score.cost > score.rounding
 
 
 def _with_gap(run: PlannedRun, scored: ScoredRun, exact: Sequence[tuple[PlannedRun, ScoredRun]]) -> ScoredRun:
@@ -183,9 +188,8 @@ def _with_gap(run: PlannedRun, scored: ScoredRun, exact: Sequence[tuple[PlannedR
     if cost is None or matrix is None:
         return scored
     for other, optimum in exact:
-        lowest = optimum.record.train_cost or 0.0
-        if lowest >= NO_ERROR and is_comparable(run, matrix, other):  # no share of rounding means anything
-            gap = cost / lowest - 1
+        if is_comparable(run, matrix, other):
+            gap = cost / optimum.scores["train"].cost - 1
             return replace(scored, record=scored.record.model_copy(update={"gap": gap, "gap_box": other.box_name}))
     return scored
 

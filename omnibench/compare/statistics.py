@@ -9,7 +9,7 @@ import numpy as np
 
 from omnibench.compare.result import EntryStatistics, EntryVerdict, ScoredRun, SplitScore, SplitStatistics
 from omnibench.data.dataset import Dataset, Split
-from omnibench.fit.held_out import judge, nothing_held_out, unfitted_runs
+from omnibench.fit.held_out import judge, nothing_held_out
 from omnibench.fit.sessions.session_differences import compare_sessions
 from omnibench.fit.uncertainty.ratio_intervals import Bootstrap, Interval, RatioIntervals
 from omnibench.registry import calibrators
@@ -57,8 +57,7 @@ def held_out_verdicts(
 ) -> dict[str, EntryVerdict]:
     """The verdict of each data set's validation runs on its best calibration, if a calibrator gave an answer.
 
-    The best calibration is the best entry, or, where that is not fitted, the fitted one of lowest judged cost. Copies
-    of training runs do not count.
+    The best calibration is the best entry, or, where that is not fitted, the fitted one of lowest judged cost.
     """
     verdicts = {}
     for name, dataset in datasets.items():
@@ -69,14 +68,9 @@ def held_out_verdicts(
         ]
         if fitted:
             _, _, label, run = min(fitted, key=itemgetter(0, 1))
-            unfitted = {each.id for each in unfitted_runs(dataset, dataset.fingerprints("train"), same=True)}
-            validation = dataset.split("validation")
-            held_out = [index for index, each in enumerate(validation) if each.id in unfitted]
-            verdict = nothing_held_out()
+            verdict, held_out = nothing_held_out(), dataset.split("validation")
             if held_out:
-                design, calibrated = run.design["validation"].errors, run.scores["validation"].errors
-                runs = [validation[index] for index in held_out]
-                verdict = judge(design[held_out], calibrated[held_out], runs, bootstrap)
+                verdict = judge(run.design["validation"].errors, run.scores["validation"].errors, held_out, bootstrap)
             verdicts[name] = EntryVerdict(label, verdict)
     return verdicts
 
@@ -144,7 +138,7 @@ def _by_split(run: ScoredRun, intervals: RatioIntervals) -> dict[Split, SplitSta
     return {
         split: SplitStatistics(
             cost=intervals.mean(score.costs, score.units),
-            improvement=intervals.improvement(score.costs, run.design[split].costs, score.units),
+            improvement=intervals.improvement(score.costs, run.design[split].costs, score.units, score.rounding),
         )
         for split, score in run.scores.items()
     }

@@ -23,6 +23,9 @@ Split = Literal["train", "validation"]
 SPLITS: tuple[Split, ...] = ("train", "validation")
 # Digits of a fingerprint that tell the wheel samples: a run is taken for one of 1000 others in 1 of 4 million cases.
 WHEEL_DIGITS = 8
+# A reference that moves by more, m and rad, is no noise of one that stands; a robot whose wheels drive less than the
+# share of that has a dead encoder. Chosen: motion capture scatters by mm, and no wheel slips a hundredfold.
+_MOVED, _TURNED, _HARDLY = 0.05, 0.1, 0.01
 _ARRAYS = ("times", "rates", "pose_times", "poses", "angles", "targets", "pose_covariances")
 
 
@@ -113,8 +116,16 @@ class Dataset:
     referenced: bool = True
 
     def split(self, name: Split) -> tuple[Trajectory, ...]:
-        """The trajectories of one split; may be empty."""
-        return tuple(trajectory for trajectory in self.trajectories if trajectory.split == name)
+        """The trajectories of one split; may be empty. Copies of training runs are not for validation."""
+        return tuple(run for run in self.trajectories if run.split == name and run.id not in self.copies)
+
+    @cached_property
+    def copies(self) -> tuple[str, ...]:
+        """Ids of the runs for validation that are copies of training runs."""
+        if len({run.split for run in self.trajectories}) < 2:
+            return ()
+        training = {run.fingerprint for run in self.trajectories if run.split == "train"}
+        return tuple(run.id for run in self.trajectories if run.split != "train" and run.fingerprint in training)
 
     def fingerprints(self, split: Split) -> tuple[str, ...]:
         """The fingerprints of the trajectories of one split."""
@@ -172,14 +183,23 @@ def make_dataset(
             f"headings of {plural(len(ambiguous), 'trajectory')} may be unwrapped wrongly (reference too sparse): "
             f"{shown}"
         ]
-    warnings += _standing(raw) + _late_references(raw) + _other_periods(median, sample_period)
+    warnings += [] if warnings else _standing(robot, raw)  # in other units all runs seem to move too far
+    warnings += _late_references(raw) + _other_periods(median, sample_period)
     unwrapped = (
         replace(trajectory, poses=np.column_stack([trajectory.poses[:, :2], heading]))
         for trajectory, heading in zip(raw, headings, strict=True)
     )
-    return Dataset(
-        name, robot, sample_period, tuple(unwrapped), description, source, licence, simulated, tuple(warnings), scans
-    )
+    dataset = Dataset(name, robot, sample_period, tuple(unwrapped), description, source, licence, simulated, (), scans)
+    return replace(dataset, warnings=(*warnings, *_copied(dataset)))
+
+
+def _copied(dataset: Dataset) -> list[str]:
+    """Warning of runs for validation that are copies of training runs."""
+    if not dataset.copies:
+        return []
+    count, shown = len(dataset.copies), ", ".join(dataset.copies[:5])
+    are = "is a copy of a training run and is" if count == 1 else "are copies of training runs and are"
+    return [f"{plural(count, 'trajectory')} {are} left out of validation: {shown}"]
 
 
 def _median_period(trajectories: Sequence[Trajectory]) -> float:
@@ -226,12 +246,25 @@ def _check_shapes(where: str, robot: Robot, trajectory: Trajectory) -> None:
         raise DataError(f"{where}: it has no {'reference poses' if samples[0] else 'wheel samples'}")
 
 
-def _standing(trajectories: Sequence[Trajectory]) -> list[str]:
-    standing = [trajectory.id for trajectory in trajectories if not trajectory.rates.any()]
+def _standing(robot: Robot, trajectories: Sequence[Trajectory]) -> list[str]:
+    """Warning of runs in which the reference moves and the wheels do not, where other runs drive."""
+    matrix = robot.inverse_kinematic_matrix
+    standing = [run.id for run in trajectories if _moves_unseen(matrix, run)]
     if not 0 < len(standing) < len(trajectories):
         return []  # that no run drives is another warning
-    shown = ", ".join(standing[:5])
-    return [f"no wheel turns in {plural(len(standing), 'trajectory')}, which says nothing of the robot, e.g. {shown}"]
+    count, shown = len(standing), ", ".join(standing[:5])
+    return [
+        f"the reference moves in {plural(count, 'trajectory')} though no wheel turns, which spoils every fit; leave "
+        f"{'it' if count == 1 else 'them'} out: {shown}"
+    ]
+
+
+def _moves_unseen(matrix: Array, run: Trajectory) -> bool:
+    """True if the reference moves in a run while the wheels, by the design matrix (3, N), travel hardly any of it."""
+    driven = np.abs(run.rates @ matrix.T) * np.diff(run.times, prepend=0.0)[:, None]
+    moved = np.abs(run.poses - run.poses[0]).max(axis=0)
+    far = moved > (_MOVED, _MOVED, _TURNED)
+    return bool(far.any() and (driven.sum(axis=0).max() < _HARDLY * moved[far].max()))
 
 
 def _late_references(trajectories: Sequence[Trajectory]) -> list[str]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from omnibench.data.delimited import not_increasing
 from omnibench.errors import DataError
+from omnibench.robot.calibration import SAMPLE_PERIODS
 from omnibench.robot.kinematics import Array, Robot
 
 Flaw = tuple[int, str]
@@ -78,6 +79,12 @@ def check_sample_period(place: str, sample_period: float, median: float) -> None
         raise DataError(
             f"{place}: sample_period is {sample_period:g} s, but the wheel samples come every {median:g} s (the "
             f"median); set it to {median:.3g}"
+        )
+    shortest, longest = SAMPLE_PERIODS
+    if not shortest <= sample_period <= longest:
+        raise DataError(
+            f"{place}: sample_period is {sample_period:g} s, expected {shortest:g} to {longest:g} s; "
+            "check the units of the times"
         )
 
 

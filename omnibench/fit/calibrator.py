@@ -15,7 +15,7 @@ from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
 from omnibench.jobs.memory import memory_limit
 from omnibench.registry import AnyOptions, Options, PluginFailure, calibrators
-from omnibench.robot.calibration import Noise
+from omnibench.robot.calibration import Noise, matrix_flaw
 from omnibench.robot.kinematics import Array, JsonArray
 
 
@@ -197,6 +197,8 @@ def _examine(
         return None, None, f"the answer is outside the box ({', '.join(outside)})"
     if freedom is not None and not (freedom > 0).all():
         return None, None, f"degrees_of_freedom of the answer's variances must be above 0, found {freedom.min():g}"
+    if flaw := matrix_flaw(problem.matrix(vector)):
+        return None, None, f"the answer's matrix holds {flaw}"
     cost = float(problem.values(vector[None])[0])
     if not np.isfinite(cost):
         return None, None, "the answer's cost is not finite"

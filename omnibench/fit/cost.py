@@ -16,19 +16,20 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
 
-NO_ERROR = 1e-9  # m, rad: a smaller cost is rounding
+NO_ERROR = 1e-9  # m, rad: smaller errors are rounding
 
 
 class Cost(ABC):
     """One number for the pose errors of a set of trajectories.
 
     stamps: where along a trajectory poses are compared, ``final`` (last reference pose) or ``reference`` (all after the
-    start).
+    start). rounding: in the cost's unit; one that is not above it is rounding, of which no share means anything.
     """
 
     Options: ClassVar[type[Options]] = Options
     name: ClassVar[str]
     stamps: ClassVar[Literal["final", "reference"]] = "final"
+    rounding: ClassVar[float] = 0.0
 
     def __init__(self, options: Any) -> None:
         self.options = options
@@ -74,6 +75,7 @@ class SumOfNorms(Cost):
     """
 
     weights: ClassVar[tuple[float, float, float]] = (1.0, 1.0, 1.0)
+    rounding = NO_ERROR
 
     def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
         """Costs (P,): the norms, weighted by the stamps' shares."""

@@ -33,10 +33,10 @@ class SplitErrors(Model):
 class Evaluation(Model):
     """Errors of a calibration and of the design values, by split; the split ``all`` is every trajectory.
 
-    held_out: the verdict by the runs that the calibration was not fitted to; unfitted: their number by split. sessions:
-    a sentence for each session that differs from the others, or on those that could not be compared. warnings: one
-    sentence if runs lie outside the training domain of the calibration's effects. Fields that are not excluded are the
-    document of ``omnibench evaluate --json``.
+    held_out: the verdict by the runs that the calibration was not fitted to; unfitted: their number by split, None
+    where they are not known. sessions: a sentence for each session that differs from the others, or on those that could
+    not be compared. warnings: one sentence if runs lie outside the training domain of the calibration's effects. Fields
+    that are not excluded are the document of ``omnibench evaluate --json``.
     """
 
     dataset: str
@@ -44,7 +44,7 @@ class Evaluation(Model):
     trajectories: int
     splits: dict[str, SplitErrors]
     design: dict[str, SplitErrors] = Field(exclude=True)
-    unfitted: dict[str, int] = Field(exclude=True)
+    unfitted: dict[str, int] | None = Field(exclude=True)
     held_out: HeldOutVerdict
     sessions: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -63,7 +63,8 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
     groups["all"] = dataset.trajectories
     model, design = calibration.model, OdometryModel.of_design(dataset.robot, calibration.integration)
     sessions = compare_sessions(model, dataset.trajectories)
-    verdict = held_out_verdict(calibration, dataset)
+    held_out, unknown = _held_out(calibration, dataset)
+    verdict = nothing_held_out(unknown) if unknown else verdict_on(model, held_out or ())
     warning = extrapolation_warning(calibration, dataset.trajectories)
     return Evaluation(
         dataset=dataset.name,
@@ -71,7 +72,7 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
         trajectories=len(dataset.trajectories),
         splits={name: split_errors(model, group) for name, group in groups.items()},
         design={name: split_errors(design, group) for name, group in groups.items()},
-        unfitted={name: sum(run.id in verdict.runs for run in group) for name, group in groups.items()},
+        unfitted=None if held_out is None else {name: _count(held_out, group) for name, group in groups.items()},
         held_out=verdict,
         sessions=(*sessions.sentences, *sessions.doubts),
         warnings=() if warning is None else (warning,),
@@ -79,7 +80,13 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
 
 
 def held_out_verdict(calibration: Calibration, dataset: Dataset) -> HeldOutVerdict:
-    """The verdict on a calibration by the runs of a data set that it was not fitted to, beside the design values.
+    """The verdict on a calibration by the runs of a data set that it was not fitted to, beside the design values."""
+    held_out, reason = _held_out(calibration, dataset)
+    return nothing_held_out(reason) if reason else verdict_on(calibration.model, held_out or ())
+
+
+def _held_out(calibration: Calibration, dataset: Dataset) -> tuple[Sequence[Trajectory] | None, str]:
+    """The runs that a calibration was not fitted to, None where they are not known, and why there are none if known.
 
     Runs are known by their fingerprints, whatever their names and splits. Of a calibration without them, the validation
     split is held out; of another data set without one, all runs; of a data set that has the name of the one that was
@@ -87,20 +94,24 @@ def held_out_verdict(calibration: Calibration, dataset: Dataset) -> HeldOutVerdi
     """
     runs, provenance = dataset.split("validation"), calibration.provenance
     if provenance is None:
-        if not runs:
-            return nothing_held_out("which runs the calibration was fitted to is not known, and none is for validation")
-    elif provenance.fitted is not None:
+        unknown = "which runs the calibration was fitted to is not known, and none is for validation"
+        return (runs, "") if runs else (None, unknown)
+    if provenance.fitted is not None:
         same = provenance.dataset_hash == dataset.hash
         runs = unfitted_runs(dataset, provenance.fitted, same=same)
-        if not runs and not same:
-            samples = "the wheel samples of a run that the calibration was fitted to"
-            return nothing_held_out(f"every run of {dataset.name} has {samples}")
-    elif provenance.dataset_hash != dataset.hash:
-        if provenance.dataset == dataset.name:
-            changed = f"the data set {dataset.name} or its split was changed after the fit"
-            return nothing_held_out(f"{changed}, so that which runs were fitted is not known")
-        runs = runs or dataset.trajectories
-    return verdict_on(calibration.model, runs)
+        samples = "the wheel samples of a run that the calibration was fitted to"
+        return runs, "" if runs or same else f"every run of {dataset.name} has {samples}"
+    if provenance.dataset_hash == dataset.hash:
+        return runs, ""
+    if provenance.dataset == dataset.name:
+        changed = f"the data set {dataset.name} or its split was changed after the fit"
+        return None, f"{changed}, so that which runs were fitted is not known"
+    return runs or dataset.trajectories, ""
+
+
+def _count(runs: Sequence[Trajectory], group: Sequence[Trajectory]) -> int:
+    """The number of runs that are in a group."""
+    return len({run.id for run in runs} & {run.id for run in group})
 
 
 def verdict_on(model: OdometryModel, held_out: Sequence[Trajectory]) -> HeldOutVerdict:

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from omnibench.data.dataset import WHEEL_DIGITS, Dataset, Trajectory
+from omnibench.fit.cost import NO_ERROR
 from omnibench.fit.uncertainty.ratio_intervals import FEWEST, Bootstrap, Interval, RatioIntervals, Units, units_of
 from omnibench.robot.calibration import HeldOutVerdict
 from omnibench.robot.kinematics import Array
@@ -49,7 +50,7 @@ def judge(
     bootstrap = bootstrap or Bootstrap()
     units = units_of(runs, bootstrap.unit)
     costs, before = np.linalg.norm(calibrated, axis=1), np.linalg.norm(design, axis=1)  # Eq. (6), run by run
-    gain = RatioIntervals(bootstrap).improvement(costs, before, units)
+    gain = RatioIntervals(bootstrap).improvement(costs, before, units, NO_ERROR)
     low, high = (None, None) if gain is None else (gain.low, gain.high)
     verdict: Literal["better", "worse", "undecided"] = "undecided"
     if low is not None and high is not None and not (low <= 0 <= high):

@@ -197,9 +197,16 @@ class CalibrationProblem:
 
     def at_bounds(self, vector: Array) -> tuple[str, ...]:
         """Names of the free elements that lie on a bound of the box."""
+        return tuple(name for name, touching in zip(self.names, self.on_bounds(vector), strict=True) if touching)
+
+    def on_bounds(self, vectors: Array) -> NDArray[np.bool_]:
+        """True (..., n) for the free elements of vectors (..., n) that lie on a bound of the box."""
         margin = _ON_BOUND * (self.upper - self.lower)
-        on_bound = self.free & ((vector <= self.lower + margin) | (vector >= self.upper - margin))
-        return tuple(name for name, touching in zip(self.names, on_bound, strict=True) if touching)
+        return np.asarray(self.free & ((vectors <= self.lower + margin) | (vectors >= self.upper - margin)))
+
+    def without_interval(self, at_bounds: tuple[str, ...]) -> NDArray[np.bool_]:
+        """True (n,) for the elements that the fit could not move both ways: on a bound of the box, or held by it."""
+        return np.asarray(np.isin(self.names, (*at_bounds, *self.held)))
 
     @property
     def held(self) -> tuple[str, ...]:

@@ -65,7 +65,7 @@ class RobotService:
         self._flows = AcknowledgedFlows(graph.session, name, tracker.flows)
         self._rate_limiter = RateLimiter()
         self._logged_anomalies: dict[str, int] = {}
-        self._logged_refusal = ""
+        self._logged_refusals = 0
         self._logged_status = ""
         self._outputs = [
             (graph.publisher(name, output.topic), output.encoding(tracker.frames))
@@ -198,6 +198,7 @@ class RobotService:
         in_words = anomalies_in_words({kind: count for kind, count in new.items() if count})
         if in_words and self._rate_limiter.allows("anomalies"):
             self._logged_anomalies = anomalies
-            last = f"; the last: {health.last_refusal}" if health.last_refusal not in ("", self._logged_refusal) else ""
-            self._logged_refusal = health.last_refusal
+            refused = self.tracker.refusals != self._logged_refusals
+            self._logged_refusals = self.tracker.refusals
+            last = f"; the last: {health.last_refusal}" if refused and health.last_refusal else ""
             LOG.warning("%s: %s%s", health.robot, in_words, last)

@@ -19,6 +19,7 @@ from omnibench.robot.odometry import Integration
 from omnibench.words import plural
 
 FORMAT: Final = "omnibench-calibration/1"
+SAMPLE_PERIODS: Final = (1e-6, 3600.0)  # s: no robot samples its wheels faster or more rarely
 _LARGEST_ELEMENT = 1e3  # m or rad per rad of wheel: no wheel is so large
 Row = tuple[FiniteFloat, ...]
 Fingerprint = Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
@@ -99,7 +100,7 @@ class Calibration(Model):
     name: Annotated[str, AfterValidator(printable)]
     created: datetime = Field(default_factory=lambda: datetime.now(UTC).replace(microsecond=0))
     robot: Robot
-    sample_period: float = Field(ge=1e-6, le=3600, description="s")
+    sample_period: float = Field(ge=SAMPLE_PERIODS[0], le=SAMPLE_PERIODS[1], description="s")
     matrix: tuple[Row, Row, Row] = Field(description="3 x N: m (rows 1, 2) and rad (row 3) per rad of wheel")
     integration: Integration
     effects: tuple[EffectTerm, ...] = ()
@@ -120,12 +121,8 @@ class Calibration(Model):
                     f"row {index} of the matrix has {plural(len(row), 'value')}, "
                     f"the robot has {plural(wheels, 'wheel')}"
                 )
-        if np.abs(self.matrix).max() > _LARGEST_ELEMENT:
-            raise ValueError(
-                f"matrix holds {np.abs(self.matrix).max():g}, which no wheel can drive in m or rad per rad"
-            )
-        if not self.matrix_array.any():
-            raise ValueError("matrix holds zeros only: no wheel would move the robot")
+        if flaw := matrix_flaw(self.matrix_array):
+            raise ValueError(f"matrix holds {flaw}")
         if self.covariance is not None:
             size = 3 * wheels + sum(len(term.parameters) for term in self.effects)
             if [len(row) for row in self.covariance] != [size] * size:
@@ -158,6 +155,13 @@ class Calibration(Model):
             )
 
 
+def matrix_flaw(matrix: Array) -> str:
+    """What a matrix (3, N) holds that no robot's can; empty if it may be one."""
+    if np.abs(matrix).max() > _LARGEST_ELEMENT:
+        return f"{np.abs(matrix).max():g}, which no wheel can drive in m or rad per rad"
+    return "" if matrix.any() else "zeros only: no wheel would move the robot"
+
+
 def _check_covariance(covariance: Array) -> None:
     largest = float(np.abs(covariance).max())
     if largest > _LARGEST_ELEMENT**2 or not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-9 * largest):
@@ -171,7 +175,8 @@ def fitted_calibration(name: str, **fields: Any) -> Calibration:
     try:
         return Calibration(name=name, **fields)
     except ValidationError as error:
-        reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+        flaw = error.errors()[0]
+        reason = ": ".join([*map(str, flaw["loc"][:1]), flaw["msg"].removeprefix("Value error, ")])
         raise DataError(
             f"calibration {name!r}: {reason}; check the recordings for poses and rates far from all others"
         ) from None

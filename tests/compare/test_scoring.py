@@ -20,7 +20,7 @@ from omnibench.data.storage import save_dataset
 from omnibench.errors import PluginError
 from omnibench.fit.calibrator import Outcome, RunResult
 from omnibench.fit.cost import Cost
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.published_matrices import published_matrix
 
 TRUE = published_matrix("palacin2023_eq8")
@@ -60,6 +60,14 @@ def test_no_gap_is_measured_from_an_optimum_without_error() -> None:
     rows = records(["closed_form", "crs"], {"closed_form": 0.0, "crs": 0.1}, datasets=exact)
     assert rows["closed_form"].train_cost == pytest.approx(0.0, abs=1e-12)
     assert (rows["closed_form"].gap, rows["crs"].gap) == (None, None)
+
+
+def test_no_improvement_is_measured_from_design_values_without_error() -> None:
+    robot = Robot.model_validate(flower()["robot"])
+    truth = {"matrix": robot.inverse_kinematic_matrix.tolist()}
+    exact = {"flower": {"simulate": flower(noise={}, truth=truth, validation=None)}}
+    (row,) = records(["crs"], {"crs": 0.0}, datasets=exact).values()
+    assert (row.theoretical_train_cost, row.train_improvement) == (pytest.approx(0.0, abs=1e-12), None)
 
 
 def test_an_optimum_in_another_box_gives_no_gap() -> None:

@@ -15,6 +15,7 @@ from omnibench.compare.result import EntryStatistics, RunRecord, ScoredRun, Spli
 from omnibench.compare.statistics import NEGLIGIBLE_SHARE, entry_statistics, is_mean
 from omnibench.data.dataset import Split
 from omnibench.fit.calibrator import Outcome
+from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.uncertainty.ratio_intervals import Interval, Units
 from omnibench.robot.kinematics import Array
 
@@ -73,7 +74,8 @@ def scored(
 
 
 def split_score(costs: Array) -> SplitScore:
-    return SplitScore(float(costs.mean()), costs, np.zeros((len(costs), 3)), Units("run", np.arange(len(costs))))
+    units = Units("run", np.arange(len(costs)))
+    return SplitScore(float(costs.mean()), costs, np.zeros((len(costs), 3)), units, SumOfNorms.rounding)
 
 
 def train_cost(entry: EntryStatistics) -> Interval:

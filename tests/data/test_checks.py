@@ -184,9 +184,29 @@ def test_wheels_that_never_turn_are_told() -> None:
 
 def test_runs_in_which_no_wheel_turns_beside_others_that_drive_are_named() -> None:
     first, second, *_ = (run.id for run in recorded().trajectories)
-    still: Change = lambda run: replace(run, rates=0 * run.rates) if run.id in (first, second) else run  # noqa: E731
-    expected = f"no wheel turns in 2 trajectories, which says nothing of the robot, e.g. {first}, {second}"
-    assert expected in warnings_of(recorded(), still)
+    still: Change = lambda run: replace(run, rates=1e-9 * run.rates) if run.id in (first, second) else run  # noqa: E731
+    expected = "the reference moves in 2 trajectories though no wheel turns, which spoils every fit; leave them out: "
+    assert expected + f"{first}, {second}" in warnings_of(recorded(), still)
+
+
+def test_runs_that_are_meant_to_stand_are_not_warned_of() -> None:
+    first = recorded().trajectories[0].id
+
+    def standing(run: Trajectory) -> Trajectory:
+        return run if run.id != first else replace(run, rates=0 * run.rates, poses=0 * run.poses + run.start)
+
+    assert warnings_of(recorded(), standing) == ""
+
+
+def test_copies_of_training_runs_are_left_out_of_validation() -> None:
+    flowers = recorded()
+    first, second = flowers.split("train")[:2]
+    copies = [replace(first, id="copy", split="validation"), replace(second, id="other", split="validation")]
+    poses = second.poses + np.linspace(0, 1e-3, len(second.poses))[:, None]
+    runs = [first, second, copies[0], replace(copies[1], poses=poses)]
+    dataset = make_dataset("x", flowers.robot, flowers.sample_period, runs)
+    assert [run.id for run in dataset.split("validation")] == ["other"]
+    assert "1 trajectory is a copy of a training run and is left out of validation: copy" in dataset.warnings
 
 
 @pytest.mark.parametrize("sparse", [False, True])

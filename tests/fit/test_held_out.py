@@ -158,6 +158,8 @@ def test_of_a_changed_data_set_nothing_is_held_out_where_a_calibration_knows_no_
     found = evaluate(calibration, swapped(dataset)).held_out
     assert (found.verdict, found.runs) == ("unknown", ())
     assert "the data set synthetic or its split was changed after the fit" in found.sentence
+    assert evaluate(calibration, swapped(dataset)).unfitted is None
+    assert evaluate(calibration, dataset).unfitted == {"train": 0, "validation": 6, "all": 6}
     assert "is not known" in found.sentence
     assert evaluate(calibration, dataset).held_out.verdict == "better"
 

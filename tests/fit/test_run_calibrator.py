@@ -171,6 +171,15 @@ def test_an_answer_in_a_box_without_width_must_match_it() -> None:
     assert (result.outcome, result.reason) == (Outcome.INVALID, "the answer is outside the box (m12)")
 
 
+def test_a_matrix_that_moves_no_robot_is_invalid() -> None:
+    class Unbounded(Scripted):
+        bounded = False
+
+    result = run_calibrator(Unbounded(answering(lambda problem: 0 * problem.start)), make_problem(RUNS))
+    assert result.outcome is Outcome.INVALID
+    assert result.reason == "the answer's matrix holds zeros only: no wheel would move the robot"
+
+
 def test_rounding_on_the_boxs_surface_is_forgiven() -> None:
     result = run(answering(lambda problem: problem.upper * (1 + 1e-15 * np.sign(problem.upper))))
     assert result.outcome is Outcome.CONVERGED

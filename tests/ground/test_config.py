@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import Field, model_validator
 
-from omnibench.config import Model, parse_yaml, read_model, read_yaml, to_yaml, validate
+from omnibench.config import Model, parse_settings, parse_yaml, read_model, read_yaml, to_yaml, validate
 from omnibench.errors import ConfigError
 
 
@@ -254,3 +254,8 @@ def test_merge_keys_take_over_what_is_not_given(text: str, expected: dict[str, i
 def test_a_key_that_is_given_twice_beside_a_merge_key_is_refused() -> None:
     with pytest.raises(ConfigError, match="line 2: key 'x' is given twice"):
         parse_yaml("a: &a {x: 1}\nb: {<<: *a, x: 1, x: 2}", "config")
+
+
+@pytest.mark.parametrize("pattern", ["*_1", "[0-4]*", "!x*", "@x*", " *_1", "&x"])
+def test_a_pattern_of_names_needs_no_quotes_on_the_command_line(pattern: str) -> None:
+    assert parse_settings([f"validation={pattern}", "n=[1, 2]"]) == {"validation": pattern, "n": [1, 2]}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import math
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from sessions import until
 
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.config import LiveConfig, read_live_config
+from omnibench.live.network.rate_limiter import RateLimiter
 from omnibench.live.node import LiveNode
 from omnibench.live.replay.arrivals import ReplayConfig
 from omnibench.live.replay.concatenated_drive import concatenate_runs
@@ -235,6 +237,21 @@ def test_a_sample_on_its_way_while_the_node_closes_is_no_failure(tmp_path: Path)
     node._services[0]._take_turn()
     assert node.health("apr").counts["failures"] == 0
     assert node.health("apr").counts["samples"] == taken
+
+
+def test_a_reason_of_refusals_is_logged_again_only_with_new_ones(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running(config_of(tmp_path)) as (node, _):
+        service, tracker = node._services[0], node._services[0].tracker
+        monkeypatch.setattr(service, "_rate_limiter", RateLimiter(0.0))
+        for _ in range(2):
+            tracker.take_wheels(b"junk", time.monotonic())
+            service.publish_diagnostics()
+        tracker.counts.missing += 1
+        service.publish_diagnostics()
+    logged = [line for line in caplog.messages if line.startswith("apr: 1 wheel ")]
+    assert ["; the last: " in line for line in logged] == [True, True, False]
 
 
 def test_frames_of_a_single_robot_can_carry_its_name(tmp_path: Path) -> None:

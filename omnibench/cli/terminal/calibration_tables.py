@@ -93,7 +93,7 @@ def _matrix_table(run: CalibrationRun) -> Table:
 
 
 def _interval(low: float, high: float, mark: str) -> str:
-    return "on a bound: no interval" if math.isnan(low) else f"{low:+.7f} to {high:+.7f}{mark}"
+    return "held or on a bound: no interval" if math.isnan(low) else f"{low:+.7f} to {high:+.7f}{mark}"
 
 
 def _intervals(run: CalibrationRun) -> Iterator[tuple[str, ElementIntervals]]:
@@ -124,9 +124,10 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     """Print cost and final errors on every split, beside those of the design values."""
     rows = []
     for split in evaluation.splits:
-        count, unfitted = evaluation.splits[split].trajectories, evaluation.unfitted[split]
-        shown = {0: "none", count: "all"}.get(unfitted, f"{unfitted:,}")
-        rows.append(Row.of(f"{split}: {plural(count, 'run')}, {shown} held out", role="group"))
+        title = f"{split}: {plural(evaluation.splits[split].trajectories, 'run')}"
+        if evaluation.unfitted is not None:
+            title += f", {_of_all(evaluation.unfitted[split], evaluation.splits[split].trajectories)} held out"
+        rows.append(Row.of(title, role="group"))
         for label, errors in (("calibration", evaluation.splits[split]), ("design", evaluation.design[split])):
             figures = (
                 f"{errors.cost:.4f}",
@@ -144,6 +145,10 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     )
     kind = " (simulated data)" if evaluation.simulated else ""
     print_table(console, Table(f"{evaluation.dataset}{kind}", columns, tuple(rows)))
+
+
+def _of_all(part: int, count: int) -> str:
+    return {0: "none", count: "all"}.get(part, f"{part:,}")
 
 
 def _deviation(value: float, design: float) -> str:

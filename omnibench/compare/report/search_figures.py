@@ -15,7 +15,6 @@ from omnibench.compare.plan import SearchSpace
 from omnibench.compare.report.search_diagram import search_diagram
 from omnibench.compare.report.view import THEORETICAL_STYLE, DatasetView
 from omnibench.compare.result import ScoredRun
-from omnibench.fit.cost import NO_ERROR
 from omnibench.fit.problem import Improvement
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem, Paragraph, Section
 from omnibench.report.numbers import listing, significant
@@ -97,7 +96,7 @@ def courses(view: DatasetView) -> list[Course]:
         if run.record.evaluations <= 1 or not run.search_space.bounded:
             continue
         history, best_known = _with_answer(run), _best_known(run, lowest[run.search_space])
-        if history and NO_ERROR <= best_known < math.inf:
+        if history and run.scores["train"].rounding < best_known < math.inf:
             drawn.append(
                 Course(
                     run,

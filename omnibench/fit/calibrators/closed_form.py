@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 # (tests/benchmarks/constants_fit.py).
 _MOST_HALVINGS = 30  # lengths of one step that are tried, each half the one before: down to a billionth
 _FLAT = 1e-6  # share of the matrix's range: a smaller step that does not lower the cost is rounding of the solver
-_NO_ERROR = 1e-10  # m, rad: a smaller cost is close to rounding, and a program finds no direction
 _NO_STEP = 1e-12  # m or rad per rad of wheel: a shorter step is rounding of the solver
 
 
@@ -66,7 +65,7 @@ class ClosedForm(Calibrator):
         cost = float(problem.cost(vector[None])[0])
         shares = problem.objective.shares(problem.odometry.trajectory)
         for count in range(1, self.options.programs + 1):
-            if cost < _NO_ERROR:
+            if cost <= problem.objective.rounding:  # a program would find no direction
                 return Solution(vector, f"no error is left after {count - 1} cone programs")
             try:
                 step = cone_program(problem, problem.objective, vector).step(shares)

@@ -32,7 +32,7 @@ from omnibench.robot.kinematics import Array
 
 @dataclass(frozen=True, eq=False)
 class ElementIntervals:
-    """95 % intervals (3, N) of the matrix elements; nan where there is none, on a bound of the box."""
+    """95 % intervals (3, N) of the matrix elements; nan where there is none, held by the box or on a bound of it."""
 
     low: Array
     high: Array
@@ -49,8 +49,8 @@ def bootstrap_intervals(
     """Intervals of the matrix elements about closed_form's ``optimum`` (n,), from three units or more.
 
     units: what is resampled; default: the runs. The optimum of every resample is found with the poses linearised about
-    ``optimum``: the error of that is far below the width of the intervals. Elements that depend on a number on a bound
-    of the box have none. ConfigError for another parameterisation,
+    ``optimum``: the error of that is far below the width of the intervals. Elements that depend on a number that the
+    box holds, on a bound of it or stopped by one in the resamples have none. ConfigError for another parameterisation,
     another cost than a sum of norms, or fewer units.
     """
     objective = problem.objective
@@ -65,7 +65,8 @@ def bootstrap_intervals(
     shares, of_stamp = objective.shares(owner), units.of_run[owner]
     few = count < BOOTSTRAPPED
     drawn = 1 - np.eye(count) if few else rng.multinomial(count, np.full(count, 1 / count), size=resamples)
-    moved = np.array([problem.matrix(optimum + program.step(shares * weights[of_stamp])) for weights in drawn])
+    vectors = np.array([optimum + program.step(shares * weights[of_stamp]) for weights in drawn])
+    moved = problem.parameterisation.matrices(vectors)
     quantile = float(stdtrit(count - 1, (1 + INTERVAL) / 2))
     if few:
         reach = quantile * np.sqrt((count - 1) * moved.var(axis=0))  # Eq. (2)
@@ -73,6 +74,7 @@ def bootstrap_intervals(
     else:
         outside = 100 * float(ndtr(-np.sqrt(count / (count - 1)) * quantile))  # Eq. (1)
         low, high = np.percentile(moved, [outside, 100 - outside], axis=0)
-    on_bound = np.isin(problem.names, problem.at_bounds(optimum))
-    bounded = depending(problem.parameterisation.slopes(optimum), on_bound).reshape(low.shape)
+    stopped = problem.without_interval(problem.at_bounds(optimum))
+    stopped |= problem.on_bounds(vectors).mean(axis=0) > (0.0 if few else outside / 100)  # an end would be the bound
+    bounded = depending(problem.parameterisation.slopes(optimum), stopped).reshape(low.shape)
     return ElementIntervals(np.where(bounded, np.nan, low), np.where(bounded, np.nan, high))

@@ -21,7 +21,7 @@ class ParameterEstimate:
     """A physical parameter of a wheel: value, standard deviation and 95 % interval, m, or rad for angles.
 
     standard_deviation, low and high are None where ``untold`` says why: the data do not identify the parameter, or it
-    depends on a number on a bound of the box.
+    depends on a number that the box holds, or on a bound of it.
     """
 
     name: str

@@ -174,9 +174,9 @@ class RatioIntervals:
         low, high = _end(upper, lower, above, -1), _end(upper, lower, below, 1)
         return Interval(ratio, None, None) if low is None or high is None else Interval(ratio, low, high)
 
-    def improvement(self, values: Array, before: Array, units: Units) -> Interval | None:
-        """The share of the costs ``before`` (Z,) that is gone; None where these are all 0."""
-        if not before.any():
+    def improvement(self, values: Array, before: Array, units: Units, rounding: float = 0.0) -> Interval | None:
+        """The share of the costs ``before`` (Z,) that is gone; None where their mean is not above ``rounding``."""
+        if before.mean() <= rounding:
             return None
         left = self.ratio(values, before, units)
         if left.low is None or left.high is None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import RunResult
-from omnibench.fit.cost import NO_ERROR, SumOfNorms
+from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.parameterisation import WheelGeometry
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.span import driven_span, unidentified_directions
@@ -50,11 +50,11 @@ class Uncertainty:
     covariance (3N, 3N): the elements' covariance, row by row, m and rad per rad of wheel. Rows and columns of elements
     that are held at their start are zero, with scatter as the basis also of those on a bound, and so is the variance
     along directions of wheel rates that were kept at the design values.
-    standard_deviations (3, N). intervals: 95 %, by Student's t; nan where an element depends on a number on a bound of
-    the box, about which the answers of other recordings do not scatter evenly. parameters: the wheels' geometry, if it
-    was searched or follows from the matrix (three omni wheels); without standard deviation where the data do not
-    identify a parameter, or it depends on a number on a bound. noise: the reference poses'. basis: likelihood (the
-    calibrator's own covariance) or scatter of the runs. source: the data behind it, in words.
+    standard_deviations (3, N). intervals: 95 %, by Student's t; nan where an element depends on a number that the box
+    holds or that lies on a bound of it, about which the answers of other recordings do not scatter evenly. parameters:
+    the wheels' geometry, if it was searched or follows from the matrix (three omni wheels); without standard deviation
+    where the data do not identify a parameter, or it depends on such a number. noise: the reference poses'. basis:
+    likelihood (the calibrator's own covariance) or scatter of the runs. source: the data behind it, in words.
     """
 
     covariance: Array
@@ -72,7 +72,7 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     The covariance is the calibrator's own if it gives one (trajectory_ml), otherwise the sandwich of an estimate that
     minimises a sum of norms (sandwich.py). Physical parameters that need directions of wheel rates which the data do
     not identify have no standard deviation, whether or not these directions were fitted. Neither has an element or
-    parameter that depends on a number on a bound of the box.
+    parameter that depends on a number that the box holds, or that lies on a bound of it.
 
     NoCovarianceError, with the reason, when there is no answer, the cost is no sum of norms, the answer is no minimum
     (a published matrix, a search that stopped too early), or the runs are too few.
@@ -89,7 +89,7 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
         of_vector = EstimatedCovariance(result.covariance, freedom)
     slopes = problem.parameterisation.slopes(result.vector)
     of_elements = of_vector.of(slopes)
-    bounded = depending(slopes, np.isin(problem.names, result.at_bounds))
+    bounded = depending(slopes, problem.without_interval(result.at_bounds))
     reach = np.where(bounded, np.nan, of_elements.reach).reshape(result.matrix.shape)
     return Uncertainty(
         covariance=of_elements.matrix,
@@ -113,7 +113,7 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult, noise: Noise) ->
         raise NoCovarianceError(
             "no covariance: no number was free to be fitted; each is kept at its design value or lies on a bound"
         )
-    if result.cost is not None and result.cost < NO_ERROR:
+    if result.cost is not None and result.cost <= objective.rounding:
         raise NoCovarianceError(
             "no covariance: the answer fits the runs exactly, and their scatter about it is what a covariance rests on"
         )
@@ -191,13 +191,13 @@ def _parameters(
     """The physical parameters with their intervals; None where the matrix does not determine them.
 
     of_vector, of_elements: covariances of the searched vector and of the matrix elements. bounded (3N,): the elements
-    that depend on a number on a bound of the box.
+    that depend on a number that the box holds, or on a bound of it.
     """
     robot = problem.robot
     assert result.vector is not None and result.matrix is not None  # noqa: PT018 (uncertainty_of has checked)
     if problem.parameterisation.name == "geometry":
         values, covariance = result.vector, of_vector
-        bounded = np.isin(problem.names, result.at_bounds)
+        bounded = problem.without_interval(result.at_bounds)
     elif is_invertible(robot):
         try:
             values = geometry_of(result.matrix, robot)
@@ -209,7 +209,7 @@ def _parameters(
         return None
     kept = unidentified_directions(robot, driven_span(problem.trajectories))
     untold = [
-        "on a bound: no interval" if touching else "" if identified else "not identified by these data"
+        "held or on a bound: no interval" if touching else "" if identified else "not identified by these data"
         for identified, touching in zip(identified_parameters(robot, kept), bounded, strict=True)
     ]
     return tuple(

@@ -52,7 +52,7 @@ class Counts:
 
     def anomalies(self) -> dict[str, int]:
         """The counters above 0 of what should not happen."""
-        return {name: value for name, value in self.as_dict().items() if value and name in _WORDS}
+        return anomalies_among(self.as_dict())
 
 
 _WORDS = {item.name: item.metadata["words"] for item in fields(Counts) if item.metadata}

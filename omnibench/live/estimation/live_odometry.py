@@ -10,6 +10,7 @@ The covariance P of the pose (x, y, heading) has two parts, P = W + J C J^T:    
 
 from __future__ import annotations
 
+import logging
 import math
 from collections import deque
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from omnibench.live.estimation.wheel_input import WheelStep
 from omnibench.robot.calibration import Calibration, Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryStream
+
+LOG = logging.getLogger("omnibench.live")
 
 # Noise for a calibration file without a noise model; chosen generously, so that a filter follows SLAM.
 UNKNOWN_NOISE = Noise(pose_position=0.02, pose_heading=0.02, walk_position=0.03, walk_heading=0.03)
@@ -84,6 +87,12 @@ class LiveOdometry:
         self._jacobian = _MatrixJacobian(wheels, calibration.integration)
         self._elements: Array | None = None
         self._blocks = np.zeros((3, wheels, wheels))
+        if calibration.provenance is not None and calibration.provenance.on_bounds:
+            LOG.warning(
+                "calibration %r: %s on a bound of the box, of which no variance is known: covariances are too small",
+                calibration.name,
+                ", ".join(calibration.provenance.on_bounds),
+            )
         if calibration.covariance is not None:
             self._elements = np.array(calibration.covariance)[: 3 * wheels, : 3 * wheels]
             by_row = self._elements.reshape(3, wheels, 3, wheels)

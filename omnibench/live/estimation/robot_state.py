@@ -24,9 +24,9 @@ class RobotState:
 
     fusion: None for odometry alone. guessed_angles: names of the calibration's effects that need wheel angles, while
     nobody has been warned that there are none. arrival: of the last wheel sample, s, monotonic. behind: longest time
-    for which a sample had waited when it was taken, s, since the health was last measured. last_refusal: why the last
-    message was refused that was. flows: flow of an acknowledged replay -> number of the next message that is not in the
-    odometry. last_swap: None before the first calibration is sent.
+    for which a sample had waited when it was taken, s, since the health was last measured. refusals: number of messages
+    that were refused for a reason; last_refusal: that of the last. flows: flow of an acknowledged replay -> number of
+    the next message that is not in the odometry. last_swap: None before the first calibration is sent.
     """
 
     name: str
@@ -43,8 +43,14 @@ class RobotState:
     arrival: float | None = None
     behind: float = 0.0
     flows: dict[int, int] = field(default_factory=dict)
+    refusals: int = 0
     last_refusal: str = ""
     last_swap: SwapRecord | None = None
+
+    def refused(self, reason: str) -> None:
+        """Remember why a message was refused."""
+        self.refusals += 1
+        self.last_refusal = reason
 
 
 def new_state(name: str, calibration: Calibration, wheels: WheelSettings, fusion: FusionSettings | None) -> RobotState:

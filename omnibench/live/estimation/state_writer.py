@@ -56,7 +56,7 @@ class StateWriter:
             self._memory.save(saved)
         except OSError as error:  # a full disk must not stop the odometry
             state.counts.failures += 1
-            state.last_refusal = f"the state could not be written: {error.strerror}"
+            state.refused(f"the state could not be written: {error.strerror}")
             self._due += _RETRY
 
     def close(self, state: RobotState) -> None:

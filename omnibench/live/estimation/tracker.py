@@ -68,6 +68,11 @@ class RobotTracker:
         self._closed = False
         self.waiting_since: Callable[[], float | None] = lambda: None  # when the oldest that waits came, s, monotonic
 
+    @property
+    def refusals(self) -> int:
+        """Number of messages that were refused for a reason."""
+        return self._state.refusals
+
     def take_wheels(self, payload: bytes, arrival: float, skipped: int = 0) -> list[Update]:
         """Take a sensor_msgs/JointState in CDR; its updates, in order.
 
@@ -93,7 +98,7 @@ class RobotTracker:
             try:
                 measurement = self._pose_input.read(payload, arrival, self.calibration)
             except MessageError as error:
-                self._state.last_refusal = str(error)
+                self._state.refused(str(error))
                 return None
             return fusion.correct(self._state.reference.corrected(measurement))
 
@@ -105,7 +110,7 @@ class RobotTracker:
             return self._decoder.decode(payload)
         except MessageError as error:
             self.counts.undecodable += 1
-            self._state.last_refusal = str(error)
+            self._state.refused(str(error))
             return None
 
     def _order_and_repair(self, message: JointState | None, arrival: float, skipped: int) -> list[WheelStep]:
@@ -115,7 +120,8 @@ class RobotTracker:
         state = self._state
         state.wheel_input.last_refusal = ""
         steps = state.wheel_input.take(message, arrival, skipped)
-        state.last_refusal = state.wheel_input.last_refusal or state.last_refusal
+        if state.wheel_input.last_refusal:
+            state.refused(state.wheel_input.last_refusal)
         if steps:
             state.arrival = arrival
         return steps

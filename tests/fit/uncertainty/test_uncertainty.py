@@ -166,7 +166,27 @@ class TestCovariance:
             assert np.argwhere(np.isnan(intervals.high)).tolist() == [[1, 2]]
         assert uncertainty.parameters is not None
         told = {each.untold for each in uncertainty.parameters}
-        assert told == {"on a bound: no interval"}
+        assert told == {"held or on a bound: no interval"}
+
+    def test_an_element_that_the_box_holds_has_no_interval(self) -> None:
+        problem = make_problem(driven(FLOWER), box="paper")
+        result = solved(problem)
+        drawn = bootstrap_intervals(problem, result.vector, rng=np.random.default_rng(1))
+        for intervals in (uncertainty_of(problem, result).intervals, drawn):
+            assert np.argwhere(np.isnan(intervals.low)).tolist() == [[0, 1]]
+
+    def test_resamples_that_a_bound_stops_have_no_interval(self) -> None:
+        free = solved(make_problem(driven(FLOWER)))
+        assert free.matrix is not None
+        wide = np.abs(ROBOT.inverse_kinematic_matrix).max() + np.zeros((3, 3))
+        lower, upper = free.matrix - wide, free.matrix + wide
+        above = free.matrix[0, 0] > ROBOT.inverse_kinematic_matrix[0, 0]
+        (upper if above else lower)[0, 0] = free.matrix[0, 0] + (1e-5 if above else -1e-5)
+        problem = make_problem(driven(FLOWER), box=ExplicitBox(lower=matrix_rows(lower), upper=matrix_rows(upper)))
+        result = solved(problem)
+        assert result.at_bounds == ()
+        drawn = bootstrap_intervals(problem, result.vector, rng=np.random.default_rng(1))
+        assert np.argwhere(np.isnan(drawn.low)).tolist() == [[0, 0]]
 
     def test_directions_that_are_kept_have_no_variance_and_their_parameters_none_at_all(self) -> None:
         uncertainty = found(driven(RING, slip=0.02))

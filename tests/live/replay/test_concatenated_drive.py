@@ -226,7 +226,7 @@ class TestOrder:
 
     @staticmethod
     def run(name: str, **known: object) -> Trajectory:
-        return random_run(name, np.random.default_rng(0), **known)
+        return random_run(name, np.random.default_rng(ord(name)), **known)
 
     def test_runs_go_by_session_and_then_by_when_they_started(self) -> None:
         runs = [("a", "two", 50.0), ("b", "one", 9.0), ("c", "two", 10.0), ("d", "one", 3.0)]
