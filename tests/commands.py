@@ -153,6 +153,16 @@ def summary(output: Path) -> dict[str, Any]:
     return content
 
 
+def without_seconds(output: Path) -> list[dict[str, Any]]:
+    return [{name: value for name, value in run.items() if name != "seconds"} for run in summary(output)["runs"]]
+
+
+def files_of(folder: Path) -> dict[str, tuple[int, bytes]]:
+    """Time of change and content of every file."""
+    files = (file for file in folder.rglob("*") if file.is_file())
+    return {str(file.relative_to(folder)): (file.stat().st_mtime_ns, file.read_bytes()) for file in files}
+
+
 def rows(output: Path) -> dict[str, dict[str, Any]]:
     """The runs of a comparison by label; of several seeds the last one."""
     return {run["label"]: run for run in summary(output)["runs"]}

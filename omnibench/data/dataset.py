@@ -251,7 +251,7 @@ def _standing(robot: Robot, trajectories: Sequence[Trajectory]) -> list[str]:
     matrix = robot.inverse_kinematic_matrix
     standing = [run.id for run in trajectories if _moves_unseen(matrix, run)]
     if not 0 < len(standing) < len(trajectories):
-        return []  # that no run drives is another warning
+        return []  # another warning says that no run drives
     count, shown = len(standing), ", ".join(standing[:5])
     return [
         f"the reference moves in {plural(count, 'trajectory')} though no wheel turns, which spoils every fit; leave "

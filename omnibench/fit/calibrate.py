@@ -12,7 +12,6 @@ from omnibench.errors import ConfigError, require_type
 from omnibench.fit.calibrator import Calibrator, RunResult, run_calibrator
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import verdict_on
-from omnibench.fit.held_out import unfitted_runs
 from omnibench.fit.parameterisation import (
     Box,
     FittedParameter,
@@ -108,7 +107,7 @@ def calibrate(
     if result.matrix is None or result.vector is None:
         raise ConfigError(f"calibrator {calibrator!r} gave no answer ({result.outcome}): {result.reason}")
     validation = dataset.split("validation")
-    model, fitted = OdometryModel(dataset.robot, result.matrix, integration), dataset.fingerprints("train")
+    model = OdometryModel(dataset.robot, result.matrix, integration)
     uncertainty, doubts = _uncertainty(problem, result, chosen)
     warnings = warnings_of_calibration(dataset.robot, training, searched.name, unidentified)
     calibration = fitted_calibration(
@@ -122,7 +121,7 @@ def calibrate(
         provenance=Provenance(
             dataset=dataset.name,
             dataset_hash=dataset.hash,
-            fitted=fitted,
+            fitted=dataset.fingerprints("train"),
             simulated=dataset.simulated,
             calibrator=calibrator,
             options=chosen.options.model_dump(mode="json"),
@@ -135,7 +134,7 @@ def calibrate(
             validation_cost=objective.of_model(model, validation) if validation else None,
             outcome=result.outcome,
             reason=result.reason,
-            held_out=verdict_on(model, unfitted_runs(dataset, fitted, same=True)),
+            held_out=verdict_on(model, validation),
         ),
     )
     units, drawn = units_of(training), None

@@ -79,12 +79,6 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
     )
 
 
-def held_out_verdict(calibration: Calibration, dataset: Dataset) -> HeldOutVerdict:
-    """The verdict on a calibration by the runs of a data set that it was not fitted to, beside the design values."""
-    held_out, reason = _held_out(calibration, dataset)
-    return nothing_held_out(reason) if reason else verdict_on(calibration.model, held_out or ())
-
-
 def _held_out(calibration: Calibration, dataset: Dataset) -> tuple[Sequence[Trajectory] | None, str]:
     """The runs that a calibration was not fitted to, None where they are not known, and why there are none if known.
 
@@ -96,13 +90,12 @@ def _held_out(calibration: Calibration, dataset: Dataset) -> tuple[Sequence[Traj
     if provenance is None:
         unknown = "which runs the calibration was fitted to is not known, and none is for validation"
         return (runs, "") if runs else (None, unknown)
-    if provenance.fitted is not None:
-        same = provenance.dataset_hash == dataset.hash
-        runs = unfitted_runs(dataset, provenance.fitted, same=same)
-        samples = "the wheel samples of a run that the calibration was fitted to"
-        return runs, "" if runs or same else f"every run of {dataset.name} has {samples}"
     if provenance.dataset_hash == dataset.hash:
         return runs, ""
+    if provenance.fitted is not None:
+        runs = unfitted_runs(dataset, provenance.fitted)
+        samples = "the wheel samples of a run that the calibration was fitted to"
+        return runs, "" if runs else f"every run of {dataset.name} has {samples}"
     if provenance.dataset == dataset.name:
         changed = f"the data set {dataset.name} or its split was changed after the fit"
         return None, f"{changed}, so that which runs were fitted is not known"

@@ -29,14 +29,14 @@ def nothing_held_out(reason: str = "no run was held out") -> HeldOutVerdict:
     return HeldOutVerdict(verdict="unknown", sentence=sentence, detail=f"to have it said, {_HOLD_OUT}")
 
 
-def unfitted_runs(dataset: Dataset, fitted: Collection[str], *, same: bool) -> tuple[Trajectory, ...]:
-    """The runs of a data set that are not among the fitted ones, which are given by their fingerprints.
+def unfitted_runs(dataset: Dataset, fitted: Collection[str]) -> tuple[Trajectory, ...]:
+    """The runs of a data set that are not among those fitted to another, which are given by their fingerprints.
 
-    same: the data set is the one that was fitted. In another one, a run with the wheel samples of a fitted run is that
-    run with a reference made anew, unless fitted runs share theirs (commanded rates, or simulated ones without noise).
+    A run with the wheel samples of a fitted run is that run with a reference made anew, unless fitted runs share theirs
+    (commanded rates, or simulated ones without noise).
     """
     runs, wheels = set(fitted), {fingerprint[:WHEEL_DIGITS] for fingerprint in fitted}
-    if same or len(wheels) < len(runs):
+    if len(wheels) < len(runs):
         return tuple(run for run in dataset.trajectories if run.fingerprint not in runs)
     return tuple(run for run in dataset.trajectories if run.fingerprint[:WHEEL_DIGITS] not in wheels)
 

@@ -156,7 +156,7 @@ class Calibration(Model):
 
 
 def matrix_flaw(matrix: Array) -> str:
-    """What a matrix (3, N) holds that no robot's can; empty if it may be one."""
+    """The flaw of a matrix (3, N) that no robot can have, as what it holds; empty if there is none."""
     if np.abs(matrix).max() > _LARGEST_ELEMENT:
         return f"{np.abs(matrix).max():g}, which no wheel can drive in m or rad per rad"
     return "" if matrix.any() else "zeros only: no wheel would move the robot"

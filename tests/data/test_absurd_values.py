@@ -63,6 +63,17 @@ def test_a_sample_period_far_from_that_of_the_stamps_is_refused(folder: Path, pe
         load_dataset(folder)
 
 
+@pytest.mark.parametrize("factor", [1e-7, 1e6])
+def test_a_sample_period_that_no_calibration_file_takes_is_refused(folder: Path, factor: float) -> None:
+    dataset = load_dataset(folder)
+    runs = [
+        replace(run, times=factor * run.times, rates=run.rates / factor, pose_times=factor * run.pose_times)
+        for run in dataset.trajectories
+    ]
+    with pytest.raises(DataError, match=r"expected 1e-06 to 3600 s; check the units of the times"):
+        make_dataset("x", dataset.robot, factor * dataset.sample_period, runs)
+
+
 def test_standstill_between_runs_is_bounded(folder: Path) -> None:
     dataset = load_dataset(folder)
     short = replace(dataset, sample_period=dataset.sample_period / 1000)  # within what is only warned of

@@ -21,6 +21,7 @@ from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.robot.kinematics import Robot
 from omnibench.words import plural
 
+_NONE = "no interval"
 _TOUCHED = 1e-6  # share of a direction of wheel rates: a smaller one is rounding
 
 
@@ -73,12 +74,13 @@ def _matrix_table(run: CalibrationRun) -> Table:
     labels = ("x (m/rad)", "y (m/rad)", "w (rad/rad)")
     touched = np.any([np.abs(each.rates) > _TOUCHED for each in run.kept], axis=0) if run.kept else []
     marks = ["*" if touch else "" for touch in touched] or [""] * len(calibration.matrix[0])
-    note, listed = "", list(_intervals(run))
+    notes, listed = [], list(_intervals(run))
     if run.kept:
         motions = " and ".join(f"{each.words} ({each.motion})" for each in run.kept)
-        note = f"* only if the design values are right along {motions}: these data say nothing of it, and they are kept"
-        if not listed:
-            note = f"the design values are kept along {motions}, of which these data say nothing"
+        only = f"* only if the design values are right along {motions}: these data say nothing of it, and they are kept"
+        notes.append(only if listed else f"the design values are kept along {motions}, of which these data say nothing")
+    if stopped := [*run.result.held, *run.result.at_bounds] if listed else []:
+        notes.append(f"{_NONE} of what rests on {', '.join(stopped)}, held by the box or on a bound of it")
     rows = []
     for number, (label, values) in enumerate(zip(labels, calibration.matrix, strict=True)):
         design = calibration.robot.inverse_kinematic_matrix[number]
@@ -89,11 +91,11 @@ def _matrix_table(run: CalibrationRun) -> Table:
             rows.append(Row.of(f"  {name}", *(Cell("", _interval(*each)) for each in bounds)))
     wheels = (Column(f"wheel {wheel}") for wheel in calibration.robot.wheel_names)
     caption = f"{calibration.name}{' (simulated data)' if simulated else ''}"
-    return Table(caption, (Column("", numeric=False), *wheels), tuple(rows), note)
+    return Table(caption, (Column("", numeric=False), *wheels), tuple(rows), "; ".join(notes))
 
 
 def _interval(low: float, high: float, mark: str) -> str:
-    return "held or on a bound: no interval" if math.isnan(low) else f"{low:+.7f} to {high:+.7f}{mark}"
+    return _NONE if math.isnan(low) else f"{low:+.7f} to {high:+.7f}{mark}"
 
 
 def _intervals(run: CalibrationRun) -> Iterator[tuple[str, ElementIntervals]]:

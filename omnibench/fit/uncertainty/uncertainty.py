@@ -209,7 +209,7 @@ def _parameters(
         return None
     kept = unidentified_directions(robot, driven_span(problem.trajectories))
     untold = [
-        "held or on a bound: no interval" if touching else "" if identified else "not identified by these data"
+        "no interval" if touching else "" if identified else "not identified by these data"
         for identified, touching in zip(identified_parameters(robot, kept), bounded, strict=True)
     ]
     return tuple(

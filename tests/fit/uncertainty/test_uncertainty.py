@@ -166,7 +166,7 @@ class TestCovariance:
             assert np.argwhere(np.isnan(intervals.high)).tolist() == [[1, 2]]
         assert uncertainty.parameters is not None
         told = {each.untold for each in uncertainty.parameters}
-        assert told == {"held or on a bound: no interval"}
+        assert told == {"no interval"}
 
     def test_an_element_that_the_box_holds_has_no_interval(self) -> None:
         problem = make_problem(driven(FLOWER), box="paper")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from omnibench.live.estimation.live_odometry import LiveOdometry
 from omnibench.live.estimation.wheel_input import WheelStep
-from omnibench.robot.calibration import Calibration, Noise
+from omnibench.robot.calibration import Calibration, Noise, Provenance
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
 
 
@@ -118,3 +118,13 @@ def test_a_calibration_without_noise_or_covariance_still_has_an_uncertain_pose()
     live = LiveOdometry(bare)
     live.step(step(0.01, [0.02, 0.01, -0.02]))
     assert np.linalg.eigvalsh(live.covariance)[0] > 0
+
+
+def test_a_calibration_with_numbers_on_a_bound_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    origin = Provenance(
+        dataset="d", dataset_hash="0", calibrator="crs", seed=1, cost="final_pose", box="row", outcome="converged"
+    )
+    LiveOdometry(calibration().model_copy(update={"provenance": origin}))
+    assert not caplog.messages
+    LiveOdometry(calibration().model_copy(update={"provenance": origin.model_copy(update={"on_bounds": ("m23",)})}))
+    assert "m23 on a bound of the box, of which no variance is known: covariances are too small" in caplog.text
