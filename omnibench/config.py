@@ -170,10 +170,15 @@ def _describe_one(model: type[BaseModel], detail: ErrorDetails) -> str:
         known = _keys_at(model, whole[:-1])
         return f"unknown key {place!r}; {nearest(str(location[-1]), known)}known: {', '.join(known) or 'none'}"
     if detail["type"] == "missing":
-        return f"key {place!r} is missing"
+        field = model.model_fields.get(place)  # of the document itself
+        meaning = f" ({field.description})" if field is not None and field.description else ""
+        return f"key {place!r} is missing{meaning}"
     message = detail["msg"].removeprefix("Value error, ")
     given = repr(detail["input"])
     shown = "" if detail["type"] == "value_error" or len(given) > 60 else f" (given: {given})"
+    if detail["type"] == "literal_error" and isinstance(detail["input"], str):
+        hint = nearest(detail["input"], re.findall(r"'([^']*)'", detail["ctx"]["expected"]))
+        shown += f"; {hint.strip()}" if hint else ""
     return f"{place}: {message}{shown}" if place else f"{message}{shown}"
 
 

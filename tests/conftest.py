@@ -69,6 +69,24 @@ def omni3() -> Dataset:
 
 
 @pytest.fixture(scope="session")
+def diff() -> Dataset:
+    """OptiOdom's recordings of a differential drive."""
+    return real_recordings.diff()
+
+
+@pytest.fixture(scope="session")
+def tricyc() -> Dataset:
+    """OptiOdom's recordings of a tricycle."""
+    return real_recordings.tricyc()
+
+
+@pytest.fixture(scope="session")
+def omni4() -> Dataset:
+    """OptiOdom's recordings of a mecanum base."""
+    return real_recordings.omni4()
+
+
+@pytest.fixture(scope="session")
 def robotino() -> Dataset:
     """Recordings of a Robotino."""
     return real_recordings.robotino()

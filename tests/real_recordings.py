@@ -10,16 +10,39 @@ from omnibench.data.dataset import Dataset
 from omnibench.registry import load_plugin_file
 from omnibench.slam.import_dataset import import_dataset
 
-OMNI3 = RECORDINGS / "optiodom" / "omni3"
+OPTIODOM = RECORDINGS / "optiodom"
+OMNI3 = OPTIODOM / "omni3"
 ROBOTINO = RECORDINGS / "robotino"
 
 
 @made_once
 def omni3() -> Dataset:
     """OptiOdom's robot on three wheels: circles to train, squares to validate."""
-    if not OMNI3.is_dir():
-        pytest.skip(f"the recordings are not at {OMNI3}")
-    return import_dataset("optiodom", OMNI3)
+    return _of_optiodom("omni3")
+
+
+@made_once
+def diff() -> Dataset:
+    """OptiOdom's differential drive: circles to train, squares and single legs to validate."""
+    return _of_optiodom("diff")
+
+
+@made_once
+def tricyc() -> Dataset:
+    """OptiOdom's tricycle: circles to train, squares to validate."""
+    return _of_optiodom("tricyc")
+
+
+@made_once
+def omni4() -> Dataset:
+    """OptiOdom's mecanum base on circles."""
+    return _of_optiodom("omni4")
+
+
+def _of_optiodom(robot: str) -> Dataset:
+    if not (OPTIODOM / robot).is_dir():
+        pytest.skip(f"the recordings are not at {OPTIODOM / robot}")
+    return import_dataset("optiodom", OPTIODOM / robot)
 
 
 @made_once

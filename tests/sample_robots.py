@@ -14,3 +14,46 @@ APR_02 = Robot(
         for name, degrees in zip("abc", (60, 180, 300), strict=True)
     ),
 )
+
+
+def _robot(name: str, *wheels: dict[str, object], **more: object) -> Robot:
+    return Robot.model_validate({"name": name, "wheels": wheels, **more})
+
+
+def _fixed(name: str, x: float, y: float, **more: object) -> dict[str, object]:
+    return {"name": name, "type": "fixed", "radius": 0.05, "x": x, "y": y, **more}
+
+
+def _steered(name: str, x: float, y: float, **more: object) -> dict[str, object]:
+    return {"name": name, "type": "steered", "radius": 0.05, "x": x, "y": y, **more}
+
+
+def _mecanum(name: str, x: float, y: float, rollers: float) -> dict[str, object]:
+    return {"name": name, "type": "mecanum", "radius": 0.05, "x": x, "y": y, "roller_angle_deg": rollers}
+
+
+_REAR = (_fixed("rear_left", 0.0, 0.2, measured=False), _fixed("rear_right", 0.0, -0.2, measured=False))
+_CORNERS = {
+    "front_left": (0.2, 0.15),
+    "front_right": (0.2, -0.15),
+    "rear_left": (-0.2, 0.15),
+    "rear_right": (-0.2, -0.15),
+}
+
+# One robot of every other class (m).
+DIFFERENTIAL = _robot("diff", _fixed("left", 0.0, 0.15), _fixed("right", 0.0, -0.15))
+SKID = _robot("skid", *(_fixed(name, *place) for name, place in _CORNERS.items()), skid=True)
+MECANUM = _robot(
+    "mecanum",
+    *(_mecanum(name, *place, 45 * (-1) ** (number in (1, 2))) for number, (name, place) in enumerate(_CORNERS.items())),
+)
+TRICYCLE = _robot("tricycle", _steered("front", 0.5, 0.0), *_REAR)
+CAR = _robot(
+    "car",
+    _fixed("left", 0.0, 0.2),
+    _fixed("right", 0.0, -0.2),
+    _steered("front_left", 0.5, 0.2, driven=False),
+    _steered("front_right", 0.5, -0.2, driven=False),
+)
+SWERVE = _robot("swerve", *(_steered(name, *place) for name, place in _CORNERS.items()))
+WHEELED = (DIFFERENTIAL, SKID, MECANUM, TRICYCLE, CAR, SWERVE)

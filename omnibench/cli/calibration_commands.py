@@ -51,9 +51,22 @@ def calibrate(
         typer.Option("--intervals", help="Also draw 95 % intervals of the matrix by resampling (closed_form only)."),
     ] = False,
     unidentified: Annotated[
-        Literal["keep", "fit"],
-        typer.Option(help="Motions hardly driven in the data: keep their design values, or fit them all the same."),
-    ] = "keep",
+        Literal["keep", "fit", "shrink"] | None,
+        typer.Option(
+            help="What the data hardly tell: keep the design where motions are hardly driven, fit it all the same, or "
+            "shrink all to the design in proportion to what is known. Default: shrink where the wheels say their type."
+        ),
+    ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-6, help="Of the design, for shrink: share of each row's largest element. Default: by class."
+        ),
+    ] = None,
+    mount: Annotated[
+        Literal["known", "fit"] | None,
+        typer.Option(help="Tracked point of a robot that cannot slide. Default: fit for tricycles and cars."),
+    ] = None,
     settings: Settings = None,
     force: Force = False,
     plugins: Plugins = None,
@@ -93,6 +106,8 @@ def calibrate(
             seed=seed,
             intervals=intervals,
             unidentified=unidentified,
+            tolerance=tolerance,
+            mount=mount,
             watch=watch,
         )
     calibration, result = run.calibration, run.result
@@ -179,19 +194,24 @@ def certify(
     if not certified.inside:
         warn([f"the calibration is outside the box {certified.certificate.box!r}; the bound is for matrices inside it"])
     if as_json:
-        return print_json(certified.certificate)
+        return print_json(certified.certificate.model_dump(exclude_none=True))
     return print_certificate(make_console(), certified)
 
 
 @calibration_app.command()
 def export(
     calibration: CalibrationFile,
-    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="ros2_controllers or c_header.")],
+    to: Annotated[
+        str, typer.Option("--to", metavar="FORMAT", help="ros2_controllers, robot_localization or c_header.")
+    ],
     output: Annotated[Path | None, output_option("File or folder to write to. Default: standard output.")] = None,
     force: Force = False,
     plugins: Plugins = None,
 ) -> None:
-    """Convert a calibration for ROS 2 controllers or C programs."""
+    """Convert a calibration for ROS 2 or C programs.
+
+    ros2_controllers takes the controller of the robot's kind, and says what it cannot hold of the calibration.
+    """
     from omnibench.files import refuse_existing, write_text
     from omnibench.robot.calibration import read_calibration
     from omnibench.robot.export.formats import export_calibration

@@ -78,8 +78,9 @@ def inspect(dataset: DatasetFolder, as_json: Json = False) -> None:
 @recording_app.command()
 def design(
     source: Annotated[
-        Path, typer.Argument(metavar="DATASET|CONFIG", help="Data set folder, or config of a comparison or a design.")
-    ],
+        Path | None,
+        typer.Argument(metavar="DATASET|CONFIG", help="Data set folder, or config of a comparison or a design."),
+    ] = None,
     use: Annotated[
         Literal["trajectory", "final"],
         typer.Option(help="Reference poses to calibrate from: all of a run's, or only its final one."),
@@ -96,6 +97,33 @@ def design(
         Literal["euler", "arc"] | None,
         typer.Option(help="Path within a sample; see calibrate. Default: the config's, or arc for a data set."),
     ] = None,
+    robot: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Instead of DATASET|CONFIG: a robot alone (robot: as in dataset.yaml)."),
+    ] = None,
+    max_speed: Annotated[
+        float | None, typer.Option(help="With --robot: its greatest speed, m/s. Default: 0.5.")
+    ] = None,
+    max_turn_rate: Annotated[
+        float | None, typer.Option(help="With --robot: its fastest turn, rad/s. Default: 1.")
+    ] = None,
+    max_wheel_rate: Annotated[
+        float | None,
+        typer.Option(help="With --robot: of any wheel, rad/s. Default: as straight on at the greatest speed."),
+    ] = None,
+    steering_limit: Annotated[
+        float | None,
+        typer.Option(help="With --robot: largest steering angle, deg. Default: tricycle 80, car 35, others 90."),
+    ] = None,
+    area: Annotated[
+        str | None, typer.Option(metavar="AxB", help="With --robot: free floor, m, like 3x2.5. Default: 3x3.")
+    ] = None,
+    position_noise: Annotated[
+        float | None, typer.Option(help="With --robot: of the reference's positions, m. Default: 0.005.")
+    ] = None,
+    heading_noise: Annotated[
+        float | None, typer.Option(help="With --robot: of the reference's headings, deg. Default: 0.3.")
+    ] = None,
     output: Annotated[
         Path | None, output_option("Folder for report.html and design.json. Default: nothing is written.")
     ] = None,
@@ -105,20 +133,29 @@ def design(
 ) -> None:
     """Choose the motion commands that are most worth driving.
 
-    These are the runs from which the matrix would be calibrated most precisely (D-optimal design).
+    These are the runs from which the matrix would be calibrated most precisely (D-optimal design): of those that were
+    recorded or that a config lists, or, with --robot, of lines, arcs and turns that fit robot and room.
     """
     from omnibench.cli.terminal.design_summary import print_design
     from omnibench.config import to_json
     from omnibench.design.design import design_experiment
     from omnibench.design.report.design_report import design_document
+    from omnibench.design.robot_commands import RobotOptions, design_source
     from omnibench.files import refuse_existing, write_text
     from omnibench.report.render import write_document
 
     if output is not None:
         refuse_existing(output / "design.json", output / "report.html", force=force)
     load_given_plugins(plugins)
+    limits = RobotOptions(max_speed, max_turn_rate, max_wheel_rate, steering_limit, area, position_noise, heading_noise)
     chosen = design_experiment(
-        source, use=use, per=per, runs=runs, repetitions=repetitions, dataset=dataset, integration=integration
+        design_source(source, robot, limits, dataset=dataset, integration=integration),
+        use=use,
+        per=per,
+        runs=runs,
+        repetitions=repetitions,
+        dataset=dataset,
+        integration=integration,
     )
     if output is not None:
         write_text(output / "design.json", to_json(chosen) + "\n")

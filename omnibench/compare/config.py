@@ -8,8 +8,10 @@ from pydantic import AfterValidator, Field, field_validator
 
 from omnibench.config import Model, Positive, RelativePath, printable
 from omnibench.data.dataset import Split
-from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
+from omnibench.fit.geometry import GeometryLimits
+from omnibench.fit.parameterisation import Box, ParameterisationName
 from omnibench.fit.problem import Budget
+from omnibench.fit.shrinkage.prior import MountChoice
 from omnibench.fit.span import Unidentified
 from omnibench.fit.uncertainty.ratio_intervals import Bootstrap
 from omnibench.robot.odometry import Integration
@@ -87,7 +89,15 @@ class CompareConfig(Model):
     integration: Integration = "arc"
     box: Box = "row"
     unidentified: Unidentified = Field(
-        "keep", description="motions that the data hardly drive: keep the design values, or fit them to slip and noise"
+        "keep",
+        description="what the data hardly tell: keep the design values of motions that they hardly drive, fit these to "
+        "slip and noise, or shrink every answer to the design in proportion to what is known",
+    )
+    mount: MountChoice | None = Field(
+        None, description="tracked point of a robot that cannot slide: known, or fitted; default: by the robot's class"
+    )
+    tolerance: Positive | None = Field(
+        None, description="of the design, share of each row's largest element, for shrink; default: the robot class's"
     )
     budget: Budget = Budget()
     seeds: tuple[int, ...] = Field((1,), min_length=1, description="one run of every search for each")

@@ -9,6 +9,7 @@ from omnibench.compare.effective_config import load_calibrators
 from omnibench.compare.plan import PlannedRun, RunTask
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error, run_calibrator
+from omnibench.fit.shrinkage.shrinkage import shrunk
 from omnibench.jobs.job import Failure, Job, JobWatch, run_jobs
 from omnibench.jobs.local_backends import Processes
 from omnibench.jobs.result_store import ResultStore
@@ -44,7 +45,8 @@ def _solve(task: RunTask, report: Reporter) -> RunResult:
     try:
         load_calibrators(task.config)
         calibrator = calibrators.create(task.entry.name, task.entry.options)
-        result = run_calibrator(calibrator, task.problem(report))
+        problem = task.problem(report)
+        result = shrunk(problem, run_calibrator(calibrator, problem), fitted=calibrator.bounded)
     except BaseException as error:  # whatever a plug-in raises, wherever, is this run's outcome
         result = _without_answer(Outcome.FAILED, describe_error(error))
     if result.outcome is Outcome.FAILED:

@@ -10,7 +10,8 @@ from omnibench.compare.config import CalibratorEntry, CompareConfig
 from omnibench.compare.run_key import run_key
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import ConfigError
-from omnibench.fit.parameterisation import Box, GeometryLimits, ParameterisationName
+from omnibench.fit.geometry import GeometryLimits
+from omnibench.fit.parameterisation import Box, ParameterisationName
 from omnibench.fit.problem import CalibrationProblem, make_parameterisation, training_split
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import calibrators, costs
@@ -58,10 +59,13 @@ class RunTask:
                 box=self.box,
                 limits=self.entry.limits,
                 unidentified=self.config.unidentified,
+                mount=self.config.mount,
+                tolerance=self.config.tolerance,
             ),
             integration=self.config.integration,
             budget=self.config.budget,
             seed=self.seed,
+            shrinks=self.config.unidentified == "shrink",
             watch=watch,
         )
 

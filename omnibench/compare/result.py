@@ -15,7 +15,8 @@ from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Split
 from omnibench.environment import Environment
 from omnibench.fit.calibrator import Outcome
-from omnibench.fit.parameterisation import FittedParameter, ParameterisationName
+from omnibench.fit.geometry import FittedParameter
+from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import Improvement
 from omnibench.fit.uncertainty.ratio_intervals import Interval, Units
 from omnibench.fit.uncertainty.uncertainty import Uncertainty

@@ -31,6 +31,8 @@ def run_key(config: CompareConfig, dataset: Dataset, entry: CalibratorEntry, see
             "cost": config.cost,
             "integration": config.integration,
             "unidentified": config.unidentified,
+            "mount": config.mount,
+            "tolerance": config.tolerance,
             "calibrator": entry.model_dump(mode="json", exclude={"label"}),
             "box": config.box,
             "budget": config.budget,

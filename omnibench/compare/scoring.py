@@ -16,7 +16,8 @@ from omnibench.errors import PluginError
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import positions_and_headings
-from omnibench.fit.parameterisation import FittedParameter, fitted_parameters, make_bounds
+from omnibench.fit.geometry import FittedParameter, WheelGeometry, fitted_parameters
+from omnibench.fit.parameterisation import make_bounds
 from omnibench.fit.uncertainty.ratio_intervals import UnitName, units_of
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import matrix_rows
@@ -172,7 +173,7 @@ def _improvement(score: SplitScore | None, theoretical: SplitScore | None) -> fl
 def _parameters(run: PlannedRun, result: RunResult) -> tuple[FittedParameter, ...] | None:
     if run.parameterisation != "geometry" or result.vector is None:
         return None
-    return fitted_parameters(run.dataset.robot, result.vector)
+    return fitted_parameters(WheelGeometry(run.dataset.robot), result.vector)
 
 
 def _is_exact(run: PlannedRun, scored: ScoredRun) -> bool:

@@ -10,13 +10,14 @@ from typing import Literal
 
 import numpy as np
 
-from omnibench.data.checks import implausible
+from omnibench.data.checks.implausible import implausible
 from omnibench.data.headings import unwrap
 from omnibench.data.run_checks import check_sample_period, pose_times_flaw, reach_flaw, values_flaw, wheel_times_flaw
 from omnibench.data.scans import Scans
 from omnibench.errors import DataError, nearest
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
+from omnibench.robot.wheels.drive import Drive, in_the_middle
 from omnibench.words import plural
 
 Split = Literal["train", "validation"]
@@ -26,7 +27,7 @@ WHEEL_DIGITS = 8
 # A reference that moves by more, m and rad, is no noise of one that stands; a robot whose wheels drive less than the
 # share of that has a dead encoder. Chosen: motion capture scatters by mm, and no wheel slips a hundredfold.
 _MOVED, _TURNED, _HARDLY = 0.05, 0.1, 0.01
-_ARRAYS = ("times", "rates", "pose_times", "poses", "angles", "targets", "pose_covariances")
+_ARRAYS = ("times", "rates", "pose_times", "poses", "angles", "targets", "pose_covariances", "steering")
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +57,16 @@ class Trajectory:
     angles: Array | None = None  # phi, absolute wheel angles at ``times`` (F, N), rad
     targets: Array | None = None  # target rates of the motor controllers (F, N), rad/s
     pose_covariances: Array | None = None  # (K, 3, 3)
+    steering: Array | None = None  # steering angles at ``times`` (F, S), rad
+    drive: Drive | None = None  # the robot's drive signals where it steers; ``make_dataset`` sets it
+
+    @cached_property
+    def signals(self) -> Array:
+        """Drive signals (F, M) of the wheel samples, rad/s: the rates, where the robot does not steer."""
+        if self.drive is None:
+            return self.rates
+        assert self.steering is not None  # the drive steers
+        return self.drive.signals(self.rates, in_the_middle(self.steering))
 
     @property
     def start(self) -> Array:
@@ -74,7 +85,8 @@ class Trajectory:
         The first 8 begin the SHA-256 of the wheel samples, the others that of the reference poses.
         """
         wheels, reference = hashlib.sha256(), hashlib.sha256()
-        for digest, arrays in ((wheels, (self.times, self.rates)), (reference, (self.pose_times, self.poses))):
+        sampled = (self.times, self.rates) if self.steering is None else (self.times, self.rates, self.steering)
+        for digest, arrays in ((wheels, sampled), (reference, (self.pose_times, self.poses))):
             for array in arrays:
                 digest.update(np.ascontiguousarray(array, dtype=float).tobytes())
         return wheels.hexdigest()[:WHEEL_DIGITS] + reference.hexdigest()[:8]
@@ -82,7 +94,17 @@ class Trajectory:
     def log(self, stamps: Sequence[float] | Array) -> WheelLog:
         """The wheel rates from the start pose, with poses wanted at ``stamps`` (s)."""
         wanted = np.asarray(stamps, dtype=float)
-        return WheelLog(self.times, self.rates, self.start, wanted, self.angles, self.started_at, self.session)
+        return WheelLog(
+            self.times,
+            self.rates,
+            self.start,
+            wanted,
+            self.angles,
+            self.started_at,
+            self.session,
+            self.steering,
+            self.drive,
+        )
 
     @property
     def final_log(self) -> WheelLog:
@@ -139,6 +161,8 @@ class Dataset:
         for trajectory in self.trajectories:
             for item in fields(trajectory):
                 value = getattr(trajectory, item.name)
+                if item.name == "drive" or (item.name == "steering" and value is None):
+                    continue  # the robot has it; a robot that does not steer keeps the hash of earlier versions
                 if isinstance(value, np.ndarray):
                     digest.update(np.ascontiguousarray(value, dtype=float).tobytes())
                 else:  # 6, 6.0 and a NumPy 6.0 are the same number
@@ -163,7 +187,7 @@ def make_dataset(
     DataError: there is no trajectory, two have the same id, an array has another shape, other times or other values
     than a data set on disk may have, or the sample period is far from that of the stamps.
     """
-    raw = tuple(trajectories)
+    raw = tuple(_with_drive(trajectory, robot) for trajectory in trajectories)
     if not raw:
         raise DataError(f"data set {name}: it has no trajectory")
     seen: set[str] = set()
@@ -191,6 +215,12 @@ def make_dataset(
     )
     dataset = Dataset(name, robot, sample_period, tuple(unwrapped), description, source, licence, simulated, (), scans)
     return replace(dataset, warnings=(*warnings, *_copied(dataset)))
+
+
+def _with_drive(trajectory: Trajectory, robot: Robot) -> Trajectory:
+    """A run with the drive signals of a robot that steers."""
+    drive = None if robot.drive.direct else robot.drive
+    return trajectory if trajectory.drive == drive else replace(trajectory, drive=drive)
 
 
 def _copied(dataset: Dataset) -> list[str]:
@@ -235,8 +265,11 @@ def _check_run(place: str, robot: Robot, trajectory: Trajectory) -> None:
 
 def _check_shapes(where: str, robot: Robot, trajectory: Trajectory) -> None:
     samples, poses = trajectory.times.shape, trajectory.pose_times.shape
-    expected: dict[str, tuple[int, ...]] = {"rates": (*samples, len(robot.wheels)), "poses": (*poses, 3)}
+    expected: dict[str, tuple[int, ...]] = {"rates": (*samples, len(robot.wheel_names)), "poses": (*poses, 3)}
     expected |= {"angles": expected["rates"], "targets": expected["rates"], "pose_covariances": (*poses, 3, 3)}
+    expected["steering"] = (*samples, len(robot.drive.steered))
+    if trajectory.steering is None and robot.drive.steered:
+        raise DataError(f"{where}: it has no steering angles; wheels {', '.join(robot.drive.steered)} steer")
     for item, shape in expected.items():
         array = getattr(trajectory, item)
         if len(samples) != 1 or len(poses) != 1 or (array is not None and array.shape != shape):
@@ -261,7 +294,7 @@ def _standing(robot: Robot, trajectories: Sequence[Trajectory]) -> list[str]:
 
 def _moves_unseen(matrix: Array, run: Trajectory) -> bool:
     """True if the reference moves in a run while the wheels, by the design matrix (3, N), travel hardly any of it."""
-    driven = np.abs(run.rates @ matrix.T) * np.diff(run.times, prepend=0.0)[:, None]
+    driven = np.abs(run.signals @ matrix.T) * np.diff(run.times, prepend=0.0)[:, None]
     moved = np.abs(run.poses - run.poses[0]).max(axis=0)
     far = moved > (_MOVED, _MOVED, _TURNED)
     return bool(far.any() and (driven.sum(axis=0).max() < _HARDLY * moved[far].max()))

@@ -14,6 +14,10 @@ from omnibench.errors import DataError, nearest
 from omnibench.robot.kinematics import Array
 
 
+class ColumnError(DataError):
+    """A table has not the columns that are expected of it."""
+
+
 @dataclass(frozen=True, eq=False)
 class NumberTable:
     """Named columns of finite numbers. values (rows, n). lines (rows,): the line of the file that a row came from."""
@@ -44,6 +48,10 @@ class NumberTable:
             raise self.fail(flaw[0], f"{name} {flaw[1]}")
         return values
 
+    def only(self, kept: NDArray[np.bool_]) -> NumberTable:
+        """The table of some of the rows."""
+        return NumberTable(self.file, self.names, self.values[kept], self.lines[kept])
+
     def fail(self, row: int, what: str) -> DataError:
         """The error of one row (0 is the first)."""
         return row_error(self.file, row, int(self.lines[row]), what)
@@ -59,24 +67,27 @@ def read_numbers(
 ) -> NumberTable:
     """The columns ``required``, and those of ``optional`` that are there, of a delimited text file.
 
-    The last of the header lines names the columns; without header lines the file has exactly the required columns.
-    separator: None for white space, with comments from ``#`` on. Blank lines are skipped. DataError: the file cannot be
-    read, a column is missing or named twice, the file has no rows, a row has more or fewer fields than columns, a field
-    is not a finite number.
+    The last of the header lines names the columns; a column that it does not name may be given by its number, from 1.
+    Without header lines all are, or the file has exactly the required columns. separator: None for white space, with
+    comments from ``#`` on. Blank lines are skipped. DataError: the file cannot be read, a column is missing or named
+    twice (ColumnError), the file has no rows, a row has more or fewer fields than columns, a field is not a finite
+    number.
     """
     lines = _read_lines(file, separator)
     names = [name.strip() for name in _header(file, lines, header_lines)] if header_lines else list(required)
-    wanted = [*required, *(name for name in optional if name in names)]
-    for name in wanted:
-        _check_column(file, name, names)
     rows = lines[header_lines:]
+    if not header_lines and rows and any(name.isdecimal() for name in required):
+        names = [str(number) for number in range(1, len(rows[0][1]) + 1)]
+    wanted = [*required, *(name for name in optional if name in names)]
+    chosen = [_column(file, name, names) for name in wanted]
     if not rows:
         raise DataError(f"{file}: it has no rows" + ("" if header_lines else f"; a row is {' '.join(required)}"))
     for row, (line, fields) in enumerate(rows):
         if len(fields) != len(names):
             what = f"it has {len(fields)} fields, expected {len(names)}"
-            raise row_error(file, row, line, f"{what}{'; repair the row' if header_lines else ': ' + ' '.join(names)}")
-    chosen = [names.index(name) for name in wanted]
+            if header_lines or names[0] == "1":
+                raise row_error(file, row, line, f"{what}; repair the row")
+            raise ColumnError(str(row_error(file, row, line, f"{what}: {' '.join(names)}")))
     try:
         values = np.array([[fields[index] for index in chosen] for _, fields in rows], dtype=float)
     except ValueError:
@@ -96,10 +107,10 @@ def not_increasing(values: Array) -> tuple[int, str] | None:
     return int(bad[0]) + 1, f"{what}: {value:.10g} after {before:.10g}"
 
 
-def missing_column(file: Path, column: str, columns: Iterable[str]) -> DataError:
+def missing_column(file: Path, column: str, columns: Iterable[str]) -> ColumnError:
     """The error of a table without a column that it must have."""
     known = ", ".join(filter(None, columns))
-    return DataError(f"{file}: column {column!r} is missing; {nearest(column, columns)}found: {known}")
+    return ColumnError(f"{file}: column {column!r} is missing; {nearest(column, columns)}found: {known}")
 
 
 def row_error(file: Path, row: int, line: int, what: str) -> DataError:
@@ -137,12 +148,16 @@ def _header(file: Path, lines: Sequence[tuple[int, list[str]]], header_lines: in
     return lines[header_lines - 1][1]
 
 
-def _check_column(file: Path, name: str, names: Sequence[str]) -> None:
+def _column(file: Path, name: str, names: Sequence[str]) -> int:
+    """Index of the column with a name, or with a number that no column has as its name."""
     count = names.count(name)
+    if count == 0 and name.isdecimal() and 1 <= int(name) <= len(names):
+        return int(name) - 1
     if count == 0:
         raise missing_column(file, name, names)
     if count > 1:
-        raise DataError(f"{file}: column {name!r} is there {count} times; name each column once")
+        raise ColumnError(f"{file}: column {name!r} is there {count} times; name each column once")
+    return names.index(name)
 
 
 def _first_flaw(

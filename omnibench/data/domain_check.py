@@ -23,7 +23,7 @@ def extrapolation_warning(calibration: Calibration, runs: Sequence[Trajectory]) 
     count = 0
     worst = dict[str, tuple[float, Array]]()  # by command: share of the worst run that is outside, and these motions
     for run in runs:
-        motions = motions_of(calibration.matrix_array, run.times, run.rates)
+        motions = motions_of(calibration.matrix_array, run.times, run.signals)
         outside = domain.outside_in_run(motions)
         if outside.any():
             count += 1

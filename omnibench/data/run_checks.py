@@ -61,8 +61,7 @@ def reach_flaw(robot: Robot, times: Array, rates: Array, pose_times: Array, pose
 
     times (F,), pose_times (K,): s. rates (F, N): rad/s. poses (K, 3): m, m, rad.
     """
-    radii = np.array([wheel.radius for wheel in robot.wheels])
-    travel = float((np.abs(rates) * radii).max(axis=1) @ np.diff(times, prepend=0.0))  # m, of the fastest wheel
+    travel = float((np.abs(rates) * robot.radii).max(axis=1) @ np.diff(times, prepend=0.0))  # m, of the fastest wheel
     distances = np.linalg.norm(poses[:, :2] - poses[0, :2], axis=1)
     for row in np.flatnonzero(distances > _FARTHEST * (travel + 1.0))[:1]:
         x, y = poses[row, :2]

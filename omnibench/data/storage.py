@@ -38,15 +38,15 @@ class Header(Model):
     simulated: bool = Field(False, description="true for simulated data")
     robot: Robot
     sample_period: Positive = Field(description="s")
-    wheels: tuple[str, ...] = Field(description="column names: omega_<wheel>")
+    wheels: tuple[str, ...] = Field(description="the wheels with a measured rate; column names: omega_<wheel>")
     scanner: Scanner | None = Field(None, description="the scanner, if there are scans")
 
     @model_validator(mode="after")
     def _wheels_are_the_robots(self) -> Header:
         if self.wheels != self.robot.wheel_names:
             raise ValueError(
-                f"wheels are {', '.join(self.wheels)}, but robot.wheels are {', '.join(self.robot.wheel_names)}; "
-                "name the same wheels in the same order"
+                f"wheels are {', '.join(self.wheels)}, but the robot's wheels with a measured rate are "
+                f"{', '.join(self.robot.wheel_names)}; name the same wheels in the same order"
             )
         return self
 
@@ -61,13 +61,14 @@ def load_dataset(path: Path | str) -> Dataset:
     runs = read_table(folder, "trajectories", ("trajectory", "split"))
     rates = [f"omega_{wheel}" for wheel in header.wheels]
     wheels = read_table(folder, "wheels", ("trajectory", "t", *rates))
+    _check_steering(wheels, header.robot)
     poses = read_table(folder, "poses", ("trajectory", "t", "x", "y", "theta"))
     _check_runs(runs)
     wheel_rows = _rows_by_trajectory(runs, wheels)
     pose_rows = _rows_by_trajectory(runs, poses)
     _check_times(wheels, wheel_rows, wheel_times_flaw)
     _check_times(poses, pose_rows, stored_pose_times_flaw)
-    samples = _WheelColumns(wheels, header.wheels)
+    samples = _WheelColumns(wheels, header.robot)
     reference = _PoseColumns(poses)
     trajectories = [
         _trajectory(row, samples, wheel_rows[index], reference, pose_rows[index])
@@ -180,11 +181,13 @@ def _recorded_scans(dataset: Dataset) -> Scans | None:
 
 
 class _WheelColumns:
-    def __init__(self, table: Table, wheels: Sequence[str]) -> None:
+    def __init__(self, table: Table, robot: Robot) -> None:
+        wheels, steered = robot.wheel_names, robot.drive.steered
         self.times = table.numbers("t")
         rates = table.stack([f"omega_{wheel}" for wheel in wheels])
         assert rates is not None  # their presence was checked on reading
         self.rates = rates
+        self.steering = table.stack([f"steer_{wheel}" for wheel in steered]) if steered else None
         self.angles = table.stack([f"phi_{wheel}" for wheel in wheels])
         self.targets = table.stack([f"target_{wheel}" for wheel in wheels])
 
@@ -221,6 +224,18 @@ def _scans(folder: Path, header: Header, trajectories: Sequence[str]) -> ScansOn
             "angle_increment, range_max (rad, m)"
         )
     return ScansOnDisk(file, header.scanner, trajectories)
+
+
+def _check_steering(wheels: Table, robot: Robot) -> None:
+    """DataError: there is no column with the steering angles of a wheel."""
+    columns = wheels.frame.columns
+    for wheel in robot.drive.steered:
+        if (column := f"steer_{wheel}") not in columns:
+            hint = nearest(column, [name for name in columns if not name.startswith("omega_")])
+            raise DataError(
+                f"{wheels.file}: column {column!r}, the steering angle of wheel {wheel} (rad, counter-clockwise, at "
+                f"the sample's end), is missing; {hint}found: {', '.join(columns)}"
+            )
 
 
 def _check_runs(runs: Table) -> None:
@@ -289,9 +304,14 @@ def _trajectory(
         session=None if run.get("session") is None else str(run["session"]),
         angles=None if wheels.angles is None else wheels.angles[wheel_rows],
         targets=None if wheels.targets is None else wheels.targets[wheel_rows],
+        steering=None if wheels.steering is None else wheels.steering[wheel_rows],
         pose_covariances=None if reference.covariances is None else reference.covariances[pose_rows],
-        **{name: float(run[name]) for name in _RUN_NUMBERS if run.get(name) is not None},
+        **_run_numbers(run),
     )
+
+
+def _run_numbers(run: dict[str, Any]) -> dict[str, Any]:
+    return {name: float(run[name]) for name in _RUN_NUMBERS if run.get(name) is not None}
 
 
 def _run_row(trajectory: Trajectory) -> dict[str, Any]:
@@ -301,8 +321,13 @@ def _run_row(trajectory: Trajectory) -> dict[str, Any]:
 
 def _wheel_frame(trajectory: Trajectory, robot: Robot) -> pl.DataFrame:
     columns: dict[str, Any] = {"trajectory": [trajectory.id] * len(trajectory.times), "t": trajectory.times}
-    for prefix, values in (("omega", trajectory.rates), ("phi", trajectory.angles), ("target", trajectory.targets)):
-        for index, wheel in enumerate(robot.wheel_names):
+    for prefix, wheels, values in (
+        ("omega", robot.wheel_names, trajectory.rates),
+        ("steer", robot.drive.steered, trajectory.steering),
+        ("phi", robot.wheel_names, trajectory.angles),
+        ("target", robot.wheel_names, trajectory.targets),
+    ):
+        for index, wheel in enumerate(wheels):
             columns[f"{prefix}_{wheel}"] = [None] * len(trajectory.times) if values is None else values[:, index]
     return pl.DataFrame(columns, schema_overrides={name: pl.Float64 for name in columns if name != "trajectory"})
 

@@ -18,12 +18,12 @@ from omnibench.fit.problem import training_split
 from omnibench.fit.span import aligned, direction_in_words, driven_span, motion_in_words
 from omnibench.fit.uncertainty.identifiability import identifiability
 from omnibench.robot.calibration import Noise
-from omnibench.robot.kinematics import Robot, wheel_equations
+from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.flower import commanded_rates, commands_of, duration_of, stamps_of_run
+from omnibench.simulate.flower import commanded_rates, commanded_steering, duration_of, stamps_of_run
 from omnibench.simulate.source import ComparedData
 from omnibench.words import noun_for
 
@@ -87,13 +87,13 @@ def read_candidates(
     """
     path = Path(source)
     if path.is_dir():
-        _no_choice(dataset, path)
+        refuse_choice(dataset, path)
         return candidates_of_dataset(load_dataset(path), integration or "arc", str(path))
     content = read_yaml(path)
     if isinstance(content, Mapping) and "datasets" in content:
         compared = validate(ComparedData, content, str(path), path.resolve().parent)
         return _candidates_of_comparison(compared, dataset, integration, str(path))
-    _no_choice(dataset, path)
+    refuse_choice(dataset, path)
     config = validate(DesignConfig, content, str(path))
     return candidates_of_config(
         config if integration is None else config.model_copy(update={"integration": integration}), str(path)
@@ -151,12 +151,12 @@ def candidates_of_config(config: DesignConfig, source: str = "") -> CandidatePoo
     place = source or f"config {config.name}"
     periods = (config.sample_period, config.pose_period)
     commands = {name: config.commands(name) for name in config.sets}
-    pool, candidates = _driven_as_designed(config.robot, config.integration, periods, commands)
+    pool, candidates = driven_as_designed(config.robot, config.integration, periods, commands)
     sets = {name: tuple(pool[command] for command in of_set) for name, of_set in commands.items()}
     baseline = np.zeros(len(candidates), dtype=np.intp)
     baseline[list(sets[config.baseline.set])] = config.baseline.repetitions
     count = len(sets[config.baseline.set])
-    return _checked(
+    return checked_pool(
         CandidatePool(
             source=place,
             name=config.name,
@@ -187,14 +187,13 @@ def candidates_of_simulation(
     """
     ramp = config.commands.ramp
     commands = tuple(
-        TimedCommand(command, duration_of(command, config.train, config.commands), ramp)
-        for command in commands_of(config)
+        TimedCommand(command, duration_of(command, config.train, config.commands), ramp) for command in config.driven
     )
     periods = (config.sample_period, config.pose_period)
-    _, candidates = _driven_as_designed(config.robot, integration, periods, {name: commands})
+    _, candidates = driven_as_designed(config.robot, integration, periods, {name: commands})
     scale = config.train.noise_scale
     noise = Noise(**{kind: scale * getattr(config.noise, kind) for kind in Noise.model_fields})
-    return _checked(
+    return checked_pool(
         CandidatePool(
             source=source or f"data set {name}",
             name=name,
@@ -234,7 +233,7 @@ def _candidates_of_comparison(
     return candidates_of_simulation(name, source.simulate, chosen, place, config.notes)
 
 
-def _driven_as_designed(
+def driven_as_designed(
     robot: Robot,
     integration: Integration,
     periods: tuple[float, float],
@@ -250,7 +249,16 @@ def _driven_as_designed(
         title = name if names.count(name) == 1 else f"{name}_t{timed.duration:.4g}"
         times, pose_times = stamps_of_run(timed.duration, *periods)
         rates = commanded_rates(robot, command, times, timed.ramp)
-        still = Trajectory(title, "train", times, rates, pose_times, np.zeros((len(pose_times), 3)))
+        still = Trajectory(
+            title,
+            "train",
+            times,
+            rates,
+            pose_times,
+            np.zeros((len(pose_times), 3)),
+            steering=commanded_steering(robot, command, times),
+            drive=None if robot.drive.direct else robot.drive,
+        )
         (poses,) = model.poses([still.log(pose_times)])
         run = replace(
             still,
@@ -266,7 +274,8 @@ def _driven_as_designed(
     return {timed: index for index, timed in enumerate(commands)}, tuple(candidates)
 
 
-def _checked(pool: CandidatePool) -> CandidatePool:
+def checked_pool(pool: CandidatePool) -> CandidatePool:
+    """The pool. ConfigError: a set leaves part of the matrix undetermined, or has one command; the noise is zero."""
     if _noiseless(pool.noise):
         raise ConfigError(
             f"{pool.source}: noise: give position and heading some noise; without it, runs cannot be weighed"
@@ -289,13 +298,14 @@ def _noiseless(noise: Noise) -> bool:
 
 def require_every_motion(robot: Robot, runs: Sequence[Trajectory], place: str, error: type[OmnibenchError]) -> None:
     """Raise ``error`` where runs leave out a motion that the robot can make, whose part of the matrix stays unknown."""
-    # Wheel rates (N, 3) of the robot's three motions without slip, orthonormal.
-    possible, _ = np.linalg.qr(wheel_equations(robot.wheels))
-    _, strengths, motions = np.linalg.svd(np.vstack([driven_span(runs).strong @ possible, np.zeros((3, 3))]))
+    # Signals (M, D) of the robot's motions without slip, orthonormal.
+    possible, _ = np.linalg.qr(robot.signal_equations @ robot.motions.T)
+    count = possible.shape[1]
+    _, strengths, motions = np.linalg.svd(np.vstack([driven_span(runs).strong @ possible, np.zeros((count, count))]))
     missing = motions[strengths < 0.5] @ possible.T
     if len(missing):
         words = [
-            f"{direction_in_words(direction, robot.wheel_names)} ({motion_in_words(direction, robot)})"
+            f"{direction_in_words(direction, robot.drive.names)} ({motion_in_words(direction, robot)})"
             for direction in aligned(missing, robot)
         ]
         raise error(
@@ -304,6 +314,7 @@ def require_every_motion(robot: Robot, runs: Sequence[Trajectory], place: str, e
         )
 
 
-def _no_choice(dataset: str | None, path: Path) -> None:
+def refuse_choice(dataset: str | None, path: Path) -> None:
+    """ConfigError: ``--dataset`` chooses where there is nothing to choose from."""
     if dataset is not None:
         raise ConfigError(f"--dataset: only a comparison config with several data sets needs it; {path} is none")

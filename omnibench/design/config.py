@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -13,9 +12,10 @@ from omnibench.config import Model, NonNegative, Positive
 from omnibench.data.importers.robot_option import RobotOption
 from omnibench.errors import UnknownNameError
 from omnibench.robot.calibration import Noise
+from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.config import MotionGrid
-from omnibench.simulate.flower import Command, grid_of
+from omnibench.simulate.command import Command, beyond_steering, within_steering
+from omnibench.simulate.config import MotionGrid, SteeringLimit
 from omnibench.words import plural
 
 # They guard memory against slips of the pen and decide nothing else: so many samples of four wheels take 640 MB.
@@ -45,9 +45,9 @@ class CommandGrid(MotionGrid):
             raise ValueError("give the length of the runs: either distance (m) or duration (s)")
         return self
 
-    def commands(self) -> Iterator[TimedCommand]:
-        """The commands in the order of the grid."""
-        for command in grid_of(self):
+    def commands(self, robot: Robot) -> Iterator[TimedCommand]:
+        """The commands in the order of the grid. ValueError: the robot's wheels do not roll in a direction."""
+        for command in self.grid(robot):
             driven = self.duration or (self.distance or 0.0) / max(command.speed, 1e-9)
             yield TimedCommand(command, driven if command.speed else self.turn_duration)
 
@@ -66,10 +66,12 @@ class SingleCommand(Model):
             raise ValueError("this command does not move the robot; give a speed or a turn_rate")
         return self
 
-    def commands(self) -> Iterator[TimedCommand]:
-        """The one command."""
-        direction = math.radians(self.direction_deg) if self.speed else 0.0
-        yield TimedCommand(Command(self.speed, direction, self.turn_rate), self.duration)
+    def commands(self, robot: Robot) -> Iterator[TimedCommand]:
+        """The one command. ValueError: the robot's wheels do not roll in its direction."""
+        direction = self.direction_deg if self.speed else 0.0
+        grid = MotionGrid(speeds=(self.speed,), directions_deg=(direction,), turn_rates=(self.turn_rate,))
+        for command in grid.grid(robot):
+            yield TimedCommand(command, self.duration)
 
 
 class OtherSet(Model):
@@ -105,6 +107,7 @@ class DesignConfig(Model):
     description: str = ""
     notes: tuple[str, ...] = Field((), description="what a reader of the result must know")
     robot: RobotOption
+    steering_limit_deg: SteeringLimit = None
     integration: Integration = "arc"
     sample_period: Positive = Field(0.01, description="time between wheel samples, s")
     pose_period: Positive = Field(0.25, description="time between reference poses, s")
@@ -125,10 +128,17 @@ class DesignConfig(Model):
     def _sets_are_known_and_of_a_size(self) -> DesignConfig:
         if self.baseline.set not in self.sets:
             raise ValueError(str(UnknownNameError("set", self.baseline.set, self.sets, "baseline")))
+        if self.steering_limit_deg is not None and self.robot.drive.direct:
+            raise ValueError("steering_limit_deg: no wheel of this robot steers; leave it out")
         for name in self.sets:
             commands = self.commands(name)
             if not commands:
                 raise ValueError(f"sets.{name}: no command moves the robot")
+            chosen = [timed.command for timed in commands]
+            _, beyond = within_steering(self.robot, chosen, self.steering_limit_deg)
+            if beyond:
+                why = beyond_steering(self.robot, beyond, self.steering_limit_deg)
+                raise ValueError(f"sets.{name}: {why}; take such commands out")
             samples = sum(command.duration for command in commands) * (1 / self.sample_period + 1 / self.pose_period)
             if len(commands) > _MOST_COMMANDS or samples > _MOST_SAMPLES:
                 raise ValueError(
@@ -144,7 +154,10 @@ class DesignConfig(Model):
     def _expanded(self, name: str, above: tuple[str, ...]) -> Iterator[TimedCommand]:
         for block in self.sets[name]:
             if not isinstance(block, OtherSet):
-                yield from block.commands()
+                try:
+                    yield from block.commands(self.robot)
+                except ValueError as error:
+                    raise ValueError(f"sets.{name}: {error}") from None
             elif block.set not in self.sets:
                 raise ValueError(str(UnknownNameError("set", block.set, self.sets, f"sets.{name}")))
             elif block.set in (*above, name):

@@ -42,16 +42,26 @@ class PhysicalSpread(Model):
     angle_deg: float
 
 
+class MotionPrecision(Model):
+    """Standard deviations of a calibrated robot's odometry after 1 m or a full turn, from the matrix alone."""
+
+    motion: str
+    position_mm: float
+    heading_deg: float
+
+
 class Precision(Model):
     """Precision of the matrix that some runs give.
 
     relative: the geometric mean of the standard deviations as a multiple of the baseline's. row_percent: the largest
-    standard deviation of an element of each row, % of the row's largest element. physical: for three wheels.
+    standard deviation of an element of each row, % of the row's largest element. motions: of odometry. physical: for
+    three omni wheels.
     """
 
     effort: Effort
     relative: float
     row_percent: tuple[float, float, float]
+    motions: tuple[MotionPrecision, ...]
     physical: PhysicalSpread | None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import get_args
 
 import numpy as np
@@ -10,9 +11,9 @@ import numpy as np
 from omnibench.design.candidates import CandidatePool, CandidateRun
 from omnibench.design.config import Per, Use
 from omnibench.design.d_optimality import Candidates, Counts, scale_of
-from omnibench.design.result import Candidate, Chosen, Effort, PhysicalSpread, Precision, Step
+from omnibench.design.result import Candidate, Chosen, Effort, MotionPrecision, PhysicalSpread, Precision, Step
 from omnibench.errors import ConfigError
-from omnibench.fit.parameterisation import WheelGeometry
+from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.span import direction_in_words, driven_span
 from omnibench.fit.uncertainty.information import information_of_runs
 from omnibench.fit.uncertainty.physical import is_invertible
@@ -78,7 +79,7 @@ class DesignProblem:
         poses = "the final poses" if use == "final" else "the poses"
         return (
             f"{self.pool.source}: {poses} of {name or 'all commands'} leave row {row} of the matrix undetermined along "
-            f"{direction_in_words(direction, self.pool.robot.wheel_names)}; add commands that determine it"
+            f"{direction_in_words(direction, self.pool.robot.drive.names)}; add commands that determine it"
         )
 
     def of_all(self, name: str, counts: Counts) -> Counts:
@@ -97,12 +98,16 @@ class DesignProblem:
         everything = self.everything(self.use)
         covariance = self.basis @ everything.covariance(counts) @ self.basis.T
         deviations = np.sqrt(np.maximum(np.diagonal(covariance), 0.0)).reshape(3, -1)
-        largest = np.abs(self.pool.robot.inverse_kinematic_matrix).max(axis=1)
+        largest = self.pool.robot.row_scales
         first, second, third = (100 * deviations.max(axis=1) / largest).tolist()
         relative = math.sqrt(everything.root(self.pool.baseline) / everything.root(counts))
         physical = None if self._physical is None else _physical_spread(self._physical, covariance, self.pool.robot)
         return Precision(
-            effort=self.effort(counts), relative=relative, row_percent=(first, second, third), physical=physical
+            effort=self.effort(counts),
+            relative=relative,
+            row_percent=(first, second, third),
+            motions=tuple(_motion_precision(name, signals, covariance) for name, signals in _motions(self.pool.robot)),
+            physical=physical,
         )
 
     def step(self, counts: Counts, bound: float) -> Step:
@@ -137,7 +142,7 @@ def _described(candidate: CandidateRun, robot: Robot) -> Candidate:
     picks = np.unique(np.linspace(0, len(first.poses) - 1, _PATH_POINTS).round().astype(int))
     path = np.round(relative(first.start, first.poses[picks]), 5)
     known = first.v is not None and first.alpha is not None and first.omega is not None
-    radii = np.array([wheel.radius for wheel in robot.wheels])
+    radii = robot.radii
     rolled = [
         float((np.abs(run.rates) * np.diff(run.times, prepend=0.0)[:, None] * radii).sum() / len(radii))
         for run in candidate.runs
@@ -152,6 +157,21 @@ def _described(candidate: CandidateRun, robot: Robot) -> Candidate:
         rolled_m=float(np.mean(rolled)),
         path=tuple((px, py, ph) for px, py, ph in path.tolist()),
     )
+
+
+def _motions(robot: Robot) -> Iterator[tuple[str, Array]]:
+    """Each motion of a robot by its name, with the signals (M,) that drive 1 m of it or a full turn, rad."""
+    names = ("1 m ahead", "1 m aside", "a full turn") if robot.slides and not robot.skid else ("1 m", "a full turn")
+    for name, motion in zip(names, robot.motions, strict=True):
+        length = math.tau / motion[2] if name == "a full turn" else 1 / math.hypot(motion[0], motion[1])
+        yield name, length * robot.signal_equations @ motion
+
+
+def _motion_precision(name: str, signals: Array, covariance: Array) -> MotionPrecision:
+    """Standard deviations of a motion with those signals (M,) under a covariance (3M, 3M) of the matrix."""
+    along = np.kron(np.eye(3), signals)
+    x, y, heading = np.sqrt(np.maximum(np.diagonal(along @ covariance @ along.T), 0.0)).tolist()
+    return MotionPrecision(motion=name, position_mm=1000 * math.hypot(x, y), heading_deg=math.degrees(heading))
 
 
 def _cost(candidate: Candidate, per: Per) -> float:

@@ -12,14 +12,14 @@ from omnibench.errors import ConfigError, require_type
 from omnibench.fit.calibrator import Calibrator, RunResult, run_calibrator
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import verdict_on
+from omnibench.fit.geometry import FittedParameter, GeometryLimits, WheelGeometry, fitted_parameters
 from omnibench.fit.parameterisation import (
     Box,
-    FittedParameter,
-    GeometryLimits,
     ParameterisationName,
-    fitted_parameters,
 )
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
+from omnibench.fit.shrinkage.prior import MountChoice, default_mount, default_unidentified
+from omnibench.fit.shrinkage.shrinkage import shrunk
 from omnibench.fit.span import Unidentified, WheelDirection
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals, bootstrap_intervals
 from omnibench.fit.uncertainty.ratio_intervals import FEWEST, Units, units_of
@@ -65,7 +65,9 @@ def calibrate(
     budget: Budget | None = None,
     seed: int = 1,
     intervals: bool = False,
-    unidentified: Unidentified = "keep",
+    unidentified: Unidentified | None = None,
+    mount: MountChoice | None = None,
+    tolerance: float | None = None,
     watch: Reporter = no_progress,
 ) -> CalibrationRun:
     """Fit the odometry model of a data set's training split.
@@ -73,7 +75,9 @@ def calibrate(
     intervals: also draw resampled intervals about the optimum (closed_form only), unless there are fewer than three
     commands (runs, where none is repeated) or too few for a covariance, of which a warning tells.
     unidentified: for motions that the data drive so little that slip alone may explain them, ``keep`` the design values
-    or ``fit`` them (see make_parameterisation). The run's warnings name them.
+    or ``fit`` them (see make_parameterisation); ``shrink`` keeps them and shrinks what else is hardly known to the
+    design, of the given tolerance (see shrinkage.py). The run's warnings name them. mount: ``known``, or ``fit`` where
+    the tracked point stands. Default of the three: by the robot (see prior.py).
     watch: told the evaluations and the best cost so far, at most every 0.1 s.
 
     Raises UnknownNameError or ConfigError for wrong arguments, DataError for an empty training split, and ConfigError
@@ -85,6 +89,12 @@ def calibrate(
         raise ConfigError("intervals are drawn about a minimum to rounding: use the calibrator closed_form")
     objective: Cost = costs.create(cost)
     training = training_split(dataset)
+    unidentified = unidentified or default_unidentified(dataset.robot)
+    if intervals and unidentified == "shrink":
+        raise ConfigError(
+            "resampled intervals are drawn about a minimum, which a shrunk answer is not: set unidentified to keep; a "
+            "shrunk answer has intervals of its own"
+        )
     searched = make_parameterisation(
         parameterisation or chosen.parameterisation,
         dataset.robot,
@@ -92,6 +102,8 @@ def calibrate(
         box=box,
         limits=limits,
         unidentified=unidentified,
+        mount=mount,
+        tolerance=tolerance,
     )
     problem = CalibrationProblem(
         dataset.robot,
@@ -101,9 +113,10 @@ def calibrate(
         integration=integration,
         budget=budget or Budget(),
         seed=seed,
+        shrinks=unidentified == "shrink",
         watch=renamed(watch, calibrator),
     )
-    result = run_calibrator(chosen, problem)
+    result = shrunk(problem, run_calibrator(chosen, problem), fitted=chosen.bounded)
     if result.matrix is None or result.vector is None:
         raise ConfigError(f"calibrator {calibrator!r} gave no answer ({result.outcome}): {result.reason}")
     validation = dataset.split("validation")
@@ -128,6 +141,10 @@ def calibrate(
             seed=seed,
             cost=cost,
             box=problem.box,
+            unidentified=unidentified,
+            tolerance=tolerance,
+            mount=None if dataset.robot.slides else mount or default_mount(dataset.robot),
+            unshrunk_cost=None if result.shrinkage is None else result.shrinkage.unshrunk_cost,
             on_bounds=result.at_bounds,
             versions=package_versions(),
             training_cost=result.cost,
@@ -142,8 +159,8 @@ def calibrate(
         doubts += (f"no resampled intervals: {units.words}; {FEWEST} are needed",)
     elif intervals and uncertainty:
         drawn = bootstrap_intervals(problem, result.vector, units=units, rng=problem.rng)
-    geometry = problem.parameterisation.name == "geometry"
-    parameters = fitted_parameters(dataset.robot, result.vector) if geometry else None
+    geometry = problem.parameterisation
+    parameters = fitted_parameters(geometry, result.vector) if isinstance(geometry, WheelGeometry) else None
     kept = kept_motions(dataset.robot, training, searched.name, unidentified)
     warnings = (*warnings, *doubts)
     return CalibrationRun(calibration, result, drawn, parameters, uncertainty, warnings, kept, units)

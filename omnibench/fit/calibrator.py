@@ -78,12 +78,21 @@ class Calibrator(ABC):
 calibrators.contract = Calibrator
 
 
+@dataclass(frozen=True)
+class Shrinkage:
+    """An answer's shrinkage to the design: its cost before, and the source of the covariance after, in words."""
+
+    unshrunk_cost: float
+    source: str
+
+
 @dataclass(frozen=True, eq=False)
 class RunResult:
     """Result of one calibrator on one problem. ``vector``, ``matrix`` and ``cost`` are None if there is no answer.
 
     at_bounds, held: names of elements on a bound of the box, and of those kept at their start values.
     covariance (n, n), degrees_of_freedom (n,), noise: as in Solution, None if the calibrator does not estimate them.
+    shrinkage: None where the answer is the calibrator's own.
     """
 
     outcome: Outcome
@@ -99,6 +108,7 @@ class RunResult:
     covariance: JsonArray | None = None
     noise: Noise | None = None
     degrees_of_freedom: JsonArray | None = None
+    shrinkage: Shrinkage | None = None
 
 
 def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunResult:

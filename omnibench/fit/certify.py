@@ -21,11 +21,12 @@ from omnibench.data.dataset import Dataset
 from omnibench.errors import DataError, require_type
 from omnibench.fit.bounds.lower_bound import LowerBounds, Node
 from omnibench.fit.bounds.stamp_sums import QUADRATURE
+from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
 from omnibench.processes import one_thread
 from omnibench.progress import Progress, Reporter, no_progress
-from omnibench.registry import costs
+from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 
@@ -55,7 +56,9 @@ class Proof:
 class Certificate(Model):
     """Largest possible distance of a calibration's cost from the optimum: ``gap`` = 1 - lower_bound / cost.
 
-    cost: on the training split. lower_bound: no matrix in the box costs less.
+    cost: on the training split; of a calibration that was shrunk to the design, that of the optimum before.
+    lower_bound: no matrix in the box costs less. shrinking: share that shrinking adds to that optimum's cost; None for
+    a calibration that was not shrunk.
     """
 
     cost: float
@@ -63,6 +66,7 @@ class Certificate(Model):
     gap: float
     box: str
     seconds: float
+    shrinking: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +93,8 @@ def certify_optimum(
 ) -> CertifiedCalibration:
     """Bound how much better than a calibration any matrix of the box could be, on a data set's training split.
 
-    Cost and integration are those of the calibration. box: default the one that was searched, or ``row``.
+    Cost and integration are those of the calibration. Of one that was shrunk to the design, the unshrunk optimum is
+    certified, found anew, and what shrinking costs is said. box: default the one that was searched, or ``row``.
     watch: told early about how long the proof takes, then of every part.
     gap: stop when the best known matrix is proven to be this close to the optimum. seconds, parts: stop after this time
     or after so many parts of the box; the number ends a proof at the same place on every machine.
@@ -113,7 +118,9 @@ def certify_optimum(
         dataset.robot,
         training,
         costs.create(provenance.cost if provenance else "final_pose"),
-        make_parameterisation("matrix", dataset.robot, training, box=chosen),
+        make_parameterisation(
+            "matrix", dataset.robot, training, box=chosen, mount=provenance.mount if provenance else "known"
+        ),
         integration=calibration.integration,
         budget=Budget(),
         seed=0,
@@ -121,6 +128,12 @@ def certify_optimum(
     vector = calibration.matrix_array.ravel()
     cost = float(problem.values(vector[None])[0])
     inside = bool(problem.inside(vector[None])[0])
+    shrinking = None
+    if provenance is not None and provenance.unidentified == "shrink":
+        optimum = run_calibrator(calibrators.create("closed_form"), problem)
+        if optimum.vector is None or optimum.cost is None:
+            raise DataError(f"calibration {calibration.name!r}: its unshrunk optimum is not found: {optimum.reason}")
+        vector, inside, shrinking, cost = optimum.vector, True, cost / optimum.cost - 1, optimum.cost
     began = time.perf_counter()
 
     def foretell(event: Progress) -> None:
@@ -137,6 +150,7 @@ def certify_optimum(
             gap=proven_gap(cost, proof.lower_bound),
             box=problem.box,
             seconds=proof.seconds,
+            shrinking=shrinking,
         ),
         proof,
         problem.objective.name,

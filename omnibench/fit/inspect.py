@@ -81,7 +81,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
     training = dataset.split("train") or trajectories
     span = driven_span(training)
     identifiable = identifiability(dataset.robot, training)
-    undriven = tuple(direction_in_words(direction, dataset.robot.wheel_names) for direction in span.null)
+    undriven = tuple(direction_in_words(direction, dataset.robot.drive.names) for direction in span.null)
     return Inspection(
         dataset=dataset.name,
         description=dataset.description,

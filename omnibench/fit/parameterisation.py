@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, Protocol
 
 import numpy as np
-from pydantic import Field, FiniteFloat, field_validator
+from pydantic import FiniteFloat
 
 from omnibench.config import Model
 from omnibench.errors import ConfigError
-from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrices
+from omnibench.fit.shrinkage.prior import prior_root, tolerance_of
+from omnibench.robot.kinematics import Array, Robot
 
 ParameterisationName = Literal["matrix", "geometry"]
 
-# Share of each parameter's scale: step of central differences, near the cube root of the rounding (Press et al.,
-# Numerical Recipes, 2007, section 5.7). Half of it and twice change nothing (tests/benchmarks/constants_fit.py).
-_STEP = 1e-6
 _PAPER_WIDTH = 0.10  # share of each start element: the box of the paper
 # Share of each row's largest element: the optimum of the recordings that are known is up to 18 % from the start
 # elements (configs/omni3.yaml).
 _ROW_WIDTH = 0.25
+_SKIDDING_WIDTH = 0.8  # the same for row 3 of a skid-steered robot, which turns by half of what its track says
 
 
 class ExplicitBox(Model):
@@ -32,22 +31,6 @@ class ExplicitBox(Model):
 
 
 Box = Literal["paper", "row"] | ExplicitBox
-Deviation = FiniteFloat | tuple[FiniteFloat, FiniteFloat]
-
-
-class GeometryLimits(Model):
-    """Largest deviation of the physical parameters from their design values: +-number, or [low, high]."""
-
-    radius: Deviation = Field(0.10, description="share of the wheel radius")
-    distance: Deviation = Field(0.20, description="share of the distance from wheel to centre")
-    angle_deg: Deviation = Field(3.0, description="degrees of the wheel's direction")
-
-    @field_validator("radius", "distance")
-    @classmethod
-    def _stays_positive(cls, deviation: Deviation) -> Deviation:
-        if _range(deviation)[0] <= -1:
-            raise ValueError("a wheel cannot lose its whole radius or distance; give a share below 1")
-        return deviation
 
 
 @dataclass(frozen=True)
@@ -74,6 +57,14 @@ class Parameterisation(Protocol):
 
     @property
     def bounds(self) -> Bounds: ...
+    @property
+    def prior_root(self) -> Array:
+        """A root (n, k) of the covariance that the numbers of such robots have about the design (prior.py)."""
+
+    @property
+    def projection(self) -> Array:
+        """The matrix (n, n) that takes from a deviation of the vector what leaves the matrix as it is."""
+
     def matrices(self, vectors: Array) -> Array:
         """Inverse kinematic matrices (P, 3, N) of vectors (P, n)."""
 
@@ -85,18 +76,21 @@ class Parameterisation(Protocol):
 class MatrixElements:
     """Elements of the matrix row by row, Eq. (4) and (5): the paper's non-parametric calibration.
 
-    null (q, N): orthonormal directions of wheel rates that the data do not identify; along them the matrix keeps its
-    start values.
+    null (q, M): orthonormal directions of drive signals that the data do not identify; along them the matrix keeps its
+    start values. known_mount: the matrix gives a robot that cannot slide only twists in which its fixed wheels do not,
+    the tracked point being where the robot says; False: it may be elsewhere. tolerance: see prior.py.
     """
 
     robot: Robot
     box: Box
     null: Array
+    known_mount: bool = True
+    tolerance: float | None = None
     name: ParameterisationName = field(default="matrix", init=False)
 
     @property
     def names(self) -> tuple[str, ...]:
-        return tuple(f"m{row}{column}" for row in (1, 2, 3) for column in range(1, len(self.robot.wheels) + 1))
+        return tuple(f"m{row}{column}" for row in (1, 2, 3) for column in range(1, len(self.robot.drive.names) + 1))
 
     @property
     def start(self) -> Array:
@@ -104,99 +98,37 @@ class MatrixElements:
 
     @property
     def bounds(self) -> Bounds:
-        return _checked(make_bounds(self.robot, self.box), self.start, self.names)
+        return checked(make_bounds(self.robot, self.box), self)
 
     def matrices(self, vectors: Array) -> Array:
-        """Matrices (P, 3, N): the elements, with their deviation along ``null`` removed."""
+        """Matrices (P, 3, M): the elements, without deviations along ``null`` and those that make wheels slide."""
         matrices = np.asarray(vectors, dtype=float).reshape(len(vectors), 3, -1)
-        if len(self.null) == 0:
-            return matrices
-        across = (matrices - self.robot.inverse_kinematic_matrix) @ self.null.T
-        return matrices - across @ self.null
+        if len(self.null):
+            across = (matrices - self.robot.inverse_kinematic_matrix) @ self.null.T
+            matrices = matrices - across @ self.null
+        if not (self.rows == np.eye(3)).all():
+            design = self.robot.inverse_kinematic_matrix
+            matrices = design + self.rows @ (matrices - design)
+        return matrices
 
     def slopes(self, vector: Array) -> Array:  # noqa: ARG002 (the matrix is linear in the vector)
-        """Derivatives (3N, 3N): the identity, less its part along ``null``."""
-        slopes: Array = np.kron(np.eye(3), np.eye(len(self.robot.wheels)) - self.null.T @ self.null)
-        return slopes
-
-
-@dataclass(frozen=True, eq=False)
-class WheelGeometry:
-    """Radius, distance and angle of each wheel, Eq. (3), within physical limits: parametric calibration."""
-
-    robot: Robot
-    limits: GeometryLimits | None = None
-    name: ParameterisationName = field(default="geometry", init=False)
+        """Derivatives (3M, 3M): the identity, less its part along ``null`` and across what the wheels allow."""
+        return self.projection
 
     @property
-    def names(self) -> tuple[str, ...]:
-        kinds = ("radius", "distance", "angle")
-        return tuple(f"{kind}_{wheel}" for kind in kinds for wheel in self.robot.wheel_names)
+    def projection(self) -> Array:
+        projection: Array = np.kron(self.rows, np.eye(len(self.robot.drive.names)) - self.null.T @ self.null)
+        return projection
 
     @property
-    def start(self) -> Array:
-        wheels = self.robot.wheels
-        return np.array([[w.radius for w in wheels], [w.distance for w in wheels], [w.angle for w in wheels]]).ravel()
+    def prior_root(self) -> Array:
+        return self.projection @ prior_root(self.robot, tolerance_of(self.robot, self.tolerance))
 
-    @property
-    def scale(self) -> Array:
-        """Scale (3N,) of each parameter: radii and distances their design values in m, angles 1 rad."""
-        wheels = self.robot.wheels
-        return np.array([[w.radius for w in wheels], [abs(w.distance) for w in wheels], [1.0] * len(wheels)]).ravel()
-
-    @property
-    def bounds(self) -> Bounds:
-        count = len(self.robot.wheels)
-        limits = self.limits or GeometryLimits()
-        low, high = np.array([_range(limits.radius), _range(limits.distance), np.radians(_range(limits.angle_deg))]).T
-        lower = self.start + np.repeat(low, count) * self.scale
-        upper = self.start + np.repeat(high, count) * self.scale
-        return _checked(Bounds("limits", lower, upper), self.start, self.names)
-
-    def matrices(self, vectors: Array) -> Array:
-        """Matrices (P, 3, N) by Eq. (3), or by the pseudo-inverse for other wheels."""
-        radius, distance, angle = np.moveaxis(np.asarray(vectors, dtype=float).reshape(len(vectors), 3, -1), 1, 0)
-        rollers = np.array([wheel.roller_angle for wheel in self.robot.wheels])
-        return inverse_kinematic_matrices(radius, distance, angle, rollers)
-
-    def slopes(self, vector: Array) -> Array:
-        """Derivatives (3N, 3N) by central differences."""
-        steps = _STEP * np.diag(self.scale)
-        difference = self.matrices(vector + steps) - self.matrices(vector - steps)
-        slopes: Array = (difference.reshape(len(steps), -1) / (2 * _STEP * self.scale)[:, None]).T
-        return slopes
-
-
-@dataclass(frozen=True)
-class FittedParameter:
-    """A physical parameter and its deviation from the design value, as in section 4.2 of the paper.
-
-    deviation: in the parameter's unit. deviation_percent: of the design value; of an angle, whose zero is a convention,
-    it means nothing, and stands for comparison with the paper's section 4.2.
-    """
-
-    name: str
-    value: float
-    unit: str
-    design: float
-    deviation: float
-    deviation_percent: float | None  # None where the design value is 0
-
-
-def fitted_parameters(robot: Robot, vector: Array) -> tuple[FittedParameter, ...]:
-    """The physical parameters in a vector (3N,) of the geometry parameterisation."""
-    geometry = WheelGeometry(robot)
-    return tuple(
-        FittedParameter(
-            name=name,
-            value=float(value),
-            unit="rad" if name.startswith("angle") else "m",
-            design=float(design),
-            deviation=float(value - design),
-            deviation_percent=float(100 * (value - design) / design) if design else None,
-        )
-        for name, value, design in zip(geometry.names, vector, geometry.start, strict=True)
-    )
+    @cached_property
+    def rows(self) -> Array:
+        """The matrix (3, 3) that takes from deviations what makes a fixed wheel slide; the identity where one may."""
+        guided = self.known_mount and not self.robot.slides
+        return self.robot.allowed_twists if guided else np.eye(3)
 
 
 def make_bounds(robot: Robot, box: Box) -> Bounds:
@@ -210,18 +142,15 @@ def make_bounds(robot: Robot, box: Box) -> Bounds:
     if box == "paper":
         width = _PAPER_WIDTH * np.abs(start)
     else:
-        width = np.repeat(_ROW_WIDTH * np.abs(start).max(axis=1, keepdims=True), start.shape[1], axis=1)
+        shares = np.full(3, _ROW_WIDTH)
+        shares[2] = _SKIDDING_WIDTH if robot.skid else _ROW_WIDTH
+        width = np.repeat((shares * robot.row_scales)[:, None], start.shape[1], axis=1)
     return Bounds(box, (start - width).ravel(), (start + width).ravel())
 
 
-def _range(deviation: float | tuple[float, float]) -> tuple[float, float]:
-    """Lowest and highest deviation."""
-    return deviation if isinstance(deviation, tuple) else (-abs(deviation), abs(deviation))
-
-
-def _checked(bounds: Bounds, start: Array, names: Sequence[str]) -> Bounds:
+def checked(bounds: Bounds, searched: Parameterisation) -> Bounds:
     """The bounds; ConfigError if they are reversed or exclude the start."""
-    for name, low, high, value in zip(names, bounds.lower, bounds.upper, start, strict=True):
+    for name, low, high, value in zip(searched.names, bounds.lower, bounds.upper, searched.start, strict=True):
         if low > high:
             raise ConfigError(f"box: lower bound {low:g} of {name} is above its upper bound {high:g}")
         if not low <= value <= high:

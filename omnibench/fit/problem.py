@@ -15,20 +15,21 @@ from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.cost import Cost, SumOfNorms
+from omnibench.fit.evaluator.driven_frame import DrivenFrame
 from omnibench.fit.evaluator.element_box import ElementBox
 from omnibench.fit.evaluator.evaluator import PoseEvaluator, make_evaluator
+from omnibench.fit.geometry import GeometryLimits, WheelGeometry
 from omnibench.fit.parameterisation import (
     Box,
-    GeometryLimits,
     MatrixElements,
     Parameterisation,
     ParameterisationName,
-    WheelGeometry,
 )
+from omnibench.fit.shrinkage.prior import MountChoice, default_mount
 from omnibench.fit.span import Unidentified, directions_kept, driven_span
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import Integration
+from omnibench.robot.odometry import Integration, OdometryBatch
 
 _PROGRESS_PERIOD = 0.1  # s, least time between two reports of progress: ten a second are all that a reader sees
 # Evaluations from which on the fast evaluator repays the time it takes to build. Both ways give the same costs to 1e-11
@@ -77,6 +78,7 @@ class CalibrationProblem:
     best_vector, best_cost: the best candidate in the box so far; the start and infinity before the first.
     history: every improvement of the best cost.
     watch: told the evaluations and the best cost so far, at most every 0.1 s.
+    shrinks: True if the answer is shrunk to the design afterwards (shrinkage.py).
     """
 
     def __init__(
@@ -89,6 +91,7 @@ class CalibrationProblem:
         integration: Integration,
         budget: Budget,
         seed: int,
+        shrinks: bool = False,
         watch: Reporter = no_progress,
     ) -> None:
         if not trajectories:
@@ -97,6 +100,7 @@ class CalibrationProblem:
         self.trajectories = tuple(trajectories)
         self.objective = cost
         self.parameterisation = parameterisation
+        self.shrinks = shrinks
         self.integration: Integration = integration
         self.budget = budget
         self.seed = seed
@@ -117,6 +121,7 @@ class CalibrationProblem:
         self.best_cost = np.inf
         self.history: list[Improvement] = []
         self._evaluator: PoseEvaluator | None = None
+        self._frame: DrivenFrame | None = None  # of the evaluator's matrices, where directions are kept
         self._evaluator_tried = False
         self._watch = watch
         self._began = time.perf_counter()  # s, of that clock, when the problem was made
@@ -169,9 +174,13 @@ class CalibrationProblem:
         """
         if not self._evaluator_tried:
             self._evaluator_tried = True
-            box = ElementBox.of(self.parameterisation, self.lower, self.upper)
-            logs = self.objective.logs(self.trajectories)
-            self._evaluator = make_evaluator(self.odometry, logs, self.integration, box)
+            logs, odometry, searched = self.objective.logs(self.trajectories), self.odometry, self.parameterisation
+            if isinstance(searched, MatrixElements) and len(searched.null):
+                self._frame = DrivenFrame.of(searched)
+                logs = self._frame.logs(logs)
+                odometry = OdometryBatch(logs, self.integration)
+            box = ElementBox.of(self._frame or searched, self.lower, self.upper)
+            self._evaluator = make_evaluator(odometry, logs, self.integration, box)
         return self._evaluator
 
     def to_unit(self, vectors: Array) -> Array:
@@ -218,8 +227,10 @@ class CalibrationProblem:
         return self.parameterisation.matrices(vector[None])[0]
 
     def settled(self, vector: Array) -> Array:
-        """For matrix elements: those of the vector's matrix (n,), or the clipped vector if these leave the box."""
+        """The clipped vector (n,); for matrix elements those of its matrix, unless these leave the box."""
         vector = np.clip(vector, self.lower, self.upper)
+        if self.parameterisation.name != "matrix":
+            return vector
         elements = self.matrix(vector).ravel()
         return elements if bool(self.inside(elements[None])[0]) else vector
 
@@ -227,11 +238,12 @@ class CalibrationProblem:
         """Costs (P,) by the fast evaluator for candidates in its box, by direct integration for the others."""
         with np.errstate(all="ignore"):
             matrices = self.parameterisation.matrices(candidates)
-            covered = evaluator.covers(matrices)
+            seen = matrices if self._frame is None else self._frame.seen(matrices)
+            covered = evaluator.covers(seen)
             if covered.all():
-                return self._costs_of_poses(evaluator.poses(matrices))
+                return self._costs_of_poses(evaluator.poses(seen))
             values = np.empty(len(candidates))
-            values[covered] = self._costs_of_poses(evaluator.poses(matrices[covered]))
+            values[covered] = self._costs_of_poses(evaluator.poses(seen[covered]))
             values[~covered] = self._costs_of_poses(self.odometry.poses(matrices[~covered]))
             return values
 
@@ -243,12 +255,13 @@ class CalibrationProblem:
     def _relevant(self) -> NDArray[np.bool_]:
         """True (n,) for elements that the cost depends on: for a cost of headings alone, those of row 3."""
         cost = self.objective
-        if not (
-            isinstance(cost, SumOfNorms) and 0.0 in cost.weights and isinstance(self.parameterisation, MatrixElements)
-        ):
+        if not isinstance(self.parameterisation, MatrixElements):
             return np.ones(len(self.start), dtype=bool)
+        used = np.repeat(self.parameterisation.rows.any(axis=0), len(self.robot.drive.names))
+        if not isinstance(cost, SumOfNorms) or 0.0 not in cost.weights:
+            return used
         slopes: Array = np.abs(self.odometry.jacobian(self.matrix(self.start))).max(axis=0)  # (3, 3, N)
-        return np.asarray((np.abs(cost.weights) @ slopes.reshape(3, -1)) > 0)
+        return np.asarray(used & ((np.abs(cost.weights) @ slopes.reshape(3, -1)) > 0))
 
     def _check_budget(self) -> None:
         """Raise BudgetSpent if no evaluations or no seconds are left."""
@@ -295,16 +308,21 @@ def make_parameterisation(
     box: Box = "row",
     limits: GeometryLimits | None = None,
     unidentified: Unidentified = "keep",
+    mount: MountChoice | None = None,
+    tolerance: float | None = None,
 ) -> Parameterisation:
     """The parameterisation called ``name``. ConfigError when its box excludes the start.
 
     unidentified: for directions of wheel rates that the trajectories drive so little that slip alone may explain it,
-    ``keep`` holds the matrix at the design values along them, ``fit`` fits it. The geometry always fits them: it cannot
-    hold values along a direction.
+    ``keep`` and ``shrink`` hold the matrix at the design values along them, ``fit`` fits it. The geometry always fits
+    them: it cannot hold values along a direction. mount: whether the tracked point of a robot that cannot slide is
+    where the robot says, or fitted; default: see ``default_mount``. tolerance: of the design, see prior.py.
     """
+    mount = mount or default_mount(robot)
     if name == "geometry":
-        return WheelGeometry(robot, limits)
-    return MatrixElements(robot, box, directions_kept(robot, driven_span(trajectories), unidentified))
+        return WheelGeometry(robot, limits, mount == "fit", tolerance)
+    null = directions_kept(robot, driven_span(trajectories), unidentified)
+    return MatrixElements(robot, box, null, mount == "known", tolerance)
 
 
 def _frozen(array: NDArray[Any]) -> NDArray[Any]:

@@ -1,4 +1,4 @@
-"""Span of the wheel rates that recordings drive: outside it the matrix is not determined."""
+"""Span of the drive signals that recordings drive: outside it the matrix is not determined."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
-from omnibench.robot.kinematics import Array, Robot, wheel_equations
+from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.planar import interpolated
 
-Unidentified = Literal["keep", "fit"]
+Unidentified = Literal["keep", "fit", "shrink"]
 State = Literal["driven", "weak", "undriven"]
 
 # Share of the strongest direction below which a direction holds noise and no motion. Half of it changes nothing; with
@@ -91,7 +91,7 @@ def driven_span(trajectories: Sequence[Trajectory]) -> DrivenSpan:
 def directions_kept(robot: Robot, span: DrivenSpan, unidentified: Unidentified) -> Array:
     """Directions (q, N), orthonormal, along which a calibration keeps the design values.
 
-    unidentified: ``fit`` keeps them along undriven directions only, ``keep`` along weak ones too.
+    unidentified: ``fit`` keeps them along undriven directions only, the others along weak ones too.
     """
     if unidentified == "fit" or len(span.weak) == 0:
         return span.null
@@ -115,7 +115,7 @@ def aligned(space: Array, robot: Robot) -> Array:
     while len(left):
         inside = motions @ left.T
         reach = np.linalg.norm(inside, axis=1)
-        best = int((reach + np.array([0.0, 0.0, 1e-9])).argmax())  # ties go to turning on the spot
+        best = int((reach + np.array([*[0.0] * (len(motions) - 1), 1e-9])).argmax())  # ties go to turning on the spot
         direction = motions[best] if reach[best] > _SAME_DIRECTION else inside[best] @ left
         if reach[best] < 1e-6:  # no motion without slip is left
             direction = left[0]
@@ -155,7 +155,7 @@ def wheel_directions(robot: Robot, span: DrivenSpan) -> tuple[WheelDirection, ..
     return tuple(
         WheelDirection(
             rates,
-            direction_in_words(rates, robot.wheel_names),
+            direction_in_words(rates, robot.drive.names),
             motion_in_words(rates, robot),
             span.share(rates),
             span.state(rates),
@@ -184,9 +184,9 @@ def motion_in_words(direction: Array, robot: Robot) -> str:
     Empty if the robot would not move because the wheels only slip.
     """
     x, y, turn = robot.inverse_kinematic_matrix @ direction
-    reach = float(np.mean([wheel.distance for wheel in robot.wheels]))
+    reach = robot.reach
     speed, spin = math.hypot(x, y), abs(turn) * reach
-    rolled = float(np.mean([wheel.radius for wheel in robot.wheels]) * np.linalg.norm(direction))
+    rolled = float(robot.radii.mean() * np.linalg.norm(direction))
     if max(speed, spin) < _NO_MOTION * rolled:
         return ""
     if speed < _ALMOST * spin:
@@ -201,9 +201,9 @@ def motion_in_words(direction: Array, robot: Robot) -> str:
 
 
 def _motions(robot: Robot) -> Array:
-    """Wheel rates (3, N) of length one that move the designed robot along x, along y, on the spot."""
-    rates = wheel_equations(robot.wheels).T
-    motions: Array = rates / np.linalg.norm(rates, axis=1, keepdims=True)
+    """Signals (D, M) of length one that move the designed robot along x, along y where it can, and on the spot."""
+    signals = robot.motions @ robot.signal_equations.T
+    motions: Array = signals / np.linalg.norm(signals, axis=1, keepdims=True)
     return motions
 
 
@@ -216,7 +216,7 @@ def _signed(directions: Array) -> Array:
 
 def _angles_at_poses(trajectory: Trajectory) -> Array:
     """Wheel angles (K, N) driven up to each reference pose, rad."""
-    driven = np.cumsum(trajectory.rates * np.diff(trajectory.times, prepend=0.0)[:, None], axis=0)
+    driven = np.cumsum(trajectory.signals * np.diff(trajectory.times, prepend=0.0)[:, None], axis=0)
     times = np.concatenate([[0.0], trajectory.times])
     angles = np.vstack([np.zeros(driven.shape[1]), driven])
     return interpolated(trajectory.pose_times, times, angles)

@@ -8,7 +8,6 @@ import time
 from omnibench.live.config import LiveConfig, RobotConfig
 from omnibench.live.estimation.saved_state import RobotMemory
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.estimation.wheel_input import check_joints
 from omnibench.robot.calibration import read_calibration
 
 LOG = logging.getLogger("omnibench.live")
@@ -20,9 +19,6 @@ def make_tracker(config: LiveConfig, robot: RobotConfig, memory: RobotMemory | N
     ConfigError or DataError: the calibration cannot be read, or the joints are not one for each wheel.
     """
     calibration = read_calibration(robot.calibration) if memory is None else memory.calibration(robot.calibration)
-    if robot.wheels.joints is not None:
-        wheels = calibration.robot.wheel_names
-        check_joints(robot.wheels.joints, wheels, f"robot {robot.name!r}: wheels.joints")
     tracker = RobotTracker(
         robot.name,
         calibration,

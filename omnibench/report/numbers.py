@@ -31,6 +31,11 @@ def significant(value: float | None, digits: int = 3, signed: bool = False) -> s
     return f"{mantissa} × 10{str(exponent).translate(_SUPERSCRIPT)}"
 
 
+def plain(value: float) -> str:
+    """A given value, as short as it can be written, with a typographic minus sign."""
+    return f"{value:g}".replace("-", "−")
+
+
 def decimals_for(value: float | None, digits: int = 3) -> int:
     """The decimals (at most 9) that show ``value`` to ``digits`` significant digits, for a column that shares them."""
     if value is None or not math.isfinite(value) or value == 0:

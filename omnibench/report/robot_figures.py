@@ -10,7 +10,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from omnibench.report.blocks import Figure, LegendItem
-from omnibench.report.numbers import fixed
+from omnibench.report.numbers import fixed, plain
 from omnibench.report.style import INK, PALETTE, QUIET, THEORETICAL, plan, text
 from omnibench.report.traces import arrows, joined, line
 from omnibench.robot.kinematics import Array, Robot, Wheel
@@ -24,9 +24,14 @@ _COMMAND = LegendItem("command", "motion command (v, α, ω)", PALETTE[2])
 DESIGN = LegendItem("design", "design values", THEORETICAL)
 
 
+def is_placed(wheel: Wheel) -> bool:
+    """True if it is known where a wheel stands; a mecanum wheel's distance is a lever arm."""
+    return wheel.kind != "mecanum" or wheel.x is not None
+
+
 def is_drawn(robot: Robot) -> bool:
-    """True for omni wheels, whose position is known; a mecanum wheel's distance is a lever arm."""
-    return not any(wheel.roller_angle for wheel in robot.wheels)
+    """True if it is known where every wheel stands."""
+    return all(map(is_placed, robot.wheels))
 
 
 def motion_system(robot: Robot) -> tuple[Figure, list[LegendItem]]:
@@ -34,10 +39,10 @@ def motion_system(robot: Robot) -> tuple[Figure, list[LegendItem]]:
     size = _size(robot)
     traces = [_outlines(DESIGN, robot)]
     traces += arrows(_FRAME, np.zeros((2, 2)), _up(0.55 * size * np.eye(2)), ["X_R, front", "Y_R, left"])
-    middles = np.array([_place(wheel) for wheel in robot.wheels])
-    ways = np.array([_rolling(wheel) for wheel in robot.wheels])
-    starts = middles + 0.22 * size * _outward(robot)
-    words = [f"V_{wheel.name}: rate times radius" for wheel in robot.wheels]
+    middles = np.array([wheel.position for wheel in robot.measured])
+    ways = np.array([_along(wheel.rolling) for wheel in robot.measured])
+    starts = middles + 0.22 * size * np.array([_along(wheel.outward) for wheel in robot.measured])
+    words = [f"V_{wheel.name}: rate times radius" for wheel in robot.measured]
     traces += arrows(_ROLLING, _up(starts - 0.18 * size * ways), _up(starts + 0.18 * size * ways), words)
     direction = math.radians(_DIRECTION)
     tip = 0.62 * size * _along(direction)[None]
@@ -51,32 +56,36 @@ def motion_system(robot: Robot) -> tuple[Figure, list[LegendItem]]:
         _label(1.22 * tip[0], "v, α", _COMMAND.colour),
         _label(turning[-1] * 1.3, "ω", _COMMAND.colour),
     ]
-    for wheel, start, way in zip(robot.wheels, starts, ways, strict=True):
+    for wheel, start, way in zip(robot.measured, starts, ways, strict=True):
         labels.append(_label(start + 0.3 * size * way, f"V<sub>{text(wheel.name)}</sub>", _ROLLING.colour))
-        labels.append(_label(_place(wheel), text(wheel.name), INK))
+    labels += [_label(np.array(wheel.position), text(wheel.name), INK) for wheel in robot.wheels]
     figure = _seen_from_above(traces, labels, size)
-    description = f"{robot.name} from above: wheels {', '.join(robot.wheel_names)}, frame, directions of rolling"
+    names = ", ".join(wheel.name for wheel in robot.wheels)
+    description = f"{robot.name} from above: wheels {names}, frame, directions of rolling"
     return Figure("The motion system", figure, description, 460), [DESIGN, _FRAME, _ROLLING, _COMMAND]
 
 
 def parameters(robot: Robot, fitted: Sequence[tuple[LegendItem, Robot]] = ()) -> Figure:
-    """Radius, distance and angle of every wheel as designed; fitted: robots whose wheels are drawn over these."""
+    """Radius and place of every wheel as designed; fitted: robots whose wheels are drawn over these."""
     size = _size(robot)
     traces, labels = [_outlines(DESIGN, robot, filled=True)], []
     traces += [_outlines(item, of_fit) for item, of_fit in fitted]
     traces += arrows(_FRAME, np.zeros((1, 2)), _up(np.array([[0.4 * size, 0.0]])), ["X_R, front"])
     for number, wheel in enumerate(robot.wheels):
-        place = _place(wheel)
-        angle = wheel.angle % (2 * math.pi)
-        reach = (0.2 + 0.1 * number) * size
+        place, name = np.array(wheel.position), text(wheel.name)
         traces.append(line(_FRAME, 1.2, *_up(np.array([[0.0, 0.0], place])).T, line_dash="dot"))
-        traces.append(line(_FRAME, 1.0, *_up(_arc(reach, 0.0, angle)).T))
-        name, before = text(wheel.name), angle - 0.35  # rad before the arc's end: beside the line to the wheel
-        labels.append(_label((reach + 0.08 * size) * _along(before), f"δ<sub>{name}</sub>", QUIET))
-        labels.append(_label(0.6 * place + 0.1 * size * _rolling(wheel), f"R<sub>{name}</sub>", INK))
-        values = f"r {wheel.radius:g} m<br>R {wheel.distance:g} m<br>δ {fixed(math.degrees(angle), 1)}°"
-        labels.append(_label(place + 0.65 * size * _along(angle), f"<b>{name}</b> {values}", DESIGN.colour))
-    description = f"Radius r, distance R and angle δ of each wheel of {robot.name}"
+        if wheel.distance is not None:
+            angle = wheel.axle % (2 * math.pi)
+            reach, before = (0.2 + 0.1 * number) * size, angle - 0.35  # rad before the arc's end: beside that line
+            traces.append(line(_FRAME, 1.0, *_up(_arc(reach, 0.0, angle)).T))
+            labels.append(_label((reach + 0.08 * size) * _along(before), f"δ<sub>{name}</sub>", QUIET))
+            labels.append(_label(0.6 * place + 0.1 * size * _along(wheel.rolling), f"R<sub>{name}</sub>", INK))
+            values = f"r {wheel.radius:g} m<br>R {wheel.distance:g} m<br>δ {fixed(math.degrees(angle), 1)}°"
+        else:
+            x, y = map(plain, wheel.position)
+            values = f"r {wheel.radius:g} m<br>x {x} m<br>y {y} m"
+        labels.append(_label(place + 0.65 * size * _along(wheel.outward), f"<b>{name}</b> {values}", DESIGN.colour))
+    description = f"Radius and place of each wheel of {robot.name}"
     return Figure("Its parameters", _seen_from_above(traces, labels, size), description, 460)
 
 
@@ -87,29 +96,16 @@ def _along(angle: float) -> Array:
 
 def _size(robot: Robot) -> float:
     """Distance of the farthest wheel, m."""
-    return max(wheel.distance for wheel in robot.wheels)
-
-
-def _place(wheel: Wheel) -> Array:
-    return wheel.distance * _along(wheel.angle)
-
-
-def _rolling(wheel: Wheel) -> Array:
-    """Unit vector in which a positive rate drives the robot at the wheel: counter-clockwise about the centre."""
-    return _along(wheel.angle + math.pi / 2)
-
-
-def _outward(robot: Robot) -> Array:
-    return np.array([_along(wheel.angle) for wheel in robot.wheels])
+    return max(math.hypot(*wheel.position) for wheel in robot.wheels)
 
 
 def _outlines(item: LegendItem, robot: Robot, filled: bool = False) -> go.Scatter:
-    """The wheels as rectangles: their diameter along the direction of rolling."""
+    """The wheels as rectangles: their diameter along the direction of rolling; those that steer straight ahead."""
     corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1]])
     rectangles = []
-    for wheel, outward in zip(robot.wheels, _outward(robot), strict=True):
-        sides = wheel.radius * np.array([_rolling(wheel), _WIDTH * outward])
-        rectangles.append(_up(_place(wheel) + corners @ sides))
+    for wheel in robot.wheels:
+        sides = wheel.radius * np.array([_along(wheel.rolling), _WIDTH * _along(wheel.axle)])
+        rectangles.append(_up(np.array(wheel.position) + corners @ sides))
     looks: dict[str, Any] = {"fill": "toself", "fillcolor": "rgba(0,135,95,0.12)"} if filled else {}
     return line(item, 2.0, *joined(rectangles).T, **looks)
 

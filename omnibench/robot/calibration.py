@@ -7,7 +7,15 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    FiniteFloat,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from omnibench.config import Model, NonNegative, parse_yaml, printable, read_yaml, to_yaml, validate
 from omnibench.errors import ConfigError, DataError, require_type
@@ -84,6 +92,10 @@ class Provenance(Model):
     seed: int
     cost: str
     box: str
+    unidentified: Literal["keep", "fit", "shrink"] = Field("keep", description="what the data hardly tell")
+    tolerance: float | None = Field(None, description="of the design, for shrink; None: that of the robot's class")
+    mount: Literal["known", "fit"] | None = Field(None, description="tracked point of a robot that cannot slide")
+    unshrunk_cost: float | None = Field(None, description="training cost before it was shrunk to the design")
     on_bounds: tuple[str, ...] = Field((), description="fitted numbers on a bound of the box")
     versions: dict[str, str] = {}
     training_cost: float | None = None
@@ -91,6 +103,12 @@ class Provenance(Model):
     outcome: str
     reason: str = ""
     held_out: HeldOutVerdict | None = None
+
+
+def _signal_names(content: dict[str, Any]) -> tuple[str, ...] | None:
+    """Names of the drive signals of a calibration's robot; None where they are its wheels."""
+    robot: Robot | None = content.get("robot")  # missing if it is wrong
+    return None if robot is None or robot.drive.direct else robot.drive.names
 
 
 class Calibration(Model):
@@ -101,7 +119,10 @@ class Calibration(Model):
     created: datetime = Field(default_factory=lambda: datetime.now(UTC).replace(microsecond=0))
     robot: Robot
     sample_period: float = Field(ge=SAMPLE_PERIODS[0], le=SAMPLE_PERIODS[1], description="s")
-    matrix: tuple[Row, Row, Row] = Field(description="3 x N: m (rows 1, 2) and rad (row 3) per rad of wheel")
+    matrix: tuple[Row, Row, Row] = Field(description="3 x M: m (rows 1, 2) and rad (row 3) per rad of wheel")
+    signals: tuple[str, ...] | None = Field(
+        default_factory=_signal_names, description="names of the M columns, where they are not the N wheels"
+    )
     integration: Integration
     effects: tuple[EffectTerm, ...] = ()
     noise: Noise | None = None
@@ -114,21 +135,33 @@ class Calibration(Model):
 
     @model_validator(mode="after")
     def _shapes_agree(self) -> Calibration:
-        wheels = len(self.robot.wheels)
+        signals = self.robot.drive.names
+        if self.signals not in (_signal_names({"robot": self.robot}), signals):
+            raise ValueError(
+                f"signals are {', '.join(self.signals or ()) or 'none'}, but the columns of this robot's matrix are "
+                f"{', '.join(signals)}; put them in this order"
+            )
         for index, row in enumerate(self.matrix, 1):
-            if len(row) != wheels:
+            if len(row) != len(signals):
+                what = "wheel" if self.robot.drive.direct else "drive signal"
                 raise ValueError(
                     f"row {index} of the matrix has {plural(len(row), 'value')}, "
-                    f"the robot has {plural(wheels, 'wheel')}"
+                    f"the robot has {plural(len(signals), what)}"
                 )
         if flaw := matrix_flaw(self.matrix_array):
             raise ValueError(f"matrix holds {flaw}")
         if self.covariance is not None:
-            size = 3 * wheels + sum(len(term.parameters) for term in self.effects)
+            size = 3 * len(signals) + sum(len(term.parameters) for term in self.effects)
             if [len(row) for row in self.covariance] != [size] * size:
                 raise ValueError(f"covariance is not {size} x {size}")
             _check_covariance(np.array(self.covariance))
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_wheels_as_signals(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Without signals where they are the wheels, so that these files stay as they were."""
+        written: dict[str, Any] = write(self)
+        return {key: value for key, value in written.items() if key != "signals" or not self.robot.drive.direct}
 
     @property
     def model(self) -> OdometryModel:
@@ -139,24 +172,29 @@ class Calibration(Model):
 
     @property
     def matrix_array(self) -> Array:
-        """The matrix as an array (3, N)."""
+        """The matrix as an array (3, M)."""
         return np.array(self.matrix)
 
     def check_wheels(self, robot: Robot, owner: str, place: str = "") -> None:
-        """DataError: the calibration is for other wheels than a robot's.
+        """DataError: the calibration is for other wheels than a robot's, or for wheels that drive it in another way.
 
         owner: whose wheels these are, for the message. place: what the message begins with, as an option.
         """
-        ours, theirs = self.robot.wheel_names, robot.wheel_names
-        if ours != theirs:
-            raise DataError(
-                f"{place}calibration {self.name!r} is for wheels {', '.join(ours)}, {owner} has {', '.join(theirs)}; "
-                "take a calibration of the same robot"
-            )
+        ours, theirs = self.robot.drive, robot.drive
+        for what, one, other in (
+            ("wheels", ours.wheels, theirs.wheels),
+            ("steered wheels", ours.steered, theirs.steered),
+            ("drive signals", ours.names, theirs.names),
+        ):
+            if one != other:
+                raise DataError(
+                    f"{place}calibration {self.name!r} is for {what} {', '.join(one) or 'none'}, {owner} has "
+                    f"{', '.join(other) or 'none'}; take a calibration of the same robot"
+                )
 
 
 def matrix_flaw(matrix: Array) -> str:
-    """The flaw of a matrix (3, N) that no robot can have, as what it holds; empty if there is none."""
+    """The flaw of a matrix (3, M) that no robot can have, as what it holds; empty if there is none."""
     if np.abs(matrix).max() > _LARGEST_ELEMENT:
         return f"{np.abs(matrix).max():g}, which no wheel can drive in m or rad per rad"
     return "" if matrix.any() else "zeros only: no wheel would move the robot"
@@ -183,7 +221,7 @@ def fitted_calibration(name: str, **fields: Any) -> Calibration:
 
 
 def matrix_rows(matrix: Array) -> tuple[Row, Row, Row]:
-    """A matrix (3, N) as rows of a document."""
+    """A matrix (3, M) as rows of a document."""
     first, second, third = (tuple(float(value) for value in row) for row in matrix)
     return first, second, third
 

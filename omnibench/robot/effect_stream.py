@@ -27,19 +27,27 @@ class EffectStream(OdometryStream):
     def __init__(
         self, terms: Sequence[Term], signals: SignalStream, integration: Integration, start: Array | None = None
     ) -> None:
-        super().__init__(signals.matrix, integration, start)
+        super().__init__(signals.matrix, integration, start, signals.robot.drive)
         self._terms, self._signals = tuple(terms), signals
         self._needs_poses = any("poses" in term.effect.needs for term in self._terms)
         self._left_at: Array | None = None
 
-    def drive(self, angles: Array, duration: float | None = None, wheel_angles: Array | None = None) -> Array:
+    def drive(
+        self,
+        angles: Array,
+        duration: float | None = None,
+        wheel_angles: Array | None = None,
+        steering: Array | None = None,
+    ) -> Array:
         if duration is None:
             raise ValueError("a model with effects needs the duration of every sample")
         angles = np.asarray(angles, dtype=float)
         if duration <= 0:
-            return self._take_at_once(angles, wheel_angles)
+            return self._take_at_once(angles, wheel_angles, steering)
         self._follow()
-        signals = self._signals.next(angles / duration, duration, wheel_angles, self.frame_heading)
+        middle = self.steer(steering)
+        self.driven = self.driven_signals(angles, middle)
+        signals = self._signals.next(angles / duration, duration, wheel_angles, self.frame_heading, middle)
         twists, drift = corrected_twists(self._terms, signals, self.matrix)
         before, moved = self.pose, twists[0] * duration
         self.pose = advance(before, moved, self.integration)
@@ -50,12 +58,12 @@ class EffectStream(OdometryStream):
         self.moved, self._left_at = moved, self.pose
         return self.pose
 
-    def _take_at_once(self, angles: Array, wheel_angles: Array | None) -> Array:
+    def _take_at_once(self, angles: Array, wheel_angles: Array | None, steering: Array | None) -> Array:
         """Advance by wheel angles (N,) rad that take no time: without rates no effect acts, and the matrix stands."""
         self._follow()
         self._signals.turn(angles, wheel_angles)
-        self._signals.move(self.matrix @ angles)
-        self._left_at = super().drive(angles)
+        self._left_at = super().drive(angles, steering=steering)
+        self._signals.move(self.moved)
         return self.pose
 
     def _follow(self) -> None:

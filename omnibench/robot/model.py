@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from omnibench.robot.signals import SignalStream, signals_of
 
 @dataclass(frozen=True, eq=False)
 class OdometryModel:
-    """A robot's odometry: ``matrix`` (3, N) in m and rad per rad of wheel, integration of a sample, and effects.
+    """A robot's odometry: ``matrix`` (3, M) in m and rad per rad, integration of a sample, and effects.
 
     terms: effects of any stage; those of stage actuator are for simulation and ignored here. sample_period: nominal, s;
     needed with effects.
@@ -71,7 +72,7 @@ class OdometryModel:
         """
         if not self.reference_terms:
             return self.poses(logs)
-        return [self._reported(log) for log in logs]
+        return [reported_poses(self.reference_terms, log, self._path) for log in logs]
 
     def stream(
         self, start: Array | None = None, session: str | None = None, session_time: float = 0.0
@@ -81,7 +82,7 @@ class OdometryModel:
         session: its name; None if it is unknown to the calibration. session_time: at the stream's start, s.
         """
         if not self.motion_terms:
-            return OdometryStream(self.matrix, self.integration, start)
+            return OdometryStream(self.matrix, self.integration, start, self.robot.drive)
         assert self.sample_period is not None  # there are terms
         signals = SignalStream(self.robot, self.matrix, self.sample_period, session, session_time)
         return EffectStream(self.motion_terms, signals, self.integration, start)
@@ -90,7 +91,7 @@ class OdometryModel:
         """The path of a log under the effects of motion."""
         durations = np.diff(log.times, prepend=0.0)[:, None]
         if not self.motion_terms:
-            return Path(log.times, log.start, (log.rates @ self.matrix.T) * durations, self.integration)
+            return Path(log.times, log.start, (log.signals @ self.matrix.T) * durations, self.integration)
         assert self.sample_period is not None  # there are terms
         check_needs(self.motion_terms, log)
         with_poses = any("poses" in term.effect.needs for term in self.motion_terms)
@@ -99,17 +100,24 @@ class OdometryModel:
         world = None if drift is None else drift * durations
         return Path(log.times, log.start, twists * durations, self.integration, world)
 
-    def _reported(self, log: WheelLog) -> Array:
-        """Poses (S, 3) of one log as the effects of the reference report them."""
-        taken, heading_taken = log.stamps, log.stamps
-        for term in self.reference_terms:
-            assert isinstance(term.effect, ReferenceEffect)
-            of_position, of_heading = term.effect.delays(log.stamps, term.values)
-            taken, heading_taken = taken - of_position, heading_taken - of_heading
-        path = self._path(log.continued(max(taken.max(initial=0.0), heading_taken.max(initial=0.0))))
-        poses = path.poses(taken)
-        poses[:, 2] = path.poses(heading_taken)[:, 2]
-        for term in self.reference_terms:
-            assert isinstance(term.effect, ReferenceEffect)
-            poses = term.effect.reported(poses, log.start, term.values)
-        return poses
+
+class PosesOfPath(Protocol):
+    """A path: its poses (S, 3) at stamps (S,), s, in any order."""
+
+    def poses(self, stamps: Array, /) -> Array: ...
+
+
+def reported_poses(terms: Sequence[Term], log: WheelLog, path_of: Callable[[WheelLog], PosesOfPath]) -> Array:
+    """Poses (S, 3) of a log as effects of the reference report them. path_of: the path that a log drives."""
+    taken, heading_taken = log.stamps, log.stamps
+    for term in terms:
+        assert isinstance(term.effect, ReferenceEffect)
+        of_position, of_heading = term.effect.delays(log.stamps, term.values)
+        taken, heading_taken = taken - of_position, heading_taken - of_heading
+    path = path_of(log.continued(max(taken.max(initial=0.0), heading_taken.max(initial=0.0))))
+    poses = path.poses(taken)
+    poses[:, 2] = path.poses(heading_taken)[:, 2]
+    for term in terms:
+        assert isinstance(term.effect, ReferenceEffect)
+        poses = term.effect.reported(poses, log.start, term.values)
+    return poses

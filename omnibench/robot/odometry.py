@@ -1,7 +1,7 @@
-"""Odometry from wheel rates, Eq. (1) and (2): many trajectories and candidates at once, or one sample at a time.
+"""Odometry from drive signals, Eq. (1) and (2): many trajectories and candidates at once, or one sample at a time.
 
-With a(k) the wheel angles driven in sample k (rad), C(k) their sum up to sample k and m3 row 3 of the matrix, the
-heading is theta(k) = theta(0) + m3.C(k), and sample k moves the robot by
+With a(k) the signals of sample k times its duration (rad: wheel angles, for most robots), C(k) their sum up to sample k
+and m3 row 3 of the matrix, the heading is theta(k) = theta(0) + m3.C(k), and sample k moves the robot by
 
     dx + i dy = (m1 + i m2).a(k) * s * exp(i psi),
 
@@ -14,12 +14,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array
+from omnibench.robot.wheels.drive import Drive, in_the_middle
 
 Integration = Literal["euler", "arc"]
 Complex = NDArray[np.complex128]
@@ -36,6 +38,8 @@ class WheelLog:
     start (3,): pose at t = 0 (m, m, rad). stamps (S,): when poses are wanted, s, increasing, >= 0.
     Needed by some effects only, None if unknown: wheel_angles (F, N): absolute, at the end of each sample, rad.
     started_at: s since the session's start. session: its name.
+    Of robots with measured steering angles: steering (F, S): at the end of each sample, rad. drive: the robot's drive
+    signals; None where the rates are the signals.
     """
 
     times: Array
@@ -45,6 +49,18 @@ class WheelLog:
     wheel_angles: Array | None = None
     started_at: float | None = None
     session: str | None = None
+    steering: Array | None = None
+    drive: Drive | None = None
+
+    @cached_property
+    def middle_steering(self) -> Array | None:
+        """Steering angles (F, S) in the middle of each sample, rad; None where none are measured."""
+        return None if self.steering is None else in_the_middle(self.steering)
+
+    @cached_property
+    def signals(self) -> Array:
+        """Drive signals (F, M): the rates, or what they and the steering angles make."""
+        return self.rates if self.drive is None else self.drive.signals(self.rates, self.middle_steering)
 
     def continued(self, until: float) -> WheelLog:
         """The log with one more sample of the last mean rate up to ``until`` (s), where its samples end before.
@@ -61,6 +77,7 @@ class WheelLog:
             times=np.append(self.times, until),
             rates=np.vstack([self.rates, rates]),
             wheel_angles=None if angles is None else np.vstack([angles, angles[-1] + rates * (until - end)]),
+            steering=None if self.steering is None else np.vstack([self.steering, self.steering[-1]]),
         )
 
 
@@ -70,7 +87,7 @@ class OdometryBatch:
     A stamp within a sample is reached by constant twist from the sample's start; one after the last sample has the
     pose at the end of the last sample.
 
-    trajectory (S,): index of the log of each stamp. driven (S, N): wheel angles driven up to each stamp, rad.
+    trajectory (S,): index of the log of each stamp. driven (S, M): integrals of the signals up to each stamp, rad.
     """
 
     def __init__(self, logs: Sequence[WheelLog], integration: Integration) -> None:
@@ -80,11 +97,11 @@ class OdometryBatch:
         self._sample = np.concatenate([sample for sample, _ in located])
         share = np.concatenate([share for _, share in located])
         counts = [int(sample[-1]) + 1 for sample, _ in located]
-        shape = (len(logs), max(counts), logs[0].rates.shape[1])
+        shape = (len(logs), max(counts), logs[0].signals.shape[1])
         self._angles = np.zeros(shape)  # a(k); zeros after a trajectory's last sample move nothing
         for row, (log, count) in enumerate(zip(logs, counts, strict=True)):
             durations = np.diff(log.times[:count], prepend=0.0)
-            self._angles[row, :count] = log.rates[:count] * durations[:, None]
+            self._angles[row, :count] = log.signals[:count] * durations[:, None]
         self._before = np.zeros(shape)  # C(k-1)
         np.cumsum(self._angles[:, :-1], axis=1, out=self._before[:, 1:])
         # The part of a sample that lies before its stamp.
@@ -100,7 +117,7 @@ class OdometryBatch:
         self._phase = self._phase_basis(self._angles, self._before)
 
     def poses(self, matrices: Array) -> Array:
-        """Poses (P, S, 3) in m, m, rad of candidate matrices (P, 3, N). Headings are not wrapped."""
+        """Poses (P, S, 3) in m, m, rad of candidate matrices (P, 3, M). Headings are not wrapped."""
         result = np.empty((len(matrices), len(self.trajectory), 3))
         result[..., 2] = self._start[:, 2] + matrices[:, 2] @ self.driven.T
         block = max(1, _BLOCK // (self._angles.shape[0] * self._angles.shape[1]))
@@ -113,7 +130,7 @@ class OdometryBatch:
         return result
 
     def jacobian(self, matrix: Array) -> Array:
-        """Derivatives (S, 3, 3, N) of the poses (x, y, theta) with respect to the elements of one matrix (3, N)."""
+        """Derivatives (S, 3, 3, M) of the poses (x, y, theta) with respect to the elements of one matrix (3, M)."""
         row_12, row_3 = self._at_stamps(
             self._slopes(self._angles, self._before, matrix), self._slopes(self._piece, self._piece_before, matrix)
         )
@@ -129,7 +146,7 @@ class OdometryBatch:
         )
 
     def position_design(self, headings: Sequence[Array]) -> Complex:
-        """Regressors (S, N) of (x - x0) + i(y - y0) on m1 + i m2 for given headings.
+        """Regressors (S, M) of (x - x0) + i(y - y0) on m1 + i m2 for given headings.
 
         headings: for each log (F,), the absolute heading at the start of each sample, rad.
         """
@@ -142,7 +159,7 @@ class OdometryBatch:
         return design
 
     def _phase_basis(self, angles: Array, before: Array) -> Array:
-        """Wheel angles (..., N) whose product with m3 is psi, relative to the start heading."""
+        """Integrals of signals (..., M) whose product with m3 is psi, relative to the start heading."""
         return before + angles / 2 if self.integration == "arc" else before
 
     def _final_displacement(self, matrices: Array) -> Complex:
@@ -183,7 +200,7 @@ class OdometryBatch:
         return (angles @ (matrix[0] + 1j * matrix[1])) * stretch * rotation
 
     def _slopes(self, angles: Array, before: Array, matrix: Array) -> tuple[Complex, Complex]:
-        """Derivatives of the steps with respect to m1 + i m2 and to m3, each (..., N)."""
+        """Derivatives of the steps with respect to m1 + i m2 and to m3, each (..., M)."""
         rotation, stretch, bend = self._rotation(angles, before, matrix)
         row_12 = angles * (stretch * rotation)[..., None]
         velocity = (angles @ (matrix[0] + 1j * matrix[1])) * rotation
@@ -203,26 +220,57 @@ class OdometryBatch:
 class OdometryStream:
     """Odometry one sample at a time: ``drive`` advances ``pose`` (3,) in m, m, rad.
 
-    moved (3,): the last sample's motion in the robot's frame, m, m, rad. frame_heading: the heading of the stream's
-    frame in the reference's, rad; effects of the world act along the axes of the reference.
+    moved (3,): the last sample's motion in the robot's frame, m, m, rad. driven (M,): integrals of its signals, rad,
+    without effects. frame_heading: the heading of the stream's frame in the reference's, rad; effects of the world act
+    along the axes of the reference.
     """
 
-    def __init__(self, matrix: Array, integration: Integration, start: Array | None = None) -> None:
+    def __init__(
+        self, matrix: Array, integration: Integration, start: Array | None = None, signals: Drive | None = None
+    ) -> None:
         self.matrix = matrix
         self.integration: Integration = integration
+        self._steered_drive = None if signals is None or signals.direct else signals
+        self._steering: Array | None = None
         self.pose = np.zeros(3) if start is None else np.array(start, dtype=float)
         self.moved = np.zeros(3)
+        self.driven: Array = np.zeros(matrix.shape[1])
         self.frame_heading = 0.0
 
-    def drive(self, angles: Array, duration: float | None = None, wheel_angles: Array | None = None) -> Array:  # noqa: ARG002
+    def drive(
+        self,
+        angles: Array,
+        duration: float | None = None,  # noqa: ARG002
+        wheel_angles: Array | None = None,  # noqa: ARG002
+        steering: Array | None = None,
+    ) -> Array:
         """Advance by one sample in which the wheels turned by ``angles`` (N,) rad; the new pose.
 
-        Only effects use the rest: duration: s. wheel_angles (N,): absolute, at the sample's end, rad; where they are
-        not known they are counted from 0. ValueError: the model has effects, and the duration is missing.
+        steering (S,): angles of steered wheels at the sample's end, rad. Only effects use the rest: duration: s.
+        wheel_angles (N,): absolute, at the sample's end, rad; where they are not known they are counted from 0.
+        ValueError: the model has effects and the duration is missing, or the robot steers and the angles are.
         """
-        self.moved = self.matrix @ angles
+        self.driven = self.driven_signals(angles, self.steer(steering))
+        self.moved = self.matrix @ self.driven
         self.pose = advance(self.pose, self.moved, self.integration)
         return self.pose
+
+    def steer(self, steering: Array | None) -> Array | None:
+        """Steering angles (S,) in the middle of a sample that ends at ``steering`` (S,), rad, the next one to come."""
+        if self._steered_drive is None:
+            return None
+        if steering is None:
+            raise ValueError("the robot steers, and its steering angles are missing")
+        steering = np.array(steering, dtype=float)
+        before, self._steering = self._steering, steering
+        return steering if before is None else (before + steering) / 2
+
+    def driven_signals(self, angles: Array, steering: Array | None) -> Array:
+        """Integrals (M,) of the signals of a sample in which the wheels turn by ``angles`` (N,) rad."""
+        if self._steered_drive is None:
+            return angles
+        assert steering is not None  # the robot steers
+        return self._steered_drive.signals(np.asarray(angles)[None], steering[None])[0]
 
 
 def advance(pose: Array, moved: Array, integration: Integration) -> Array:

@@ -20,13 +20,14 @@ _SMOOTHING = 0.05  # s, time constant of the smoothed twist whose derivative is 
 class Signals:
     """F wheel samples as recorded; every quantity is computed from the uncorrected rates.
 
-    durations (F,): s. rates (F, N): mean wheel rates, rad/s. elapsed (F,): s from the start of the run to the middle of
-    the sample. twists (F, 3): by the model's matrix, m/s, m/s, rad/s. accelerations (F, 3): derivatives of the twists,
-    smoothed over 50 ms, from rest before the first sample. travelled (F,): distance since the robot last stood still,
-    m. wheel_angles (F, N): absolute, in the middle of the sample, rad; None if they were not recorded. session_time
-    (F,): s since the session's start; None if unknown. session: its name. poses (F, 3): in the reference's frame, m, m,
-    rad, by the uncorrected twists and exact arcs: mean of the poses before and after the sample; None if no effect
-    needs them.
+    durations (F,): s. rates (F, N): mean wheel rates, rad/s. steering (F, S): steering angles in the middle of the
+    sample, rad; None if the robot does not steer. elapsed (F,): s from the start of the run to the middle of the
+    sample. twists (F, 3): of the robot's centre by the model's matrix, m/s, m/s, rad/s. accelerations (F, 3):
+    derivatives of the twists, smoothed over 50 ms, from rest before the first sample. travelled (F,): distance since
+    the robot last stood still, m. wheel_angles (F, N): absolute, in the middle of the sample, rad; None if they were
+    not recorded. session_time (F,): s since the session's start; None if unknown. session: its name. poses (F, 3): in
+    the reference's frame, m, m, rad, by the uncorrected twists and exact arcs: mean of the poses before and after the
+    sample; None if no effect needs them.
     """
 
     robot: Robot
@@ -40,12 +41,13 @@ class Signals:
     session_time: Array | None = None
     session: str | None = None
     poses: Array | None = None
+    steering: Array | None = None
 
 
 def signals_of(
     log: WheelLog, robot: Robot, matrix: Array, sample_period: float, *, with_poses: bool = False
 ) -> Signals:
-    """The signals of a log's F samples by a matrix (3, N).
+    """The signals of a log's F samples by a matrix (3, M).
 
     sample_period: nominal, s. with_poses: compute the poses, which some effects need.
 
@@ -56,7 +58,8 @@ def signals_of(
     from scipy.signal import lfilter  # slow to import, and not needed by a live node
 
     durations = np.diff(log.times, prepend=0.0)
-    twists = log.rates @ matrix.T
+    tracked = log.signals @ matrix.T
+    twists = of_centre(robot, tracked)
     share = smoothing_share(sample_period)
     smoothed = lfilter([share], [1.0, share - 1.0], twists, axis=0)
     elapsed = log.times - durations / 2
@@ -71,8 +74,14 @@ def signals_of(
         wheel_angles=None if log.wheel_angles is None else log.wheel_angles - log.rates * (durations / 2)[:, None],
         session_time=None if log.started_at is None else log.started_at + elapsed,
         session=log.session,
-        poses=Path(log.times, log.start, twists * durations[:, None], "arc").middles if with_poses else None,
+        poses=Path(log.times, log.start, tracked * durations[:, None], "arc").middles if with_poses else None,
+        steering=log.middle_steering,
     )
+
+
+def of_centre(robot: Robot, twists: Array) -> Array:
+    """Twists (F, 3) of the robot's centre from those of its tracked point."""
+    return twists if robot.mount is None else twists @ np.linalg.inv(robot.mount.twist).T
 
 
 class SignalStream:
@@ -93,11 +102,11 @@ class SignalStream:
     ) -> None:
         self.matrix = matrix
         self.pose = pose
-        self._robot, self._session, self._session_time = robot, session, session_time
+        self.robot, self._session, self._session_time = robot, session, session_time
         self._share = smoothing_share(sample_period)
         self._elapsed = self._way = 0.0
         self._smoothed = np.zeros(3)
-        self._angles = np.zeros(matrix.shape[1])
+        self._angles = np.zeros(len(robot.wheel_names))
 
     def turn(self, angles: Array, wheel_angles: Array | None = None) -> None:
         """Turn the wheels by angles (N,) rad, or to the absolute ``wheel_angles`` (N,) if they are known."""
@@ -113,16 +122,23 @@ class SignalStream:
         return middle
 
     def next(
-        self, rates: Array, duration: float, wheel_angles: Array | None = None, frame_heading: float = 0.0
+        self,
+        rates: Array,
+        duration: float,
+        wheel_angles: Array | None = None,
+        frame_heading: float = 0.0,
+        steering: Array | None = None,
     ) -> Signals:
         """The signals (F = 1) of one sample: mean rates (N,) rad/s over a duration > 0 s, absolute angles at its end.
 
         Unknown angles are integrated from the last known ones, or from 0. frame_heading: heading of the stream's frame
-        in the reference's, rad; both have the same origin.
+        in the reference's, rad; both have the same origin. steering (S,): angles in the sample's middle, rad.
         """
         turned = rates * duration
         self.turn(turned, wheel_angles)
-        twist = self.matrix @ rates
+        steered = None if steering is None else steering[None]
+        tracked = self.matrix @ self.robot.drive.signals(rates[None], steered)[0]
+        twist = of_centre(self.robot, tracked[None])[0]
         gained = self._share * (twist - self._smoothed)
         self._smoothed = self._smoothed + gained
         middle = self._elapsed + duration / 2
@@ -133,14 +149,14 @@ class SignalStream:
             vx, vy, _ = twist.tolist()
             step = math.hypot(vx, vy) * duration
             self._way += step
-        poses = self.move(twist * duration)
+        poses = self.move(tracked * duration)
         if poses is not None and frame_heading:
             poses = compose(np.array([0.0, 0.0, frame_heading]), poses)
         elapsed, session_time, travelled, durations = np.array(
             [[middle], [self._session_time + middle], [self._way - step / 2], [duration]]
         )
         return Signals(
-            self._robot,
+            self.robot,
             durations,
             rates[None],
             elapsed,
@@ -151,6 +167,7 @@ class SignalStream:
             session_time,
             self._session,
             poses,
+            steered,
         )
 
 

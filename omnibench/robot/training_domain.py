@@ -17,10 +17,10 @@ _STANDING = 0.02  # a smaller motion is standing still, which is inside every do
 _OFTEN = 0.05  # share of a run's time: motions outside that take less are transitions, and do not count
 
 
-def motions_of(matrix: Array, times: Array, rates: Array) -> Array:
-    """Twists (k, 3) of a run, m/s, m/s, rad/s, smoothed over a quarter of a second; times (F,), rates (F, N)."""
+def motions_of(matrix: Array, times: Array, signals: Array) -> Array:
+    """Twists (k, 3) of a run, m/s, m/s, rad/s, smoothed over a quarter of a second; times (F,), signals (F, M)."""
     width = max(1, round(_SMOOTHING * len(times) / float(times[-1])))
-    totals = np.cumsum(np.vstack([np.zeros(3), rates @ matrix.T]), axis=0)
+    totals = np.cumsum(np.vstack([np.zeros(3), signals @ matrix.T]), axis=0)
     if len(times) <= width:
         return totals[-1:] / len(times)
     smooth: Array = (totals[width:] - totals[:-width])[:: max(1, width // 2)] / width
@@ -88,7 +88,7 @@ def extrapolation_consequence(effects: Sequence[str]) -> str:
 
 def _scale(robot: Robot) -> Array:
     """Factors (3,) that make m/s of a twist: turning counts as the speed that it gives the wheels."""
-    return np.array([1.0, 1.0, np.mean([wheel.distance for wheel in robot.wheels])])
+    return np.array([1.0, 1.0, robot.reach])
 
 
 def _size(at_wheels: Array) -> float:

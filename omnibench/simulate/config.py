@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 from typing import Annotated, Generic, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, Field, FiniteFloat, model_validator
@@ -14,10 +15,23 @@ from omnibench.robot.calibration import EffectTerm, Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import Integration
 from omnibench.robot.published_matrices import PUBLISHED
+from omnibench.simulate.command import (
+    Command,
+    beyond_steering,
+    default_directions,
+    straight_and_pivot,
+    within_steering,
+)
+from omnibench.words import plural
 
 _MOST_NOISE = 1e4  # rad/s, or a factor; chosen: a hundred thousand turns a minute
 _MOST_RUNS = 100_000  # simulated runs; chosen: more take hours and gigabytes
 _MOST_ROWS = 1e8  # wheel samples and poses; more do not fit into memory
+_ASIDE = 1e-6  # sine of a direction off that of rolling, above which wheels would slide: rounding of degrees
+SteeringLimit = Annotated[
+    float | None,
+    Field(None, gt=0, le=180, description="largest steering angle, degrees; default: tricycle 80, car 35, others 90"),
+]
 
 
 def _named(robot: Robot) -> Robot:
@@ -30,20 +44,38 @@ NamedRobot = Annotated[Robot, AfterValidator(_named)]
 
 
 class Tolerances(Model):
-    """Standard deviations of the true wheels about their design values."""
+    """Standard deviations of the true robot about its design values."""
 
     radius: float = Field(0.0, ge=0, lt=0.3, description="relative to the radius")
     distance: float = Field(0.0, ge=0, lt=0.3, description="relative to the distance")
-    angle_deg: float = Field(0.0, ge=0, lt=30, description="degrees")
+    angle_deg: float = Field(0.0, ge=0, lt=30, description="degrees, of the axle or the direction of rolling")
     seed: int = Field(0, ge=0)
+    position: float = Field(0.0, ge=0, lt=1, description="of wheels placed by x and y, in each, m")
+    steering_deg: float = Field(0.0, ge=0, lt=30, description="offset of each steering angle, degrees")
+    mount: float = Field(0.0, ge=0, lt=10, description="of the tracked point's place, in x and y, m")
+    mount_deg: float = Field(0.0, ge=0, lt=90, description="of the tracked point's yaw, degrees")
+
+    def check_robot(self, robot: Robot) -> None:
+        """ValueError: a tolerance is for another kind of robot."""
+        if self.distance and any(wheel.distance is None for wheel in robot.wheels):
+            raise ValueError("truth.tolerances.distance: wheels that are placed by x and y have position (m) instead")
+        if self.position and all(wheel.distance is not None for wheel in robot.wheels):
+            raise ValueError(
+                "truth.tolerances.position: these wheels have no x and y; give distance (relative) instead"
+            )
+        if self.steering_deg and not robot.drive.steered:
+            raise ValueError("truth.tolerances.steering_deg: no steering angle of this robot is measured; leave it out")
 
 
 class Truth(Model):
     """The true robot: its matrix, given by exactly one of published, matrix and tolerances, and its effects."""
 
     published: str | None = Field(None, description=f"one of {', '.join(PUBLISHED)}")
-    matrix: tuple[tuple[FiniteFloat, ...], ...] | None = Field(None, description="3 rows of N")
+    matrix: tuple[tuple[FiniteFloat, ...], ...] | None = Field(None, description="3 rows of M, of the drive signals")
     tolerances: Tolerances | None = Field(None, description="drawn about the design")
+    lateral_friction: float = Field(
+        0.0, ge=0, le=10, description="skid steering, with tolerances: across the wheels, as a share of that along them"
+    )
     effects: tuple[EffectTerm, ...] = Field((), description="effects hidden in the data; see omnibench list")
 
     @model_validator(mode="after")
@@ -59,13 +91,18 @@ class Truth(Model):
                 raise ValueError(f"effects: {name} is given twice; add the parameters up, or leave one out")
         return self
 
-    def check_wheels(self, robot: Robot) -> None:
-        """ValueError: the matrix is for another number of wheels than the robot's."""
-        wheels = len(robot.wheels)
-        if self.matrix is not None and [len(row) for row in self.matrix] != [wheels] * 3:
-            raise ValueError(f"truth.matrix must have 3 rows of {wheels} values")
-        if self.published is not None and wheels != 3:
+    def check_robot(self, robot: Robot) -> None:
+        """ValueError: the matrix, a tolerance or the friction is for another robot."""
+        signals = robot.drive.names
+        if self.matrix is not None and [len(row) for row in self.matrix] != [len(signals)] * 3:
+            of = "" if robot.drive.direct else f" ({', '.join(signals)})"
+            raise ValueError(f"truth.matrix must have 3 rows of {len(signals)} values{of}")
+        if self.published is not None and not (len(robot.wheels) == len(signals) == 3 and robot.drive.direct):
             raise ValueError("truth.published matrices are for three wheels")
+        if self.tolerances is not None:
+            self.tolerances.check_robot(robot)
+        if self.lateral_friction and not (robot.skid and self.tolerances):
+            raise ValueError("truth.lateral_friction: is for a robot with skid: true and truth.tolerances")
 
 
 class RobotSession(Model):
@@ -85,9 +122,40 @@ class MotionGrid(Model):
     """Motion commands: every direction with every rate of turn, at each speed."""
 
     speeds: tuple[NonNegative, ...] = Field((0.2,), min_length=1, description="m/s")
-    directions_deg: tuple[FiniteFloat, ...] = Field(min_length=1)
+    directions_deg: tuple[FiniteFloat, ...] | None = Field(
+        None, min_length=1, description="default: every 45; forward and backward for a robot that cannot go sideways"
+    )
     turn_rates: tuple[FiniteFloat, ...] = Field(min_length=1, description="rad/s")
     turn_duration: Positive = Field(6.0, description="duration of turns on the spot, s")
+
+    def directions(self, robot: Robot) -> tuple[float, ...]:
+        """Directions, deg, for a robot. ValueError: its fixed wheels do not roll in one that is given."""
+        if self.directions_deg is None:
+            return default_directions(robot)
+        rolls = straight_and_pivot(robot)
+        for direction in self.directions_deg:
+            if rolls is not None and abs(math.sin(math.radians(direction) - rolls[0])) > _ASIDE:
+                forward, backward = default_directions(robot)
+                raise ValueError(
+                    f"directions_deg: this robot's fixed wheels would slide at {direction:g} deg; give {forward:g} and "
+                    f"{backward:g}, or leave directions_deg out"
+                )
+        return self.directions_deg
+
+    def grid(self, robot: Robot) -> list[Command]:
+        """Every direction with every rate of turn, at each speed; the direction of a turn on the spot is 0.
+
+        ValueError as for ``directions``.
+        """
+        rolls = straight_and_pivot(robot)
+        pivot = (0.0, 0.0) if rolls is None else rolls[1]
+        directions = self.directions(robot)
+        return [
+            Command(speed, math.radians(direction), turn_rate, pivot)
+            for speed, turn_rate in product(self.speeds, self.turn_rates)
+            for direction in (directions if speed > 0 else (0.0,))
+            if speed or turn_rate
+        ]
 
 
 class Commands(MotionGrid):
@@ -100,6 +168,7 @@ class EncoderNoise(Noise):
     """Noise of the encoders, and of the reference poses as in a calibration file."""
 
     encoder: float = Field(0.0, ge=0, le=_MOST_NOISE, description="white noise of each wheel rate, rad/s")
+    steering: float = Field(0.0, ge=0, le=1, description="white noise of each steering angle, rad")
 
 
 S = TypeVar("S", bound=RobotSession)
@@ -112,6 +181,7 @@ class Experiment(Model, Generic[S]):
     robot: NamedRobot
     sample_period: Positive = Field(0.01, description="s")
     commands: MotionGrid
+    steering_limit_deg: SteeringLimit = None
     repetitions: int = Field(5, gt=0)
     order: Literal["shuffled", "sorted"] = "shuffled"
     truth: Truth
@@ -122,8 +192,31 @@ class Experiment(Model, Generic[S]):
     def _something_moves(self) -> Self:
         if not any(self.commands.speeds) and not any(self.commands.turn_rates):
             raise ValueError("commands: no command moves the robot")
-        self.truth.check_wheels(self.robot)
+        if self.steering_limit_deg is not None and self.robot.drive.direct:
+            raise ValueError("steering_limit_deg: no wheel of this robot steers; leave it out")
+        self.truth.check_robot(self.robot)
+        try:
+            grid = self.commands.grid(self.robot)
+        except ValueError as error:
+            raise ValueError(f"commands.{error}") from None
+        if not self.driven:
+            raise ValueError(f"commands: {beyond_steering(self.robot, grid, self.steering_limit_deg)}")
         return self
+
+    @property
+    def driven(self) -> list[Command]:
+        """The commands within the steering limit, in the order of the grid."""
+        return within_steering(self.robot, self.commands.grid(self.robot), self.steering_limit_deg)[0]
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """A warning if commands are beyond the steering limit, and are not driven."""
+        grid = self.commands.grid(self.robot)
+        _, beyond = within_steering(self.robot, grid, self.steering_limit_deg)
+        if not beyond:
+            return ()
+        why = beyond_steering(self.robot, beyond, self.steering_limit_deg)
+        return (f"{len(beyond)} of {plural(len(grid), 'command')} cannot be steered and are left out: {why}",)
 
     @property
     def sessions(self) -> dict[Split, S]:
@@ -173,7 +266,7 @@ class FlowerConfig(Experiment[Session]):
     def runs(self) -> int:
         """Number of runs of all sessions, at most."""
         chosen = self.commands
-        commands = len(chosen.speeds) * len(chosen.directions_deg) * len(chosen.turn_rates)
+        commands = len(chosen.speeds) * len(chosen.directions(self.robot)) * len(chosen.turn_rates)
         return commands * self.repetitions * len(self.sessions)
 
     def _rows(self) -> float:
@@ -183,5 +276,5 @@ class FlowerConfig(Experiment[Session]):
         driven = [way / speed + chosen.ramp for way in ways for speed in chosen.speeds if speed]
         turns = (chosen.turn_duration + chosen.ramp) * len(ways) * (0.0 in chosen.speeds)
         runs = len(chosen.turn_rates) * self.repetitions
-        seconds = runs * (len(chosen.directions_deg) * sum(driven) + turns)
+        seconds = runs * (len(chosen.directions(self.robot)) * sum(driven) + turns)
         return seconds / self.sample_period + seconds / self.pose_period

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import product
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from omnibench.data.dataset import Split, Trajectory, make_dataset
 from omnibench.progress import Progress, Reporter, no_progress
-from omnibench.robot.kinematics import Array, Robot, wheel_equations
-from omnibench.simulate.config import Commands, FlowerConfig, MotionGrid, Session
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.simulate.command import Command, straight_and_pivot, wheels_of
+from omnibench.simulate.config import Commands, FlowerConfig, Session
 from omnibench.simulate.pose_noise import reference_noise
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.truth import TrueRobot, true_record
@@ -21,25 +21,6 @@ from omnibench.words import plural
 
 _MANY = 1000  # runs whose checks and tables take more than about a second; chosen
 PAUSE = 10.0  # s between runs
-
-
-@dataclass(frozen=True)
-class Command:
-    """A motion command: speed (m/s), direction (rad, robot's frame), rate of turn (rad/s)."""
-
-    speed: float
-    direction: float
-    turn_rate: float
-
-    @property
-    def name(self) -> str:
-        return f"v{self.speed:g}_a{math.degrees(self.direction):g}_w{self.turn_rate:g}"
-
-    @property
-    def twist(self) -> Array:
-        """(vx, vy, w)."""
-        x, y = self.speed * math.cos(self.direction), self.speed * math.sin(self.direction)
-        return np.array([x, y, self.turn_rate])
 
 
 def simulate_flower(
@@ -76,22 +57,7 @@ def simulate_flower(
         source="simulated by omnibench",
         simulated=True,
     )
-    return Simulation(dataset, truth)
-
-
-def commands_of(config: FlowerConfig) -> list[Command]:
-    """The commands of a config, in the order of its grid."""
-    return grid_of(config.commands)
-
-
-def grid_of(chosen: MotionGrid) -> list[Command]:
-    """Every direction with every rate of turn, at each speed; the direction of a turn on the spot is 0."""
-    return [
-        Command(speed, math.radians(direction), turn_rate)
-        for speed, turn_rate in product(chosen.speeds, chosen.turn_rates)
-        for direction in (chosen.directions_deg if speed > 0 else (0.0,))
-        if speed or turn_rate
-    ]
+    return Simulation(replace(dataset, warnings=(*dataset.warnings, *config.left_out)), truth)
 
 
 def runs_of(
@@ -113,8 +79,20 @@ def commanded_rates(robot: Robot, command: Command, times: Array, ramp: float) -
 
     ramp: time in which the rates rise and fall linearly, s.
     """
-    rates: Array = np.tile(wheel_equations(robot.wheels) @ command.twist, (len(times), 1))
+    rates: Array = np.tile(wheels_of(robot, command.twist)[0], (len(times), 1))
     return rates if not ramp else rates * _mean_shares(times, ramp)[:, None]
+
+
+def commanded_steering(robot: Robot, command: Command, times: Array) -> Array | None:
+    """Steering angles (F, S) by the design values, rad, which hold throughout a run; None for robots without any."""
+    return None if robot.drive.direct else np.tile(wheels_of(robot, command.twist)[1], (len(times), 1))
+
+
+def true_steering(robot: Robot, run: Trajectory) -> Array | None:
+    """True steering angles (F, S), rad, of a simulated run; None for robots without any."""
+    chosen = straight_and_pivot(robot)
+    pivot = (0.0, 0.0) if chosen is None else chosen[1]
+    return commanded_steering(robot, Command(run.v or 0.0, run.alpha or 0.0, run.omega or 0.0, pivot), run.times)
 
 
 def _mean_shares(times: Array, ramp: float) -> Array:
@@ -128,9 +106,9 @@ def _mean_shares(times: Array, ramp: float) -> Array:
 
 def _session(config: FlowerConfig, robot: TrueRobot, split: Split, session: Session) -> Iterator[Trajectory]:
     rng = np.random.default_rng(session.seed)
-    runs = runs_of(commands_of(config), config.repetitions, config.order, rng)
+    runs = runs_of(config.driven, config.repetitions, config.order, rng)
     started_at = 0.0
-    angles: Array = np.zeros(len(config.robot.wheels))
+    angles: Array = np.zeros(len(config.robot.wheel_names))
     for number, (command, repetition) in enumerate(runs, 1):
         planned = _Planned(f"{split}-{number:03d}", split, command, repetition, started_at, angles)
         run, angles = _drive(config, robot, planned, session, rng)
@@ -153,7 +131,7 @@ class _Planned:
 def _drive(
     config: FlowerConfig, robot: TrueRobot, planned: _Planned, session: Session, rng: np.random.Generator
 ) -> tuple[Trajectory, Array]:
-    """One run: target rates by the design values, wheel rates by the motors, motion by the true robot.
+    """One run: targets and steering by the design values, wheel rates by the motors, motion by the true robot.
 
     Encoders are exact between runs, so that recorded and true wheel angles do not drift apart: the angles (N,) at the
     run's end are those at which the next one begins.
@@ -163,10 +141,12 @@ def _drive(
     times, pose_times = stamps_of_run(duration, config.sample_period, config.pose_period)
     targets = commanded_rates(config.robot, command, times, ramp)
     start = _start(config, rng)
-    driven = robot.driven(times, targets)
-    rates = driven + config.noise.encoder * rng.standard_normal(targets.shape)
-    log = robot.log(times, driven, start, pose_times, planned.angles, planned.started_at, planned.split)
-    (poses,) = robot.model.reported([log])
+    driven, steering = robot.driven(times, targets), commanded_steering(config.robot, command, times)
+    log = robot.log(times, driven, start, pose_times, planned.angles, planned.started_at, planned.split, steering)
+    rates = log.rates + config.noise.encoder * rng.standard_normal(targets.shape)
+    if steering is not None:
+        steering = steering + config.noise.steering * rng.standard_normal(steering.shape)
+    poses = robot.reported(log)
     angles = planned.angles + np.cumsum(rates * config.sample_period, axis=0)
     run = Trajectory(
         id=planned.id,
@@ -186,6 +166,7 @@ def _drive(
         poses=poses + session.noise_scale * reference_noise(config.noise, pose_times, rng),
         angles=angles,
         targets=targets,
+        steering=steering,
     )
     return run, angles[-1]
 

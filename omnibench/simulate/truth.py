@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
@@ -12,20 +12,36 @@ from omnibench.config import Model
 from omnibench.errors import UnknownNameError
 from omnibench.registry import effects
 from omnibench.robot.calibration import EffectTerm, Row, matrix_rows
+from omnibench.robot.corrected import Corrected, check_needs, corrected
 from omnibench.robot.effects.effect import ActuatorEffect
 from omnibench.robot.effects.term import make_term
-from omnibench.robot.kinematics import Array, Robot, Wheel, inverse_kinematic_matrix
-from omnibench.robot.model import OdometryModel
+from omnibench.robot.kinematics import Array, Mount, Robot, Wheel, inverse_kinematic_matrix
+from omnibench.robot.model import OdometryModel, reported_poses
 from omnibench.robot.odometry import Integration, WheelLog
 from omnibench.robot.published_matrices import published_matrix
-from omnibench.simulate.config import EncoderNoise, Truth
+from omnibench.robot.signals import signals_of
+from omnibench.simulate.config import EncoderNoise, Tolerances, Truth
+from omnibench.simulate.true_motion import TrueMotion
+from omnibench.simulate.wheel_contacts import WheelContacts
+
+_SETTLES = 3  # corrections of a car's rates for the effects on them, each of which leaves some 1 % of the one before
 
 
 @dataclass(frozen=True, eq=False)
 class TrueRobot:
-    """The true robot of a simulation: its matrix, and effects of any stage."""
+    """The true robot of a simulation: its matrix, and effects of any stage.
+
+    contacts: its wheels on the floor, which move it where they were drawn about the design; without them, and for omni
+    and mecanum wheels that are placed by distance and angle, the matrix does.
+    """
 
     model: OdometryModel
+    contacts: WheelContacts | None = None
+
+    @property
+    def has_differential(self) -> bool:
+        """True for a car, of whose rear wheels the mean rate is driven."""
+        return self.contacts is not None and self.contacts.has_differential
 
     def driven(self, times: Array, targets: Array) -> Array:
         """True mean wheel rates (F, N), rad/s, for targets (F, N) in samples that end at times (F,), s."""
@@ -44,10 +60,57 @@ class TrueRobot:
         angles: Array,
         started_at: float | None,
         session: str | None,
+        steering: Array | None = None,
     ) -> WheelLog:
-        """Log of the true wheel rates (F, N), from a start pose (3,) and start angles of the wheels (N,), rad, on."""
-        turned = np.cumsum(rates * np.diff(times, prepend=0.0)[:, None], axis=0)
-        return WheelLog(times, rates, start, stamps, angles + turned, started_at, session)
+        """Log of what exact encoders would measure, from a start pose (3,) and angles of the wheels (N,), rad, on.
+
+        rates (F, N): of the wheels, rad/s; of a car's, whose differential lets each turn as it rolls, the mean counts.
+        steering (F, S): angles at the samples' ends, rad, where the robot steers.
+        """
+        durations = np.diff(times, prepend=0.0)[:, None]
+        drive = None if steering is None else self.model.robot.drive
+        turned = angles + np.cumsum(rates * durations, axis=0)
+        log = WheelLog(times, rates, start, stamps, turned, started_at, session, steering, drive)
+        if self.contacts is None or not self.has_differential:
+            return log
+        for _ in range(_SETTLES):
+            twists, true = self._motion(log)
+            rates = self.contacts.rolling_rates(twists) - (true.rates - log.rates)
+            turned = angles + np.cumsum(rates * durations, axis=0)
+            log = replace(log, rates=rates, wheel_angles=turned)
+        return log
+
+    def poses(self, log: WheelLog) -> Array:
+        """True poses (S, 3) of the tracked point at the log's stamps."""
+        return self.model.poses([log])[0] if self.contacts is None else self._path(log).poses(log.stamps)
+
+    def reported(self, log: WheelLog) -> Array:
+        """Poses (S, 3) that an exact reference reports at the log's stamps, with the effects on it."""
+        if self.contacts is None:
+            return self.model.reported([log])[0]
+        terms = self.model.reference_terms
+        return reported_poses(terms, log, self._path) if terms else self.poses(log)
+
+    def _path(self, log: WheelLog) -> TrueMotion:
+        assert self.contacts is not None  # without them the model has the path
+        twists, true = self._motion(log)
+        if true.body is not None:
+            twists = twists + true.body
+        return TrueMotion(log.times, log.start, self.contacts.tracked(twists), self.model.integration, true.world)
+
+    def _motion(self, log: WheelLog) -> tuple[Array, Corrected]:
+        """Twists (F, 3) of the centre that the true wheels give, and the effects of motion on a log."""
+        assert self.contacts is not None
+        terms, model = self.model.motion_terms, self.model
+        true = Corrected(log.rates, log.middle_steering)
+        if terms:
+            assert model.sample_period is not None  # there are terms
+            check_needs(terms, log)
+            with_poses = any("poses" in term.effect.needs for term in terms)
+            true = corrected(
+                terms, signals_of(log, model.robot, model.matrix, model.sample_period, with_poses=with_poses)
+            )
+        return self.contacts.twists(true.rates, true.steering), true
 
 
 class TruthRecord(Model):
@@ -61,6 +124,9 @@ class TruthRecord(Model):
     noise: EncoderNoise
     effects: tuple[EffectTerm, ...] = ()
     wheels: tuple[Wheel, ...] | None = Field(None, description="the true wheels, if they were drawn about the design")
+    steering_offsets: dict[str, float] = Field({}, description="drawn: true steering angle less the measured one, rad")
+    mount: Mount | None = Field(None, description="the true tracked point, if it is not the robot's centre")
+    lateral_friction: float = 0.0
 
     def true_robot(self, step: float | None = None) -> TrueRobot:
         """The true robot. step: of its motion, s; default: the sample period.
@@ -68,10 +134,17 @@ class TruthRecord(Model):
         OmnibenchError in one line: an effect or a parameter is unknown, or a parameter is missing.
         """
         where = _place(self.dataset)
-        terms = tuple(make_term(effect.name, effect.parameters, self.robot, where) for effect in self.effects)
-        return TrueRobot(
-            OdometryModel(self.robot, np.array(self.matrix), self.integration, terms, step or self.sample_period)
-        )
+        robot = self.robot if self.mount is None else self.robot.model_copy(update={"mount": self.mount})
+        terms = tuple(make_term(effect.name, effect.parameters, robot, where) for effect in self.effects)
+        model = OdometryModel(robot, np.array(self.matrix), self.integration, terms, step or self.sample_period)
+        return TrueRobot(model, self._contacts)
+
+    @property
+    def _contacts(self) -> WheelContacts | None:
+        if self.wheels is None or _moved_by_matrix(self.robot, self.mount):
+            return None
+        offsets = [self.steering_offsets[name] for name in self.robot.drive.steered]
+        return WheelContacts(self.robot, self.wheels, offsets, self.mount, self.lateral_friction)
 
 
 def true_record(
@@ -85,6 +158,7 @@ def true_record(
     noise: EncoderNoise | None = None,
 ) -> TruthRecord:
     """The record of a data set's truth. UnknownNameError as for ``complete_effects``."""
+    drawn = _drawn(truth, robot)
     return TruthRecord(
         dataset=dataset,
         robot=robot,
@@ -93,7 +167,10 @@ def true_record(
         integration=integration,
         noise=noise or EncoderNoise(),
         effects=complete_effects(truth, robot, sessions, dataset),
-        wheels=true_wheels(truth, robot),
+        wheels=drawn and drawn.wheels,
+        steering_offsets={} if drawn is None else drawn.steering_offsets,
+        mount=robot.mount if drawn is None else drawn.mount,
+        lateral_friction=truth.lateral_friction,
     )
 
 
@@ -106,32 +183,69 @@ def complete_effects(truth: Truth, robot: Robot, sessions: tuple[str, ...], data
     return tuple(_complete(term, robot, sessions, _place(dataset)) for term in truth.effects)
 
 
-def true_wheels(truth: Truth, robot: Robot) -> tuple[Wheel, ...] | None:
-    """The wheels drawn about the design, if the truth says so."""
-    if truth.tolerances is None:
-        return None
-    rng = np.random.default_rng(truth.tolerances.seed)
-    draws = rng.standard_normal((3, len(robot.wheels)))
-    drawn = []
-    for wheel, (radius, distance, angle) in zip(robot.wheels, draws.T.tolist(), strict=True):
-        changes = {
-            "radius": wheel.radius * (1 + truth.tolerances.radius * radius),
-            "distance": wheel.distance * (1 + truth.tolerances.distance * distance),
-            "angle": wheel.angle + math.radians(truth.tolerances.angle_deg) * angle,
-        }
-        drawn.append(wheel.model_copy(update=changes))
-    return tuple(drawn)
-
-
 def true_matrix(truth: Truth, robot: Robot) -> Array:
-    """The hidden inverse kinematic matrix (3, N)."""
+    """The hidden inverse kinematic matrix (3, M); of a car with steering offsets the one for small angles."""
     if truth.published is not None:
         return published_matrix(truth.published)
     if truth.matrix is not None:
         return np.array(truth.matrix)
-    wheels = true_wheels(truth, robot)
-    assert wheels is not None  # one of the three is given
-    return inverse_kinematic_matrix(wheels)
+    drawn = _drawn(truth, robot)
+    assert drawn is not None  # one of the three is given
+    if _moved_by_matrix(robot, drawn.mount):
+        return inverse_kinematic_matrix(drawn.wheels)
+    offsets = list(drawn.steering_offsets.values())
+    return WheelContacts(robot, drawn.wheels, offsets, drawn.mount, truth.lateral_friction).matrix
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """A robot drawn about its design. steering_offsets: rad, of each wheel whose steering angle is measured."""
+
+    wheels: tuple[Wheel, ...]
+    steering_offsets: dict[str, float]
+    mount: Mount | None
+
+
+def _moved_by_matrix(robot: Robot, mount: Mount | None) -> bool:
+    """True for omni and mecanum wheels placed by distance and angle, whose matrix is Eq. (3) or its general form."""
+    return mount is None and all(wheel.distance is not None and wheel.measured for wheel in robot.wheels)
+
+
+def _drawn(truth: Truth, robot: Robot) -> _Drawn | None:
+    """The robot drawn about the design, if the truth says so."""
+    given = truth.tolerances
+    if given is None:
+        return None
+    rng = np.random.default_rng(given.seed)
+    radii, distances, angles = rng.standard_normal((3, len(robot.wheels))).tolist()
+    places = rng.standard_normal((len(robot.wheels), 2)).tolist()
+    wheels = []
+    for wheel, radius, distance, angle, place in zip(robot.wheels, radii, distances, angles, places, strict=True):
+        changes = {"radius": wheel.radius * (1 + given.radius * radius)}
+        if wheel.distance is not None:
+            changes["distance"] = wheel.distance * (1 + given.distance * distance)
+        else:
+            x, y = wheel.position
+            changes |= {"x": x + given.position * place[0], "y": y + given.position * place[1]}
+        if wheel.kind != "steered":
+            axle_or_rolling = wheel.rolling if wheel.kind == "fixed" else wheel.axle
+            changes["angle"] = axle_or_rolling + math.radians(given.angle_deg) * angle
+        wheels.append(wheel.model_copy(update=changes))
+    steered = robot.drive.steered
+    offsets = np.radians(given.steering_deg * rng.standard_normal(len(steered))).tolist()
+    return _Drawn(tuple(wheels), dict(zip(steered, offsets, strict=True)), _drawn_mount(given, robot, rng))
+
+
+def _drawn_mount(given: Tolerances, robot: Robot, rng: np.random.Generator) -> Mount | None:
+    if not given.mount and not given.mount_deg:
+        return robot.mount
+    x, y, yaw = rng.standard_normal(3).tolist()
+    design = robot.mount or Mount()
+    return Mount(
+        x=design.x + given.mount * x,
+        y=design.y + given.mount * y,
+        yaw=design.yaw + math.radians(given.mount_deg) * yaw,
+    )
 
 
 def _complete(term: EffectTerm, robot: Robot, sessions: tuple[str, ...], where: str) -> EffectTerm:

@@ -66,7 +66,7 @@ class ImporterConformance(Conformance):
     def test_sample_is_a_valid_data_set(self) -> None:
         """Shapes, times and splits are as in a data set folder."""
         dataset = self.read_sample()
-        wheels = len(dataset.robot.wheels)
+        wheels = len(dataset.robot.wheel_names)
         require(len(dataset.trajectories) > 0, "the data set has no trajectory; make it with make_dataset")
         for run in dataset.trajectories:
             place = f"trajectory {run.id}"

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.fit.cost import FinalPose
-from omnibench.fit.parameterisation import GeometryLimits, ParameterisationName
+from omnibench.fit.geometry import GeometryLimits
+from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import Budget, BudgetSpent, CalibrationProblem, make_parameterisation
 from omnibench.registry import Options
 from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
@@ -50,7 +51,7 @@ def synthetic_robot(wheels: Literal[3, 4] = 3) -> Robot:
 def true_robot(robot: Robot) -> Robot:
     """The true robot: radii 3 % below to 4 % above the design, distances 6 % above."""
     wheels = (
-        wheel.model_copy(update={"radius": wheel.radius * share, "distance": wheel.distance * _DISTANCE})
+        wheel.model_copy(update={"radius": wheel.radius * share, "distance": wheel.lever * _DISTANCE})
         for wheel, share in zip(robot.wheels, _RADII, strict=False)
     )
     return robot.model_copy(update={"wheels": tuple(wheels)})

@@ -16,11 +16,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sample_robots import CAR, DIFFERENTIAL, MECANUM, SWERVE
+from wheeled_recordings import recorded
 
 from omnibench.compare.read_config import read_compare_config
+from omnibench.data.dataset import make_dataset
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.registry import costs
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, Robot
 
 CONFIG = Path(__file__).parents[2] / "configs" / "apr02.yaml"
 BATCH = 200
@@ -51,15 +54,15 @@ def candidates(problem: CalibrationProblem, count: int = BATCH) -> Array:
 
 
 def direct_numpy(problem: CalibrationProblem) -> Callable[[Array], float]:
-    """Eq. (1), (2) and (6) in plain NumPy, one candidate (9,) a call."""
+    """Eq. (1), (2) and (6) in plain NumPy, one candidate (3M,) a call."""
     runs = problem.trajectories
-    rates = np.stack([run.rates for run in runs])  # (Z, F, 3)
+    rates = np.stack([run.signals for run in runs])  # (Z, F, M)
     durations = np.diff(runs[0].times, prepend=0.0)
     start = np.stack([run.start for run in runs])
     final = np.stack([run.final_pose for run in runs])
 
     def cost(candidate: Array) -> float:
-        vx, vy, omega = np.moveaxis(rates @ candidate.reshape(3, 3).T, -1, 0)
+        vx, vy, omega = np.moveaxis(rates @ candidate.reshape(3, -1).T, -1, 0)
         turned = np.cumsum(omega * durations, axis=1)
         heading = start[:, 2:] + np.hstack([np.zeros((len(runs), 1)), turned[:, :-1]])
         x = start[:, 0] + ((vx * np.cos(heading) - vy * np.sin(heading)) * durations).sum(axis=1)
@@ -99,6 +102,34 @@ def test_batch_of_200(benchmark) -> None:
     }
     assert max(difference, own_difference) <= 1e-11
     assert numpy_seconds / each >= 250
+
+
+@pytest.mark.parametrize("robot", [DIFFERENTIAL, CAR, MECANUM, SWERVE], ids=lambda robot: robot.name)
+def test_batch_of_200_for_robots_of_other_classes(benchmark, robot: Robot) -> None:
+    """Two, three, four and eight drive signals; as many runs and samples as in the flower, and its box."""
+    runs = recorded(
+        robot, robot.inverse_kinematic_matrix, np.random.default_rng(0), repetitions=15, samples=558, period=0.01
+    )
+    dataset = make_dataset(robot.name, robot, 0.01, runs, simulated=True)
+    problem = CalibrationProblem(
+        robot,
+        dataset.trajectories,
+        costs.create("final_pose"),
+        make_parameterisation("matrix", robot, dataset.trajectories, box="paper"),
+        integration="euler",
+        budget=Budget(evaluations=10**9, seconds=1e6),
+        seed=1,
+    )
+    assert problem.build_evaluator() is not None
+    population = candidates(problem)
+    plain = direct_numpy(problem)
+    found = benchmark.pedantic(problem.cost, (population,), rounds=100, warmup_rounds=10)
+    numpy_seconds = median_seconds(lambda: plain(population[0]), 30)
+    each = benchmark.stats.stats.median / BATCH
+    difference = float(np.abs(found - problem.values(population)).max())
+    benchmark.extra_info |= {"times faster than direct NumPy": numpy_seconds / each, "largest difference": difference}
+    assert difference <= 1e-11
+    assert robot is SWERVE or numpy_seconds / each >= 250
 
 
 def test_one_at_a_time(benchmark) -> None:

@@ -23,7 +23,7 @@ from omnibench.robot.kinematics import Array, Robot, Wheel
 from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
 from omnibench.simulate.chain.motors import Controller, Encoder, Motor
 from omnibench.simulate.chain.wheel_drive import DrivenRun, drive_session
-from omnibench.simulate.flower import Command
+from omnibench.simulate.command import Command
 
 PERIOD = 0.01
 APR_02 = Robot(

@@ -19,7 +19,7 @@ from slam_study import Run, drive, flower_command
 from omnibench.data.scans import TrajectoryScans
 from omnibench.simulate.chain.floor_plan import RoomPlan, make_plan
 from omnibench.simulate.chain.lidar import Lidar
-from omnibench.simulate.flower import Command
+from omnibench.simulate.command import Command
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.slam_run import run_slam
 

@@ -3,7 +3,8 @@
     python tests/benchmarks/live_latency.py [--seconds 20] [--robots 50]
 
 1. 100 Hz: from a wheel sample's put to its odometry in a subscriber, fusion on and SLAM poses 200 ms late, and the
-   same for as many bytes through a process that only echoes, sample by sample in turn.
+   same for as many bytes through a process that only echoes, sample by sample in turn: three omni wheels, and a swerve
+   base, whose messages have four wheels and four steering joints.
 2. 1 kHz: samples that a FIFO subscriber misses (none).
 3. Many robots at 100 Hz in one node: the share of a core that the node's process needs, and its latency.
 """
@@ -28,11 +29,20 @@ import yaml
 import zenoh
 from zenoh.handlers import Callback, FifoChannel
 
+from omnibench.live.wheels.joints import joints_of
 from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 from omnibench.robot.calibration import Calibration, Noise, matrix_rows, write_calibration
+from omnibench.robot.kinematics import Robot as Base
 from omnibench.testing.synthetic import synthetic_robot
 
-WHEELS = ("a", "b", "c")
+OMNI = synthetic_robot()
+CORNERS = {"fl": (0.2, 0.15), "fr": (0.2, -0.15), "rl": (-0.2, 0.15), "rr": (-0.2, -0.15)}
+SWERVE = Base.model_validate(
+    {
+        "name": "swerve",
+        "wheels": [{"name": n, "type": "steered", "radius": 0.05, "x": x, "y": y} for n, (x, y) in CORNERS.items()],
+    }
+)
 ECHO = """
 import json, sys, zenoh
 from zenoh.handlers import Callback
@@ -100,9 +110,9 @@ class Process:
         self._process.wait(10)
 
 
-def node(folder: Path, robots: int) -> tuple[Process, int]:
+def node(folder: Path, robots: int, robot: Base = OMNI) -> tuple[Process, int]:
     """`omnibench live` with so many robots, fusion on."""
-    robot, port = synthetic_robot(), free_port()
+    port = free_port()
     noise = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.01, walk_heading=0.01)
     calibration = Calibration(
         name="benchmark",
@@ -111,7 +121,7 @@ def node(folder: Path, robots: int) -> tuple[Process, int]:
         matrix=matrix_rows(robot.inverse_kinematic_matrix),
         integration="arc",
         noise=noise,
-        covariance=tuple(tuple(row) for row in (1e-8 * np.eye(9)).tolist()),
+        covariance=tuple(tuple(row) for row in (1e-8 * np.eye(3 * len(robot.drive.names))).tolist()),
     )
     write_calibration(calibration, folder / "calibration.yaml")
     config = {
@@ -130,16 +140,24 @@ class Robot:
     Messages are patched rather than encoded, so that this process, which shares the machine with the node, is light.
     """
 
-    def __init__(self, session: zenoh.Session, name: str) -> None:
+    def __init__(self, session: zenoh.Session, name: str, base: Base = OMNI) -> None:
         self.sent: dict[bytes, int] = {}
         self.delays: list[float] = []
-        self._count, self._angles, self._rates = 0, np.zeros(3), np.array([1.0, -0.4, 0.3])
+        names, steered = joints_of(base).names, len(base.drive.steered)
+        self._count, self._angles = 0, np.zeros(len(names))
+        self._rates = np.append(np.resize([1.0, -0.4, 0.3], len(names) - steered), np.full(steered, 0.02))
         self._wheels = session.declare_publisher(f"{name}/joint_states", priority=zenoh.Priority.INTERACTIVE_HIGH)
         self._slam = session.declare_publisher(f"{name}/slam_pose")
-        marked = JOINT_STATE.encode(JointState(0, WHEELS, np.array([1.25, 2.5, 5.0]), self._rates))
+        marks = 1.25 * 2.0 ** np.arange(len(names))
+        marked = JOINT_STATE.encode(JointState(0, names, marks, self._rates))
         self._template = bytearray(marked)
-        self._place = marked.index(struct.pack("<ddd", 1.25, 2.5, 5.0))
+        self._place = marked.index(marks.tobytes())
         self._subscriber = session.declare_subscriber(f"{name}/odom", Callback(self._came, indirect=False))
+
+    @property
+    def size(self) -> int:
+        """Bytes of a wheel sample."""
+        return len(self._template)
 
     def send(self, period: float) -> None:
         self._count += 1
@@ -147,7 +165,7 @@ class Robot:
         stamp = time.time_ns()
         encoded = struct.pack("<iI", stamp // 10**9, stamp % 10**9)
         self._template[4:12] = encoded
-        self._template[self._place : self._place + 24] = self._angles.tobytes()
+        self._template[self._place : self._place + self._angles.nbytes] = self._angles.tobytes()
         self.sent[encoded] = time.perf_counter_ns()
         self._wheels.put(bytes(self._template))
         if self._count % round(0.25 / period) == 0:
@@ -175,13 +193,13 @@ def quantiles(delays: list[float]) -> tuple[float, float]:
     return float(np.percentile(delays, 50)), float(np.percentile(delays, 99))
 
 
-def latency(folder: Path, seconds: float) -> None:
-    running, port = node(folder, 1)
+def latency(folder: Path, seconds: float, base: Base) -> None:
+    running, port = node(folder, 1, base)
     echo_port = free_port()
     echo = Process("-c", ECHO, raw("router", echo_port))
     try:
         session, echo_session = client(port), client(echo_port)
-        robot, delays = Robot(session, "r0"), []
+        robot, delays = Robot(session, "r0", base), []
         echo_session.declare_subscriber(
             "echo/out",
             Callback(
@@ -195,12 +213,12 @@ def latency(folder: Path, seconds: float) -> None:
         time.sleep(1.0)
         for number in pace(0.005, round(seconds / 0.005)):
             if number % 2:
-                out.put(time.perf_counter_ns().to_bytes(8, "little") + bytes(104))
+                out.put(time.perf_counter_ns().to_bytes(8, "little") + bytes(robot.size - 8))
             else:
                 robot.send(0.01)
         time.sleep(0.5)
         (median, worst), (echo_median, echo_worst) = quantiles(robot.delays), quantiles(delays)
-        print(f"100 Hz, {len(robot.delays)} of {len(robot.sent)} samples came back, fusion on")
+        print(f"{base.name}, 100 Hz, {len(robot.delays)} of {len(robot.sent)} samples came back, fusion on")
         print(f"  wheel sample to odometry: p50 {median:.3f} ms, p99 {worst:.3f} ms")
         print(f"  bare echo:                p50 {echo_median:.3f} ms, p99 {echo_worst:.3f} ms")
         print(f"  ratios:                   p50 {median / echo_median:.2f}, p99 {worst / echo_worst:.2f}")
@@ -268,7 +286,8 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=50)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        latency(Path(folder), arguments.seconds)
+        for base in (OMNI, SWERVE):
+            latency(Path(folder), arguments.seconds, base)
         lossless(Path(folder), arguments.seconds / 2)
         fleet(Path(folder), arguments.seconds / 2, arguments.robots)
 

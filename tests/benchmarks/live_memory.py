@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import zenoh
-from live_latency import WHEELS, client, node
+from live_latency import OMNI, client, node
 
 from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 
@@ -44,7 +44,7 @@ def main() -> None:
             begin = time.perf_counter()
             for number in range(1, total + 1):
                 angles, stamp = angles + step, stamp + 10_000_000
-                wheels.put(JOINT_STATE.encode(JointState(stamp, WHEELS, angles, None)))
+                wheels.put(JOINT_STATE.encode(JointState(stamp, OMNI.wheel_names, angles, None)))
                 if number % 25 == 0:
                     late = PoseEstimate(stamp - 200_000_000, "map", np.zeros(3), 1e4 * np.eye(3))
                     poses.put(POSE_ESTIMATE.encode(late))

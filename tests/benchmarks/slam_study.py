@@ -29,7 +29,7 @@ from omnibench.robot.published_matrices import published_matrix
 from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.chain.lidar import Lidar, measure_scans, scan_stamps
 from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
-from omnibench.simulate.flower import Command
+from omnibench.simulate.command import Command
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.slam_run import SlamPath, run_slam
 

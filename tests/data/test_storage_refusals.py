@@ -154,7 +154,7 @@ REFUSED: dict[str, tuple[Change, str, str]] = {
     "other wheels than the robot's": (
         header("wheels", ["a", "b", "d"]),
         "dataset.yaml: ",
-        "wheels are a, b, d, but robot.wheels are a, b, c",
+        "wheels are a, b, d, but the robot's wheels with a measured rate are a, b, c;",
     ),
     "wheels in another order": (header("wheels", ["c", "b", "a"]), "dataset.yaml: ", "the same order"),
 }

@@ -10,7 +10,8 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.parameterisation import Box, ExplicitBox, GeometryLimits, ParameterisationName
+from omnibench.fit.geometry import GeometryLimits
+from omnibench.fit.parameterisation import Box, ExplicitBox, ParameterisationName
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.progress import Reporter, no_progress
 from omnibench.registry import Options, costs

@@ -21,7 +21,7 @@ from omnibench.errors import ConfigError, DataError, UnknownNameError
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.calibrator import Outcome
 from omnibench.fit.evaluate import evaluate
-from omnibench.fit.parameterisation import GeometryLimits
+from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.problem import Budget
 from omnibench.progress import Progress
 from omnibench.registry import costs

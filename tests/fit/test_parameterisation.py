@@ -14,7 +14,8 @@ from sample_robots import APR_02
 
 from omnibench.config import validate
 from omnibench.errors import ConfigError
-from omnibench.fit.parameterisation import Box, GeometryLimits, MatrixElements, WheelGeometry, make_bounds
+from omnibench.fit.geometry import GeometryLimits, WheelGeometry
+from omnibench.fit.parameterisation import Box, MatrixElements, make_bounds
 from omnibench.robot.kinematics import Array, Robot, inverse_kinematic_matrix
 from omnibench.robot.published_matrices import published_matrix
 from omnibench.testing.synthetic import synthetic_robot

@@ -19,7 +19,7 @@ from omnibench.data.dataset import Trajectory, make_dataset
 from omnibench.errors import DataError
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.parameterisation import GeometryLimits
+from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem
 from omnibench.progress import Progress
 from omnibench.registry import calibrators

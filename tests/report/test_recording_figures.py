@@ -10,11 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from recording_samples import COMMANDS, NOISE, TICK, Sample, sample
+from wheeled_samples import ROBOTS, driven
 
 from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
+from omnibench.report.recording.player import player
 from omnibench.report.recording.runs import representative_runs
 from omnibench.report.recording.scan_points import scan_points, thinned
 from omnibench.report.recording.wheel_figures import rate_step, wheel_rates
+from omnibench.report.robot_figures import is_placed
+from omnibench.robot.kinematics import Robot, Wheel
+from omnibench.robot.model import OdometryModel
 from omnibench.slam.accuracy import run_errors
 
 
@@ -135,3 +140,40 @@ def test_errors_do_not_depend_on_where_the_reference_has_its_origin(made: Sample
     there = run_errors(replace(run, poses=moved, pose_covariances=turn @ narrow @ turn.T), made.truth[run.id])
     np.testing.assert_allclose(there.position, here.position, atol=1e-12)
     np.testing.assert_allclose(there.nees, here.nees, rtol=1e-9)
+
+
+@pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
+def test_measured_rates_and_steering_angles_have_a_row_each(robot: Robot) -> None:
+    run = driven(robot, runs=1, samples=20).trajectories[0]
+    rows = wheel_rates(run, robot).figures[0].plot
+    titles = [axis.title.text for axis in rows.select_yaxes()]
+    assert titles == [f"{name} (rad/s)" for name in robot.wheel_names] + [f"{name} (°)" for name in robot.drive.steered]
+    steering = [trace.y for trace in rows.data if trace.legendgroup == "steering"]
+    if run.steering is not None:
+        np.testing.assert_allclose(steering, np.degrees(run.steering.T), atol=0.01)
+
+
+@pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
+def test_the_player_draws_every_wheel_where_it_stands_and_turns_those_that_steer(robot: Robot) -> None:
+    dataset = driven(robot, runs=1, samples=20)
+    run = dataset.trajectories[0]
+    played = player(dataset, {"run": run}, OdometryModel.of_design(robot, "arc"), {}, {}).runs["run"]
+    assert played["rated"] == robot.wheel_names
+    assert [tuple(wheel["at"]) for wheel in played["wheels"]] == [wheel.position for wheel in robot.wheels]
+    turned = [wheel["steered"] for wheel in played["wheels"] if wheel["steered"] is not None]
+    assert turned == list(range(len(robot.drive.steered)))
+    assert (played["steering"] is None) == (run.steering is None)
+    assert run.steering is None or len(played["steering"]) == len(played["times"])
+
+
+def test_a_mecanum_wheel_given_by_its_lever_arm_only_is_not_drawn(made: Sample) -> None:
+    rollers = {"roller_angle_deg": 45}
+    placed = Wheel.model_validate({"name": "a", "radius": 0.05, "x": 0.1, "y": 0.1} | rollers)
+    lever = Wheel.model_validate({"name": "a", "radius": 0.05, "distance": 0.2, "angle_deg": 90} | rollers)
+    assert [is_placed(wheel) for wheel in (placed, lever, *made.dataset.robot.wheels)] == [
+        True,
+        False,
+        True,
+        True,
+        True,
+    ]

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from effect_samples import a_drive
+from export_samples import TRICYCLE, calibration
 from hypothesis import given
 from hypothesis import strategies as st
 from sample_robots import APR_02
@@ -99,6 +100,33 @@ def test_everything_in_a_calibration_comes_back(tmp_path: Path) -> None:
     )
     write_calibration(written, tmp_path / "calibration.yaml")
     assert read_calibration(tmp_path / "calibration.yaml") == written
+
+
+def test_a_robot_that_steers_names_the_columns_of_its_matrix(tmp_path: Path) -> None:
+    write_calibration(calibration(TRICYCLE), tmp_path / "tricycle.yaml")
+    assert "\nsignals: [front_cos, front_sin]\n" in (tmp_path / "tricycle.yaml").read_text()
+    assert read_calibration(tmp_path / "tricycle.yaml").signals == ("front_cos", "front_sin")
+    write_calibration(a_calibration(), tmp_path / "omni.yaml")
+    assert "signals" not in (tmp_path / "omni.yaml").read_text()
+
+
+def test_columns_of_other_signals_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    write_calibration(calibration(TRICYCLE), file)
+    file.write_text(file.read_text().replace("[front_cos, front_sin]", "[front_sin, front_cos]"))
+    with pytest.raises(
+        DataError, match=r"signals are front_sin, front_cos, but the columns .* are front_cos, front_sin"
+    ):
+        read_calibration(file)
+
+
+def test_the_signals_of_a_file_without_them_are_the_robots(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    write_calibration(calibration(TRICYCLE), file)
+    file.write_text(file.read_text().replace("signals: [front_cos, front_sin]\n", ""))
+    assert read_calibration(file) == calibration(TRICYCLE).model_copy(
+        update={"created": read_calibration(file).created}
+    )
 
 
 TERMS = (

@@ -23,7 +23,6 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.published_matrices import published_matrix
 from omnibench.simulate.config import EncoderNoise, FlowerConfig
-from omnibench.simulate.flower import commands_of
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.truth import true_matrix
@@ -79,7 +78,7 @@ def test_repetitions_are_numbered_from_1_to_5() -> None:
 
 
 def test_the_commands_are_12_directions_with_3_rates_at_one_speed() -> None:
-    found = {(round(math.degrees(c.direction)), c.turn_rate, c.speed) for c in commands_of(config())}
+    found = {(round(math.degrees(c.direction)), c.turn_rate, c.speed) for c in config().driven}
     assert found == {(30 * i, rate, 0.2) for i in range(12) for rate in (-0.35, 0.0, 0.35)}
 
 
@@ -140,7 +139,7 @@ def test_the_runs_of_a_session_follow_each_other() -> None:
 
 
 def test_the_order_of_the_runs_is_shuffled_unless_sorted_is_asked_for() -> None:
-    given = [command.name for command in commands_of(small()) for _ in range(2)]
+    given = [command.name for command in small().driven for _ in range(2)]
     orders = {
         order: [run.command for run in simulate_dataset(small(order=order)).dataset.trajectories]
         for order in ("sorted", "shuffled")

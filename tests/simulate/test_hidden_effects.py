@@ -23,8 +23,9 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.planar import moved_to
 from omnibench.robot.published_matrices import published_matrix
+from omnibench.simulate.command import Command
 from omnibench.simulate.config import Commands, EncoderNoise, FlowerConfig
-from omnibench.simulate.flower import Command, commanded_rates, commands_of
+from omnibench.simulate.flower import commanded_rates
 from omnibench.simulate.simulate import simulate_dataset
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -60,7 +61,7 @@ def runs(effects: Mapping[str, Mapping[str, float]] | None = None, **changes: An
 def driven_before(config: FlowerConfig, seed: int, scale: float, way: float) -> list[tuple[Array, Array, Array]]:
     """Rates, angles and poses of a session as they were simulated before there were effects, ramps and starts."""
     rng = np.random.default_rng(seed)
-    commands = [command for command in commands_of(config) for _ in range(config.repetitions)]
+    commands = [command for command in config.driven for _ in range(config.repetitions)]
     commands = [commands[index] for index in rng.permutation(len(commands))]
     model = OdometryModel(config.robot, published_matrix(PUBLISHED), config.integration)
     noise, made = config.noise, []

@@ -17,7 +17,7 @@ from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.chain.floor_plan import FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.chain.lidar import Lidar, LidarMount
-from omnibench.simulate.flower import Command
+from omnibench.simulate.command import Command
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.slam.slam_run import SlamPath, run_slam
 

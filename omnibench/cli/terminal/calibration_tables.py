@@ -14,7 +14,7 @@ from omnibench.fit.bounds.stamp_sums import QUADRATURE
 from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.certify import CertifiedCalibration
 from omnibench.fit.evaluate import Evaluation
-from omnibench.fit.parameterisation import WheelGeometry
+from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals
 from omnibench.fit.uncertainty.physical import ParameterEstimate
 from omnibench.report.blocks import Cell, Column, Row, Table
@@ -22,7 +22,7 @@ from omnibench.robot.kinematics import Robot
 from omnibench.words import plural
 
 _NONE = "no interval"
-_TOUCHED = 1e-6  # share of a direction of wheel rates: a smaller one is rounding
+_TOUCHED = 1e-6  # share of a direction of drive signals: a smaller one is rounding
 
 
 def print_certificate(console: Console, certified: CertifiedCalibration) -> None:
@@ -30,7 +30,12 @@ def print_certificate(console: Console, certified: CertifiedCalibration) -> None
     certificate, proof = certified.certificate, certified.proof
     kind = "simulated data" if certified.dataset.simulated else "recorded data"
     console.print(f"{certified.dataset.name} ({kind}), training split, cost {certified.cost_name}", soft_wrap=True)
-    console.print(f"cost of the calibration      {certificate.cost:.9f}")
+    if certificate.shrinking is None:
+        console.print(f"cost of the calibration      {certificate.cost:.9f}")
+    else:
+        console.print(f"cost of the calibration      {certificate.cost * (1 + certificate.shrinking):.9f}")
+        console.print(f"cost before it was shrunk    {certificate.cost:.9f}")
+        console.print(f"Shrinking it to the design adds {certificate.shrinking:.2%} to the cost.", soft_wrap=True)
     if proof.best_cost < certificate.cost:
         console.print(f"best matrix seen in the box  {proof.best_cost:.9f}")
     console.print(f"proven lower bound           {certificate.lower_bound:.9f}")
@@ -89,9 +94,10 @@ def _matrix_table(run: CalibrationRun) -> Table:
         for name, intervals in listed:
             bounds = zip(intervals.low[number], intervals.high[number], marks, strict=True)
             rows.append(Row.of(f"  {name}", *(Cell("", _interval(*each)) for each in bounds)))
-    wheels = (Column(f"wheel {wheel}") for wheel in calibration.robot.wheel_names)
+    drive = calibration.robot.drive
+    signals = (Column(f"wheel {name}" if drive.direct else name) for name in drive.names)
     caption = f"{calibration.name}{' (simulated data)' if simulated else ''}"
-    return Table(caption, (Column("", numeric=False), *wheels), tuple(rows), "; ".join(notes))
+    return Table(caption, (Column("", numeric=False), *signals), tuple(rows), "; ".join(notes))
 
 
 def _interval(low: float, high: float, mark: str) -> str:

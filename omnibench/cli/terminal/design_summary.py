@@ -5,7 +5,13 @@ from __future__ import annotations
 from rich.console import Console
 
 from omnibench.cli.terminal.tables import print_table
-from omnibench.design.report.design_wording import USE_IN_WORDS, choice_in_words, origin_in_words
+from omnibench.design.report.design_wording import (
+    USE_IN_WORDS,
+    choice_in_words,
+    motions_in_words,
+    origin_in_words,
+    plan_in_words,
+)
 from omnibench.design.report.tables import chosen_table, effort_table, equal_table
 from omnibench.design.result import Design
 
@@ -19,6 +25,11 @@ def print_design(console: Console, design: Design) -> None:
         console.print()
         print_table(console, chosen_table(design, of_set))
         console.print(choice_in_words(design, of_set))
+        if not design.recorded:
+            console.print("What to drive:")
+            for line in plan_in_words(design, of_set):
+                console.print(f"  {line}")
+        console.print(motions_in_words(of_set))
         console.print()
         print_table(console, effort_table(design, of_set))
     console.print()

@@ -33,10 +33,11 @@ def print_inspection(console: Console, inspection: Inspection) -> None:
         _print_scans(console, inspection.scans)
     print_table(console, _split_table(inspection))
     shares = ", ".join(f"{share:.2g}" for share in inspection.driven_shares)
+    what = "wheel rates" if len(inspection.driven_shares) == len(inspection.wheels) else "drive signals"
     console.print(
-        f"directions of wheel rates driven: {inspection.driven_directions} of {len(inspection.wheels)} ({shares})"
+        f"directions of {what} driven: {inspection.driven_directions} of {len(inspection.driven_shares)} ({shares})"
     )
-    print_table(console, _identifiability_table(inspection.identifiability))
+    print_table(console, _identifiability_table(inspection.identifiability, what))
     console.print(f"noise: {inspection.identifiability.noise_source}", soft_wrap=True)
     for finding in inspection.findings:
         console.print(f"- {finding}", soft_wrap=True)
@@ -72,7 +73,7 @@ def _split_table(inspection: Inspection) -> Table:
     return Table("", columns, tuple(rows))
 
 
-def _identifiability_table(identifiability: Identifiability) -> Table:
+def _identifiability_table(identifiability: Identifiability, what: str) -> Table:
     rows = []
     for direction in identifiability.directions:
         deviations = ["open"] * len(ROWS)
@@ -81,7 +82,7 @@ def _identifiability_table(identifiability: Identifiability) -> Table:
         motion = direction.motion or "slip of the wheels"
         rows.append(Row.of(direction.direction, motion, f"{100 * direction.share:.3g} %", *deviations))
     columns = (
-        Column("wheel rates along", numeric=False),
+        Column(f"{what} along", numeric=False),
         Column("motion", numeric=False),
         Column("driven"),
         *(Column(f"row {row}") for row in ROWS),

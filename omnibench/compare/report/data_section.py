@@ -8,7 +8,7 @@ from omnibench.compare.report.view import SPLIT_NAMES, DatasetView
 from omnibench.data.dataset import SPLITS
 from omnibench.report.blocks import Callout, Fact, Facts, Section
 from omnibench.report.numbers import count, fixed, listing, significant
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, Wheel
 
 
 def data_section(view: DatasetView) -> Section:
@@ -19,12 +19,7 @@ def data_section(view: DatasetView) -> Section:
     commands = {trajectory.command for trajectory in trajectories} - {None}
     sessions = {trajectory.session for trajectory in trajectories} - {None}
     split_sizes = [f"{count(len(dataset.split(split)))} for {SPLIT_NAMES[split]}" for split in SPLITS]
-    wheels = [
-        f"{wheel.name}: radius {wheel.radius:g} m, distance {wheel.distance:g} m, "
-        f"angle {fixed(np.degrees(wheel.angle), 1)}°"
-        + (f", rollers {fixed(np.degrees(wheel.roller_angle), 1)}°" if wheel.roller_angle else "")
-        for wheel in dataset.robot.wheels
-    ]
+    wheels = [_wheel(wheel) for wheel in dataset.robot.wheels]
     facts = [
         Fact("Data set", dataset.name, "simulated" if dataset.simulated else ""),
         Fact("Description", dataset.description),
@@ -49,6 +44,20 @@ def data_section(view: DatasetView) -> Section:
         Callout("Warnings on reading the data", warnings, "warning"),
     )
     return Section("data", "Data", blocks)
+
+
+def _wheel(wheel: Wheel) -> str:
+    """A wheel's design values: its place as it was given, angles in degrees."""
+    lengths = (("radius", wheel.radius), ("distance", wheel.distance), ("x", wheel.x), ("y", wheel.y))
+    angles = (("angle", wheel.angle), ("rollers", wheel.roller_angle or None))
+    parts = [
+        *([wheel.type] if wheel.type else []),
+        *(f"{name} {value:g} m".replace("-", "−") for name, value in lengths if value is not None),
+        *(f"{name} {fixed(np.degrees(value), 1)}°" for name, value in angles if value is not None),
+        *([] if wheel.driven else ["not driven"]),
+        *([] if wheel.measured else ["not measured"]),
+    ]
+    return f"{wheel.name}: {', '.join(parts)}"
 
 
 def _range(values: Array) -> str:

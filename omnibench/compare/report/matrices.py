@@ -10,7 +10,7 @@ import numpy as np
 from omnibench.compare.report.view import DatasetView
 from omnibench.compare.report.wording import entry_cell, on_bounds
 from omnibench.compare.result import RunRecord
-from omnibench.fit.parameterisation import FittedParameter
+from omnibench.fit.geometry import FittedParameter
 from omnibench.fit.span import driven_span
 from omnibench.report.blocks import Block, Cell, Code, Column, Paragraph, Row, Section, Table
 from omnibench.report.numbers import NOTHING, fixed, significant
@@ -41,7 +41,7 @@ def _blocks(view: DatasetView) -> tuple[Block, ...]:
 
 
 def differences(matrix: Array, reference: Array) -> Array:
-    """D of Eq. (10), (11): reference * (1 + D) = matrix, element by element (3, N); NaN where the reference is 0."""
+    """D of Eq. (10), (11): reference * (1 + D) = matrix, element by element (3, M); NaN where the reference is 0."""
     zero = np.abs(reference) <= _ZERO_SHARE * np.abs(reference).max(axis=1, keepdims=True)
     quotient: Array = matrix / np.where(zero, np.nan, reference) - 1
     return quotient
@@ -96,12 +96,14 @@ def _element_table(view: DatasetView) -> Table:
             for name, value in zip(_element_names(view), run.matrix.ravel(), strict=True)
         ]
         rows.append(Row.of(entry_cell(view, entry), *cells, role="best" if entry.is_best else "plain"))
+    drive = view.dataset.robot.drive
     held = any(run.record.held for entry, run in view.calibrated if entry.parameterisation == "matrix")
     return Table(
         "Inverse kinematic matrices M⁻¹",
         (Column("M⁻¹", numeric=False), *_element_columns(view, with_units=True)),
         tuple(rows),
-        f"Columns of each row in the order of the wheels: {', '.join(view.dataset.robot.wheel_names)}. "
+        f"Columns of each row in the order of the {'wheels' if drive.direct else 'drive signals'}: "
+        f"{', '.join(drive.names)}. "
         f"† on a bound of its box.{' ‡ held by the box, which has no width there.' if held else ''}",
     )
 
@@ -123,7 +125,8 @@ def _difference_table(view: DatasetView, against: str | None) -> Table:
     name = "the design values" if against is None else against
     note = "Eq. (10) and (11) of the paper, element by element. Where the reference is 0 the change itself is given."
     if project is not None:
-        note += " Compared on the span of wheel rates that the data drive; across it the matrix is not determined."
+        what = "wheel rates" if view.dataset.robot.drive.direct else "drive signals"
+        note += f" Compared on the span of {what} that the data drive; across it the matrix is not determined."
     return Table(
         f"Differences from {name}",
         (Column("M⁻¹", numeric=False), *_element_columns(view, with_units=False)),
@@ -139,9 +142,8 @@ def _difference_cell(share: float, moved: float) -> Cell:
 
 
 def _span_projector(view: DatasetView) -> Array | None:
-    wheels = len(view.dataset.robot.wheels)
-    training = view.dataset.split("train")
-    if wheels == 3 or not training:
+    robot, training = view.dataset.robot, view.dataset.split("train")
+    if len(robot.drive.names) == len(robot.motions) or not training:
         return None
     driven = driven_span(training).driven
     projector: Array = driven.T @ driven
@@ -149,7 +151,7 @@ def _span_projector(view: DatasetView) -> Array | None:
 
 
 def _element_names(view: DatasetView) -> list[str]:
-    return [f"m{row}{column}" for row in (1, 2, 3) for column in range(1, len(view.dataset.robot.wheels) + 1)]
+    return [f"m{row}{column}" for row in (1, 2, 3) for column in range(1, len(view.dataset.robot.drive.names) + 1)]
 
 
 def _element_columns(view: DatasetView, with_units: bool) -> tuple[Column, ...]:

@@ -50,7 +50,7 @@ def _fitted(view: DatasetView) -> list[tuple[LegendItem, Robot]]:
     try:
         radii, distances, angles = geometry_of(best.typical.matrix, robot).reshape(3, -1).tolist()
         wheels = tuple(
-            wheel.model_copy(update={"radius": radius, "distance": distance, "angle": angle})
+            wheel.model_copy(update={"radius": radius, "distance": distance, "angle": angle, "x": None, "y": None})
             for wheel, radius, distance, angle in zip(robot.wheels, radii, distances, angles, strict=True)
         )
     except DataError:

@@ -125,7 +125,7 @@ class DatasetView:
 
     @property
     def design_matrix(self) -> Array:
-        """The design matrix (3, N)."""
+        """The design matrix (3, M)."""
         return self.dataset.robot.inverse_kinematic_matrix
 
 

@@ -18,7 +18,7 @@ from omnibench.registry import Options
 class RecordingOptions(Options):
     """The robot, which runs train and validate, and what the data set says of itself."""
 
-    robot: RobotOption = Field(description="mapping as in dataset.yaml, or path of a YAML file")
+    robot: RobotOption = Field(description="YAML file with name and wheels, see omnibench guide data; or a mapping")
     train: Names = Field((), description="patterns of run names that train")
     validation: Names = Field((), description="patterns of run names that validate")
     sample_period: Positive | None = Field(None, description="s; default: the median of the wheel samples")

@@ -10,7 +10,9 @@ from omnibench.design.report.design_wording import (
     duration_in_words,
     equal_in_words,
     headline,
+    motions_in_words,
     origin_in_words,
+    plan_in_words,
 )
 from omnibench.design.report.tables import candidate_table, chosen_table, equal_table, promise_table
 from omnibench.design.result import Design
@@ -83,7 +85,10 @@ def _commands(design: Design) -> tuple[Block, ...]:
         blocks += [
             Paragraph(f"{of_set.name}: {choice_in_words(design, of_set)}"),
             chosen_table(design, of_set),
+            Paragraph(motions_in_words(of_set)),
         ]
+        if not design.recorded:
+            blocks.append(Callout("What to drive", tuple(plan_in_words(design, of_set))))
         equal = f"{of_set.name} equals the baseline with {equal_in_words(design, of_set, design.use)}"
         blocks.append(Paragraph(f"{equal}, calibrated from {USE_IN_WORDS[design.use]}.", "note"))
     return tuple(blocks)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from omnibench.design.config import Per, Use
 from omnibench.design.result import Candidate, Design, Effort, SetDesign
 from omnibench.report.motions import motion_in_words
-from omnibench.report.numbers import count, fixed, percent, significant
+from omnibench.report.numbers import count, fixed, listing, percent, significant
 from omnibench.words import noun_for, plural
 
 USE_IN_WORDS: Mapping[Use, str] = {"final": "final poses", "trajectory": "whole trajectories"}
@@ -17,6 +17,46 @@ UNIT_OF_COST: Mapping[Per, str] = {"run": "runs", "second": "s", "metre": "m of 
 
 def command_in_words(candidate: Candidate) -> str:
     return motion_in_words(candidate.name, candidate.speed, candidate.direction, candidate.turn_rate)
+
+
+def drive_in_words(candidate: Candidate) -> str:
+    """A command as a person drives it: ``forward 2 m at 0.5 m/s, turning left with radius 1.2 m``."""
+    speed, direction, rate = candidate.speed, candidate.direction, candidate.turn_rate
+    if speed is None or direction is None or rate is None:
+        return candidate.name
+    turned = math.degrees(abs(rate) * candidate.duration_s)
+    turns = plural(round(turned / 360), "full turn") if turned > 359 else f"{fixed(turned, 0)}°"
+    side = "left" if rate > 0 else "right"
+    if not speed:
+        return f"on the spot {turns} to the {side} at {significant(abs(rate), 2)} rad/s"
+    driven = f"{_way_in_words(direction)} {significant(candidate.distance_m, 2)} m at {significant(speed, 2)} m/s"
+    if not rate:
+        return driven
+    return f"{driven}, turning {side} by {turns} with radius {significant(speed / abs(rate), 2)} m"
+
+
+def _way_in_words(direction: float) -> str:
+    """A direction, rad, as ``forward``, ``backward``, ``sideways to the left`` or with its angle."""
+    degrees = round(math.degrees(direction), 3) % 360
+    words = {0.0: "forward", 90.0: "sideways to the left", 180.0: "backward", 270.0: "sideways to the right"}
+    side = "left" if degrees < 180 else "right"
+    return words.get(degrees, f"at {fixed(min(degrees, 360 - degrees), 0)}° to the {side} of forward,")
+
+
+def plan_in_words(design: Design, of_set: SetDesign) -> list[str]:
+    """What to drive of a set, a line for each chosen command, with how often."""
+    return [
+        f"{drive_in_words(design.candidate(chosen.command))}, {plural(chosen.runs, 'time')}" for chosen in of_set.chosen
+    ]
+
+
+def motions_in_words(of_set: SetDesign) -> str:
+    """Precision of odometry that the chosen runs promise, in words."""
+    left = [
+        f"{significant(each.position_mm, 2)} mm and {significant(each.heading_deg, 2)} deg after {each.motion}"
+        for each in of_set.step.motions
+    ]
+    return f"Calibrated from these runs, the matrix leaves an error of {listing(left)} (standard deviations)."
 
 
 def duration_in_words(seconds: float) -> str:

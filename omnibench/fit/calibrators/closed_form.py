@@ -102,7 +102,7 @@ def _stopped(problem: CalibrationProblem, objective: SumOfNorms, cost: float, er
 
 def linear_start(problem: CalibrationProblem) -> Array:
     """Vector (n,) in the box by linear least squares."""
-    design, identity = problem.matrix(problem.start), np.eye(len(problem.robot.wheels))
+    design, identity = problem.matrix(problem.start), np.eye(len(problem.robot.drive.names))
     matrix = linear_fit(problem.odometry, problem.trajectories, problem.reference, design, identity)
     return problem.settled(matrix.ravel())
 

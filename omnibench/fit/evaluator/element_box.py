@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
-from omnibench.fit.parameterisation import Parameterisation
+from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.robot.kinematics import Array
 
 # Share by which the box of a curved parameterisation is widened beyond its linear reach. Candidates outside are
@@ -14,6 +15,14 @@ from omnibench.robot.kinematics import Array
 # a third at most (tests/benchmarks/constants_fit.py).
 _MARGIN = 0.1
 _ROUNDING = 1e-9, 1e-15  # shares of the reach and of a row's largest element by which a box is widened against rounding
+
+
+class _Matrices(Protocol):
+    """What a box is made around."""
+
+    @property
+    def name(self) -> ParameterisationName: ...
+    def matrices(self, vectors: Array) -> Array: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +33,7 @@ class ElementBox:
     upper: Array
 
     @classmethod
-    def of(cls, parameterisation: Parameterisation, lower: Array, upper: Array) -> ElementBox:
+    def of(cls, parameterisation: _Matrices, lower: Array, upper: Array) -> ElementBox:
         """The box around the matrices of all vectors between ``lower`` and ``upper`` (n,).
 
         It holds all of them where the matrix is linear in the vector, and nearly all where it is curved.

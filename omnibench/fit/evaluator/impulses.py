@@ -57,11 +57,11 @@ def make_path(log: WheelLog, integration: Integration) -> Path:
     cuts = np.unique(np.concatenate([[0.0], cuts]))
     sample = np.searchsorted(log.times, cuts[1:])
     durations = np.diff(bounds)
-    driven = np.concatenate([np.zeros((1, log.rates.shape[1])), np.cumsum(log.rates * durations[:, None], axis=0)])
-    angles = log.rates[sample] * np.diff(cuts)[:, None]
+    driven = np.concatenate([np.zeros((1, log.signals.shape[1])), np.cumsum(log.signals * durations[:, None], axis=0)])
+    angles = log.signals[sample] * np.diff(cuts)[:, None]
     before = driven[sample]
     if integration == "arc":  # an arc may be cut anywhere; an Euler step keeps the heading of its sample's start
-        before = before + log.rates[sample] * (cuts[:-1] - bounds[sample])[:, None]
+        before = before + log.signals[sample] * (cuts[:-1] - bounds[sample])[:, None]
     ends = np.searchsorted(cuts, stamps)
     reached = np.concatenate([np.zeros((1, angles.shape[1])), np.cumsum(angles, axis=0)])
     return Path(angles, before, ends, reached[ends])

@@ -121,7 +121,7 @@ class SessionScores:
             data.scores,
             data.information_of_runs,
             fit.model.matrix,
-            fit.model.robot.wheel_names,
+            fit.model.robot.drive.names,
         )
 
     @property

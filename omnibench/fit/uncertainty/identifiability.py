@@ -9,16 +9,16 @@ import numpy as np
 from omnibench.config import Model
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
+from omnibench.fit.geometry import WheelGeometry, unit_of
 from omnibench.fit.least_squares.noise import NoiseEstimate
 from omnibench.fit.least_squares.roots import roots_of
 from omnibench.fit.linear_fit import linear_fit
-from omnibench.fit.parameterisation import WheelGeometry
+from omnibench.fit.shrinkage.prior import default_mount
 from omnibench.fit.span import DrivenSpan, State, driven_span, unidentified_directions, wheel_directions
 from omnibench.fit.uncertainty.information import information_of_runs, noise_of_matrix
 from omnibench.fit.uncertainty.physical import (
     identified_parameters,
     known_slopes,
-    unit_of,
 )
 from omnibench.fit.uncertainty.unidentified import open_directions
 from omnibench.robot.calibration import Noise
@@ -84,7 +84,7 @@ def identifiability(
     span = driven_span(trajectories)
     estimate, matrix = _quick_noise(robot, trajectories, span, integration)
     information = information_of_runs(trajectories, matrix, integration, estimate.noise).sum(axis=0)
-    rows = np.abs(robot.inverse_kinematic_matrix).max(axis=1)
+    rows = robot.row_scales
     every = wheel_directions(robot, span)
     driven = np.array([each.rates for each in every if each.state != "undriven"])
     deviations = iter((deviations_along(information, driven) / rows).tolist())
@@ -133,7 +133,7 @@ def _rough_rows(directions: Sequence[DirectionIdentifiability]) -> Iterator[str]
 def _open_parameters(robot: Robot, parameters: Sequence[ParameterIdentifiability]) -> Iterator[str]:
     """A sentence about physical parameters that these recordings do not identify, but others could."""
     _, _, directions = np.linalg.svd(robot.inverse_kinematic_matrix)
-    ever = identified_parameters(robot, directions[3:])
+    ever = identified_parameters(_geometry(robot), directions[len(robot.motions) :])
     missing = [
         parameter.name for parameter, could in zip(parameters, ever, strict=True) if could and not parameter.told
     ]
@@ -173,10 +173,15 @@ def _inverse(information: Array) -> Array:
     return inverse
 
 
+def _geometry(robot: Robot) -> WheelGeometry:
+    """The geometry that is fitted by default."""
+    return WheelGeometry(robot, fitted_mount=default_mount(robot) == "fit")
+
+
 def _parameters(robot: Robot, span: DrivenSpan, information: Array) -> tuple[ParameterIdentifiability, ...]:
     """Identifiability of the physical parameters if the matrix is unknown along unidentified directions."""
-    kept = unidentified_directions(robot, span)
-    identified, slopes, geometry = identified_parameters(robot, kept), known_slopes(robot, kept), WheelGeometry(robot)
+    kept, geometry = unidentified_directions(robot, span), _geometry(robot)
+    identified, slopes = identified_parameters(geometry, kept), known_slopes(geometry, kept)
     deviations = geometry.scale * np.linalg.norm(roots_of(slopes.T @ information @ slopes), axis=1)
     return tuple(
         ParameterIdentifiability(

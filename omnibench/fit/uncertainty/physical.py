@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.errors import DataError
-from omnibench.fit.parameterisation import MatrixElements, WheelGeometry
+from omnibench.fit.geometry import WheelGeometry
+from omnibench.fit.parameterisation import MatrixElements
 from omnibench.robot.kinematics import Array, Robot
 
 # Both are far above the rounding of derivatives (1e-10) and below any share that a direction of wheel rates can have;
@@ -33,14 +34,9 @@ class ParameterEstimate:
     untold: str = ""
 
 
-def unit_of(name: str) -> str:
-    """The unit of a physical parameter."""
-    return "rad" if name.startswith("angle") else "m"
-
-
 def is_invertible(robot: Robot) -> bool:
     """True if the matrix determines the geometry: three omni wheels, nine elements for nine parameters."""
-    return len(robot.wheels) == 3 and not any(wheel.roller_angle for wheel in robot.wheels)
+    return len(robot.wheels) == 3 and all(wheel.kind == "omni" and wheel.measured for wheel in robot.wheels)
 
 
 def geometry_of(matrix: Array, robot: Robot) -> Array:
@@ -56,30 +52,30 @@ def geometry_of(matrix: Array, robot: Robot) -> Array:
     except np.linalg.LinAlgError:
         raise DataError("the matrix is singular: no wheels have it") from None
     radius = 1 / np.hypot(across, along)
-    design = np.array([wheel.angle for wheel in robot.wheels])
+    design = np.array([wheel.axle for wheel in robot.wheels])
     angle = np.arctan2(-across, along)
     angle += 2 * np.pi * np.round((design - angle) / (2 * np.pi))
     return np.concatenate([radius, turn * radius, angle])
 
 
-def known_slopes(robot: Robot, kept: Array) -> Array:
-    """Derivatives (3N, 3N) of the matrix elements by the parameters in units of their scale, at the design.
+def known_slopes(geometry: WheelGeometry, kept: Array) -> Array:
+    """Derivatives (3M, n) of the matrix elements by the numbers of a geometry in units of their scale, at the design.
 
-    kept (q, N): directions of wheel rates along which the matrix is unknown; the derivatives are 0 there.
+    kept (q, M): directions of drive signals along which the matrix is unknown; the derivatives are 0 there.
     """
-    geometry = WheelGeometry(robot)
-    known = MatrixElements(robot, "row", kept).slopes(geometry.start)
+    known = MatrixElements(geometry.robot, "row", kept, known_mount=False).projection
     slopes: Array = known @ geometry.slopes(geometry.start) * geometry.scale
     return slopes
 
 
-def identified_parameters(robot: Robot, kept: Array) -> tuple[bool, ...]:
-    """True (3N,) for the parameters that a matrix identifies which is unknown along the directions ``kept`` (q, N).
+def identified_parameters(geometry: WheelGeometry, kept: Array) -> tuple[bool, ...]:
+    """True (n,) for the numbers that a matrix identifies which is unknown along the directions ``kept`` (q, M).
 
     Linearised about the design: a parameter is identified if every change of the geometry that moves it changes the
     known part of the matrix.
     """
-    rows = np.repeat(np.abs(robot.inverse_kinematic_matrix).max(axis=1), len(robot.wheels))
-    _, strengths, directions = np.linalg.svd(known_slopes(robot, kept) / rows[:, None])
+    rows = np.repeat(geometry.robot.row_scales, len(geometry.robot.drive.names))
+    slopes = known_slopes(geometry, kept) / rows[:, None]
+    _, strengths, directions = np.linalg.svd(np.vstack([slopes, np.zeros((slopes.shape[1], slopes.shape[1]))]))
     unidentified = directions[strengths <= _NO_CHANGE * strengths[0]]
     return tuple(bool(share < _UNIDENTIFIED) for share in np.square(unidentified).sum(axis=0))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import RunResult
 from omnibench.fit.cost import SumOfNorms
-from omnibench.fit.parameterisation import WheelGeometry
+from omnibench.fit.geometry import WheelGeometry, unit_of
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.span import driven_span, unidentified_directions
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals
@@ -22,7 +22,6 @@ from omnibench.fit.uncertainty.physical import (
     geometry_of,
     identified_parameters,
     is_invertible,
-    unit_of,
 )
 from omnibench.fit.uncertainty.sandwich import Sandwich, Scores, sandwich, scores_of_runs
 from omnibench.robot.calibration import Noise
@@ -39,6 +38,9 @@ _NO_GAIN = 1e-4  # relative decrease of the cost that ends the steps
 _LEAST_LEFT = 0.25
 
 
+Basis = Literal["likelihood", "scatter", "posterior"]
+
+
 class NoCovarianceError(DataError):
     """A calibration has no covariance; the message says why, in one line."""
 
@@ -49,12 +51,12 @@ class Uncertainty:
 
     covariance (3N, 3N): the elements' covariance, row by row, m and rad per rad of wheel. Rows and columns of elements
     that are held at their start are zero, with scatter as the basis also of those on a bound, and so is the variance
-    along directions of wheel rates that were kept at the design values.
-    standard_deviations (3, N). intervals: 95 %, by Student's t; nan where an element depends on a number that the box
-    holds or that lies on a bound of it, about which the answers of other recordings do not scatter evenly. parameters:
-    the wheels' geometry, if it was searched or follows from the matrix (three omni wheels); without standard deviation
-    where the data do not identify a parameter, or it depends on such a number. noise: the reference poses'. basis:
-    likelihood (the calibrator's own covariance) or scatter of the runs. source: the data behind it, in words.
+    along directions of wheel rates that were kept at the design values. standard_deviations (3, N). intervals: 95 %, by
+    Student's t; nan where an element depends on a number that the box holds or that lies on a bound of it, about which
+    the answers of other recordings do not scatter evenly. parameters: the wheels' geometry, if it was searched or
+    follows from the matrix (three omni wheels); without standard deviation where the data do not identify a parameter,
+    or it depends on such a number. noise: the reference poses'. basis: likelihood (the calibrator's own covariance),
+    scatter of the runs, or posterior of either and the design. source: the data behind it, in words.
     """
 
     covariance: Array
@@ -62,7 +64,7 @@ class Uncertainty:
     intervals: ElementIntervals
     parameters: tuple[ParameterEstimate, ...] | None
     noise: Noise
-    basis: Literal["likelihood", "scatter"]
+    basis: Basis
     source: str
 
 
@@ -79,14 +81,8 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     """
     if result.matrix is None or result.vector is None:
         raise NoCovarianceError(f"no covariance without an answer: {result.reason}")
-    noise = result.noise or noise_of_matrix(problem.trajectories, result.matrix, problem.integration).noise
-    scatter = _by_scatter(problem, result, noise) if result.covariance is None else None
-    if scatter is not None:
-        of_vector = EstimatedCovariance(scatter.covariance, scatter.effective_freedom)
-    else:
-        assert result.covariance is not None
-        freedom = np.inf if result.degrees_of_freedom is None else result.degrees_of_freedom
-        of_vector = EstimatedCovariance(result.covariance, freedom)
+    answer = covariance_of_answer(problem, result)
+    of_vector = answer.of_vector
     slopes = problem.parameterisation.slopes(result.vector)
     of_elements = of_vector.of(slopes)
     bounded = depending(slopes, problem.without_interval(result.at_bounds))
@@ -96,10 +92,34 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
         standard_deviations=of_elements.standard_deviations.reshape(result.matrix.shape),
         intervals=ElementIntervals(result.matrix - reach, result.matrix + reach),
         parameters=_parameters(problem, result, of_vector, of_elements, bounded),
-        noise=noise,
-        basis="likelihood" if scatter is None else "scatter",
-        source="the calibrator's own (see its reason)" if scatter is None else scatter.words,
+        noise=answer.noise,
+        basis=answer.basis,
+        source=answer.source,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class AnswerCovariance:
+    """The covariance of a searched vector, the noise of the reference poses; basis and source as in Uncertainty."""
+
+    of_vector: EstimatedCovariance
+    noise: Noise
+    basis: Basis
+    source: str
+
+
+def covariance_of_answer(problem: CalibrationProblem, result: RunResult) -> AnswerCovariance:
+    """The calibrator's own covariance of its answer, or else that of the scatter. NoCovarianceError says why not."""
+    assert result.matrix is not None  # callers have checked
+    noise = result.noise or noise_of_matrix(problem.trajectories, result.matrix, problem.integration).noise
+    if result.covariance is None:
+        scatter = _by_scatter(problem, result, noise)
+        estimated = EstimatedCovariance(scatter.covariance, scatter.effective_freedom)
+        return AnswerCovariance(estimated, noise, "scatter", scatter.words)
+    freedom = np.inf if result.degrees_of_freedom is None else result.degrees_of_freedom
+    basis: Basis = "likelihood" if result.shrinkage is None else "posterior"
+    source = "the calibrator's own (see its reason)" if result.shrinkage is None else result.shrinkage.source
+    return AnswerCovariance(EstimatedCovariance(result.covariance, freedom), noise, basis, source)
 
 
 def _by_scatter(problem: CalibrationProblem, result: RunResult, noise: Noise) -> Sandwich:
@@ -195,13 +215,14 @@ def _parameters(
     """
     robot = problem.robot
     assert result.vector is not None and result.matrix is not None  # noqa: PT018 (uncertainty_of has checked)
-    if problem.parameterisation.name == "geometry":
-        values, covariance = result.vector, of_vector
+    geometry = WheelGeometry(robot)
+    if isinstance(problem.parameterisation, WheelGeometry):
+        geometry, values, covariance = problem.parameterisation, result.vector, of_vector
         bounded = problem.without_interval(result.at_bounds)
     elif is_invertible(robot):
         try:
             values = geometry_of(result.matrix, robot)
-            inverse = np.linalg.inv(WheelGeometry(robot).slopes(values))
+            inverse = np.linalg.inv(geometry.slopes(values))
             covariance, bounded = of_elements.of(inverse), depending(inverse, bounded)
         except (DataError, np.linalg.LinAlgError):
             return None
@@ -210,7 +231,7 @@ def _parameters(
     kept = unidentified_directions(robot, driven_span(problem.trajectories))
     untold = [
         "no interval" if touching else "" if identified else "not identified by these data"
-        for identified, touching in zip(identified_parameters(robot, kept), bounded, strict=True)
+        for identified, touching in zip(identified_parameters(geometry, kept), bounded, strict=True)
     ]
     return tuple(
         ParameterEstimate(
@@ -223,7 +244,7 @@ def _parameters(
             untold=untold,
         )
         for name, value, deviation, reach, untold in zip(
-            WheelGeometry(robot).names,
+            geometry.names,
             values,
             covariance.standard_deviations,
             covariance.reach,

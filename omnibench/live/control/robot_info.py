@@ -12,12 +12,15 @@ from omnibench.live.wire.topics import TOPICS, KeySpace
 
 
 def robot_info(config: LiveConfig, keys: KeySpace, tracker: RobotTracker) -> Mapping[str, Any]:
-    """Calibration, topics' keys, frames, fusion settings and versions of a robot of the node ``config``."""
-    robot = robot_called(config, tracker.name)
+    """Wheels, calibration, topics' keys, frames, fusion settings and versions of a robot of the node ``config``."""
+    robot, drive = robot_called(config, tracker.name), tracker.calibration.robot.drive
     return {
         "robot": tracker.name,
         "node": config.name,
-        "wheels": tracker.calibration.robot.wheel_names,
+        "wheels": drive.wheels,
+        "steered": drive.steered,
+        "signals": drive.names,
+        "mount": tracker.calibration.robot.mount,
         "calibration": tracker.calibration.name,
         "integration": tracker.calibration.integration,
         "profile": config.profile,

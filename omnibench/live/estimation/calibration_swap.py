@@ -11,6 +11,7 @@ from omnibench.live.estimation.extrapolation_monitor import ExtrapolationMonitor
 from omnibench.live.estimation.health import SwapRecord
 from omnibench.live.estimation.robot_state import RobotState, wheel_angle_effects
 from omnibench.robot.calibration import Calibration
+from omnibench.robot.signals import of_centre
 
 _OTHER_ROBOT = 0.5  # share of a row's largest element; chosen: no calibration moves a matrix so far from its design
 
@@ -38,11 +39,15 @@ def record_refused_swap(state: RobotState, name: str | None, reason: str) -> Non
 
 
 def check_same_robot(calibration: Calibration, running: Calibration) -> None:
-    """DataError: a calibration has other wheels than the running one, or its matrix is far off the design's."""
+    """DataError: a calibration has other wheels than the running one, or its matrix is far off the design's.
+
+    The tracked point may be another one; matrices of the robot's centre are compared.
+    """
     calibration.check_wheels(running.robot, "this robot")
+    matrix = of_centre(calibration.robot, calibration.matrix_array.T).T
     for robot in (calibration.robot, running.robot):
-        design = robot.inverse_kinematic_matrix
-        off = np.abs(calibration.matrix_array - design).max(axis=1) / np.abs(design).max(axis=1)
+        centred = robot.model_copy(update={"mount": None})
+        off = np.abs(matrix - centred.inverse_kinematic_matrix).max(axis=1) / centred.row_scales
         if off.max() > _OTHER_ROBOT:
             raise DataError(
                 f"row {int(off.argmax()) + 1} of the matrix is {off.max():.0%} off the design of robot "

@@ -31,6 +31,9 @@ class Counts:
     not_finite: int = _anomaly("wheel sample", "not finite")  # NaN or infinity among angles and rates
     too_fast: int = _anomaly("wheel sample", "faster than max_rate")
     wrong_joints: int = _anomaly("wheel sample", "without all wheels")  # by name, or without angle and rate
+    no_steering: int = _anomaly("wheel sample", "before the first steering angles")
+    old_steering: int = _anomaly("wheel sample", "with old steering angles")  # beyond max_steering_age: these are held
+    bad_steering: int = _anomaly("steering angle", "too large")  # mostly a car's in degrees
     undecodable: int = _anomaly("wheel message", "undecodable")  # no sensor_msgs/JointState
     poses: int = 0  # SLAM poses that were fused
     pose_rejected: int = _anomaly("pose", "refused by the gate")  # too far from the expected one

@@ -6,7 +6,7 @@ import logging
 
 import numpy as np
 
-from omnibench.live.estimation.wheel_input import WheelStep
+from omnibench.live.wheels.wheel_input import WheelStep
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.training_domain import TrainingDomain, extrapolation_consequence
@@ -30,24 +30,24 @@ class ExtrapolationMonitor:
             self._domain, self.seconds = TrainingDomain(calibration.robot, calibration.driven), 0.0
         self._matrix = calibration.matrix_array
         self._lasted = 0.0  # s that the robot has now been outside the domain without a break
-        self._turned: Array = np.zeros(self._matrix.shape[1])  # rad, of the wheels in the present window
+        self._driven: Array = np.zeros(self._matrix.shape[1])  # rad, integrals of the signals in the present window
         self._elapsed = 0.0  # s since the present window began
 
-    def take(self, step: WheelStep) -> None:
-        """Take a wheel step."""
+    def take(self, step: WheelStep, driven: Array) -> None:
+        """Take a wheel step with the integrals (M,) of its drive signals, rad."""
         if self._domain is None:
             return
         if step.blind:  # its motion is not known
             self._begin()
             return
-        self._turned = self._turned + step.angles
+        self._driven = self._driven + driven
         self._elapsed += step.duration
         if self._elapsed >= _WINDOW:
-            self._judge(self._domain, self._matrix @ self._turned / self._elapsed)
+            self._judge(self._domain, self._matrix @ self._driven / self._elapsed)
             self._begin()
 
     def _begin(self) -> None:
-        self._turned = np.zeros(self._matrix.shape[1])
+        self._driven = np.zeros(self._matrix.shape[1])
         self._elapsed = 0.0
 
     def _judge(self, domain: TrainingDomain, motion: Array) -> None:

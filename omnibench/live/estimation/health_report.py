@@ -66,12 +66,14 @@ class HealthReporter:
     def _status(self, state: RobotState, now: float, age: float | None) -> tuple[Status, str]:
         """The status and its reason in words. age: of the last wheel sample, s; None before the first."""
         if age is None:
-            return "waiting", "no wheel sample yet"
+            return "waiting", f"no wheel sample yet{f': {state.last_refusal}' if state.last_refusal else ''}"
         behind = self._longest_wait(state)
         if age > self._stale_after + behind:
             return "stale", f"no wheel sample for {age:.1f} s"
         if behind > _BEHIND:
             return "degraded", f"behind by {behind:.1f} s: samples come faster than they can be taken"
+        if old := state.wheel_input.old_steering:
+            return "degraded", f"no steering angles for {old:.1f} s: the last ones are held"
         fusion = state.fusion
         if fusion is None:
             return "ok", "odometry"

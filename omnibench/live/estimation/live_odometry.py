@@ -6,6 +6,9 @@ The covariance P of the pose (x, y, heading) has two parts, P = W + J C J^T:    
   the derivative of the pose after the step with respect to the pose before it.                                 (L2)
 - C is the covariance of the matrix's elements, J the derivative of the pose with respect to them. The matrix errs in
   the same way all the time, so that J adds up along the way.                                                   (L3)
+
+The matrix moves the tracked point. Where that is mounted off the robot's centre, W and J are of its pose, and what is
+told is of the centre.
 """
 
 from __future__ import annotations
@@ -17,10 +20,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.live.estimation.wheel_input import WheelStep
+from omnibench.live.estimation.robot_centre import RobotCentre, carried
+from omnibench.live.wheels.wheel_input import WheelStep
 from omnibench.robot.calibration import Calibration, Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryStream
+from omnibench.robot.planar import relative, unit_twist
 
 LOG = logging.getLogger("omnibench.live")
 
@@ -61,32 +66,38 @@ class Motion:
 
 
 class LiveOdometry:
-    """Pose and twist of one robot with covariances; the pose does not jump when the calibration changes.
+    """Pose and twist of a robot's centre with covariances; the pose does not jump when the calibration changes.
 
     Effects take the session that the calibration names as the one that is driven. Wheel angles that the sender does not
     give are counted from 0.
 
-    standstill: share of the noise that is left while no wheel turns. session_time: s since the session began; 0 for a
-    new node.
+    standstill: share of the noise that is left while no wheel turns. pose (3,): m, m, rad; the heading is not wrapped.
+    session_time: s since the session began; 0 for a new node.
     """
 
     def __init__(self, calibration: Calibration, standstill: float = 0.01) -> None:
         self._standstill = standstill
         self._calibration = calibration
+        mount, self._drive = calibration.robot.mount, calibration.robot.drive
+        self._centre = None if mount is None else RobotCentre(mount)
         self.session_time = 0.0
         self._stream = self._new_stream(self.session_time)
+        self.pose: Array = np.zeros(3)
         self._recent: deque[WheelStep] = deque(maxlen=_REMEMBERED)
-        self._wheel_angles: Array = np.zeros(len(calibration.robot.wheels))
+        self._wheel_angles: Array = np.zeros(len(self._drive.wheels))
+        self._steering: Array | None = None  # at the end of the last step
+        self._unsteered = 0.0  # m that the wheels have rolled since steering angles are held for too long
+        self._radii, self._reach = calibration.robot.radii, calibration.robot.reach
         self.twist: Array = np.zeros(3)
         self._duration = calibration.sample_period
         noise = calibration.noise or UNKNOWN_NOISE
         self._position_walk = noise.walk_position**2 or UNKNOWN_NOISE.walk_position**2 / 100
         self._heading_walk = noise.walk_heading**2 or UNKNOWN_NOISE.walk_heading**2 / 100
         self._walk = _RandomWalk()
-        wheels = len(calibration.robot.wheels)
-        self._jacobian = _MatrixJacobian(wheels, calibration.integration)
+        signals = len(self._drive.names)
+        self._jacobian = _MatrixJacobian(signals, calibration.integration)
         self._elements: Array | None = None
-        self._blocks = np.zeros((3, wheels, wheels))
+        self._blocks = np.zeros((3, signals, signals))
         if calibration.provenance is not None and calibration.provenance.on_bounds:
             LOG.warning(
                 "calibration %r: %s on a bound of the box, of which no variance is known: covariances are too small",
@@ -94,23 +105,24 @@ class LiveOdometry:
                 ", ".join(calibration.provenance.on_bounds),
             )
         if calibration.covariance is not None:
-            self._elements = np.array(calibration.covariance)[: 3 * wheels, : 3 * wheels]
-            by_row = self._elements.reshape(3, wheels, 3, wheels)
+            self._elements = np.array(calibration.covariance)[: 3 * signals, : 3 * signals]
+            by_row = self._elements.reshape(3, signals, 3, signals)
             self._blocks = np.stack([by_row[row, :, row] for row in range(3)])
         self._matrix_variances = [0.0, 0.0, 0.0]  # variances of the twist by the matrix's covariance
 
     @property
-    def pose(self) -> Array:
-        """(3,): m, m, rad; the heading is not wrapped."""
-        return self._stream.pose
+    def driven(self) -> Array:
+        """Integrals (M,) of the last step's drive signals, rad."""
+        return self._stream.driven
 
     @property
     def covariance(self) -> Array:
         """Covariance (3, 3) of the pose, Eq. (L1)."""
-        if self._elements is None:
-            return self._walk.covariance
-        jacobian = self._jacobian.values
-        return self._walk.covariance + jacobian @ self._elements @ jacobian.T
+        covariance = self._walk.covariance
+        if self._elements is not None:
+            jacobian = self._jacobian.values
+            covariance = covariance + jacobian @ self._elements @ jacobian.T
+        return covariance if self._centre is None else carried(covariance, (self.pose - self._stream.pose)[:2])
 
     @property
     def twist_covariance(self) -> Array:
@@ -120,20 +132,29 @@ class LiveOdometry:
         covariance = np.zeros((3, 3))
         covariance[0, 0], covariance[1, 1] = position + along_x, position + along_y
         covariance[2, 2] = heading + turning
-        return covariance
+        if self._centre is None:
+            return covariance
+        of_centre: Array = self._centre.of_twist @ covariance @ self._centre.of_twist.T
+        return of_centre
 
     def set_odom_heading(self, heading: float) -> None:
         """Set the heading of odom in the map, rad, along whose axes effects of the world act; at first it is 0."""
         self._stream.frame_heading = heading
 
-    def resume(self, pose: Array, covariance: Array, session_time: float = 0.0) -> None:
-        """Continue from the pose, covariance and session time (s) that another process reached."""
+    def resume(self, pose: Array, covariance: Array, session_time: float = 0.0, steering: Array | None = None) -> None:
+        """Continue from the pose, covariance, session time (s) and steering (S,) that another process reached."""
         self._stream = self._new_stream(session_time)
         self.session_time = session_time
-        self._begin(pose, covariance)
+        self._begin(pose, covariance, steering)
 
-    def _begin(self, pose: Array, covariance: Array) -> None:
-        self._stream.pose = np.array(pose, dtype=float)
+    def _begin(self, pose: Array, covariance: Array, steering: Array | None) -> None:
+        self.pose = self._stream.pose = np.array(pose, dtype=float)
+        if self._centre is not None:
+            self._stream.pose = self._centre.tracked(self.pose)
+            covariance = carried(covariance, (self._stream.pose - self.pose)[:2])
+        if steering is not None:
+            self._stream.steer(steering)
+        self._steering = steering
         self._walk.set(covariance)
         self._jacobian.clear()
 
@@ -143,9 +164,9 @@ class LiveOdometry:
         begun = self.session_time - sum(step.duration for step in self._recent)
         other._stream = other._new_stream(begun)
         for step in self._recent:  # so that no effect takes the swap for a start from rest
-            other._stream.drive(step.angles, step.duration, step.positions)
+            other._stream.drive(step.angles, step.duration, step.positions, step.steering)
         other._stream.frame_heading = self._stream.frame_heading
-        other._begin(self.pose, self.covariance)
+        other._begin(self.pose, self.covariance, self._steering)
         other.session_time, other._recent, other._wheel_angles = self.session_time, self._recent, self._wheel_angles
         other.twist, other._duration = self.twist, self._duration
         return other
@@ -155,24 +176,45 @@ class LiveOdometry:
         before, twist = self._stream.pose, self.twist
         positions = step.positions
         self._wheel_angles = self._wheel_angles + step.angles if positions is None else positions
-        self._stream.drive(step.angles, step.duration, self._wheel_angles)
+        self._stream.drive(step.angles, step.duration, self._wheel_angles, step.steering)
+        self._steering = step.steering
         self.session_time += step.duration
         self._recent.append(step)
-        moved = self._stream.moved
+        moved: Array = self._stream.moved
         if step.duration > 0:
-            self.twist = self._stream.matrix @ step.rates if step.blind else moved / step.duration
+            rates = self._signal_rates(step)
+            twist_now = self._stream.matrix @ rates if step.blind else moved / step.duration
+            self.twist = twist_now if self._centre is None else self._centre.of_twist @ twist_now
             self._duration = step.duration
-            self._matrix_variances = ((self._blocks @ step.rates) @ step.rates).tolist()
+            self._matrix_variances = ((self._blocks @ rates) @ rates).tolist()
         position, heading = self._walk_variances(step, moved, twist)
-        self._propagate(before, step.angles, position, heading)
+        self._propagate(before, self._stream.driven, position, heading)
+        moved, integration = self._centre_moved()
         return Motion(
             step.stamp,
             step.duration,
             moved,
-            self._stream.integration,
+            integration,
             *self._filter_variances(step.duration, position, heading),
             step.restarted,
         )
+
+    def _signal_rates(self, step: WheelStep) -> Array:
+        """Drive signals (M,) at the end of a step, rad/s."""
+        if self._drive.direct:
+            return step.rates
+        if not step.blind:
+            return self._stream.driven / step.duration
+        steering = None if step.steering is None else step.steering[None]
+        return self._drive.signals(step.rates[None], steering)[0]
+
+    def _centre_moved(self) -> tuple[Array, Integration]:
+        """Bring the pose to that of the stream: the motion (3,) of the centre in its own frame, and along what path."""
+        if self._centre is None:
+            self.pose = self._stream.pose
+            return self._stream.moved, self._stream.integration
+        before, self.pose = self.pose, self._centre.pose(self._stream.pose)
+        return unit_twist(relative(before, self.pose)), "arc"
 
     def covariance_after_silence(self, seconds: float) -> Array:
         """Covariance (3, 3) of the pose after a silence, in which the robot may have kept its twist or stood."""
@@ -186,20 +228,28 @@ class LiveOdometry:
         return self.covariance + np.diag(growth)
 
     def _new_stream(self, session_time: float) -> OdometryStream:
-        return self._calibration.model.stream(session=self._calibration.session, session_time=session_time)
+        start = None if self._centre is None else self._centre.start
+        return self._calibration.model.stream(start, self._calibration.session, session_time)
 
     def _walk_variances(self, step: WheelStep, moved: Array, twist: Array) -> tuple[float, float]:
         """Variances of position (m2) and heading (rad2) that a step adds. twist (3,): before the step."""
         still = max(map(abs, step.angles.tolist())) <= _STILL * step.duration
         share = self._standstill if still and not step.blind else 1.0
         position, heading = share * self._position_walk * step.duration, share * self._heading_walk * step.duration
+        if not step.held:
+            self._unsteered = 0.0
         if step.blind:
             length, turn = math.hypot(moved[0], moved[1]), 0.0
             if not step.counted:  # the robot may have kept the twist before, had the one after, or stood
                 length = step.blind * max(math.hypot(vx, vy) for vx, vy, _ in (twist, self.twist))
                 turn = step.blind * max(abs(float(turning)) for _, _, turning in (twist, self.twist))
-            position += (_BLIND_SHARE * length) ** 2
-            heading += (_BLIND_SHARE * turn) ** 2
+            if step.held:
+                length = float(np.abs(step.angles * self._radii).max())
+                turn = length / self._reach
+            # where steering angles are held, every step errs in the same way as the one before
+            position += _BLIND_SHARE**2 * length * (length + 2 * self._unsteered)
+            heading += _BLIND_SHARE**2 * turn * (turn + 2 * self._unsteered / self._reach)
+            self._unsteered += length
         return position, heading
 
     def _filter_variances(self, duration: float, position: float, heading: float) -> tuple[float, float]:
@@ -208,14 +258,14 @@ class LiveOdometry:
         time = _CORRELATION * duration
         return position + time * (along_x + along_y) / 2, heading + time * turning
 
-    def _propagate(self, before: Array, angles: Array, position: float, heading: float) -> None:
+    def _propagate(self, before: Array, driven: Array, position: float, heading: float) -> None:
         """Eq. (L2) and (L3) for the step from the pose ``before``; position (m2), heading (rad2): Q of the step."""
         x, y, start = before.tolist()
         to_x, to_y, end = self._stream.pose.tolist()
         self._walk.carry(to_x - x, to_y - y)
         self._walk.add(position, heading)
         if self._elements is not None:
-            self._jacobian.add(angles, to_x - x, to_y - y, start, end)
+            self._jacobian.add(driven, to_x - x, to_y - y, start, end)
 
 
 class _RandomWalk:
@@ -252,19 +302,19 @@ class _RandomWalk:
 class _MatrixJacobian:
     """Derivative J of the pose with respect to the matrix, Eq. (L3), to first order in the turn of one step.
 
-    values (3, 3N): derivatives of (x, y, heading) by the matrix's elements, row by row.
+    values (3, 3M): derivatives of (x, y, heading) by the matrix's elements, row by row.
     """
 
-    def __init__(self, wheels: int, integration: Integration) -> None:
+    def __init__(self, signals: int, integration: Integration) -> None:
         self._arc = integration == "arc"
-        self.values = np.zeros((3, 3 * wheels))
-        self._by_row = self.values.reshape(3, 3, wheels)
+        self.values = np.zeros((3, 3 * signals))
+        self._by_row = self.values.reshape(3, 3, signals)
 
     def clear(self) -> None:
         self.values[:] = 0.0
 
-    def add(self, angles: Array, along_x: float, along_y: float, start: float, end: float) -> None:
-        """Add a step: wheel angles (N,) rad, path (m) in the world's frame, headings at its ends (rad)."""
+    def add(self, driven: Array, along_x: float, along_y: float, start: float, end: float) -> None:
+        """Add a step: integrals (M,) of its signals, rad, path (m) in the world's frame, headings at its ends (rad)."""
         direction, half = ((start + end) / 2, 0.5) if self._arc else (start, 0.0)
         cosine, sine = math.cos(direction), math.sin(direction)
         by_row = self._by_row
@@ -273,4 +323,4 @@ class _MatrixJacobian:
         by_row[0, 2] -= along_y * turned
         by_row[1, 2] += along_x * turned
         shares = ((cosine, -sine, -half * along_y), (sine, cosine, half * along_x), (0.0, 0.0, 1.0))
-        by_row += np.array(shares)[:, :, None] * angles
+        by_row += np.array(shares)[:, :, None] * driven

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from omnibench.live.estimation.counts import Counts
@@ -9,13 +10,18 @@ from omnibench.live.estimation.extrapolation_monitor import ExtrapolationMonitor
 from omnibench.live.estimation.health import SwapRecord
 from omnibench.live.estimation.live_odometry import LiveOdometry
 from omnibench.live.estimation.published_stamps import PublishedStamps
-from omnibench.live.estimation.wheel_input import WheelInput, WheelSettings
 from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings
 from omnibench.live.fusion.reference_correction import ReferenceCorrection
 from omnibench.live.fusion.timeline import Timeline
+from omnibench.live.wheels.joints import joints_of
+from omnibench.live.wheels.steering_input import SteeringInput
+from omnibench.live.wheels.wheel_input import WheelInput, WheelSettings
 from omnibench.robot.calibration import Calibration
+from omnibench.robot.wheels.drive import CarDrive
 
 _HISTORY = 5.0  # s of odometry that are remembered without fusion; chosen, as FusionSettings.history
+# Largest steering angles, rad, of a car, which drives by their tangents, and of others, 1600 turns one way; chosen.
+_FARTHEST_OF_CAR, _FARTHEST = math.radians(85.0), 1e4
 
 
 @dataclass(slots=True, eq=False)
@@ -54,14 +60,20 @@ class RobotState:
 
 
 def new_state(name: str, calibration: Calibration, wheels: WheelSettings, fusion: FusionSettings | None) -> RobotState:
-    """The state before the first message: odometry at the origin, nobody knows where in the map."""
-    counts = Counts()
+    """The state before the first message: odometry at the origin, nobody knows where in the map.
+
+    ConfigError: the joints that ``wheels`` names are not one for each wheel.
+    """
+    counts, drive = Counts(), calibration.robot.drive
+    joints = joints_of(calibration.robot, wheels, f"robot {name!r}: wheels")
+    limit = _FARTHEST_OF_CAR if isinstance(drive, CarDrive) else _FARTHEST
+    steering = SteeringInput(joints.steering, limit, counts) if drive.steered else None
     timeline = Timeline(fusion.history if fusion else _HISTORY)
     return RobotState(
         name=name,
         calibration=calibration,
         counts=counts,
-        wheel_input=WheelInput(calibration.robot.wheel_names, wheels, calibration.sample_period, counts),
+        wheel_input=WheelInput(joints.wheels, wheels, calibration.sample_period, counts, steering),
         odometry=LiveOdometry(calibration, (fusion or FusionSettings()).standstill),
         timeline=timeline,
         fusion=Fusion(fusion, timeline, counts) if fusion else None,

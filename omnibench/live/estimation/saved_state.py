@@ -35,14 +35,15 @@ class SavedState(Model):
     """A robot's state after a wheel sample; poses in m, m, rad, covariances (3, 3) row by row.
 
     sequence: number of the state. stamp: of the sample, ns. wall: unix time of its arrival, s. positions: wheel angles,
-    rad. map_pose: fused pose, once SLAM has located the robot. session_time: s since the session began. flows: as
-    RobotState's.
+    rad. steering: of steered wheels, rad. map_pose: fused pose, once SLAM has located the robot. session_time: s since
+    the session began. flows: as RobotState's.
     """
 
     sequence: int = Field(0, ge=0)
     stamp: int = Field(ge=-(2**63), lt=2**63)
     wall: FiniteFloat
     positions: tuple[FiniteFloat, ...] | None
+    steering: tuple[FiniteFloat, ...] | None = None
     pose: SavedPose
     covariance: SavedCovariance
     map_pose: SavedPose | None = None
@@ -108,7 +109,8 @@ class RobotMemory:
             return
         self._sequence += 1
         numbered = state.model_copy(update={"sequence": self._sequence})
-        text = numbered.model_dump_json().encode()
+        # a robot that does not steer has the states of earlier versions
+        text = numbered.model_dump_json(exclude={"steering"} if state.steering is None else None).encode()
         slot = _BLOCK if len(text) < _BLOCK else _LONG
         if len(text) >= slot:
             raise OSError(errno.EFBIG, f"it takes {len(text)} bytes")

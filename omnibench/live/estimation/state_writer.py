@@ -38,13 +38,14 @@ class StateWriter:
         if self._memory is None or last is None or state.arrival is None:
             return
         self._due = state.arrival + _PERIOD
-        stamp, positions = last
+        stamp, positions, steering = last
         fusion = state.fusion
         fused = (fusion.pose, fusion.covariance) if fusion is not None and fusion.located else (None, None)
         saved = SavedState.model_construct(  # not validated: reading refuses numbers that are not finite
             stamp=stamp,
             wall=time.time() - (time.monotonic() - state.arrival),
             positions=_row(positions),
+            steering=_row(steering),
             pose=_row(state.odometry.pose),
             covariance=_row(state.odometry.covariance),
             map_pose=_row(fused[0]),
@@ -76,15 +77,19 @@ def resume_state(state: RobotState, saved: SavedState, now: float, wall: float) 
 
     now, wall: monotonic and unix time, s. DataError: the saved state is of a robot with other wheels.
     """
-    wheels = len(state.calibration.robot.wheels)
-    positions = None if saved.positions is None else np.array(saved.positions)
-    if positions is not None and len(positions) != wheels:
-        raise DataError(
-            f"the state of robot {state.name!r} is of a robot with {plural(len(positions), 'wheel')}; remove it"
-        )
-    state.wheel_input.resume(saved.stamp, positions, now - (wall - saved.wall))
+    drive = state.calibration.robot.drive
+    for angles, wheels, what in (
+        (saved.positions, drive.wheels, "wheel"),
+        (saved.steering, drive.steered, "steered wheel"),
+    ):
+        if angles is not None and len(angles) != len(wheels):
+            raise DataError(
+                f"the state of robot {state.name!r} is of a robot with {plural(len(angles), what)}; remove it"
+            )
+    positions, steering = (None if row is None else np.array(row) for row in (saved.positions, saved.steering))
+    state.wheel_input.resume(saved.stamp, positions, now - (wall - saved.wall), steering)
     state.flows.update(saved.flows)
-    state.odometry.resume(np.array(saved.pose), np.reshape(saved.covariance, (3, 3)), saved.session_time)
+    state.odometry.resume(np.array(saved.pose), np.reshape(saved.covariance, (3, 3)), saved.session_time, steering)
     if state.fusion is not None and saved.map_pose is not None and saved.map_covariance is not None:
         state.fusion.begin(np.array(saved.map_pose), np.reshape(saved.map_covariance, (3, 3)))
     state.stamps.unique(saved.stamp)

@@ -25,11 +25,11 @@ from omnibench.live.estimation.robot_state import new_state
 from omnibench.live.estimation.saved_state import RobotMemory, SavedState
 from omnibench.live.estimation.state_writer import StateWriter, resume_state
 from omnibench.live.estimation.update import Update
-from omnibench.live.estimation.wheel_input import WheelSettings, WheelStep
 from omnibench.live.frames import Frames
 from omnibench.live.fusion.pose_fusion import Fusion, FusionSettings, Outcome
 from omnibench.live.fusion.pose_input import PoseInput
 from omnibench.live.fusion.timeline import Entry
+from omnibench.live.wheels.wheel_input import WheelSettings, WheelStep
 from omnibench.live.wire.messages import JointState, MessageError
 from omnibench.live.wire.robot_messages import JointStateDecoder
 from omnibench.robot.calibration import Calibration
@@ -133,7 +133,7 @@ class RobotTracker:
         if state.fusion is not None and state.fusion.located:
             state.odometry.set_odom_heading(float(state.fusion.pose[2] - state.odometry.pose[2]))
         motion = state.odometry.step(step)
-        state.monitor.take(step)
+        state.monitor.take(step, state.odometry.driven)
         return motion
 
     def _fuse(self, motion: Motion) -> None:

@@ -19,7 +19,7 @@ from omnibench.config import Model
 from omnibench.live.estimation.counts import Counts
 from omnibench.live.estimation.live_odometry import Motion
 from omnibench.live.fusion.pose_filter import PoseFilter
-from omnibench.live.fusion.reference_correction import turned
+from omnibench.live.fusion.reference_correction import of_centre, turned
 from omnibench.live.fusion.rejections import Rejections
 from omnibench.live.fusion.timeline import Entry, PoseMeasurement, Timeline
 from omnibench.robot.kinematics import Array
@@ -164,14 +164,14 @@ class Fusion:
         return None
 
     def _at_one_time(self, measurement: PoseMeasurement) -> PoseMeasurement:
-        """A pose whose heading was measured at another time, turned by odometry to the time of its position."""
+        """The centre's pose, its heading turned by odometry to the time of its position if it is of another."""
         if measurement.heading_stamp is None:
-            return measurement
+            return of_centre(measurement)
         before = self._timeline.odometry_at(measurement.heading_stamp)
         after = self._timeline.odometry_at(measurement.stamp)
         assert before is not None
         assert after is not None
-        return turned(measurement, before, after)
+        return of_centre(turned(measurement, before, after))
 
     def _fused_or_rejected(self, measurement: PoseMeasurement) -> Outcome:
         """Fuse a pose whose time is within the timeline, or reject it by the gate."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from omnibench.live.estimation.robot_centre import RobotCentre, carried
 from omnibench.live.fusion.timeline import PoseMeasurement
 from omnibench.robot.effects.effect import ReferenceEffect, Values
 from omnibench.robot.kinematics import Array
@@ -21,6 +22,7 @@ class ReferenceCorrection:
     """
 
     def __init__(self, model: OdometryModel, start: PoseMeasurement | None = None) -> None:
+        self._mount = model.robot.mount
         self._terms: list[tuple[ReferenceEffect, Values]] = [
             (term.effect, term.values) for term in model.reference_terms if isinstance(term.effect, ReferenceEffect)
         ]
@@ -35,9 +37,11 @@ class ReferenceCorrection:
         self._start = None
 
     def corrected(self, measurement: PoseMeasurement) -> PoseMeasurement:
-        """The true pose at the time at which its position was measured; its heading may be of another time."""
+        """The tracked point's true pose when its position was measured; its heading may be of another time."""
         if self._start is None:
             self._start = measurement
+        if self._mount is not None:
+            measurement = replace(measurement, mount=self._mount)
         if not self._terms:
             return measurement
         stamps = np.array([(measurement.stamp - self._start.stamp) / _SECOND])
@@ -61,3 +65,12 @@ def turned(measurement: PoseMeasurement, before: Array, after: Array) -> PoseMea
     """
     pose: Array = measurement.pose + np.array([0.0, 0.0, after[2] - before[2]])
     return replace(measurement, pose=pose, heading_stamp=None)
+
+
+def of_centre(measurement: PoseMeasurement) -> PoseMeasurement:
+    """The pose of the robot's centre, from that of a point of the robot."""
+    if measurement.mount is None:
+        return measurement
+    pose = RobotCentre(measurement.mount).pose(measurement.pose)
+    covariance = carried(measurement.covariance, (pose - measurement.pose)[:2])
+    return replace(measurement, pose=pose, covariance=covariance, mount=None)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.live.estimation.live_odometry import Motion
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, Mount
 from omnibench.robot.odometry import advance
 
 _SECOND = 1e9  # ns
@@ -20,7 +20,7 @@ class PoseMeasurement:
     """Measurement of a pose (3,) in the map, m, m, rad, at ``stamp`` (ns), with its covariance (3, 3).
 
     arrival: s, monotonic. absolute: it replaces the filter's pose instead of correcting it. heading_stamp: when its
-    heading was measured (ns), if that is another time.
+    heading was measured (ns), if that is another time. mount: the point of the robot that it is of; None: its centre.
     """
 
     stamp: int
@@ -29,6 +29,7 @@ class PoseMeasurement:
     arrival: float = 0.0
     absolute: bool = False
     heading_stamp: int | None = None
+    mount: Mount | None = None
 
     @property
     def latest(self) -> int:

@@ -21,6 +21,7 @@ from omnibench.live.replay.played_recording import Recording
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.planar import compose, moved_to, relative, rotation
+from omnibench.simulate.flower import true_steering
 
 FULL_TURN = 2 * np.pi
 LONGEST_PAUSE = 3600.0  # s between two runs; chosen
@@ -39,7 +40,8 @@ class ConcatenatedDrive:
     slam_times (m,), slam_poses (m, 3) in m, m, rad with continuous headings, slam_covariances (m, 3, 3) if the data set
     has them, slam_run (m,). Runs after the first have no pose at their start: the drive sets it, nobody measured it.
 
-    start_poses (R, 3) and start_times (R,), s: of the runs in the drive.
+    start_poses (R, 3) and start_times (R,), s: of the runs in the drive. steering (n, S): at the samples' ends, rad;
+    None of a robot that does not steer. Where it stands before a run, it steers to where that one begins.
     """
 
     robot: Robot
@@ -54,6 +56,7 @@ class ConcatenatedDrive:
     slam_run: NDArray[np.intp]
     start_poses: Array
     start_times: Array
+    steering: Array | None = None
 
     @property
     def duration(self) -> float:
@@ -67,7 +70,15 @@ class ConcatenatedDrive:
         """
         wanted = self.wheel_times if stamps is None else np.asarray(stamps, dtype=float)
         return WheelLog(
-            self.wheel_times[1:], self.rates[1:], self.start_poses[0], wanted, self.angles[1:], 0.0, session or ""
+            self.wheel_times[1:],
+            self.rates[1:],
+            self.start_poses[0],
+            wanted,
+            self.angles[1:],
+            0.0,
+            session or "",
+            None if self.steering is None else self.steering[1:],
+            None if self.steering is None else self.robot.drive,
         )
 
 
@@ -107,7 +118,7 @@ def concatenate_runs(
         ids=tuple(run.id for run in runs),
         wheel_times=np.concatenate([[0.0], *(begin + leg.times for begin, leg in zip(begins, legs, strict=True))]),
         angles=_continuous_angles(legs),
-        rates=np.concatenate([np.zeros((1, len(dataset.robot.wheels))), *(leg.rates for leg in legs)]),
+        rates=np.concatenate([np.zeros((1, len(dataset.robot.wheel_names))), *(leg.rates for leg in legs)]),
         run=np.repeat(np.arange(len(legs)), [1 + len(legs[0].times), *(len(leg.times) for leg in legs[1:])]),
         slam_times=np.concatenate([b + run.pose_times[m] for b, run, m in zip(begins, runs, measured, strict=True)]),
         slam_poses=np.concatenate(
@@ -117,6 +128,7 @@ def concatenate_runs(
         slam_run=np.repeat(np.arange(len(runs)), [np.count_nonzero(m) for m in measured]),
         start_poses=starts,
         start_times=begins,
+        steering=_steering(legs, resting),
     )
 
 
@@ -189,8 +201,8 @@ def _trimmed(run: Trajectory) -> Trajectory:
     if run.angles is not None:
         angles = run.angles[kept].copy()
         angles[last] -= run.rates[last] * (run.times[last] - times[last])
-    targets = None if run.targets is None else run.targets[kept]
-    return replace(run, times=times, rates=run.rates[kept], angles=angles, targets=targets)
+    targets, steering = (None if array is None else array[kept] for array in (run.targets, run.steering))
+    return replace(run, times=times, rates=run.rates[kept], angles=angles, targets=targets, steering=steering)
 
 
 def _rest_samples(run: Trajectory, pause: float, period: float) -> int:
@@ -210,7 +222,21 @@ def _with_rest(run: Trajectory, rest: int, period: float) -> Trajectory:
         rates=np.vstack([run.rates, still]),
         angles=np.vstack([angles, angles[-1] + still]),
         targets=None,
+        steering=None if run.steering is None else np.vstack([run.steering, *[run.steering[-1:]] * rest]),
     )
+
+
+def _steering(legs: Sequence[Trajectory], resting: Sequence[int]) -> Array | None:
+    """Steering angles (n, S) at the baseline and at all samples, made continuous over whole turns."""
+    parts: list[Array] = []
+    for leg, rest in zip(legs, (0, *resting), strict=False):
+        if leg.steering is None:
+            return None
+        if rest:
+            parts[-1][-1] = leg.steering[0]
+        parts += [leg.steering.copy()] if parts else [leg.steering[:1], leg.steering.copy()]
+    angles: Array = np.unwrap(np.concatenate(parts), axis=0)
+    return angles
 
 
 def _continuous_angles(legs: Sequence[Trajectory]) -> Array:
@@ -271,5 +297,6 @@ class _TruthOfRuns:
             raise DataError(f"run {run.id}: its set points are not recorded, so its truth is not known")
         rates = self._robot.driven(run.times, run.targets)
         angles = run.angles[0] - run.rates[0] * run.times[0]  # before its first sample
-        log = self._robot.log(run.times, rates, run.start, stamps, angles, run.started_at, run.session)
-        return self._robot.model.poses([log])[0]
+        steering = true_steering(self._robot.model.robot, run)
+        log = self._robot.log(run.times, rates, run.start, stamps, angles, run.started_at, run.session, steering)
+        return self._robot.poses(log)

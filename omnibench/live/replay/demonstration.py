@@ -13,6 +13,7 @@ import zenoh
 
 from omnibench.live.config import LiveConfig, client_session, robot_called
 from omnibench.live.estimation.health import Health
+from omnibench.live.estimation.robot_centre import RobotCentre
 from omnibench.live.estimation.tracker import RobotTracker
 from omnibench.live.network.session import close_session, open_session
 from omnibench.live.node import LiveNode, load_effects
@@ -21,6 +22,7 @@ from omnibench.live.replay.delivery import WINDOW, DeliveryError
 from omnibench.live.replay.played_recording import Recording
 from omnibench.live.replay.replay_player import Player, PlayReport
 from omnibench.live.stopping import wait_until
+from omnibench.live.wheels.joints import joints_of
 from omnibench.live.wire.messages import Odometry
 from omnibench.live.wire.subscriber import Subscription, subscribe
 from omnibench.live.wire.topics import GraphNode
@@ -151,7 +153,7 @@ def demonstrate(
                 robot.name,
                 drive,
                 config.replay,
-                names=robot.wheels.joints,
+                names=joints_of(tracker.calibration.robot, robot.wheels).names,
                 noise=tracker.calibration.noise,
             )
 
@@ -193,13 +195,16 @@ def _evaluated(
     fused: _Collector | None,
     health: Health,
 ) -> Demonstration:
+    drive = replace(drive, robot=calibration.robot)  # whose drive signals the node took
     times = drive.wheel_times
     batch = calibration.model.poses([drive.log(session=calibration.session)])[0]
     design = OdometryModel.of_design(calibration.robot, calibration.integration).poses([drive.log()])[0]
     origin = odometry.stamps[0] if odometry.stamps else 0
     rows = _rows(odometry.stamps, origin, times)
-    # odom begins at the origin, the drive at its start pose
-    published = moved_to(drive.start_poses[0], odometry.poses) if odometry.stamps else odometry.poses
+    # odom begins at the origin, the drive at its start pose; the drive's poses are of the tracked point
+    published = _tracked(calibration, odometry.poses)
+    if odometry.stamps:
+        published = moved_to(drive.start_poses[0], published)
     if recording.truth is not None:
         against, reference = "the simulated truth", concatenated_truth(drive, recording)
         chosen = rows
@@ -217,7 +222,9 @@ def _evaluated(
         against=against,
         theoretical=_deviation(design[chosen], reference[chosen]),
         calibrated=_deviation(batch[chosen], reference[chosen]),
-        fused=None if fused is None else _fused_deviation(fused, origin, drive, reference, chosen),
+        fused=None
+        if fused is None
+        else _fused_deviation(fused.stamps, _tracked(calibration, fused.poses), origin, drive, reference, chosen),
         batch_difference=_difference(published, batch[rows]),
         health=health,
     )
@@ -229,13 +236,19 @@ def _rows(stamps: list[int], origin: int, times: Array) -> Array:
     return np.clip(np.searchsorted(times, seconds - 1e-6), 0, len(times) - 1)
 
 
+def _tracked(calibration: Calibration, poses: Array) -> Array:
+    """Poses (K, 3) of the tracked point, from those of the robot's centre, which a node publishes."""
+    mount = calibration.robot.mount
+    return poses if mount is None else RobotCentre(mount).tracked(poses)
+
+
 def _fused_deviation(
-    fused: _Collector, origin: int, drive: ConcatenatedDrive, reference: Array, chosen: Array
+    stamps: list[int], poses: Array, origin: int, drive: ConcatenatedDrive, reference: Array, chosen: Array
 ) -> Deviation:
     """Deviation from 1 s after the first SLAM pose on: before, the robot's pose in the map is not known."""
-    rows = _rows(fused.stamps, origin, drive.wheel_times)
+    rows = _rows(stamps, origin, drive.wheel_times)
     known = np.isin(rows, chosen) & (drive.wheel_times[rows] > drive.slam_times[0] + 1.0)
-    return _deviation(fused.poses[known], reference[rows[known]])
+    return _deviation(poses[known], reference[rows[known]])
 
 
 def _difference(poses: Array, others: Array) -> float:

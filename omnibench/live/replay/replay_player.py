@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from omnibench.errors import ConfigError, OmnibenchError
 from omnibench.live.control.request_queue import source_of
 from omnibench.live.estimation.counts import anomalies_among
-from omnibench.live.estimation.wheel_input import check_joints
 from omnibench.live.network.callbacks import answers
 from omnibench.live.network.presence import alive_robots, checked_robot
 from omnibench.live.replay.arrivals import (
@@ -31,6 +30,7 @@ from omnibench.live.replay.arrivals import (
 from omnibench.live.replay.concatenated_drive import ConcatenatedDrive
 from omnibench.live.replay.delivery import AcknowledgedDelivery, Delivery, DeliveryError, UnconfirmedDelivery
 from omnibench.live.stopping import wait_until
+from omnibench.live.wheels.joints import check_joints, joints_of
 from omnibench.live.wire.messages import JointState, PoseEstimate
 from omnibench.live.wire.topics import GraphNode
 from omnibench.progress import Progress, Reporter, no_progress
@@ -67,8 +67,8 @@ def events(
     """The messages of a drive, by time of arrival.
 
     origin: stamp of the drive's start, ns (default: the config's, or now). noise: noise model of the reference, for
-    poses whose covariance neither the data set nor the config gives. names (N,): names of the joints; default: the
-    wheels'.
+    poses whose covariance neither the data set nor the config gives. names (N + S,): names of the joints, those
+    that steer after those of the wheels; default: the usual ones.
     """
     return _Messages(drive, config, noise, names).stamped_from(origin)
 
@@ -81,13 +81,12 @@ class _Messages:
     ) -> None:
         self._drive = drive
         self._origin = config.stamp_origin
-        self._joints = tuple(drive.robot.wheel_names if names is None else names)
-        check_joints(self._joints, drive.robot.wheel_names, "joints")
+        self._joints = joints_of(drive.robot).names if names is None else tuple(names)
+        check_joints(self._joints, (*drive.robot.wheel_names, *drive.robot.drive.steered), "joints")
         self._schedule = make_schedule(drive, config)
         self._sampled, self._posed = (_nanoseconds(times) for times in (drive.wheel_times, drive.slam_times))
         self._covariances = _pose_covariances(drive, config.slam, noise)
-        self._angles = None if config.wheels.use == "velocities" else drive.angles
-        self._rates = None if config.wheels.use == "positions" else drive.rates
+        self._positions, self._velocities = _joint_values(drive, config.wheels.use)
 
     def __len__(self) -> int:
         return len(self._schedule)
@@ -101,8 +100,8 @@ class _Messages:
         )
 
     def _sample(self, start: int, row: int) -> JointState:
-        positions = None if self._angles is None else self._angles[row]
-        velocities = None if self._rates is None else self._rates[row]
+        positions = None if self._positions is None else self._positions[row]
+        velocities = None if self._velocities is None else self._velocities[row]
         return JointState(start + int(self._sampled[row]), self._joints, positions, velocities)
 
     def _pose(self, start: int, row: int) -> PoseEstimate:
@@ -264,6 +263,16 @@ class Player:
                 f"{self._robot}, check robot, profile and endpoint of both, or wait longer"
             )
         wait_until(lambda: slam.matched, min(wait, _SLAM_WAIT), stop)
+
+
+def _joint_values(drive: ConcatenatedDrive, use: str) -> tuple[Array | None, Array | None]:
+    """Positions and velocities (n, N + S) of the joints; NaN of those that tell none beside others that do."""
+    angles = None if use == "velocities" else drive.angles
+    rates = None if use == "positions" else drive.rates
+    if drive.steering is None:
+        return angles, rates
+    positions = np.hstack([np.full_like(drive.rates, np.nan) if angles is None else angles, drive.steering])
+    return positions, None if rates is None else np.hstack([rates, np.full_like(drive.steering, np.nan)])
 
 
 def _nanoseconds(times: Array) -> NDArray[np.int64]:

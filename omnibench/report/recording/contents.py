@@ -23,6 +23,7 @@ def contents_table(dataset: Dataset) -> Table:
         _wheels("Target wheel rates", "(ωMa, ωMb, ωMc)", runs, "targets", "what the motor controllers were told"),
         _row("Measured wheel rates", "(ωa, ωb, ωc)", number, "samples", _every(samples, first=0.0), _steps(runs)),
         _wheels("Wheel angles", "beyond Table 1", runs, "angles", "absolute, continuous within a session"),
+        *_steering(runs),
         _row("Odometry", "(x, y, θ)", number, "poses", _every(samples, first=0.0), "computed from the wheel rates"),
         _scans(dataset),
         _reference(runs),
@@ -59,6 +60,12 @@ def _wheels(name: str, symbol: str, runs: Sequence[Trajectory], field: str, rema
     if len(recorded) < len(runs):
         remark += f"; in {count(len(recorded))} of {count(len(runs))} runs"
     return _row(name, symbol, sum(map(len, times)), "samples", _every(times, first=0.0), remark)
+
+
+def _steering(runs: Sequence[Trajectory]) -> list[Row]:
+    if runs[0].steering is None:
+        return []
+    return [_wheels("Steering angles", "beyond Table 1", runs, "steering", "at the samples' ends")]
 
 
 def _steps(runs: Sequence[Trajectory]) -> str:

@@ -21,6 +21,7 @@ from omnibench.report.recording.drawing import (
     TRUTH_ITEM,
 )
 from omnibench.report.recording.scan_points import evenly, poses_at, scan_points
+from omnibench.report.robot_figures import is_placed
 from omnibench.report.style import INK
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
@@ -80,8 +81,10 @@ def _run(
         "scans": scans,
         "plan": [_rounded(outline) for outline in outlines],
         "window": _window(np.vstack(drawn)),
+        "rated": dataset.robot.wheel_names,
+        "steering": None if run.steering is None else _rounded(interpolated(times, run.times, run.steering)),
         "wheels": _wheels(dataset.robot),
-        "radius": max(math.hypot(wheel.distance, wheel.radius) for wheel in dataset.robot.wheels),
+        "radius": max(math.hypot(wheel.reach, wheel.radius) for wheel in dataset.robot.wheels),
         "colours": _colours(),
         "key": _key(bool(scans), truth is not None, bool(outlines)),
     }
@@ -128,8 +131,18 @@ def _window(points: Array) -> list[float]:
 
 
 def _wheels(robot: Robot) -> list[dict[str, Any]]:
-    """The robot's wheels; mecanum wheels are not drawn, because a wheel's angle does not say where it sits."""
-    return [wheel.model_dump() | {"drawn": wheel.roller_angle == 0} for wheel in robot.wheels]
+    """The wheels that are drawn: radius and place, m, direction of rolling, rad, index of the angle that steers it."""
+    steered = robot.drive.steered
+    return [
+        {
+            "radius": wheel.radius,
+            "at": _rounded(np.array(wheel.position), 6),
+            "rolling": wheel.rolling,
+            "steered": steered.index(wheel.name) if wheel.has_steering else None,
+        }
+        for wheel in robot.wheels
+        if is_placed(wheel)
+    ]
 
 
 def _colours() -> dict[str, str]:

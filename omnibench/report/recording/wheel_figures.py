@@ -1,4 +1,4 @@
-"""Figures of the wheel rates of a run: measured, their mean over 100 ms, targets, and the difference."""
+"""Figures of the wheels of a run: measured rates, their mean over 100 ms, targets, the difference, steering angles."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ _HOVER = "{}<br>%{{y:.3f}} rad/s at %{{x:.2f}} s"
 _MEASURED = LegendItem("measured", "measured", "#a9c9e8")
 _MEAN = LegendItem("mean", "measured, mean over 100 ms", PALETTE[0])
 _TARGET = LegendItem("target", "target", INK, "dash")
+_STEERING = LegendItem("steering", "steering angle", PALETTE[3])
 _ERROR = LegendItem("error", "measured − target, mean over 100 ms", PALETTE[2])
 
 
@@ -42,12 +43,12 @@ class _Series:
 
 
 def wheel_rates(trajectory: Trajectory, robot: Robot) -> FigureGrid:
-    """Measured rates and targets over time, a row for each wheel; with targets also the difference."""
+    """Measured rates, targets and steering angles over time, a row for each wheel; with targets also the difference."""
     measured = _blocks(trajectory.times, trajectory.rates, max(1, -(-len(trajectory.times) // _DRAWN)))
     period = float(np.median(np.diff(trajectory.times, prepend=0.0)))
     size = max(1, round(_MEAN_OVER / period), -(-len(trajectory.times) // _DRAWN))
     mean = _blocks(trajectory.times, trajectory.rates, size)
-    rows = [[_steps(_MEASURED, measured, w, 1.0), _line(_MEAN, mean, w, 1.8)] for w in range(len(robot.wheels))]
+    rows = [[_steps(_MEASURED, measured, w, 1.0), _line(_MEAN, mean, w, 1.8)] for w in range(len(robot.wheel_names))]
     items = [_MEASURED, _MEAN]
     words = []
     if len(measured.values) < len(trajectory.times):
@@ -65,7 +66,7 @@ def wheel_rates(trajectory: Trajectory, robot: Robot) -> FigureGrid:
         for wheel, row in enumerate(rows):
             row.append(_steps(_TARGET, target, wheel, 1.6))
         error = _blocks(trajectory.times, trajectory.rates - trajectory.targets, size)
-        errors = [[_line(_ERROR, error, wheel, 1.6)] for wheel in range(len(robot.wheels))]
+        errors = [[_line(_ERROR, error, wheel, 1.6)] for wheel in range(len(rows))]
         items += [_TARGET, _ERROR]
         figures.append(
             Figure(
@@ -76,6 +77,14 @@ def wheel_rates(trajectory: Trajectory, robot: Robot) -> FigureGrid:
             )
         )
     description = "Wheel rates over time, one row a wheel" + (", with their targets" if figures else "")
+    if trajectory.steering is not None:
+        every = slice(None, None, max(1, -(-len(trajectory.times) // _DRAWN)))
+        degrees = np.degrees(trajectory.steering[every].T)
+        hover = "steering angle<br>%{y:.2f}° at %{x:.2f} s"
+        rows += [[line(_STEERING, 1.8, trajectory.times[every], angle, hover=hover)] for angle in degrees]
+        titles += [f"{name} (°)" for name in robot.drive.steered]
+        items.append(_STEERING)
+        description += "; steering angles below"
     rates = Figure("Wheel rates", _stacked(rows, titles, end), description, _ROW * len(rows) + 60)
     return FigureGrid((rates, *figures), tuple(items), 2 if figures else 1, " ".join(words))
 

@@ -76,7 +76,7 @@ function makeRateBars(parent, run) {
   const title = document.createElement("h4");
   title.textContent = run.targets ? "Wheel rates; strokes: targets" : "Wheel rates";
   parent.replaceChildren(title);
-  return run.wheels.map((wheel, index) => {
+  return run.rated.map((name, index) => {
     const row = document.createElement("div"), words = document.createElement("span");
     const rate = document.createElement("div"), bar = document.createElement("i"), stroke = document.createElement("b");
     rate.className = "rate";
@@ -89,7 +89,7 @@ function makeRateBars(parent, run) {
       const measured = run.rates[frame][index];
       bar.style.left = `${50 + Math.min(0, share(measured))}%`;
       bar.style.width = `${Math.abs(share(measured))}%`;
-      let text = `${wheel.name}: ${measured.toFixed(2)}`;
+      let text = `${name}: ${measured.toFixed(2)}`;
       if (run.targets) {
         stroke.style.left = `${50 + share(run.targets[frame][index])}%`;
         text += ` of ${run.targets[frame][index].toFixed(2)}`;
@@ -147,12 +147,13 @@ function drawRoom(canvas, run, frame, near) {
   line(run.odometry.slice(0, frame + 1), run.colours.odometry, 2, [6, 4]);
   if (run.truth) line(run.truth.slice(0, frame + 1), run.colours.truth, 1.5, [2, 3]);
   line(run.poses.slice(0, frame + 1), run.colours.reference, 2.5);
-  drawRobot(pen, run, pose, place, scale);
+  drawRobot(pen, run, frame, place, scale);
   drawScaleBar(pen, scale, height);
 }
 
 // A disc with a stroke to the front and its wheels, seen from above.
-function drawRobot(pen, run, [x, y, heading], place, scale) {
+function drawRobot(pen, run, frame, place, scale) {
+  const [x, y, heading] = run.poses[frame];
   pen.save();
   pen.translate(...place(x, y));
   pen.rotate(-heading);
@@ -164,10 +165,11 @@ function drawRobot(pen, run, [x, y, heading], place, scale) {
   pen.strokeStyle = pen.fillStyle = run.colours.robot;
   pen.lineWidth = 1.6 / scale;
   pen.stroke();
-  for (const { radius, distance, angle, drawn } of run.wheels.filter((wheel) => wheel.drawn)) {
+  for (const { radius, at, rolling, steered } of run.wheels) {
     pen.save();
-    pen.rotate(angle);
-    pen.fillRect(distance - 0.02, -radius, 0.04, 2 * radius);
+    pen.translate(...at);
+    pen.rotate(rolling + (steered === null ? 0 : run.steering[frame][steered]));
+    pen.fillRect(-radius, -0.02, 2 * radius, 0.04);
     pen.restore();
   }
   pen.beginPath();

@@ -43,5 +43,5 @@ class CoulombCreep(MotionEffect):
 
     def correction(self, signals: Signals, values: Values) -> Array:
         speed = np.hypot(signals.twists[:, 0], signals.twists[:, 1])
-        radii = np.array([wheel.radius for wheel in signals.robot.wheels])
+        radii = signals.robot.radii
         return values["c"] * _smooth_sign(signals.rates) * (speed[:, None] / radii)

@@ -11,7 +11,7 @@ from omnibench.registry import Options, effects
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals
 
-Stage = Literal["actuator", "wheel", "clock", "body", "world", "reference"]
+Stage = Literal["actuator", "wheel", "steering", "clock", "body", "world", "reference"]
 Need = Literal["wheel_angles", "session_time", "session", "targets", "poses"]
 Values = Mapping[str, float]
 
@@ -72,14 +72,15 @@ class Effect(ABC):
 
 
 class MotionEffect(Effect):
-    """An effect of stage wheel, clock, body or world."""
+    """An effect of stage wheel, steering, clock, body or world."""
 
     @abstractmethod
     def correction(self, signals: Signals, values: Values) -> Array:
         """The correction that is added, for every sample by itself (no memory beyond the signals).
 
-        Stage wheel or clock: to the wheel rates, (F, N) rad/s. Body: to the twist, (F, 3) m/s, m/s, rad/s. World: to
-        the velocity in the reference's frame, (F, 2) m/s. Corrections of several effects add up.
+        Stage wheel or clock: to the wheel rates, (F, N) rad/s. Steering: to the steering angles, (F, S) rad. Body: to
+        the twist of the robot's centre, (F, 3) m/s, m/s, rad/s. World: to the velocity in the reference's frame, (F, 2)
+        m/s. Corrections of several effects add up.
         """
 
 

@@ -67,7 +67,7 @@ class LoadTransfer(MotionEffect):
     fixed_parameters = (Parameter("k", "s2/m", 0.0, 0.3, "relative change of the radius per acceleration"),)
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        angles = np.array([wheel.angle for wheel in signals.robot.wheels])
+        angles = np.array([wheel.outward for wheel in signals.robot.measured])
         towards = np.stack([np.cos(angles), np.sin(angles)])
         acceleration = signals.accelerations[:, :2] + _centripetal(signals.twists)
         return -values["k"] * (acceleration @ towards) * signals.rates

@@ -63,7 +63,7 @@ def direction(mode: str, signals: Signals) -> Array:
 
 def lever(robot: Robot) -> float:
     """Mean lever arm of the wheels, m, which converts turning to speed at the wheels."""
-    return float(np.mean([wheel.distance for wheel in robot.wheels]))
+    return robot.reach
 
 
 def waves(angle: Array, harmonics: Sequence[float]) -> Array:

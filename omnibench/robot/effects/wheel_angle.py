@@ -46,7 +46,7 @@ def ripple(signals: Signals, harmonic: float, values: Values) -> Array:
 def _ripple_of_one_sample(signals: Signals, angles: Array, harmonic: float, values: Values) -> Array:
     """``ripple`` of one sample in Python floats, which are faster than NumPy for a few wheels in a stream."""
     half = harmonic / 2 * float(signals.durations[0])
-    samples = zip(signals.robot.wheels, signals.rates[0].tolist(), angles[0].tolist(), strict=True)
+    samples = zip(signals.robot.measured, signals.rates[0].tolist(), angles[0].tolist(), strict=True)
     added = []
     for wheel, rate, angle in samples:
         a, b, phase = values[f"a_{wheel.name}"], values[f"b_{wheel.name}"], harmonic * angle

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from omnibench.robot.calibration import Calibration
+from omnibench.robot.export.c_signals import definitions, functions, literal, middle
 from omnibench.robot.kinematics import Array
 
 _ARC = """\
@@ -16,13 +17,32 @@ _EULER = """\
     const double stretch = 1.0;
     const double direction = pose[2];
 """
+_COUNTER_CLOCKWISE = "A positive rate drives the robot counter-clockwise."
+_ROLLING = "A positive rate drives the robot in the wheel's\n * direction of rolling."
+_STEERING = (
+    "A positive rate drives the robot in the wheel's\n * direction of rolling. steering: angles (rad, "
+    "counter-clockwise) at the sample's end, which state keeps for the next."
+)
 
 
 def c_header(calibration: Calibration, prefix: str) -> tuple[str, tuple[str, ...]]:
     """The header's text, with identifiers that begin with ``prefix``, and a warning for everything left out."""
-    upper = prefix.upper()
-    wheels = calibration.robot.wheel_names
-    names = ", ".join(f'"{name}"' for name in wheels)
+    upper, robot = prefix.upper(), calibration.robot
+    names = ", ".join(f'"{name}"' for name in robot.wheel_names)
+    rates = f"const double rates[{upper}_WHEELS]"
+    if robot.drive.direct:
+        sizes = code = signals = ""
+        source, of, per, columns = "rates", "wheel", "wheel", f"{upper}_WHEELS"
+        arguments = f"double pose[3], {rates}, double duration"
+        signs = _COUNTER_CLOCKWISE if all(wheel.lever > 0 for wheel in robot.measured) else _ROLLING
+    else:
+        sizes, code, signals = definitions(upper, robot.drive), functions(prefix, robot.drive), middle(prefix)
+        source, of, per, columns = "signals", "signal", "drive signal", f"{upper}_SIGNALS"
+        arguments = (
+            f"double pose[3], {prefix}_odometry_state *state, {rates},\n{' ' * (len(prefix) + 34)}"
+            f"const double steering[{upper}_STEERED], double duration"
+        )
+        signs = _STEERING
     text = f"""\
 /*
 {_comment(calibration)}
@@ -32,26 +52,29 @@ def c_header(calibration: Calibration, prefix: str) -> tuple[str, tuple[str, ...
 
 #include <math.h>
 
-#define {upper}_WHEELS {len(wheels)}
+#define {upper}_WHEELS {len(robot.wheel_names)}
 #define {upper}_WHEEL_NAMES {{ {names} }}
-#define {upper}_SAMPLE_PERIOD {_literal(calibration.sample_period)} /* s */
+{sizes}\
+#define {upper}_SAMPLE_PERIOD {literal(calibration.sample_period)} /* s */
 #define {upper}_INTEGRATION "{calibration.integration}"
 
-/* Inverse kinematic matrix: rows x, y (m) and heading (rad) per radian of each wheel. */
-static const double {prefix}_matrix[3][{upper}_WHEELS] = {{
+/* Inverse kinematic matrix: rows x, y (m) and heading (rad) per radian of each {per}. */
+static const double {prefix}_matrix[3][{columns}] = {{
 {_rows(calibration.matrix_array)}
 }};
 
+{code}\
 /*
  * Advance a pose (x m, y m, heading rad, not wrapped) by one sample: mean rates (rad/s) of the wheels over
- * duration (s). A positive rate drives the robot counter-clockwise.
+ * duration (s). {signs}
  */
-static inline void {prefix}_odometry_step(double pose[3], const double rates[{upper}_WHEELS], double duration)
+static inline void {prefix}_odometry_step({arguments})
 {{
+{signals}\
     double moved[3] = {{ 0.0, 0.0, 0.0 }};
     for (int row = 0; row < 3; ++row) {{
-        for (int wheel = 0; wheel < {upper}_WHEELS; ++wheel) {{
-            moved[row] += {prefix}_matrix[row][wheel] * rates[wheel];
+        for (int {of} = 0; {of} < {columns}; ++{of}) {{
+            moved[row] += {prefix}_matrix[row][{of}] * {source}[{of}];
         }}
         moved[row] *= duration;
     }}
@@ -65,20 +88,17 @@ static inline void {prefix}_odometry_step(double pose[3], const double rates[{up
 
 #endif /* {upper}_ODOMETRY_H */
 """
-    if not calibration.effects:
-        return text, ()
-    left_out = ", ".join(term.name for term in calibration.effects)
-    return text, (f"the header holds the matrix only; effects of the calibration are left out: {left_out}",)
+    warnings = []
+    if calibration.effects:
+        left_out = ", ".join(term.name for term in calibration.effects)
+        warnings.append(f"the header holds the matrix only; effects of the calibration are left out: {left_out}")
+    if robot.mount is not None:
+        warnings.append("the header's pose is that of the tracked point, which is not the robot's centre (mount)")
+    return text, tuple(warnings)
 
 
 def _rows(matrix: Array) -> str:
-    return ",\n".join(f"    {{ {', '.join(_literal(value) for value in row)} }}" for row in matrix)
-
-
-def _literal(value: float) -> str:
-    """A C literal that is read as exactly the same double."""
-    text = f"{float(value):.17g}"
-    return text if any(mark in text for mark in ".e") else f"{text}.0"
+    return ",\n".join(f"    {{ {', '.join(literal(value) for value in row)} }}" for row in matrix)
 
 
 def _comment(calibration: Calibration) -> str:
@@ -97,6 +117,8 @@ def _comment(calibration: Calibration) -> str:
         ]
         costs = (("training", origin.training_cost), ("validation", origin.validation_cost))
         lines += [f"{name} cost {cost:.6g}" for name, cost in costs if cost is not None]
+    if calibration.robot.mount is not None:
+        lines.append("the pose is that of the tracked point, which is not the robot's centre (mount)")
     if calibration.effects:
         lines.append(f"left out: effects {', '.join(term.name for term in calibration.effects)}")
     return "\n".join(f" * {' '.join(line.split())}".replace("*/", "* /") for line in lines)

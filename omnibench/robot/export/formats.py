@@ -1,4 +1,4 @@
-"""Export formats of calibrations: parameters of a ROS 2 controller, or a C header."""
+"""Export formats of calibrations: parameters of ROS 2 controllers and of robot_localization, or a C header."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from types import MappingProxyType
 from omnibench.errors import UnknownNameError, require_type
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.export.c_header import c_header
+from omnibench.robot.export.robot_localization import robot_localization
 from omnibench.robot.export.ros2_controllers import ros2_controllers
 
 
@@ -23,8 +24,13 @@ class Export:
 
 
 def _ros2_controllers(calibration: Calibration) -> Export:
-    text, warnings = ros2_controllers(calibration)
-    return Export(text, warnings, f"{_stem(calibration.name)}_omni_wheel_drive.yaml")
+    text, warnings, controller = ros2_controllers(calibration)
+    return Export(text, warnings, f"{_stem(calibration.name)}_{controller.removesuffix('_controller')}.yaml")
+
+
+def _robot_localization(calibration: Calibration) -> Export:
+    text, warnings = robot_localization(calibration)
+    return Export(text, warnings, f"{_stem(calibration.name)}_robot_localization.yaml")
 
 
 def _c_header(calibration: Calibration) -> Export:
@@ -34,12 +40,12 @@ def _c_header(calibration: Calibration) -> Export:
 
 
 EXPORT_FORMATS: Mapping[str, Callable[[Calibration], Export]] = MappingProxyType(
-    {"c_header": _c_header, "ros2_controllers": _ros2_controllers}
+    {"c_header": _c_header, "robot_localization": _robot_localization, "ros2_controllers": _ros2_controllers}
 )
 
 
 def export_calibration(calibration: Calibration, format: str) -> Export:  # noqa: A002 (the command's own word)
-    """A calibration in another format: ``ros2_controllers`` or ``c_header``.
+    """A calibration in another format: ``ros2_controllers``, ``robot_localization`` or ``c_header``.
 
     Raises UnknownNameError for another format and ConfigError when the format cannot describe this robot at all.
     """

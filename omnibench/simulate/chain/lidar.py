@@ -20,7 +20,7 @@ _SHORTEST_PERIOD = 0.001  # s between scans; a shorter one is a mistake of units
 
 
 class LidarMount(Model):
-    """Pose of the LIDAR in the robot's frame."""
+    """Pose of the LIDAR in the robot's frame, or in that of its tracked point where it has a ``mount``."""
 
     x: FiniteFloat = Field(0.1, description="m, forward")
     y: FiniteFloat = Field(0.0, description="m, left")

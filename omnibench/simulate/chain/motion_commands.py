@@ -7,7 +7,7 @@ longer than 500 ms, so that the robot stops when its computer does.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from typing import Literal
 
@@ -16,9 +16,9 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from omnibench.config import Model, NonNegative, Positive
 from omnibench.errors import ConfigError
-from omnibench.robot.kinematics import Array, Robot, wheel_equations
+from omnibench.robot.kinematics import Array, Robot
 from omnibench.simulate.chain.set_point import SetPoint, SlewLimits
-from omnibench.simulate.flower import Command
+from omnibench.simulate.command import Command, wheels_of
 
 _NOTHING = 1e-9  # s; a command of a shorter validity is not sent
 
@@ -80,6 +80,19 @@ class CommandedMotion:
     commands: tuple[SentCommand, ...]
     stopped_by_watchdog: tuple[tuple[float, float], ...]
 
+    def after(self, samples: int) -> CommandedMotion:
+        """The motion after a rest of some samples, in which the robot steers."""
+        if not samples:
+            return self
+        count, period = samples + len(self.times), self.times[0]
+        rest = samples * period
+        return CommandedMotion(
+            period * np.arange(1, count + 1),
+            np.vstack([np.zeros((samples, 3)), self.twists]),
+            tuple(replace(sent, time=sent.time + rest) for sent in self.commands),
+            tuple((since + rest, until + rest) for since, until in self.stopped_by_watchdog),
+        )
+
     @property
     def distance(self) -> float:
         """Length of the set point's path, m."""
@@ -116,9 +129,13 @@ def command_motion(
 
 
 def target_rates(robot: Robot, motion: CommandedMotion) -> Array:
-    """Target wheel rates (F, N) by the robot's design values, rad/s."""
-    rates: Array = motion.twists @ wheel_equations(robot.wheels).T
-    return rates
+    """Target wheel rates (F, N) by the robot's design values, rad/s; its steering angles hold throughout the run."""
+    if robot.drive.direct:
+        rates: Array = motion.twists @ robot.signal_equations.T
+        return rates
+    speeds = np.linalg.norm(motion.twists, axis=1)
+    fastest = int(np.argmax(speeds))  # all twists are shares of one
+    return np.outer(speeds / max(speeds[fastest], 1e-12), wheels_of(robot, motion.twists[fastest])[0])
 
 
 def _slower(command: Command, straight: float, turning: float) -> float:

@@ -10,8 +10,8 @@ from pydantic import Field, model_validator
 
 from omnibench.config import Model, NonNegative, Positive
 from omnibench.errors import ConfigError
-from omnibench.robot.kinematics import Array, Robot, wheel_equations
-from omnibench.simulate.flower import Command
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.simulate.command import Command, wheels_of
 from omnibench.words import plural
 
 TRUE_STEP = 1e-3  # s between the true wheel angles that are kept (chosen: a tenth of the usual sample period)
@@ -97,16 +97,16 @@ def check_reach(robot: Robot, commands: Sequence[Command], motor: Motor | Sequen
 
     A tenth of the motor's fastest rate is left to the controller.
     """
-    motors = motors_of_wheels(motor, len(robot.wheels))
+    motors = motors_of_wheels(motor, len(robot.wheel_names))
     limits = (1 - _RESERVE) * np.array([each.fastest_rate for each in motors])
     for command in commands:
-        rates = wheel_equations(robot.wheels) @ command.twist
+        rates, _ = wheels_of(robot, command.twist)
         wheel = int(np.argmax(np.abs(rates) / limits))
         if abs(rates[wheel]) > limits[wheel]:
             raise ConfigError(
                 f"command {command.name} (speed {command.speed:g} m/s, direction {math.degrees(command.direction):g} "
                 f"deg, turn rate {command.turn_rate:g} rad/s) is faster than the motors can go: wheel "
-                f"{robot.wheels[wheel].name} would need {abs(rates[wheel]):.4g} rad/s, its motor reaches "
+                f"{robot.wheel_names[wheel]} would need {abs(rates[wheel]):.4g} rad/s, its motor reaches "
                 f"{motors[wheel].fastest_rate:.4g} rad/s, of which the controller keeps {_RESERVE:.0%}; "
                 f"{_way_out(robot, command, limits)}"
             )
@@ -114,7 +114,12 @@ def check_reach(robot: Robot, commands: Sequence[Command], motor: Motor | Sequen
 
 def _way_out(robot: Robot, command: Command, limits: Array) -> str:
     """Advice: the greatest speed at this rate of turn; if there is none, the greatest rate of turn."""
-    straight, across, turn = (wheel_equations(robot.wheels) * command.twist).T
+    if not robot.drive.direct:
+        share = float(np.min(limits / np.maximum(np.abs(wheels_of(robot, command.twist)[0]), 1e-9)))
+        if not command.speed:
+            return f"give it a turn rate of at most {_rounded_down(share * abs(command.turn_rate))} rad/s"
+        return f"give it a speed of at most {_rounded_down(share * command.speed)} m/s, and a turn rate as much lower"
+    straight, across, turn = (robot.signal_equations * command.twist).T
     travel = straight + across
     left = limits - np.abs(turn)
     if command.speed and (left > 0).all():

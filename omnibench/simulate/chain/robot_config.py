@@ -12,6 +12,7 @@ from omnibench.simulate.chain.floor_plan import RoomPlan
 from omnibench.simulate.chain.lidar import Lidar
 from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile
 from omnibench.simulate.chain.motors import TRUE_STEP, Controller, Encoder, Motor
+from omnibench.simulate.chain.steering import Steering
 from omnibench.simulate.config import Experiment, RobotSession
 from omnibench.slam.slam_options import SlamOptions
 
@@ -36,6 +37,7 @@ class RobotConfig(Experiment[RobotSession]):
     motor: Motor = Motor()
     controller: Controller = Controller()
     encoder: Encoder = Encoder()
+    steering: Steering = Field(Steering(), description="of robots that steer")
     room: RoomPlan
     radius: Positive = Field(0.25, description="of the robot, to check for collisions, m")
     placement: Placement = Placement()
@@ -71,11 +73,13 @@ class RobotConfig(Experiment[RobotSession]):
         sessions = self.sessions.values()
         seconds = 0.0
         for speed in chosen.speeds:
-            directions = len(chosen.directions_deg) if speed else 1
+            directions = len(chosen.directions(self.robot)) if speed else 1
             for turn_rate in chosen.turn_rates:
                 ramps = 2 * max(speed / profile.acceleration, abs(turn_rate) / profile.turn_acceleration)
                 if profile.shape == "jerk_limited":
                     ramps += 4 * max(math.sqrt(speed / profile.jerk), math.sqrt(abs(turn_rate) / profile.turn_jerk))
                 driven = sum(session.distance / speed if speed else chosen.turn_duration for session in sessions)
                 seconds += directions * (driven + len(sessions) * (ramps + self.settle))
+        if not self.robot.drive.direct:  # half a turn of the steering, at most, before each run
+            seconds += len(self.driven) * len(sessions) * 180 / self.steering.rate_deg
         return seconds * self.repetitions * len(self.robot.wheels) / TRUE_STEP

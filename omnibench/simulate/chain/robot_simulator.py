@@ -13,19 +13,20 @@ from omnibench.data.scans import ScansInMemory, TrajectoryScans
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
 from omnibench.progress import Progress, Reporter, no_progress
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, Mount
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.path import Path
-from omnibench.robot.planar import compose
+from omnibench.robot.planar import compose, placed, seen_from
 from omnibench.simulate.chain.floor_plan import FloorPlan, make_plan
 from omnibench.simulate.chain.lidar import measure_scans, scan_stamps
 from omnibench.simulate.chain.motion_commands import CommandedMotion, command_motion, target_rates
 from omnibench.simulate.chain.motors import TRUE_STEP, check_reach
 from omnibench.simulate.chain.robot_config import Placement, RobotConfig
 from omnibench.simulate.chain.wheel_drive import DrivenRun, drive_session
+from omnibench.simulate.command import Command, wheels_of
 from omnibench.simulate.config import RobotSession
-from omnibench.simulate.flower import PAUSE, Command, grid_of, runs_of
+from omnibench.simulate.flower import PAUSE, runs_of
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.truth import TrueRobot, true_record
 from omnibench.slam.slam_dataset import slam_dataset
@@ -44,7 +45,7 @@ def simulate_robot(
     is invalid, a command is faster than the motors, or leads out of the room.
     """
     plan = make_plan(config.room, f"data set {name}: room")
-    commands = grid_of(config.commands)
+    commands = config.driven
     check_reach(config.robot, commands, config.motor)
     sessions = config.sessions
     for command in commands:
@@ -70,7 +71,8 @@ def simulate_robot(
         scans=ScansInMemory(config.lidar.scanner, {run.trajectory.id: run.scans for run in runs}),
     )
     dataset = slam_dataset(recorded, config.slam, watch=watch)
-    dataset = replace(dataset, warnings=(*dataset.warnings, *_stopped(runs), *_missed_targets(runs)))
+    warnings = (*dataset.warnings, *config.left_out, *_stopped(runs), *_missed_targets(runs))
+    dataset = replace(dataset, warnings=warnings)
     paths = {run.trajectory.id: run.path for run in runs}
     return Simulation(dataset, truth, paths, plan, {run.trajectory.id: run.start for run in runs})
 
@@ -80,8 +82,17 @@ def _check_way(config: RobotConfig, plan: FloorPlan, command: Command, session: 
     if not command.speed:
         return
     times = np.linspace(0.0, session.distance / command.speed, max(2, math.ceil(session.distance / _STEP)))
-    path = Path(times[-1:], plan.start, times[-1] * command.twist[None], "arc")
-    plan.check_path(path.poses(times)[:, :2], times, config.radius, f"command {command.name}")
+    mount = config.robot.mount
+    twist = command.twist if mount is None else mount.twist @ command.twist
+    path = Path(times[-1:], plan.start, times[-1] * twist[None], "arc")
+    plan.check_path(_places(path.poses(times), mount), times, config.radius, f"command {command.name}")
+
+
+def _places(poses: Array, mount: Mount | None) -> Array:
+    """Places (K, 2) of the robot's centre, m, from poses (K, 3) of its tracked point."""
+    if mount is None:
+        return poses[:, :2]
+    return placed(poses, seen_from(np.array([mount.x, mount.y, mount.yaw]), np.zeros(2)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,20 +124,21 @@ class _RobotSimulator:
         config, rng = self.config, np.random.default_rng(session.seed)
         runs = runs_of(self.commands, config.repetitions, config.order, rng)
         motions = [self._motion(command, session, rng) for command, _ in runs]
+        steered, motions = self._steered([command for command, _ in runs], motions)
         targets = [target_rates(config.robot, motion) for motion in motions]
         rates = [self.robot.driven(motion.times, target) for motion, target in zip(motions, targets, strict=True)]
+        if self.robot.has_differential:
+            rates = [rate.mean(axis=1, keepdims=True) for rate in rates]
         driven = drive_session(
-            config.motor,
-            config.controller,
-            config.encoder,
-            rates,
-            config.sample_period,
-            np.zeros(len(config.robot.wheels)),
+            config.motor, config.controller, config.encoder, rates, config.sample_period, np.zeros(rates[0].shape[1])
         )
-        started_at = 0.0
-        for number, ((command, repetition), motion, target, wheels) in enumerate(
-            zip(runs, motions, targets, driven, strict=True), 1
+        started_at, angles = 0.0, np.zeros(len(config.robot.wheel_names))
+        for number, ((command, repetition), motion, target, steering, wheels) in enumerate(
+            zip(runs, motions, targets, steered, driven, strict=True), 1
         ):
+            if self.robot.has_differential:
+                wheels = self._behind_differential(wheels, steering, angles)
+                angles = wheels.wheel_angles[-1]
             run = Trajectory(
                 id=f"{split}-{number:03d}",
                 split=split,
@@ -145,8 +157,10 @@ class _RobotSimulator:
                 poses=np.zeros((1, 3)),
                 angles=wheels.angles,
                 targets=target,
+                steering=self._measured(steering, rng),
+                drive=None if config.robot.drive.direct else config.robot.drive,
             )
-            yield self._scanned(run, wheels, motion, rng)
+            yield self._scanned(run, wheels, steering, motion, rng)
             started_at += float(motion.times[-1]) + PAUSE
 
     def _motion(self, command: Command, session: RobotSession, rng: np.random.Generator) -> CommandedMotion:
@@ -157,16 +171,52 @@ class _RobotSimulator:
             config.settle, rng,
         )  # fmt: skip
 
+    def _steered(
+        self, commands: Sequence[Command], motions: Sequence[CommandedMotion]
+    ) -> tuple[list[Array], list[CommandedMotion]]:
+        """True steering angles (K + 1, S), rad, every millisecond of each run, and its motion once it has steered."""
+        config, robot = self.config, self.config.robot
+        before, angles, rested = np.zeros(len(robot.drive.steered)), [], []
+        for command, motion in zip(commands, motions, strict=True):
+            _, wanted = wheels_of(robot, command.twist)
+            rested.append(motion.after(config.steering.rest(robot, before, wanted, config.sample_period)))
+            angles.append(config.steering.angles(before, wanted, len(rested[-1].times) * self._steps))
+            before = angles[-1][-1]
+        return angles, rested
+
+    def _measured(self, steering: Array, rng: np.random.Generator) -> Array | None:
+        """Measured steering angles (F, S), rad, at the samples' ends; None for a robot without any."""
+        if self.config.robot.drive.direct:
+            return None
+        return self.config.steering.measured(steering[self._steps :: self._steps], rng)
+
+    @property
+    def _steps(self) -> int:
+        """Milliseconds of a sample."""
+        return round(self.config.sample_period / TRUE_STEP)
+
+    def _behind_differential(self, shaft: DrivenRun, steering: Array, angles: Array) -> DrivenRun:
+        """Motion of a car's wheels (N), which turn as they roll, from angles (N,), rad, on; shaft: their mean."""
+        rates = np.repeat(np.diff(shaft.wheel_angles, axis=0) / TRUE_STEP, len(angles), axis=1)
+        ends = TRUE_STEP * np.arange(1, len(rates) + 1)
+        log = self.robot.log(ends, rates, np.zeros(3), ends, angles, 0.0, None, steering[1:])
+        assert log.wheel_angles is not None  # they were given
+        true, tick = np.vstack([angles, log.wheel_angles]), self.config.encoder.tick
+        counts = np.floor(true[:: self._steps] / tick)
+        measured = np.diff(counts, axis=0) * tick / self.config.sample_period
+        return DrivenRun(true, measured, counts[1:] * tick, shaft.voltages)
+
     def _scanned(
-        self, run: Trajectory, wheels: DrivenRun, motion: CommandedMotion, rng: np.random.Generator
+        self, run: Trajectory, wheels: DrivenRun, steering: Array, motion: CommandedMotion, rng: np.random.Generator
     ) -> _Recorded:
         """The run with its scans; its poses are the design model's odometry until SLAM replaces them."""
         config, plan = self.config, self.plan
-        log = _true_log(run, wheels.wheel_angles)
-        (path,) = self.robot.model.poses([log])
-        (seen,) = self.robot.model.reported([log])  # the LIDAR's poses: with the effects on the reference
+        log = _true_log(run, wheels.wheel_angles, steering)
+        path = self.robot.poses(log)
+        seen = self.robot.reported(log)  # the LIDAR's poses: with the effects on the reference
         start = _placed(plan.start, config.placement, rng)
-        plan.check_path(compose(start, path)[:, :2], log.stamps, config.radius, f"run {run.id}")
+        places = _places(compose(start, path), self.robot.model.robot.mount)
+        plan.check_path(places, log.stamps, config.radius, f"run {run.id}")
         stamps = scan_stamps(config.lidar, float(run.times[-1]), rng)
         try:
             scans = measure_scans(plan, config.lidar, TruePath(log.stamps, compose(start, seen)), stamps, rng)
@@ -211,11 +261,14 @@ def _missed_targets(runs: Sequence[_Recorded]) -> tuple[str, ...]:
     )
 
 
-def _true_log(run: Trajectory, wheel_angles: Array) -> WheelLog:
-    """Log of the true wheels from absolute angles (M + 1, N), rad, every millisecond, with a stamp at each of them."""
+def _true_log(run: Trajectory, wheel_angles: Array, steering: Array) -> WheelLog:
+    """Log of the true wheels from their angles (K + 1, N) and steering angles (K + 1, S), rad, at every millisecond."""
     stamps = TRUE_STEP * np.arange(len(wheel_angles))
     rates = np.diff(wheel_angles, axis=0) / TRUE_STEP
-    return WheelLog(stamps[1:], rates, np.zeros(3), stamps, wheel_angles[1:], run.started_at, run.session)
+    steered = None if run.drive is None else steering[1:]
+    return WheelLog(
+        stamps[1:], rates, np.zeros(3), stamps, wheel_angles[1:], run.started_at, run.session, steered, run.drive
+    )
 
 
 def _placed(mark: Array, placement: Placement, rng: np.random.Generator) -> Array:

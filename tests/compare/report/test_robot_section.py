@@ -9,15 +9,17 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 from report_samples import config, flower, run, usual
+from wheeled_samples import CAR, ROBOTS
 
+from omnibench.compare.report.data_section import data_section
 from omnibench.compare.report.robot_section import robot_section
 from omnibench.compare.report.search_figures import search_section
 from omnibench.compare.report.view import DatasetView, views
 from omnibench.data.importers.table1 import APR_02
 from omnibench.fit.uncertainty.physical import geometry_of
-from omnibench.report.blocks import Figure, FigureGrid
+from omnibench.report.blocks import Facts, Figure, FigureGrid
 from omnibench.report.robot_figures import motion_system, parameters
-from omnibench.robot.kinematics import Array, wheel_equations
+from omnibench.robot.kinematics import Array, Robot, wheel_equations
 
 
 def usual_view() -> DatasetView:
@@ -47,6 +49,28 @@ def test_every_wheel_stands_at_its_distance_and_angle_and_is_as_long_as_its_diam
         np.testing.assert_allclose(corners.mean(axis=0), place, atol=1e-4)
         assert np.hypot(*(corners[1] - corners[2])) == pytest.approx(2 * wheel.radius, abs=1e-4)
     assert "<b>b</b> r 0.148 m<br>R 0.195 m<br>δ 180.0°" in labels(figure)
+
+
+@pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
+def test_wheels_given_by_x_and_y_stand_there_along_their_rolling(robot: Robot) -> None:
+    figure, _ = motion_system(robot)
+    for wheel, corners in zip(robot.wheels, rectangles(figure.plot.data[0]), strict=True):
+        np.testing.assert_allclose(corners.mean(axis=0), wheel.position, atol=1e-4)
+        np.testing.assert_allclose(corners[1] - corners[2], [2 * wheel.radius, 0], atol=1e-4)
+    x, y = (f"{value:g}".replace("-", "−") for value in robot.wheels[0].position)
+    first = robot.wheels[0]
+    assert f"<b>{first.name}</b> r {first.radius:g} m<br>x {x} m<br>y {y} m" in labels(parameters(robot))
+    arrows = [name for name in labels(figure) if name.startswith("V<sub>")]
+    assert arrows == [f"V<sub>{name}</sub>" for name in robot.wheel_names]
+
+
+def test_the_section_on_the_data_says_where_wheels_stand_and_what_is_not_measured() -> None:
+    view = usual_view()
+    facts = data_section(replace(view, dataset=replace(view.dataset, robot=CAR))).blocks[0]
+    assert isinstance(facts, Facts)
+    (robot,) = (fact for fact in facts.items if fact.name == "Robot")
+    assert "rr: fixed, radius 0.03 m, x 0 m, y −0.1 m; " in robot.note
+    assert robot.note.endswith("fr: steered, radius 0.03 m, x 0.3 m, y −0.1 m, its rate is not measured")
 
 
 def test_the_arrow_at_a_wheel_points_where_a_positive_rate_drives_it() -> None:

@@ -105,6 +105,11 @@ def pose(place: Sequence[float]) -> dict[str, Any]:
     return {"position": {"x": x, "y": y, "z": 0.0}, "orientation": turn}
 
 
+def transform(place: Sequence[float]) -> dict[str, Any]:
+    content = pose(place)
+    return {"translation": content["position"], "rotation": content["orientation"]}
+
+
 def covariance(variances: Sequence[float] = (1e-4, 2e-4, 3e-4)) -> list[float]:
     full = np.zeros((6, 6))
     full[[0, 1, 5], [0, 1, 5]] = variances

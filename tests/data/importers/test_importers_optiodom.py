@@ -200,7 +200,15 @@ def test_angles_are_left_out_when_one_session_has_no_log(tmp_path: Path) -> None
     write_session(tmp_path, name="s2", log=False)
     data = import_dataset("optiodom", tmp_path)
     assert {run.angles is None for run in data.trajectories} == {True}
-    assert {run.command is None for run in data.trajectories if run.session == "s2"} == {True}
+    assert "1 of 2 sessions have no log (s2)" in data.warnings[0]
+
+
+def test_without_a_log_a_command_is_named_after_the_motion_by_the_wheels(tmp_path: Path) -> None:
+    write_session(tmp_path, name="s1")
+    write_session(tmp_path, name="s2", log=False)
+    data = import_dataset("optiodom", tmp_path)
+    commands = {run.session: run.command for run in data.trajectories}
+    assert commands == {"s1": "circular_a0_turn+0_v0.2_r0.85x0.9", "s2": "circular_a0_turn+0_0.0m"}
 
 
 def test_a_log_with_other_ticks_is_refused_with_a_way_out(tmp_path: Path) -> None:
@@ -231,7 +239,11 @@ def test_a_malformed_row_of_a_run_is_named(tmp_path: Path, old: str, new: str, m
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("type,omni3", "type,diff", r"s1_metadata\.csv: type is 'diff', only omni3"),
+        (
+            "type,omni3",
+            "type,omni2",
+            r"s1_metadata\.csv: type is 'omni2'; did you mean 'omni4'\? it must be one of diff",
+        ),
         ("Di,0.102,0.102,0.102", "Di,0.102,0.102", r"s1_metadata\.csv: Di is '0\.102, 0\.102', expected 3 numbers"),
         ("Li,0.195", "Lo,0.195", r"s1_metadata\.csv: key 'Li' is missing; did you mean 'Lo'\?"),
         ("ngear,12", "ngear,0", r"s1_metadata\.csv: ngear is 0, it must be above 0"),
@@ -252,12 +264,34 @@ def test_a_malformed_row_of_the_log_is_named(tmp_path: Path) -> None:
         import_dataset("optiodom", tmp_path)
 
 
-def test_sessions_of_different_robots_are_refused(tmp_path: Path) -> None:
+def test_of_different_dimensions_the_commonest_are_the_robots_and_it_is_said(tmp_path: Path) -> None:
+    for name in ("s1", "s2", "s3"):
+        metadata = write_session(tmp_path, name=name) / f"{name}_metadata.csv"
+        if name != "s1":
+            metadata.write_text(metadata.read_text().replace("Li,0.195", "Li,0.2,,"))
+    data = import_dataset("optiodom", tmp_path)
+    assert [wheel.distance for wheel in data.robot.wheels] == [0.2] * 3
+    said = "of 2 of 3 are taken, L 0.2 m, D 0.102 m (others: L 0.195 m, D 0.102 m in 1)"
+    assert said in data.warnings[0]
+    assert said in data.description
+
+
+def test_of_equally_common_dimensions_those_of_the_first_session_are_taken(tmp_path: Path) -> None:
     write_session(tmp_path, name="s1")
     other = write_session(tmp_path, name="s2") / "s2_metadata.csv"
     other.write_text(other.read_text().replace("Li,0.195", "Li,0.2"))
-    with pytest.raises(DataError, match=r"s2_metadata\.csv: geometry differs from .*s1_metadata\.csv"):
+    assert import_dataset("optiodom", tmp_path).robot.wheels[0].distance == 0.195
+
+
+def test_a_source_of_several_robots_is_refused_with_the_way_out(tmp_path: Path) -> None:
+    write_session(tmp_path, name="s1")
+    other = write_session(tmp_path, name="s2") / "s2_metadata.csv"
+    other.write_text("type,diff,,\nngear,43.7\nencRes,64\nLi,0.2\nDi,0.084,0.084,\n")
+    with pytest.raises(DataError, match=r"it holds recordings of 2 robots, diff, omni3; .* or --set robot=diff"):
         import_dataset("optiodom", tmp_path)
+    assert len(import_dataset("optiodom", tmp_path, {"robot": "omni3"}).trajectories) == 2
+    with pytest.raises(DataError, match="it holds no recordings of robot tricyc; found: diff, omni3"):
+        import_dataset("optiodom", tmp_path, {"robot": "tricyc"})
 
 
 def test_a_folder_without_sessions_is_refused(tmp_path: Path) -> None:

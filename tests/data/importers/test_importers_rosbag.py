@@ -29,6 +29,7 @@ from bag_samples import (
     pose,
     read,
     slam_pose,
+    transform,
     write_mcap,
     write_rosbag2,
 )
@@ -36,7 +37,6 @@ from commands import Command, assert_refused
 from timing import PATIENCE
 
 from omnibench.data.storage import load_dataset
-from omnibench.errors import DataError
 from omnibench.fit.calibrate import calibrate
 from omnibench.testing import ImporterConformance
 
@@ -103,13 +103,14 @@ def test_positions_that_begin_again_are_unwrapped(tmp_path: Path) -> None:
         return changed(each, position=[(angle + np.pi) % turn - np.pi for angle in each.content["position"]])
 
     source = write_mcap(tmp_path / "drive", edited(messages(DRIVE), WHEELS, wrapped))
-    data = read(source, wheel_wrap=turn)
+    data = read(source, wraps_at=turn)
     assert data.warnings == ()
     assert odometry_error(data) < 1e-9
     angles = np.concatenate([run.angles for run in data.trajectories if run.angles is not None])
     assert np.ptp(angles, axis=0).max() > turn
-    with pytest.raises(DataError, match=r"positions begin again after a turn; set wheel_wrap=6\.28"):
-        read(source)
+    recognised = read(source)
+    assert recognised.hash == data.hash
+    assert recognised.warnings[0].startswith("wheel positions begin again after 6.283185307 rad and were counted on")
 
 
 def test_joints_that_count_the_other_way_round_are_turned(tmp_path: Path) -> None:
@@ -135,12 +136,13 @@ def test_covariances_of_zeros_mean_that_they_are_not_known(tmp_path: Path) -> No
     assert read(write_mcap(tmp_path / "drive", [*wheels, *poses])).trajectories[0].pose_covariances is None
 
 
-@pytest.mark.parametrize("kind", ["geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry"])
+@pytest.mark.parametrize("kind", ["PoseStamped", "TransformStamped"])
 def test_other_types_of_poses_are_read(tmp_path: Path, kind: str) -> None:
     poses = []
     for stamp, place in zip(DRIVE.pose_stamps, DRIVE.poses, strict=True):
-        body = pose(place) if kind.endswith("PoseStamped") else {"pose": pose(place)}
-        poses.append(Sent("/tracker/robot", kind, {"header": header(stamp), "pose": body}, int(stamp)))
+        body = {"pose": pose(place)} if kind == "PoseStamped" else {"transform": transform(place)}
+        content = {"header": header(stamp)} | body
+        poses.append(Sent("/tracker/robot", f"geometry_msgs/msg/{kind}", content, int(stamp)))
     wheels = [each for each in messages(DRIVE) if each.topic == WHEELS]
     assert odometry_error(read(write_rosbag2(tmp_path / "drive", [*wheels, *poses]))) < 1e-9
 

@@ -55,20 +55,6 @@ def test_several_candidates_are_listed(tmp_path: Path) -> None:
     assert odometry_error(read(source, wheel_topic="/r2/joint_states")) < 1e-9  # its own slam_pose goes with it
 
 
-def test_the_robot_s_own_odometry_is_no_reference_unless_asked_for(tmp_path: Path) -> None:
-    odometry = [
-        Sent(
-            "/robot/odom", "nav_msgs/msg/Odometry", {"header": header(stamp), "pose": {"pose": pose(place)}}, int(stamp)
-        )
-        for stamp, place in zip(DRIVE.pose_stamps, DRIVE.poses, strict=True)
-    ]
-    wheels = [each for each in messages(DRIVE) if each.topic == WHEELS]
-    source = write_mcap(tmp_path / "drive", [*wheels, *odometry])
-    with pytest.raises(ConfigError, match=r"the only poses are /robot/odom .* own odometry .* set pose_topic"):
-        read(source)
-    assert odometry_error(read(source, pose_topic="robot/odom")) < 1e-9
-
-
 @pytest.mark.parametrize(
     "names",
     [
@@ -128,7 +114,10 @@ def test_other_joints_may_come_by_the_same_topic(tmp_path: Path) -> None:
         ({"joints": ["a", "b", "b"]}, "joints names one joint twice"),
         ({"joint_signs": [1, -1]}, "joint_signs has 2 values, expected 3"),
         ({"joint_signs": [1, 0, 1]}, "joint_signs"),
-        ({"wheel_wrap": 6, "use": "velocities"}, "wheel_wrap is for positions"),
+        ({"wraps_at": 6, "use": "velocities"}, "wraps_at is for positions"),
+        ({"wheel_unit": "rpm", "use": "positions"}, "wheel_unit rpm is not one of positions; leave use out"),
+        ({"pose_frames": "map"}, r"pose_frames has 1 value, expected 2: \[world, robot\]"),
+        ({"wheel_topic": [WHEELS, WHEELS]}, "wheel_topic has 2 values, expected 3, one for each wheel"),
         ({"least_rest": 0}, "least_rest: .*greater than 0"),
         ({"wheel_topc": "/a"}, r"unknown key 'wheel_topc'; did you mean 'wheel_topic'\?"),
         ({"train": "7*"}, r"train: no run matches '7\*'"),

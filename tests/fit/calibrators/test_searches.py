@@ -10,7 +10,7 @@ from fit_samples import box_between, make_problem, noisy_trajectories
 
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
-from omnibench.fit.parameterisation import GeometryLimits
+from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import calibrators
 from omnibench.robot.published_matrices import published_matrix

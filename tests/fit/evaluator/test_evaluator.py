@@ -15,7 +15,7 @@ from omnibench.fit.evaluator.element_box import ElementBox
 from omnibench.fit.evaluator.evaluator import PoseEvaluator, make_evaluator
 from omnibench.fit.evaluator.expansion import Basis, degree_for
 from omnibench.fit.evaluator.impulses import cut, impulses, make_path, quadrature
-from omnibench.fit.parameterisation import GeometryLimits
+from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Array

@@ -13,6 +13,7 @@ from motions import FLOWER, RING, SPEED, TURNS, Twist, driven
 from omnibench.data.dataset import Dataset
 from omnibench.errors import DataError
 from omnibench.fit.calibrators.closed_form import linear_start
+from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.inspect import inspect_dataset
 from omnibench.fit.span import aligned, driven_span, unidentified_directions
 from omnibench.fit.uncertainty.identifiability import Identifiability, deviations_along, identifiability
@@ -62,7 +63,10 @@ class TestSmallMatrices:
 
     def test_a_wheel_of_twice_the_radius_moves_the_robot_twice_as_far(self) -> None:
         """A matrix column is proportional to its wheel's radius, so that its derivative is the column itself."""
-        matrix, slopes = ROBOT.inverse_kinematic_matrix, known_slopes(ROBOT, np.zeros((0, 3))).reshape(3, 3, 9)
+        matrix, slopes = (
+            ROBOT.inverse_kinematic_matrix,
+            known_slopes(WheelGeometry(ROBOT), np.zeros((0, 3))).reshape(3, 3, 9),
+        )
         for wheel in range(3):
             column = np.where(np.arange(3) == wheel, matrix, 0.0)
             np.testing.assert_allclose(slopes[:, :, wheel], column, rtol=1e-8, atol=1e-11)
@@ -70,9 +74,9 @@ class TestSmallMatrices:
     def test_each_parameter_needs_the_directions_in_which_it_shows(self) -> None:
         """Equal steps of all three wheels turn the robot: only the distances change with what it then does."""
         turn = np.full((1, 3), 1 / math.sqrt(3))
-        assert identified_parameters(ROBOT, np.zeros((0, 3))) == (True,) * 9
-        assert identified_parameters(ROBOT, turn) == (True,) * 3 + (False,) * 3 + (True,) * 3
-        assert identified_parameters(ROBOT, np.eye(3)) == (False,) * 9
+        assert identified_parameters(WheelGeometry(ROBOT), np.zeros((0, 3))) == (True,) * 9
+        assert identified_parameters(WheelGeometry(ROBOT), turn) == (True,) * 3 + (False,) * 3 + (True,) * 3
+        assert identified_parameters(WheelGeometry(ROBOT), np.eye(3)) == (False,) * 9
 
 
 class TestPrecision:

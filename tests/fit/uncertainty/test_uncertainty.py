@@ -18,7 +18,8 @@ from motions import FLOWER, RING, driven
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import RunResult, run_calibrator
-from omnibench.fit.parameterisation import ExplicitBox, WheelGeometry
+from omnibench.fit.geometry import WheelGeometry
+from omnibench.fit.parameterisation import ExplicitBox
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.fit.uncertainty.bootstrap import bootstrap_intervals
 from omnibench.fit.uncertainty.information import information_of_run, information_of_runs
@@ -327,13 +328,13 @@ class TestParameters:
             assert one.standard_deviation == pytest.approx(other.standard_deviation, rel=1e-3)
 
     def test_every_parameter_is_told_when_every_direction_is(self) -> None:
-        assert all(identified_parameters(ROBOT, np.zeros((0, 3))))
+        assert all(identified_parameters(WheelGeometry(ROBOT), np.zeros((0, 3))))
 
     def test_nothing_is_told_when_nothing_is_driven(self) -> None:
-        assert not any(identified_parameters(ROBOT, np.eye(3)))
+        assert not any(identified_parameters(WheelGeometry(ROBOT), np.eye(3)))
 
     def test_without_turns_the_distances_are_not_told(self) -> None:
-        told = identified_parameters(ROBOT, np.ones((1, 3)) / np.sqrt(3))
+        told = identified_parameters(WheelGeometry(ROBOT), np.ones((1, 3)) / np.sqrt(3))
         assert told == (True,) * 3 + (False,) * 3 + (True,) * 3
 
 

@@ -11,7 +11,7 @@ from drives import ORIGIN, PERIOD, SECOND, calibration
 from omnibench.live.estimation.extrapolation_monitor import ExtrapolationMonitor
 from omnibench.live.estimation.health import diagnostic
 from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.estimation.wheel_input import WheelStep
+from omnibench.live.wheels.wheel_input import WheelStep
 from omnibench.live.wire.messages import JOINT_STATE, JointState
 from omnibench.robot.calibration import Calibration, EffectTerm
 
@@ -38,7 +38,7 @@ def watched(*driven: list[WheelStep], by: Calibration | None = None) -> Extrapol
     watch = ExtrapolationMonitor("apr", by or fitted())
     for each in driven:
         for step in each:
-            watch.take(step)
+            watch.take(step, step.angles)
     return watch
 
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.live.estimation.live_odometry import LiveOdometry
-from omnibench.live.estimation.wheel_input import WheelStep
+from omnibench.live.wheels.wheel_input import WheelStep
 from omnibench.robot.calibration import Calibration, Noise, Provenance
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
 

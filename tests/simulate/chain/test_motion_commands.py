@@ -22,7 +22,7 @@ from omnibench.simulate.chain.motion_commands import (
     target_rates,
 )
 from omnibench.simulate.chain.set_point import Phase, SetPoint, SlewLimits
-from omnibench.simulate.flower import Command
+from omnibench.simulate.command import Command
 
 PERIOD, SETTLE, TURN = 0.01, 0.5, 6.0
 PETAL, WAY = Command(0.2, math.radians(30), 0.35), 1.116

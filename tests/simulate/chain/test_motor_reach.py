@@ -15,7 +15,7 @@ from omnibench.config import validate
 from omnibench.errors import ConfigError
 from omnibench.simulate.chain.motors import Controller, Encoder, Motor, check_reach
 from omnibench.simulate.chain.wheel_drive import drive_session
-from omnibench.simulate.flower import Command
+from omnibench.simulate.command import Command
 
 
 @given(st.floats(0.05, 4), st.floats(-math.pi, math.pi), st.floats(-5, 5))

@@ -16,7 +16,7 @@ from omnibench.robot.kinematics import Array, wheel_equations
 from omnibench.simulate.chain.motion_commands import CommandLink, MotionProfile, command_motion, target_rates
 from omnibench.simulate.chain.motors import Controller, Encoder, Motor
 from omnibench.simulate.chain.wheel_drive import DrivenRun, drive_session
-from omnibench.simulate.flower import Command
+from omnibench.simulate.command import Command
 
 PERIOD, STEP = 0.01, 0.001
 TICK = Encoder().tick

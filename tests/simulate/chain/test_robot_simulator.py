@@ -20,7 +20,6 @@ from omnibench.robot.kinematics import wheel_equations
 from omnibench.robot.odometry import OdometryBatch
 from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.simulate.config import MotionGrid, Truth
-from omnibench.simulate.flower import grid_of
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.source import read_simulation
@@ -274,7 +273,7 @@ class TestWhatIsRefused:
 def test_the_papers_experiment_is_36_commands_5_times_in_two_sessions() -> None:
     config = read_simulation(CONFIGS / "apr02_robot.yaml").config
     assert isinstance(config, RobotConfig)
-    assert len(grid_of(config.commands)) == 36
+    assert len(config.driven) == 36
     assert config.repetitions == 5
     assert config.validation is not None
 

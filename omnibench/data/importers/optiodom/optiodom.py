@@ -1,11 +1,13 @@
-"""Importer of the OptiOdom recordings: three-wheeled omni robot, encoders and motion capture."""
+"""Importer of the OptiOdom recordings: four robots with encoders and motion capture."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -14,23 +16,21 @@ from omnibench.data.alignment import median_period
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.delimited import NumberTable, read_numbers
 from omnibench.data.importer import Importer
-from omnibench.data.importers.optiodom.session_files import (
-    SessionLog,
-    SessionMetadata,
-    read_log,
-    read_metadata,
-    run_number,
-)
+from omnibench.data.importers.optiodom.robots import Geometry
+from omnibench.data.importers.optiodom.session_files import SessionMetadata, read_metadata, run_number
+from omnibench.data.importers.optiodom.session_log import SessionLog, read_log
 from omnibench.data.splits import Names, complete, divided
 from omnibench.errors import DataError
 from omnibench.registry import Options, importers
-from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.wheels.drive import in_the_middle
+from omnibench.words import plural
 
-_COLUMNS = ("t", "x", "y", "theta", "ticks_0", "ticks_1", "ticks_2")
-_AXLES_DEG = (300, 60, 180)
+_POSE = ("t", "x", "y", "theta")
 _SAME_SPEED = 0.02  # m/s, rad/s: commands below are standstill
+_SAME_TICKS = 1e-6  # logs of turns are rounded to some digits
 _DESCRIPTION = (
-    "INESC TEC three-wheeled omnidirectional robot, encoders at 25 Hz and OptiTrack; Sousa, Petry, Costa, Moreira: "
+    "INESC TEC {} and OptiTrack; Sousa, Petry, Costa, Moreira: "
     "OptiOdom, J. Intell. Robot. Syst. 105:39 (2022), doi 10.1007/s10846-022-01630-3. Encoders and OptiTrack were "
     "synchronised by hand, run by run: offsets up to 0.2 s and a drift of about 0.1 s a minute remain."
 )
@@ -39,11 +39,14 @@ _DESCRIPTION = (
 class OptiodomOptions(Options):
     """Choice of groups that train and validate. A group is the folder that holds session folders: circular, square."""
 
+    robot: Literal["diff", "omni3", "omni4", "tricyc"] | None = Field(
+        None, description="the robot to import where the source holds several; its sessions' metadata say their type"
+    )
     train: Names = Field((), description="groups that train; default: the first by name")
     validation: Names = Field((), description="groups that validate; default: all others")
     log: bool = Field(True, description="read commands and absolute wheel angles from each session's own log")
     name: str = Field("optiodom", min_length=1, description="name of the data set")
-    robot_name: str = Field("inesc_tec_omni3", min_length=1)
+    robot_name: str | None = Field(None, min_length=1, description="default: inesc_tec_ and its type")
     source: str = "public GitHub repository sousarbarb/optiodom, commit 8e025fd7"
 
 
@@ -51,14 +54,22 @@ class OptiodomOptions(Options):
 class Optiodom(Importer):
     """OptiOdom recordings (Sousa et al. 2022): session folders with runs of encoders and motion capture.
 
-    The source is any folder above session folders, or one of them; a session is found by ``<session>_metadata.csv``.
-    Beside it are ``<session>_run-NN.csv`` (t, x, y, theta, three tick increments; no header) and the robot's own log
-    ``<session>.csv``, from which come commands and absolute wheel angles. The authors' wheels 0, 1, 2 turn the other
-    way round and stand at 300, 60, 180 degrees in the convention of omnibench, so ticks are negated here. A row's ticks
-    were driven since the row before; the row at t = 0 only gives the start pose.
+    The source is any folder above session folders of one robot, or one of them; a session is found by
+    ``<session>_metadata.csv``, which says the robot's type: diff (a differential drive), tricyc (a tricycle), omni3
+    (three omni wheels) or omni4 (four mecanum wheels). Beside it are ``<session>_run-NN.csv`` (t, x, y, theta, then
+    increments of each wheel in ticks, of omni4 in turns; tricyc also has the steering angle, rad; no header) and the
+    robot's own log ``<session>.csv``, from which come commands and absolute wheel angles. Wheels that the authors count
+    the other way round than omnibench are negated here: omni3's, whose axles point to 300, 60, 180 degrees, and omni4's
+    on the right. A row's ticks were driven since the row before; the row at t = 0 only gives the start pose.
 
-    Runs share a command when group, direction, radius and its shrinkage, speed and total commanded turn (to the nearest
-    quarter) agree. v, alpha and omega are medians over the commanded motion.
+    Where sessions state different dimensions, the commonest are the robot's (of equally many the first session's), and
+    a warning and the description say so.
+
+    Runs share a command when group, direction, path (radius and shrinkage or length; of diff also the dimensions by
+    which the robot drove it), speed and total turn (to the nearest quarter, by the odometry by which the robot drove)
+    agree. v, alpha and omega are medians over the commanded motion. tricyc does not log commands, and most sessions of
+    omni4 have no log: the direction is then by that odometry, too, and so is the length (to 0.1 m) in the place of an
+    unknown path.
 
     Splits: with one group and no options every second run of a command validates. With two or more the first group by
     name trains and the others validate; ``train`` and ``validation`` say otherwise (patterns such as ``circ*`` work).
@@ -70,77 +81,121 @@ class Optiodom(Importer):
 
     def read(self, source: Path) -> Dataset:
         """All sessions under ``source``; DataError names the file and the row of what is wrong."""
-        sessions = [read_metadata(file) for file in sorted(source.resolve().rglob("*_metadata.csv"))]
-        if not sessions:
-            raise DataError(f"{source}: no *_metadata.csv below it; name a folder with OptiOdom sessions (data/omni3)")
-        robot = self._robot(sessions)
-        runs = [run for session in sessions for run in _read_session(session, self.options.log)]
+        sessions = self._sessions(source)
+        geometry, notes = _reference_geometry(sessions)
+        wheels = sessions[0].kind.wheels(geometry)
+        robot = Robot(name=self.options.robot_name or f"inesc_tec_{sessions[0].robot}", wheels=wheels)
+        logs = [read_log(session) if self.options.log else None for session in sessions]
+        notes += _unlogged(sessions, logs) if self.options.log else []
+        runs = [
+            _read_run(session, index, log, self.options.log)
+            for session, log in zip(sessions, logs, strict=True)
+            for index in range(len(session.runs))
+        ]
         groups = [session.group for session in sessions for _ in session.runs]
         train, validation = self.options.train, self.options.validation
         if not train and not validation and len(set(groups)) > 1:
             train = (min(groups),)
-        return make_dataset(
+        dataset = make_dataset(
             self.options.name,
             robot,
             median_period([run.pose_times for run in runs]),
             divided(complete(runs), train, validation, "group", names=groups),
-            description=_DESCRIPTION,
+            description=" ".join([_DESCRIPTION.format(sessions[0].kind.title), *(f"{_capital(n)}." for n in notes)]),
             source=self.options.source,
             licence="MIT",
         )
+        return replace(dataset, warnings=(*notes, *dataset.warnings))
 
-    def _robot(self, sessions: Sequence[SessionMetadata]) -> Robot:
-        first = sessions[0]
-        for session in sessions[1:]:
-            if session.geometry != first.geometry:
-                raise DataError(f"{session.file}: geometry differs from {first.file}; import one robot at a time")
-        wheels = (
-            Wheel(
-                name=str(index),
-                radius=diameter / 2,
-                distance=first.distance,
-                angle=math.radians(axle),
-                roller_angle=0.0,
+    def _sessions(self, source: Path) -> list[SessionMetadata]:
+        """The sessions of the one robot to import."""
+        sessions = [read_metadata(file) for file in sorted(source.resolve().rglob("*_metadata.csv"))]
+        if not sessions:
+            raise DataError(f"{source}: no *_metadata.csv below it; name a folder with OptiOdom sessions (data/omni3)")
+        found = sorted({session.robot for session in sessions})
+        wanted = self.options.robot
+        if wanted is None and len(found) > 1:
+            raise DataError(
+                f"{source}: it holds recordings of {plural(len(found), 'robot')}, {', '.join(found)}; import one at a "
+                f"time: name its folder, or --set robot={found[0]}"
             )
-            for index, (diameter, axle) in enumerate(zip(first.diameters, _AXLES_DEG, strict=True))
-        )
-        return Robot(name=self.options.robot_name, wheels=tuple(wheels))
+        if wanted is not None and wanted not in found:
+            raise DataError(f"{source}: it holds no recordings of robot {wanted}; found: {', '.join(found)}")
+        return [session for session in sessions if wanted in (None, session.robot)]
+
+
+def _reference_geometry(sessions: Sequence[SessionMetadata]) -> tuple[Geometry, list[str]]:
+    """The commonest geometry, of equally common ones the first session's; and a note if there are others."""
+    (reference, most), *others = Counter(session.geometry for session in sessions).most_common()
+    if not others:
+        return reference, []
+    rest = "; ".join(f"{geometry} in {count}" for geometry, count in others)
+    return reference, [
+        f"sessions state different dimensions of the robot: those of {most} of {len(sessions)} are taken, {reference} "
+        f"(others: {rest})"
+    ]
+
+
+def _unlogged(sessions: Sequence[SessionMetadata], logs: Sequence[SessionLog | None]) -> list[str]:
+    """A note on the sessions without a log, in which absolute angles and commands are not known."""
+    missing = [session.name for session, log in zip(sessions, logs, strict=True) if log is None]
+    if not missing:
+        return []
+    return [
+        f"{len(missing)} of {plural(len(sessions), 'session')} have no log ({', '.join(missing)}): commands are named "
+        "after the motion by the wheels there, and absolute wheel angles are left out of all runs"
+    ]
+
+
+def _capital(words: str) -> str:
+    return words[:1].upper() + words[1:]
 
 
 @dataclass(frozen=True)
-class _Command:
-    """The command of a run by the session's log: m/s, rad, rad/s, m."""
+class _Motion:
+    """A run's motion: medians of speed, m/s, direction, rad, and rate of turn, rad/s, while it moves; the greatest
+    speed, m/s; length, m, and turn, rad, in all."""
 
-    name: str
     v: float
     alpha: float
     omega: float
+    fastest: float
     distance: float
+    turned: float
+
+    @classmethod
+    def of(cls, twists: Array, durations: Array) -> _Motion:
+        """The motion of twists (rows, 3) in m/s, m/s, rad/s for durations (rows,), s."""
+        speeds = np.hypot(twists[:, 0], twists[:, 1])
+        moving = (speeds > _SAME_SPEED) | (np.abs(twists[:, 2]) > _SAME_SPEED)
+        vx, vy, omega = np.median(twists[moving], axis=0) if moving.any() else np.zeros(3)
+        v, alpha = float(np.hypot(vx, vy)), math.atan2(vy, vx)
+        turned = float(twists[:, 2] @ durations)
+        return cls(v, alpha, float(omega), float(speeds.max()), float(speeds @ durations), turned)
 
 
-def _read_session(session: SessionMetadata, with_log: bool) -> list[Trajectory]:
-    log = read_log(session) if with_log else None
-    return [_read_run(session, index, log) for index in range(len(session.runs))]
-
-
-def _read_run(session: SessionMetadata, index: int, log: SessionLog | None) -> Trajectory:
-    table = read_numbers(session.runs[index], _COLUMNS, header_lines=0)
+def _read_run(session: SessionMetadata, index: int, log: SessionLog | None, with_log: bool) -> Trajectory:
+    columns = (*_POSE, *session.kind.columns)
+    table = read_numbers(session.runs[index], columns, header_lines=0)
     if len(table.values) < 2:
         raise DataError(f"{table.file}: a run needs two rows or more")
     times = table.increasing("t") - table.values[0, 0]
-    ticks = table.columns(_COLUMNS[4:])
-    driven = -ticks * session.angle_per_tick
+    ticks = table.columns(session.kind.ticks) * session.kind.signs
+    driven = ticks * session.angle_per_tick
     run = Trajectory(
         id=f"{session.group}_{session.runs[index].stem}",
         split="train",
         times=times[1:],
         rates=driven[1:] / np.diff(times)[:, None],
         pose_times=times,
-        poses=table.columns(("x", "y", "theta")),
+        poses=table.columns(_POSE[1:]),
         session=session.name,
         duration=float(times[-1]),
+        steering=table.columns(("steering",))[1:] if "steering" in table else None,
     )
-    return run if log is None else _with_log(run, session, log, table, ticks)
+    if not with_log:
+        return run
+    return _with_command(run, session) if log is None else _with_log(run, session, log, table, ticks)
 
 
 def _with_log(
@@ -149,32 +204,29 @@ def _with_log(
     number = run_number(table.file)
     start = session.starts[number - 1] if number <= len(session.starts) else 0.0
     part = log.stretch(number, round(start / float(np.median(np.diff(run.pose_times)))), len(table.values))
-    if part is None or not np.array_equal(part.ticks, -ticks):
+    if part is None or not np.allclose(part.ticks, ticks, rtol=0, atol=_SAME_TICKS):
         raise DataError(
             f"{log.file}: does not hold the ticks of {table.file.name}; import with log: false to do without"
         )
-    command = _command(session, log, part.commands, part.times)
-    return replace(
-        run,
-        angles=part.angles[1:],
-        started_at=float(part.times[0] - log.begin),
-        command=command.name,
-        v=command.v,
-        alpha=command.alpha,
-        omega=command.omega,
-        distance=command.distance,
-    )
+    run = replace(run, angles=part.angles[1:], started_at=float(part.times[0] - log.begin))
+    if part.commands is None:
+        return _with_command(run, session, log)
+    told = _Motion.of(part.commands, np.diff(part.times, prepend=part.times[0]))
+    run = replace(run, v=told.v, alpha=told.alpha, omega=told.omega, distance=told.distance)
+    return _with_command(run, session, log, told)
 
 
-def _command(session: SessionMetadata, log: SessionLog, twists: Array, times: Array) -> _Command:
-    """The command behind commanded twists (rows, 3) in m/s, m/s, rad/s."""
-    speeds = np.hypot(twists[:, 0], twists[:, 1])
-    moving = (speeds > _SAME_SPEED) | (np.abs(twists[:, 2]) > _SAME_SPEED)
-    durations = np.diff(times, prepend=times[0])
-    turned = math.degrees(float(twists[:, 2] @ durations))
-    vx, vy, omega = np.median(twists[moving], axis=0) if moving.any() else np.zeros(3)
-    alpha = math.atan2(vy, vx)
-    direction = round(math.degrees(alpha) / 5) * 5
-    turn = round(turned / 90) * 90
-    name = f"{session.group}_a{direction}_turn{turn:+d}_v{speeds.max():.2g}{log.path}"
-    return _Command(name, float(np.hypot(vx, vy)), alpha, float(omega), float(speeds @ durations))
+def _with_command(
+    run: Trajectory, session: SessionMetadata, log: SessionLog | None = None, told: _Motion | None = None
+) -> Trajectory:
+    """The run with the name of its command: what was told, as far as the log has it, and what the robot made of that by
+    the odometry by which it drove."""
+    robot = Robot(name=session.robot, wheels=session.kind.wheels(session.geometry))
+    middle = None if run.steering is None else in_the_middle(run.steering)
+    twists = robot.drive.signals(run.rates, middle) @ robot.inverse_kinematic_matrix.T
+    driven = _Motion.of(twists, np.diff(run.times, prepend=0.0))
+    direction = round(math.degrees((told or driven).alpha) / 5) * 5
+    turn = round(math.degrees(driven.turned) / 90) * 90
+    speed = f"_v{told.fastest:.2g}" if told else ""
+    path = log.path if log else f"_{driven.distance:.1f}m"
+    return replace(run, command=f"{session.group}_a{direction}_turn{turn:+d}{speed}{path}")

@@ -11,18 +11,13 @@ from omnibench.data.alignment import align
 from omnibench.data.dataset import Trajectory
 from omnibench.data.importers.rosbag.bag import Bag, Topic, open_bag
 from omnibench.data.importers.rosbag.cutting import Cut, Piece, between_rests, find_rests, from_cuts, windows
-from omnibench.data.importers.rosbag.message_streams import (
-    PoseStream,
-    Stamps,
-    WheelStream,
-    header_stamp,
-    read_poses,
-    read_wheels,
-)
+from omnibench.data.importers.rosbag.joint_streams import WheelStream, read_wheels
+from omnibench.data.importers.rosbag.message_streams import PoseStream, Stamps, header_stamp, read_poses
 from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
 from omnibench.data.importers.rosbag.scan_stream import RunScans, ScanStream, read_scans
-from omnibench.data.importers.rosbag.topic_choice import pose_topic, scan_topic, wheel_topic
-from omnibench.data.importers.rosbag.wheel_samples import FASTEST, Losses, WheelSamples, seconds, wheel_samples
+from omnibench.data.importers.rosbag.topic_choice import TRANSFORMS, joint_topics, pose_topic, scan_topic
+from omnibench.data.importers.rosbag.transform_poses import read_transforms
+from omnibench.data.importers.wheel_samples import Losses, WheelSamples, wheel_samples
 from omnibench.errors import DataError, one_line
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
@@ -32,20 +27,26 @@ _SAME_TIME = 1e-9  # s, the resolution of the stamps
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Content of a bag, in s since the first wheel message. place: bag and wheel topic, for messages.
+    """Content of a bag, in s since ``origin`` (ns), the first wheel message. place: bag and wheel topic, for messages.
 
-    referenced: the bag holds reference poses; else poses are zeros at the stamps of the scans.
+    reference: topic of the reference poses; None: poses are zeros at the stamps of the scans.
     """
 
     name: str
     place: str
+    origin: int
     samples: WheelSamples
     pose_times: Array
     poses: Array
     covariances: Array | None
     cuts: tuple[Cut, ...]
     scans: ScanStream | None
-    referenced: bool
+    reference: Topic | None
+
+    @property
+    def referenced(self) -> bool:
+        """True if the bag holds reference poses."""
+        return self.reference is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +60,17 @@ class Run:
 def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list[str]) -> Recording:
     """Read one bag; what is left out is added to ``warnings``. DataError, ConfigError."""
     with open_bag(path) as bag:
-        topic = wheel_topic(bag, options.wheel_topic)
+        topics = joint_topics(bag, options.wheel_topic, options.steering_topic, bool(options.robot.drive.steered))
+        topic = topics.wheels[0]
         scan = scan_topic(bag, options.scan_topic, topic) if options.scans else None
         reference = pose_topic(bag, options.pose_topic, topic, scan)
         commands = bag.topic(options.cut_topic, "cut_topic") if options.cut_topic else None
-        wheels = read_wheels(bag, topic, options.robot, options.joints, options.use, warnings)
-        poses = read_poses(bag, reference, warnings) if reference else None
+        wheels = read_wheels(bag, topics, options, warnings)
+        poses = None
+        if reference is not None and reference.type == TRANSFORMS:
+            poses = read_transforms(bag, reference, options.pose_frames, warnings)
+        elif reference is not None:
+            poses = read_poses(bag, reference, warnings)
         cuts = _read_cuts(bag, commands, wheels) if commands else []
         scans = read_scans(bag, scan, options.scanner_mount, warnings) if scan else None
     if reference and poses:
@@ -75,12 +81,16 @@ def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list
         assert scans is not None  # else a topic of poses is asked for
         poses = PoseStream(scans.stamps, np.zeros((len(scans.stamps), 3)), None)
     place = f"{path}: topic {topic.name}"
-    signs = np.array(options.joint_signs or [1] * len(options.robot.wheels), dtype=float)
-    samples, losses = wheel_samples(wheels, signs, options.wheel_wrap, options.still, place)
-    warnings.extend(f"{place}: {loss}; runs end there" for loss in _losses_in_words(losses, options))
-    pose_times = seconds(poses.stamps, samples.origin)
+    period = float(np.median(np.diff(wheels.readings.times)))
+    samples, losses = wheel_samples(
+        wheels.readings, options, place, period, longest_gap=wheels.longest_gap, still=options.still
+    )
+    warnings.extend(f"{place}: {loss}" for loss in _losses_in_words(losses))
+    origin = int(wheels.stamps[0])
+    # Exact to the nanosecond, which a double of unix time is not.
+    pose_times = (poses.stamps - origin) / 1e9
     return Recording(
-        name, place, samples, pose_times, poses.poses, poses.covariances, tuple(cuts), scans, reference is not None
+        name, place, origin, samples, pose_times, poses.poses, poses.covariances, tuple(cuts), scans, reference
     )
 
 
@@ -163,9 +173,10 @@ def _run(recording: Recording, part: slice, piece: Piece, number: str, session: 
         started_at=aligned.zero - float(samples.begins[0 if samples.angles is None else part.start]),
         duration=float(ends[-1]),
         angles=None if samples.angles is None else samples.angles[kept],
+        steering=None if samples.steering is None else samples.steering[kept],
         pose_covariances=None if recording.covariances is None else recording.covariances[shown],
     )
-    seen_by = None if scans is None else scans.between(aligned.zero, aligned.zero + float(ends[-1]), samples.origin)
+    seen_by = None if scans is None else scans.between(aligned.zero, aligned.zero + float(ends[-1]), recording.origin)
     return Run(trajectory, seen_by)
 
 
@@ -202,16 +213,11 @@ def _check_clocks(path: Path, topic: Topic, wheels: WheelStream, what: str, othe
     )
 
 
-def _losses_in_words(losses: Losses, options: RosbagOptions) -> list[str]:
+def _losses_in_words(losses: Losses) -> list[str]:
     words = []
     if losses.gaps:
         words.append(
             f"wheel samples are missing {plural(losses.gaps, 'time')} while the wheels turned, "
-            f"up to {losses.longest:.3g} s"
+            f"up to {losses.longest:.3g} s; runs end there"
         )
-    if losses.restarts:
-        hint = "" if options.wheel_wrap else " (if that is a counter that wraps, set wheel_wrap)"
-        words.append(
-            f"the positions begin anew {plural(losses.restarts, 'time')}, by more than {FASTEST:g} rad/s{hint}"
-        )
-    return words
+    return words + losses.in_words("message")

@@ -1,43 +1,28 @@
-"""Wheels and poses of a bag as arrays, by the stamps of their headers."""
+"""Messages of a bag that can be used, by the stamps of their headers, and poses among them as arrays."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.importers.orientation import planar_headings
 from omnibench.data.importers.rosbag.bag import Bag, Record, Topic
-from omnibench.data.importers.rosbag.topic_choice import no_joints, wheel_joints
 from omnibench.errors import DataError
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
 T = TypeVar("T")
-Use = Literal["auto", "positions", "velocities"]
 Stamps = NDArray[np.int64]
 
 _SECOND = 1_000_000_000  # ns
 _NO_STAMP = "without a header stamp (it is 0)"
 _MOST_SET_BACK = 20  # messages that may come over a second late; more mean a clock that was set back (chosen)
-_LARGEST = 1e9  # rad, rad/s or m; a larger value is garbage
+_LARGEST = 1e9  # m; a larger value is garbage
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))  # x, y and yaw of a covariance of x, y, z, roll, pitch, yaw
-
-
-@dataclass(frozen=True, eq=False)
-class WheelStream:
-    """Wheel messages. stamps (F,): ns, increasing. logged (F,): times of recording, ns.
-
-    values (F, N): positions (rad) if ``absolute``, else velocities (rad/s).
-    """
-
-    stamps: Stamps
-    logged: Stamps
-    values: Array
-    absolute: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,39 +34,14 @@ class PoseStream:
     covariances: Array | None
 
 
-def read_wheels(
-    bag: Bag, topic: Topic, robot: Robot, joints: Sequence[str], use: Use, warnings: list[str]
-) -> WheelStream:
-    """The wheels in the robot's order; what is left out is added to ``warnings``. DataError, ConfigError."""
-    messages = MessageFilter(bag, topic)
-    places: dict[tuple[str, ...], tuple[int, ...] | None] = {}
-    rows: list[tuple[Any, ...]] = []
-    for record, stamp, (names, position, velocity) in messages.decoded(_joint_state):
-        if names not in places:
-            places[names] = wheel_joints(robot, joints, names)
-        chosen = places[names]
-        if chosen is not None:  # other joints may come by the same topic
-            picked = (_picked(values, chosen, len(names)) for values in (position, velocity))
-            rows.append((record.number, stamp, record.logged, *picked))
-    if not rows:
-        if not places:
-            messages.require(0)
-        raise no_joints(bag, topic, robot, joints, list(dict.fromkeys(name for names in places for name in names)))
-    numbers, stamps, logged = (np.array([row[column] for row in rows], dtype=np.int64) for column in range(3))
-    positions, velocities = (np.array([row[column] for row in rows]) for column in (3, 4))
-    absolute = _uses_positions(positions, velocities, use)
-    values = positions if absolute else velocities
-    kind = "position" if absolute else "velocity"
-    good = messages.keep(_possible(values), numbers, f"without a finite {kind} of every wheel")
-    order = good[messages.in_order(stamps[good], numbers[good])]
-    messages.require(len(order))
-    warnings.extend(messages.warnings())
-    return WheelStream(stamps[order], logged[order], values[order], absolute)
+def read_poses(
+    bag: Bag, topic: Topic, warnings: list[str], part: Callable[[Any], Any] = lambda message: message
+) -> PoseStream:
+    """Planar poses of messages, or of the ``part`` of each that has one; what is left out is added to ``warnings``.
 
-
-def read_poses(bag: Bag, topic: Topic, warnings: list[str]) -> PoseStream:
-    """Planar reference poses; what is left out is added to ``warnings``. DataError."""
-    messages = MessageFilter(bag, topic)
+    DataError.
+    """
+    messages = MessageFilter(bag, topic, part)
     rows, covariances, numbers, stamps = [], [], [], []
     for record, stamp, (pose, covariance) in messages.decoded(_pose):
         rows.append(pose)
@@ -90,7 +50,7 @@ def read_poses(bag: Bag, topic: Topic, warnings: list[str]) -> PoseStream:
         stamps.append(stamp)
     table = np.array(rows, dtype=float).reshape(-1, 6)
     number, stamp_array = np.array(numbers, dtype=np.int64), np.array(stamps, dtype=np.int64)
-    good = messages.keep(_possible(table[:, :2]), number, "without a finite position")
+    good = messages.keep(possible(table[:, :2]), number, "without a finite position")
     headings = planar_headings(table[:, 2:])
     flawed = good[headings.flawed[good]]
     if len(flawed):
@@ -110,11 +70,17 @@ def header_stamp(message: Any) -> int:
 
 
 class MessageFilter:
-    """Filter of a topic's messages: drops the useless ones, and counts them by reason."""
+    """Filter of a topic's messages: drops the useless ones, and counts them by reason.
 
-    def __init__(self, bag: Bag, topic: Topic) -> None:
+    part: gives the wanted part of a message; None where that is not in it. Messages of a type without header have the
+    time of recording as their stamp.
+    """
+
+    def __init__(self, bag: Bag, topic: Topic, part: Callable[[Any], Any] = lambda message: message) -> None:
         self._bag = bag
         self._topic = topic
+        self._part = part
+        self._headless = False
         self._place = f"{bag.path}: topic {topic.name}"
         self._reasons: dict[str, tuple[int, int]] = {}  # how many, and the first one's number
         self._sorted = 0
@@ -123,10 +89,15 @@ class MessageFilter:
         """The messages that can be decoded and have a stamp (ns), each with the result of ``unpack``."""
         for record in self._bag.records(self._topic):
             try:
-                stamp, content = header_stamp(record.message), unpack(record.message)
+                message = self._part(record.message)
+                if message is None and record.message is not None:
+                    continue
+                stamp, content = header_stamp(message), unpack(message)
             except (AttributeError, TypeError, ValueError):  # garbage, or a type that the bag defines otherwise
                 self._drop("that cannot be decoded", record.number)
                 continue
+            if not hasattr(message, "header"):
+                stamp, self._headless = record.logged, True
             if stamp <= 0:
                 self._drop(_NO_STAMP, record.number)
             else:
@@ -165,6 +136,8 @@ class MessageFilter:
     def warnings(self) -> list[str]:
         """Warnings of messages that were dropped or put in order."""
         warnings = [f"{self._place}: {self._dropped_in_words()}"] if self._reasons else []
+        if self._headless:
+            warnings.append(f"{self._place}: its messages have no stamps; they have the times of recording")
         if self._sorted:
             late = "message was recorded late and sorted by its stamp"
             if self._sorted > 1:
@@ -184,37 +157,21 @@ class MessageFilter:
         return f"{lost} of {plural(self._topic.messages, 'message')} left out: {', '.join(parts)}"
 
 
-def _picked(values: Array, places: Sequence[int], names: int) -> Array:
-    return values[list(places)] if len(values) == names else np.full(len(places), np.nan)
-
-
-def _uses_positions(positions: Array, velocities: Array, use: Use) -> bool:
-    if use != "auto":
-        return use == "positions"
-    counted, measured = _possible(positions), _possible(velocities)
-    if measured.sum() > 2 * counted.sum():
-        return False
-    # Some drivers fill in zeros for positions that they do not know.
-    stands = bool((positions[counted] == positions[counted][:1]).all())
-    return not (stands and measured.any() and bool(velocities[measured].any()))
-
-
-def _possible(values: Array) -> NDArray[np.bool_]:
-    """True for rows whose values are finite, and smaller than any robot reaches."""
-    small: NDArray[np.bool_] = np.abs(values) < _LARGEST
+def possible(values: Array, largest: float = _LARGEST) -> NDArray[np.bool_]:
+    """True for rows of values (F, n) that are finite, and smaller than anything real."""
+    small: NDArray[np.bool_] = np.abs(values) < largest
     return np.asarray(small.all(axis=1))
-
-
-def _joint_state(message: Any) -> tuple[tuple[str, ...], Array, Array]:
-    return tuple(message.name), np.asarray(message.position, dtype=float), np.asarray(message.velocity, dtype=float)
 
 
 def _pose(message: Any) -> tuple[tuple[float, ...], Array | None]:
     """x, y and the quaternion of a message of any of the known types, and its covariance (3, 3)."""
-    pose, covariance = message.pose, None
-    if hasattr(pose, "covariance"):
-        pose, covariance = pose.pose, np.reshape(pose.covariance, (6, 6))[_PLANAR]
-    place, turn = pose.position, pose.orientation
+    if hasattr(message, "transform"):
+        place, turn, covariance = message.transform.translation, message.transform.rotation, None
+    else:
+        pose, covariance = message.pose, None
+        if hasattr(pose, "covariance"):
+            pose, covariance = pose.pose, np.reshape(pose.covariance, (6, 6))[_PLANAR]
+        place, turn = pose.position, pose.orientation
     return (place.x, place.y, turn.x, turn.y, turn.z, turn.w), covariance
 
 

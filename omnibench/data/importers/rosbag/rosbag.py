@@ -8,10 +8,12 @@ from pathlib import Path
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importer import Importer
+from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.importers.rosbag.bag import find_bags
 from omnibench.data.importers.rosbag.bag_recording import cut_into_runs, read_recording
 from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
 from omnibench.data.importers.rosbag.scan_stream import RunScans, gather_scans
+from omnibench.data.importers.rosbag.topic_choice import ODOMETRY, TRANSFORMS
 from omnibench.data.splits import complete, divided
 from omnibench.errors import DataError
 from omnibench.registry import importers
@@ -23,10 +25,15 @@ class Rosbag(Importer):
     """ROS recordings: MCAP, rosbag2 (sqlite3 and mcap) and ROS 1, with wheels and reference poses or laser scans.
 
     The source is a bag, or a folder of bags; ``robot`` (a YAML file or a mapping) is the only option that must be
-    given. Wheels are a sensor_msgs/JointState, poses a geometry_msgs/PoseWithCovarianceStamped or PoseStamped or a
-    nav_msgs/Odometry. A bag with several of them lists them, and ``wheel_topic`` and ``pose_topic`` choose. Joints are
+    given. Wheels are a sensor_msgs/JointState, poses a geometry_msgs/PoseWithCovarianceStamped, PoseStamped or
+    TransformStamped. A bag with several of them lists them, and ``wheel_topic`` and ``pose_topic`` choose. Joints are
     those called like the wheels (``a``, ``wheel_a``, ``a_wheel_joint``), or ``joints`` names them in the robot's order;
-    ``joint_signs: [-1, 1, 1]`` turns a wheel round: a positive rate drives the robot counter-clockwise.
+    those that steer have "steer" in their names, too, or ``steering_joints`` names them. ``joint_signs: [-1, 1, 1]``
+    turns a wheel round; the sense of a positive rate is in ``omnibench guide conventions``.
+
+    Named topics may hold std_msgs numbers, too: of all wheels in an array, or each wheel by its own topic in a list;
+    these are interpolated at the stamps of the first, as steering angles of another topic are. A nav_msgs/Odometry or
+    a tf (``pose_frames: [world, robot]``) is a reference only when named, and refused where it is made of the wheels.
 
     scans: those of a sensor_msgs/LaserScan (``scan_topic``; ``scans: false`` leaves them out) go into the data set.
     Where the scanner is mounted comes from /tf_static or from ``scanner_mount: {x, y, yaw}`` (m, rad). A bag with scans
@@ -35,8 +42,9 @@ class Rosbag(Importer):
 
     times: the stamps of the headers, of all topics by one clock; when a message was recorded does not matter.
     Messages recorded late are sorted; those without a stamp, with a stamp that was there or with values that are not
-    finite are left out. Warnings say how many. Positions (rad) are preferred: their differences are exact however many
-    samples were lost. Velocities count as the mean since the message before.
+    finite are left out. Warnings say how many. Plain numbers have no stamps but the times of recording. Positions are
+    preferred: their differences are exact however many samples were lost. Velocities count as the mean since the
+    message before.
 
     cut: at ``rests`` (each run keeps a little of the rest at both ends, and begins and ends at a reference pose there);
     by a ``topic`` (a message of ``cut_topic`` begins a run, and a String says which command is driven); in ``windows``
@@ -59,10 +67,13 @@ class Rosbag(Importer):
         runs: list[Trajectory] = []
         scans: dict[str, RunScans] = {}
         unreferenced: list[Path] = []
+        doubtful: set[str] = set()
         for name, path in bags.items():
             recording = read_recording(path, name, self.options, warnings)
             if not recording.referenced:
                 unreferenced.append(path)
+            elif recording.reference is not None and recording.reference.type in (ODOMETRY, TRANSFORMS):
+                doubtful.add(recording.reference.name)
             recorded_runs, left_out = cut_into_runs(recording, self.options, alone=len(bags) == 1)
             warnings += left_out
             for run in recorded_runs:
@@ -83,6 +94,12 @@ class Rosbag(Importer):
         dataset = self.options.dataset(
             chosen, gather_scans({run.id: scans[run.id] for run in chosen if run.id in scans})
         )
+        if doubtful and (residual := follows_the_wheels(dataset.trajectories)) is not None:
+            raise DataError(
+                f"{source}: {', '.join(sorted(doubtful))} is the robot's own odometry: some matrix makes its headings "
+                f"of the wheels to {residual:.1g} rad a second, and no error can show; set pose_topic to an "
+                "independent reference (motion capture, SLAM), or record one"
+            )
         if unreferenced:  # the data set is checked once more when it has its poses
             return replace(dataset, referenced=False, warnings=tuple(warnings))
         return replace(dataset, warnings=(*warnings, *dataset.warnings))
@@ -90,5 +107,7 @@ class Rosbag(Importer):
     def _with_placeholders(self, runs: Sequence[Trajectory]) -> list[Trajectory]:
         """The runs with the design model's odometry, from (0, 0, 0) on, in the place of reference poses."""
         design = OdometryModel.of_design(self.options.robot, "arc")
+        if not self.options.robot.drive.direct:
+            runs = [replace(run, drive=self.options.robot.drive) for run in runs]
         poses = design.poses([run.log(run.pose_times) for run in runs])
         return [replace(run, poses=pose) for run, pose in zip(runs, poses, strict=True)]

@@ -7,28 +7,35 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from omnibench.config import NonNegative, Positive
-from omnibench.data.importers.recording_options import RecordingOptions
-from omnibench.data.importers.rosbag.message_streams import Use
+from omnibench.data.importers.encoder_options import EncoderOptions, Signs, WheelUnit
 from omnibench.data.scans import Mount
 from omnibench.data.splits import Names
 from omnibench.words import plural
 
+Use = Literal["auto", "positions", "velocities"]
 
-class RosbagOptions(RecordingOptions):
+
+class RosbagOptions(EncoderOptions):
     """The robot, topics and joints, how the recording is cut into runs, and which of these train and validate."""
 
     name: str = Field("rosbag", min_length=1, description="name of the data set")
-    wheel_topic: str | None = Field(
-        None,
-        min_length=1,
-        description="sensor_msgs/JointState; default: the only one, or the one ending in joint_states",
+    wheel_unit: WheelUnit = Field(
+        "rad",
+        description="of positions and (per second) velocities: rad, deg, rev, ticks; rpm; or increments rad/sample",
     )
+    wheel_topic: Names = Field(
+        (),
+        description="sensor_msgs/JointState or std_msgs numbers, of all wheels or a list of one each; default: the "
+        "only JointState, or the one ending in joint_states",
+    )
+    steering_topic: Names = Field((), description="of all steering angles, or a list of one each; default: the wheels'")
     pose_topic: str | None = Field(
         None,
         min_length=1,
-        description="PoseWithCovarianceStamped, PoseStamped or Odometry; default: the only one, or the one ending in "
-        "slam_pose",
+        description="PoseWithCovarianceStamped, PoseStamped or TransformStamped, default: the only one, or the one "
+        "ending in slam_pose; or, if independent of the wheels, Odometry or tf",
     )
+    pose_frames: Names = Field((), description="with a tf pose_topic: frame of the reference, and the tracked one")
     scan_topic: str | None = Field(
         None, min_length=1, description="sensor_msgs/LaserScan; default: the only one, or the one ending in /scan"
     )
@@ -40,9 +47,12 @@ class RosbagOptions(RecordingOptions):
     slam: dict[str, Any] = Field(
         {}, description="options of omnibench slam, for bags whose reference poses are made from their scans"
     )
-    joints: Names = Field((), description="in the robot's wheel order; default: those called like the wheels")
-    joint_signs: tuple[Literal[1, -1], ...] = Field((), description="-1 for joints that count the other way round")
-    wheel_wrap: Positive | None = Field(None, description="positions start again after this many rad")
+    joints: Names = Field(
+        (),
+        description="in the robot's wheel order, or numbers of elements from 0; default: those called like the wheels",
+    )
+    joint_signs: Signs = Field((), description="-1 for joints that count the other way round")
+    steering_joints: Names = Field((), description="in the order of the wheels that steer; default: by their names")
     use: Use = Field("auto", description="positions or velocities of the joints; auto: positions, if they are there")
     cut: Literal["rests", "topic", "windows", "none"] = Field(
         "rests", description="where one run ends and another begins"
@@ -57,21 +67,26 @@ class RosbagOptions(RecordingOptions):
 
     @model_validator(mode="after")
     def _fits_together(self) -> RosbagOptions:
-        wheels = len(self.robot.wheels)
-        for key in ("joints", "joint_signs"):
-            given = len(getattr(self, key))
-            if given not in (0, wheels):
-                raise ValueError(f"{key} has {plural(given, 'value')}, expected {wheels}, one for each wheel")
+        self.require_one_each("joints", "joint_signs", "steering_joints")
+        self.require_one_each("wheel_topic", "steering_topic", or_one=True)
         if not self.scans and (self.scan_topic is not None or self.scanner_mount is not None):
             raise ValueError("scans=false leaves the scans out; leave scan_topic and scanner_mount out, too")
         if len(set(self.joints)) < len(self.joints):
             raise ValueError("joints names one joint twice; name another one for each wheel")
-        if self.wheel_wrap is not None and self.use == "velocities":
-            raise ValueError("wheel_wrap is for positions; leave it out with use=velocities")
+        if isinstance(self.wraps_at, float) and self.use == "velocities":
+            raise ValueError("wraps_at is for positions; leave it out with use=velocities")
+        if self.quantity == {"positions": "rates", "velocities": "increments"}.get(self.use):
+            raise ValueError(f"wheel_unit {self.wheel_unit} is not one of {self.use}; leave use out")
+        if len(self.pose_frames) not in (0, 2):
+            raise ValueError(f"pose_frames has {plural(len(self.pose_frames), 'value')}, expected 2: [world, robot]")
         for key, cut in (("cut_topic", "topic"), ("window", "windows")):
             if (getattr(self, key) is not None) != (self.cut == cut):
                 raise ValueError(f"cut={cut} and {key} belong together; give both or none")
         return self
+
+    @property
+    def signs(self) -> Signs:
+        return self.joint_signs
 
     @property
     def still(self) -> float:

@@ -27,7 +27,7 @@ class ScannerMounting:
 
 def scanner_mounting(bag: Bag, frame: str) -> ScannerMounting | None:
     """Mounting of the scanner with a frame; None if the bag has no transform to it. DataError: it is tilted."""
-    parents = _fixed_transforms(bag)
+    parents = fixed_transforms(bag)
     child, whole = frame.strip("/"), np.eye(4)
     for _ in range(len(parents) + 1):
         if child.rpartition("/")[2] in _BASES:
@@ -39,7 +39,7 @@ def scanner_mounting(bag: Bag, frame: str) -> ScannerMounting | None:
     return None  # a ring of frames
 
 
-def _fixed_transforms(bag: Bag) -> dict[str, tuple[str, Array]]:
+def fixed_transforms(bag: Bag) -> dict[str, tuple[str, Array]]:
     """Parent of every frame, and the transform (4, 4) from the frame to its parent."""
     parents: dict[str, tuple[str, Array]] = {}
     for topic in bag.topics:

@@ -1,31 +1,58 @@
-"""Choice of a bag's topics for wheels, reference poses and scans, and of the joints that are the robot's wheels."""
+"""Choice of a bag's topics for wheels, reference poses and scans."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from omnibench.data.importers.rosbag.bag import Bag, Topic
-from omnibench.errors import ConfigError, DataError, nearest
-from omnibench.robot.kinematics import Robot
+from omnibench.errors import ConfigError, DataError
 
-WHEEL_TYPES = ("sensor_msgs/msg/JointState",)
+JOINT_TYPES = ("sensor_msgs/msg/JointState",)
+NUMBER_TYPES = tuple(
+    f"std_msgs/msg/{sort}{array}"
+    for array in ("", "MultiArray")
+    for sort in ("Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64", "Float32", "Float64")
+)
 POSE_TYPES = (
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/PoseStamped",
-    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/TransformStamped",
 )
+ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 SCAN_TYPES = ("sensor_msgs/msg/LaserScan",)
-# Words in the names of joints besides the wheel's own name: front_left_wheel_joint, drive/wheel_a.
-_USUAL = {"wheel", "wheels", "joint", "motor", "drive", "link", "axle", "hub"}
+_NUMBERS = "std_msgs numbers (Int32, Float64MultiArray ...)"
 
 
-def wheel_topic(bag: Bag, name: str | None) -> Topic:
-    """The topic of the wheels: the one named, the only one of its type, or the only one that ends in joint_states."""
-    if name is not None:
-        return _named(bag, name, "wheel_topic", WHEEL_TYPES)
-    candidates = [topic for topic in bag.topics if topic.type in WHEEL_TYPES]
-    return _only(bag, "wheel_topic", candidates, "joint_states", WHEEL_TYPES)
+@dataclass(frozen=True)
+class JointTopics:
+    """The topics of the wheels and, of robots that steer, of the steering angles: one of all, or one of each."""
+
+    wheels: tuple[Topic, ...]
+    steering: tuple[Topic, ...]
+
+
+def joint_topics(bag: Bag, wheels: Sequence[str], steering: Sequence[str], steers: bool) -> JointTopics:
+    """The topics that are named; else of the wheels the only JointState, or the only one that ends in joint_states.
+
+    Steering angles come by the topic of the wheels if theirs is not named, and a robot ``steers``.
+    """
+    types = (*JOINT_TYPES, *NUMBER_TYPES)
+    named = tuple(_named(bag, name, "wheel_topic", types, f"{JOINT_TYPES[0]} or {_NUMBERS}") for name in wheels)
+    if not named:
+        candidates = [topic for topic in bag.topics if topic.type in JOINT_TYPES]
+        numbers = [topic for topic in bag.topics if topic.type in NUMBER_TYPES and topic.messages]
+        if not candidates and numbers:
+            raise ConfigError(
+                f"{bag.path}: no topic of type {JOINT_TYPES[0]}; set wheel_topic to one of plain numbers, or to a list "
+                f"of one for each wheel: {_listed(numbers)}"
+            )
+        named = (_only(bag, "wheel_topic", candidates, "joint_states", JOINT_TYPES),)
+    angles = tuple(_named(bag, name, "steering_topic", types, f"{JOINT_TYPES[0]} or {_NUMBERS}") for name in steering)
+    if steers and not angles and len(named) > 1:
+        raise ConfigError(f"{bag.path}: every wheel has its own topic; set steering_topic, too")
+    return JointTopics(named, (angles or named) if steers else ())
 
 
 def scan_topic(bag: Bag, name: str | None, wheels: Topic) -> Topic | None:
@@ -45,20 +72,22 @@ def scan_topic(bag: Bag, name: str | None, wheels: Topic) -> Topic | None:
 def pose_topic(bag: Bag, name: str | None, wheels: Topic, scans: Topic | None = None) -> Topic | None:
     """The topic of the reference poses: the one named, the only one, or the only one that ends in slam_pose.
 
-    Among several that do, the one of the wheels' namespace. Odometry is never taken unasked: a calibration against the
-    robot's own odometry would find nothing wrong. None: there is none, but there are ``scans``, from which poses can be
-    made.
+    Among several that do, the one of the wheels' namespace. Odometry and transforms are never taken unasked: a
+    calibration against the robot's own odometry would find nothing wrong. None: there is none, but there are ``scans``,
+    from which poses can be made.
     """
+    types = (*POSE_TYPES, ODOMETRY, TRANSFORMS)
     if name is not None:
-        return _named(bag, name, "pose_topic", POSE_TYPES)
+        return _named(bag, name, "pose_topic", types)
     candidates = [topic for topic in bag.topics if topic.type in POSE_TYPES]
     references = [topic for topic in candidates if topic.messages and not _is_odometry(topic)]
     if not references and scans is not None:
         return None
-    if not references and any(topic.messages for topic in candidates):
+    others = [topic for topic in bag.topics if topic.type in types and topic.messages and not _is_fixed(topic)]
+    if not references and others:
         raise ConfigError(
-            f"{bag.path}: the only poses are {_listed(candidates)}, by name the robot's own odometry and not a "
-            "reference for it; if it is one, set pose_topic"
+            f"{bag.path}: the only poses are {_listed(others)}, by name or type the robot's own odometry and not a "
+            "reference for it; if one is independent of the wheels, set pose_topic to it"
         )
     beside = [topic for topic in references if _ends_in(topic, "slam_pose") and _space(topic) == _space(wheels)]
     if len(beside) == 1:
@@ -66,44 +95,12 @@ def pose_topic(bag: Bag, name: str | None, wheels: Topic, scans: Topic | None = 
     return _only(bag, "pose_topic", references or candidates, "slam_pose", POSE_TYPES)
 
 
-def wheel_joints(robot: Robot, asked: Sequence[str], found: Sequence[str]) -> tuple[int, ...] | None:
-    """Indices of the robot's wheels in a JointState with the names ``found``; None when not all of them are there.
-
-    asked: joints in the robot's wheel order. Without them joints are chosen by the wheels' names: equal ones, else
-    those that are equal but for words such as ``wheel`` and ``joint``, case, and text before a slash.
-    """
-    wanted = asked or robot.wheel_names
-    if all(found.count(name) == 1 for name in wanted):
-        return tuple(found.index(name) for name in wanted)
-    if asked:
-        return None
-    cores = [_core(name) for name in found]
-    places = [[place for place, core in enumerate(cores) if core == _core(wheel)] for wheel in robot.wheel_names]
-    if not all(len(each) == 1 for each in places) or len({each[0] for each in places}) < len(places):
-        return None
-    return tuple(each[0] for each in places)
-
-
-def no_joints(bag: Bag, topic: Topic, robot: Robot, asked: Sequence[str], found: Sequence[str]) -> ConfigError:
-    """The error of a topic whose messages never hold all wheels; it lists the joints found."""
-    shown = ", ".join(found) or "none (the messages name no joints)"
-    place = f"{bag.path}: topic {topic.name}"
-    missing = next((name for name in asked if name not in found), None)
-    if missing is not None:
-        return ConfigError(f"{place}: joints: no joint {missing!r}; {nearest(missing, found)}found: {shown}")
-    if asked:
-        return ConfigError(f"{place}: no message holds all of {', '.join(asked)} once; joints found: {shown}")
-    return ConfigError(
-        f"{place}: cannot tell which joints are the wheels {', '.join(robot.wheel_names)}; set joints, in that order; "
-        f"joints found: {shown}"
-    )
-
-
-def _named(bag: Bag, name: str, key: str, types: Sequence[str]) -> Topic:
+def _named(bag: Bag, name: str, key: str, types: Sequence[str], words: str = "") -> Topic:
     topic = bag.topic(name, key)
     if topic.type not in types:
         found = _listed([each for each in bag.topics if each.type in types])
-        raise ConfigError(f"{bag.path}: {key}: {topic.name} is {topic.type}, expected {_either(types)}; found: {found}")
+        expected = words or _either(types)
+        raise ConfigError(f"{bag.path}: {key}: {topic.name} is {topic.type}, expected {expected}; found: {found}")
     return topic
 
 
@@ -136,10 +133,9 @@ def _space(topic: Topic) -> str:
     return topic.name.strip("/").rpartition("/")[0]
 
 
+def _is_fixed(topic: Topic) -> bool:
+    return topic.type == TRANSFORMS and topic.name.endswith("tf_static")
+
+
 def _is_odometry(topic: Topic) -> bool:
     return not {"odom", "odometry"}.isdisjoint(re.split(r"[^a-z]+", topic.name.lower()))
-
-
-def _core(name: str) -> str:
-    words = re.findall(r"[a-z]+|[0-9]+", name.lower().rpartition("/")[2])
-    return " ".join(word for word in words if word not in _USUAL) or " ".join(words)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.live.estimation.counts import Counts
-from omnibench.live.estimation.wheel_input import WheelInput, WheelSettings, WheelStep
+from omnibench.live.wheels.wheel_input import WheelInput, WheelSettings, WheelStep
 from omnibench.live.wire.messages import JointState
 
 NAMES = ("a", "b", "c")

@@ -1,7 +1,8 @@
 """From wheel messages to wheel steps: messages are put in order, repaired or refused, and counted.
 
 A message is late, doubled, or next. One whose stamp is too far from the last one waits until others confirm the new
-time (a clock that jumped); one after a silence that this machine's clock saw too is a step of unknown path.
+time (a clock that jumped); one after a silence that this machine's clock saw too is a step of unknown path. Messages
+that hold steering joints alone make no step; their angles are those of the next wheel sample.
 """
 
 from __future__ import annotations
@@ -16,16 +17,15 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from omnibench.config import Model, Positive
-from omnibench.errors import ConfigError
 from omnibench.live.estimation.counts import Counts
-from omnibench.live.estimation.wheel_angles import WheelAngles
+from omnibench.live.wheels.steering_input import REORDERED, SteeringInput
+from omnibench.live.wheels.wheel_angles import WheelAngles
 from omnibench.live.wire.messages import JointState, MessageError
 from omnibench.robot.kinematics import Array
 
 _SECOND = 1e9  # ns
 # All of these are chosen.
 _CONFIRMATION = 3  # stamps in a row that confirm a new time of the sender's clock
-_REORDERED = 0.2  # s; a sample that is late by less is out of order, or the clock was set back a little
 _SET_BACK = 3  # late samples in a row; so many are of a clock that was set back, and not out of order
 _SLACK = 0.1  # s, by which arrivals may scatter
 _LEARNING = 10  # samples, whose lower quartile gives the first period, so that lost ones do not lengthen it
@@ -39,21 +39,17 @@ class WheelSettings(Model):
     """Settings for reading wheel messages."""
 
     joints: tuple[str, ...] | None = Field(None, description="names in the messages, in the robot's order of wheels")
+    steering_joints: tuple[str, ...] | None = Field(
+        None,
+        description="names in the messages, in the order of steered wheels; default: <wheel>_steering",
+    )
     use: Literal["auto", "positions", "velocities"] = Field("auto", description="auto: positions where there are any")
     wrap: Positive | None = Field(
         None, description="angle after which angles start again, rad; default: one turn where they seem to"
     )
     max_rate: Positive = Field(100.0, description="no wheel turns faster, rad/s")
     max_gap: Positive = Field(1.0, description="a longer silence makes the path unknown, s")
-
-
-def check_joints(joints: Sequence[str], wheels: Sequence[str], where: str) -> None:
-    """ConfigError that begins with ``where``: the joints are not one, and a different one, for each wheel."""
-    if len(joints) != len(wheels) or len(set(joints)) < len(joints):
-        raise ConfigError(
-            f"{where}: {', '.join(joints) or 'none'}; name one joint, and a different one, "
-            f"for each of the wheels {', '.join(wheels)}"
-        )
+    max_steering_age: Positive = Field(0.2, description="older steering angles make the path unknown, s")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +59,8 @@ class WheelStep:
     stamp: ns, at its end. duration: s. angles (N,): rad. rates (N,): at its end, rad/s. blind: s of the duration for
     which only ``angles`` are known and not the path. counted: angles are differences of counters, which hold the whole
     motion of blind times too. restarted: the clock jumped, and stamps before have no meaning. positions (N,): readings
-    of the counters at its end, rad; None where there are none.
+    of the counters at its end, rad; None where there are none. steering (S,): angles of the steered wheels at its end,
+    rad; None of a robot that does not steer. held: these are old ones.
     """
 
     stamp: int
@@ -74,13 +71,16 @@ class WheelStep:
     counted: bool = True
     restarted: bool = False
     positions: Array | None = None
+    steering: Array | None = None
+    held: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sample:
     """A checked message, its joints in the order of the wheels. stamp: ns. arrival: s.
 
-    skipped: messages before it that never came, by the sender's numbers; 0 also of a sender without numbers.
+    skipped: messages before it that never came, by the sender's numbers; 0 also of a sender without numbers. steering
+    (S,): rad. steering_age: of the oldest of these angles, s.
     """
 
     stamp: int
@@ -88,20 +88,31 @@ class _Sample:
     positions: Array | None
     velocities: Array | None
     skipped: int = 0
+    steering: Array | None = None
+    steering_age: float = 0.0
 
 
 class WheelInput:
     """Takes the wheel messages of one robot in the order of their arrival.
 
-    wheels: names in the robot's order. last_refusal: reason of the latest refusal, in words. period: mean time from
-    sample to sample, s, at first the calibration's.
+    wheels (N): names in the robot's order, and in the messages, unless the settings name joints. steering: of a robot
+    that steers. last_refusal: reason of the latest refusal, in words. period: mean time from sample to sample, s, at
+    first the calibration's.
     """
 
-    def __init__(self, wheels: Sequence[str], settings: WheelSettings, period: float, counts: Counts) -> None:
+    def __init__(
+        self,
+        wheels: Sequence[str],
+        settings: WheelSettings,
+        period: float,
+        counts: Counts,
+        steering: SteeringInput | None = None,
+    ) -> None:
         self._joints = settings.joints or tuple(wheels)
         self._settings = settings
         self._counts = counts
-        self._places: dict[tuple[str, ...], NDArray[np.intp]] = {}
+        self._steering = steering
+        self._places: dict[tuple[str, ...], NDArray[np.intp] | None] = {}
         self._angles = WheelAngles(len(self._joints), settings.wrap, settings.max_rate, counts)
         self._counting = settings.use == "positions"  # True: angles come from counters, False: from rates
         self._last: _Sample | None = None
@@ -115,13 +126,21 @@ class WheelInput:
         self.last_refusal = ""
 
     @property
-    def last_sample(self) -> tuple[int, Array | None] | None:
-        """Stamp (ns) and wheel angles (N,) of the last sample taken, for a node that starts again."""
-        return None if self._last is None else (self._last.stamp, self._angles.known)
+    def last_sample(self) -> tuple[int, Array | None, Array | None] | None:
+        """Stamp (ns), wheel angles (N,) and steering (S,) of the last sample taken, for a node that starts again."""
+        return None if self._last is None else (self._last.stamp, self._angles.known, self._last.steering)
 
-    def resume(self, stamp: int, positions: Array | None, arrival: float) -> None:
+    @property
+    def old_steering(self) -> float:
+        """Age of the last sample's steering angles, s, where that is more than it may be; else 0."""
+        age = 0.0 if self._last is None else self._last.steering_age
+        return age if age > self._settings.max_steering_age else 0.0
+
+    def resume(self, stamp: int, positions: Array | None, arrival: float, steering: Array | None = None) -> None:
         """Continue after a sample that another process took; arrival: s, by this process's clock."""
-        self._last = _Sample(stamp, arrival, positions, None)
+        if self._steering is not None:
+            self._steering.resume(stamp, steering)
+        self._last = _Sample(stamp, arrival, positions, None, steering=steering)
         self._counting = positions is not None and self._settings.use != "velocities"
         self._angles.begin(positions if self._counting else None)
 
@@ -136,6 +155,8 @@ class WheelInput:
         except MessageError as error:
             self.last_refusal = str(error)
             return []
+        if sample is None:
+            return []
         if self._last is None:
             return [self._first(sample)]
         elapsed = (sample.stamp - self._last.stamp) / _SECOND
@@ -146,7 +167,7 @@ class WheelInput:
             if self._unconfirmed:
                 self._drop_unconfirmed()
             return [self._step(sample, elapsed)]
-        if -_REORDERED <= elapsed < 0:
+        if -REORDERED <= elapsed < 0:
             self._counts.late += 1
             self._late_in_a_row += 1
             return []
@@ -154,14 +175,23 @@ class WheelInput:
             return [self._after_silence(sample, elapsed)]
         return self._confirmed(sample)
 
-    def _read(self, message: JointState, arrival: float, skipped: int) -> _Sample:
-        """Check a message and take the wheels' values from it. MessageError: why it is refused."""
-        places = self._places.get(message.names)
+    def _read(self, message: JointState, arrival: float, skipped: int) -> _Sample | None:
+        """Check a message and take the wheels' values from it; None if it holds steering joints alone.
+
+        MessageError: why it is refused.
+        """
+        if self._steering is not None:
+            self.last_refusal = self._steering.take(message)
+        places = self._places[message.names] if message.names in self._places else self._find(message.names)
         if places is None:
-            places = self._find(message.names)
+            return None
         use = self._settings.use
         positions = None if message.positions is None or use == "velocities" else message.positions.take(places)
         velocities = None if message.velocities is None or use == "positions" else message.velocities.take(places)
+        if positions is not None and velocities is not None:
+            # ros2_control fills in NaN for what its joints do not tell
+            told = _told(positions, velocities), _told(velocities, positions)
+            positions, velocities = told
         if positions is None and velocities is None:
             self._counts.wrong_joints += 1
             raise MessageError(f"it has no {'positions and no velocities' if use == 'auto' else use}")
@@ -176,19 +206,27 @@ class WheelInput:
                     f"wheel rates {velocities.tolist()} rad/s exceed max_rate {self._settings.max_rate:g}"
                 )
             velocities = None
-        return _Sample(message.stamp, arrival, positions, velocities, skipped)
+        if self._steering is None:
+            return _Sample(message.stamp, arrival, positions, velocities, skipped)
+        steering, age = self._steering.known(message), self._steering.age(message.stamp)
+        return _Sample(message.stamp, arrival, positions, velocities, skipped, steering, age)
 
-    def _find(self, names: tuple[str, ...]) -> NDArray[np.intp]:
-        """Places (N,) of the wheels among a message's joints. MessageError: one is not there."""
+    def _find(self, names: tuple[str, ...]) -> NDArray[np.intp] | None:
+        """Places (N,) of the wheels among a message's joints; None if it holds steering joints alone.
+
+        MessageError: a wheel is not there.
+        """
         missing = [joint for joint in self._joints if joint not in names]
-        if missing:
+        alone = len(missing) == len(self._joints) and self._steering is not None and self._steering.tells(names)
+        if missing and not alone:
             self._counts.wrong_joints += 1
             raise MessageError(
                 f"no joint {missing[0]!r} among {', '.join(names[:12]) or 'no names'}; set wheels.joints"
             )
         if len(self._places) > 16:  # so that a sender of ever new names cannot fill the memory
             self._places.clear()
-        places = self._places[names] = np.array([names.index(joint) for joint in self._joints])
+        places = None if alone else np.array([names.index(joint) for joint in self._joints])
+        self._places[names] = places
         return places
 
     def _first(self, sample: _Sample) -> WheelStep:
@@ -199,7 +237,8 @@ class WheelInput:
         self._last = sample
         if sample.velocities is not None:
             self._rates = sample.velocities
-        return WheelStep(sample.stamp, 0.0, np.zeros(len(self._joints)), self._rates, positions=self._angles.known)
+        still = np.zeros(len(self._joints))
+        return WheelStep(sample.stamp, 0.0, still, self._rates, positions=self._angles.known, steering=sample.steering)
 
     def _step(self, sample: _Sample, elapsed: float) -> WheelStep:
         """The step to the next sample, ``elapsed`` s after the last one by its stamp."""
@@ -256,7 +295,11 @@ class WheelInput:
         """The step of a sample that is taken, which becomes the last one."""
         self._counts.samples += 1
         self._last, self._rates = sample, rates
-        return WheelStep(sample.stamp, elapsed, angles, rates, blind, counted, restarted, self._angles.known)
+        known, steering, held = self._angles.known, sample.steering, self.old_steering > 0
+        if held:
+            self._counts.old_steering += 1
+            blind = elapsed
+        return WheelStep(sample.stamp, elapsed, angles, rates, blind, counted, restarted, known, steering, held)
 
     def _learn(self, elapsed: float, waited: float, skipped: int) -> None:
         """Update the mean period and the pace of the stamps, and count missing and irregular samples.
@@ -319,3 +362,8 @@ class WheelInput:
         self._counts.late += late
         self._counts.bad_stamps += len(self._unconfirmed) - late
         self._unconfirmed = []
+
+
+def _told(values: Array, others: Array) -> Array | None:
+    """Values (N,) of the wheels; None if none is told, and the ``others`` (N,) are."""
+    return None if math.isnan(values[0]) and np.isnan(values).all() and not np.isnan(others).any() else values

@@ -1,0 +1,60 @@
+"""Recognition of reference poses that are the robot's own odometry, against which a calibration finds nothing wrong.
+
+Odometry has the heading k . C(t) for the angles C (M,) that the drive signals count up to its stamp and some row k,
+whatever radii, distances and rule of integration were put into it. So headings over intervals of a second are fitted by
+least squares to the signals' increments, with free k, and to the change of their rates, as odometry may be stamped
+late; once with C between two wheel samples, and once with C of the last sample.
+
+What remains of an independent reference is its noise and the wheels' slip: 2.9 mrad at least in each of 239 runs of
+four robots under motion capture (OptiOdom), and about 1 mrad of the noise alone of markers 0.4 m apart that are seen to
+0.3 mm. Of odometry remains rounding, and up to 0.4 mrad where its stamps are 30 ms late (simulated of these runs).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from omnibench.data.dataset import Trajectory
+from omnibench.robot.kinematics import Array
+from omnibench.robot.planar import interpolated
+
+_INTERVAL = 1.0  # s
+_COPIED = 5e-4  # rad; chosen between the two above, and nearer to odometry: to refuse a good reference is worse
+_DRIVEN = 0.1  # rad; in intervals in which no wheel turns by more all headings agree
+_FEWEST = 8  # degrees of freedom, from which the residual of an independent reference is never that small by chance
+
+
+def follows_the_wheels(runs: Sequence[Trajectory]) -> float | None:
+    """The residual of the headings, rad in a second, of reference poses that are odometry; None for independent ones.
+
+    None, too, where the runs are too short to tell.
+    """
+    headings = np.concatenate([_increments(run, run.poses[:, 2:]) for run in runs])[:, 0]
+    residuals = []
+    for held in (False, True):
+        design = np.concatenate([_increments(run, _counted(run, held)) for run in runs])
+        driven = np.abs(design[:, : design.shape[1] // 2]).max(axis=1) > _DRIVEN
+        row, _, rank, _ = np.linalg.lstsq(design[driven], headings[driven])
+        if driven.sum() - rank < _FEWEST:
+            return None
+        left = headings[driven] - design[driven] @ row
+        residuals.append(float(np.sqrt(left @ left / (driven.sum() - rank))))
+    return min(residuals) if min(residuals) < _COPIED else None
+
+
+def _increments(run: Trajectory, values: Array) -> Array:
+    """Increments (I, n) of values (K, n) at the reference poses, from one to another about an interval later."""
+    every = max(1, round(_INTERVAL / float(np.median(np.diff(run.pose_times)))))
+    increments: Array = np.diff(values[::every], axis=0)
+    return increments
+
+
+def _counted(run: Trajectory, held: bool) -> Array:
+    """Integrals of the drive signals up to each reference pose, or to the last sample before it, and rates (K, 2 M)."""
+    edges = np.append(0.0, run.times)
+    counted = np.vstack([np.zeros(run.signals.shape[1]), np.cumsum(run.signals * np.diff(edges)[:, None], axis=0)])
+    last = np.searchsorted(edges, run.pose_times + 1e-6, side="right") - 1
+    rates = run.signals[np.minimum(last, len(run.signals) - 1)]
+    return np.hstack([counted[last] if held else interpolated(run.pose_times, edges, counted), rates])

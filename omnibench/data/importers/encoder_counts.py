@@ -1,0 +1,71 @@
+"""Counts of encoders that begin again, and absolute encoders, as numbers that go on."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.robot.kinematics import Array
+
+POWERS_OF_TWO = tuple(2.0**bits for bits in range(8, 65))  # where counters of 8 to 64 bits begin again
+# A counter is taken to begin again where its steps are short beside its range, and where the step across its end is
+# not longer than the others are (chosen): that of a counter that was set to 0 is, but for one case in some thousands.
+_LONGEST_STEP = 0.25  # of the range
+_LONGER, _ROUNDING = 2.0, 1e-4  # times the longest other step, and of the range
+_FEWEST_TICKS = 10  # of a step that is not slow; chosen
+_USUAL = 2.0  # periods; a longer one without a step is a rest
+
+
+def recognised_wrap(counts: Array, ranges: tuple[float, ...]) -> float | None:
+    """The one of ``ranges`` after which a counter with counts (F,) begins again; None if it does so after none."""
+    steps, spread = np.abs(np.diff(counts)), np.ptp(counts)
+    for wrap in sorted(ranges):
+        across = steps > wrap / 2
+        if not across.any() or spread > wrap * (1 + _ROUNDING):
+            continue
+        usual = float(steps[~across].max(initial=0.0))
+        over = float(np.abs(steps[across] - wrap).max())
+        if usual <= _LONGEST_STEP * wrap and over <= max(_LONGER * usual, _ROUNDING * wrap):
+            return wrap
+    return None
+
+
+def counted_on(counts: Array, wrap: float) -> Array:
+    """Counts (F,) of a counter that begins again after ``wrap``, signed or not, as counts that go on from the first."""
+    turns = np.cumsum(np.round(np.diff(counts, prepend=counts[0]) / wrap))
+    on: Array = counts - wrap * turns
+    return on
+
+
+def about_zero(shown: Array, turn: float) -> Array:
+    """Angles (F,) of an absolute encoder, continuous; one that counts from 0 to a turn is read as about 0.
+
+    An axle that steers stands nearer to straight ahead than half a turn of its encoder most of the time.
+    """
+    on = counted_on(shown, turn)
+    if shown.min() < 0 or shown.max() > turn:  # it counts both ways, or several turns
+        return on
+    middle: Array = on - turn * np.round(np.median(on) / turn)
+    return middle
+
+
+def repeated_readings(times: Array, angles: Array, steering: Array | None) -> NDArray[np.bool_]:
+    """True (F,) for single readings of angles (F, N) and steering (F, S) that were logged again while the robot drives.
+
+    They are as in the reading before, at the usual time (F,), s, after it, and the wheels turn by at least half their
+    usual step before and after.
+    """
+    steps = np.abs(np.diff(angles, axis=0)).max(axis=1)
+    durations = np.diff(times)
+    still = (steps == 0) & (durations < _USUAL * np.median(durations))
+    if steering is not None:
+        still &= (np.diff(steering, axis=0) == 0).all(axis=1)
+    moved = steps[steps > 0]
+    if not len(moved) or len(steps) < 3:
+        return np.zeros(len(angles), dtype=bool)
+    # Slow wheels that step from tick to tick repeat themselves rightly.
+    tick = np.diff(np.unique(steps)).min(initial=np.inf)
+    fast = steps >= max(np.median(moved) / 2, _FEWEST_TICKS * tick)
+    repeated = np.zeros(len(angles), dtype=bool)
+    repeated[2:-1] = still[1:-1] & fast[:-2] & fast[2:]
+    return repeated

@@ -1,0 +1,1 @@
+"""How well a design is known, and the shrinkage of answers to it."""

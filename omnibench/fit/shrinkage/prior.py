@@ -1,0 +1,74 @@
+"""Prior knowledge of a matrix: its design, and by how much robots of a class are off theirs.
+
+With the design K0 and the largest element s_i of its row i, the elements of a robot's matrix are
+
+    k_ij = k0_ij (1 + g_i) + s_i e_ij                                                             (1)
+
+with independent normal e_ij, for wheels that are not as drawn, and g_i, for what shortens a whole motion: rollers that
+slip, tyres that skid in a turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.robot_class import RobotClass, class_of
+
+MountChoice = Literal["known", "fit"]
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Standard deviations: of every element (e, share of the row's largest) and of each row's factor (g), Eq. (1)."""
+
+    elements: float
+    rows: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+# Of wheels with tyres radius and place are known to 1 or 2 % (Borenstein and Feng, IEEE T-RA 12:869, 1996). Rollers
+# lose or gain some per cent of a motion, 8 on the mecanum base of OptiOdom; a skid-steered base turns by 0.5 to 0.8 of
+# what its track says (Mandow et al., IROS 2007). Half of each and twice: tests/benchmarks/shrink_study.py.
+TOLERANCES: Mapping[RobotClass, Tolerance] = MappingProxyType(
+    {
+        "differential": Tolerance(0.02),
+        "tricycle": Tolerance(0.02),
+        "car": Tolerance(0.02),
+        "swerve": Tolerance(0.02),
+        "omni": Tolerance(0.02, (0.05, 0.05, 0.05)),
+        "mecanum": Tolerance(0.02, (0.06, 0.06, 0.06)),
+        "skid": Tolerance(0.02, (0.05, 0.05, 0.2)),
+        "mixed": Tolerance(0.02, (0.05, 0.05, 0.05)),
+    }
+)
+# The tracked point of these stands in front of the rear axle, which is the robot's centre, and is seldom known as well
+# as the middle of a body is.
+_UNKNOWN_MOUNTS: frozenset[RobotClass] = frozenset({"tricycle", "car"})
+
+
+def tolerance_of(robot: Robot, elements: float | None = None) -> Tolerance:
+    """The tolerance of a robot's class; elements: another share for the elements, without factors of rows."""
+    return TOLERANCES[class_of(robot)] if elements is None else Tolerance(elements)
+
+
+def prior_root(robot: Robot, tolerance: Tolerance) -> Array:
+    """A root (3M, 3M + 3) of the covariance of the matrix elements, row by row, about the design: Eq. (1)."""
+    design = robot.inverse_kinematic_matrix
+    elements = np.diag(np.repeat(tolerance.elements * robot.row_scales, design.shape[1]))
+    rows = [share * (np.eye(3)[:, [row]] * design).ravel() for row, share in enumerate(tolerance.rows)]
+    return np.column_stack([elements, *rows])
+
+
+def default_unidentified(robot: Robot) -> Literal["keep", "shrink"]:
+    """The treatment of what data hardly drive: shrunk for robots whose wheels say their types, else kept as ever."""
+    return "shrink" if any(wheel.type is not None for wheel in robot.wheels) else "keep"
+
+
+def default_mount(robot: Robot) -> MountChoice:
+    """Whether the tracked point counts as where the robot says, or is fitted: that of a tricycle and of a car is."""
+    return "fit" if class_of(robot) in _UNKNOWN_MOUNTS else "known"

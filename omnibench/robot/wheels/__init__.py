@@ -1,0 +1,1 @@
+"""Wheels of a robot, and the drive signals that they measure."""

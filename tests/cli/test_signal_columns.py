@@ -1,0 +1,40 @@
+"""Tables of matrices of robots that steer: columns are drive signals, not wheels."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+from export_samples import TRICYCLE
+from rich.console import Console
+
+from omnibench.cli.terminal.calibration_tables import print_calibration
+from omnibench.cli.terminal.inspection_tables import print_inspection
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.fit.calibrate import calibrate
+from omnibench.fit.inspect import inspect_dataset
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import WheelLog
+
+
+def a_dataset() -> Dataset:
+    """Curves of a tricycle to both sides, a hundredth off its design."""
+    times, stamps = 0.1 * np.arange(1, 51), 0.5 * np.arange(11)
+    model = OdometryModel(TRICYCLE, 1.01 * TRICYCLE.inverse_kinematic_matrix, "arc")
+    runs = []
+    for number, angle in enumerate((-0.6, -0.3, 0.0, 0.3, 0.6)):
+        rates, steering = 3 + np.sin(times + number)[:, None], angle + 0.2 * np.sin(times)[:, None]
+        (poses,) = model.poses([WheelLog(times, rates, np.zeros(3), stamps, steering=steering, drive=TRICYCLE.drive)])
+        runs.append(Trajectory(f"run-{number}", "train", times, rates, stamps, poses, steering=steering))
+    return make_dataset("curves", TRICYCLE, 0.1, runs)
+
+
+def test_a_matrix_has_a_column_for_each_drive_signal() -> None:
+    dataset, console = a_dataset(), Console(file=io.StringIO(), width=120)
+    print_calibration(console, calibrate(dataset))
+    print_inspection(console, inspect_dataset(dataset))
+    assert isinstance(console.file, io.StringIO)
+    lines = console.file.getvalue().splitlines()
+    assert any(line.split() == ["front_cos", "front_sin"] for line in lines)
+    assert any(line.startswith("directions of drive signals driven: 2 of 2") for line in lines)
+    assert not any("wheel front" in line for line in lines)

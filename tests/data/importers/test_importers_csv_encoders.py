@@ -1,0 +1,265 @@
+"""The csv importer on other people's logs: one table of wheels and poses, steered wheels, counters of any kind."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import RECORDINGS
+from tricycle_samples import PERIOD, REAR, TRICYCLE, tricycle_drive
+
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.errors import DataError
+from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
+from omnibench.slam.import_dataset import import_dataset
+
+CORELLI = RECORDINGS / "tricycle_corelli" / "dataset.txt"
+DRIVE = tricycle_drive()
+
+
+def write_table(file: Path, columns: Mapping[str, Array], rows: Any = slice(None), header: bool = True) -> Path:
+    lines = [",".join(f"{value:.12g}" for value in row) for row in np.column_stack(list(columns.values()))[rows]]
+    file.write_text("\n".join([",".join(columns)] * header + lines) + "\n")
+    return file
+
+
+def read(source: Path, **options: Any) -> Dataset:
+    return import_dataset("csv", source, {"robot": TRICYCLE} | options)
+
+
+def odometry_error(data: Dataset, runs: int = 1) -> float:
+    """Largest difference of the design's odometry from the reference at any pose."""
+    assert len(data.trajectories) == runs
+    model = OdometryModel.of_design(data.robot, "arc")
+    return max(float(np.abs(model.poses([run.reference_log])[0] - run.poses[1:]).max()) for run in data.trajectories)
+
+
+def test_one_table_may_hold_wheels_steering_and_poses(tmp_path: Path) -> None:
+    columns = {"t": DRIVE["t"], "phi_front": DRIVE["angle"], "steer_front": DRIVE["phi"]}
+    poses = {key: DRIVE[key] for key in ("x", "y", "theta")}
+    data = read(write_table(tmp_path / "log.csv", columns | poses), wheel_unit="rad")
+    assert odometry_error(data) < 1e-9
+    assert data.trajectories[0].id == "log"
+    whole = read(tmp_path, wheel_unit="rad", wheel_suffix=".csv", pose_suffix=".csv")
+    assert whole.trajectories[0].fingerprint == data.trajectories[0].fingerprint
+
+
+@pytest.mark.parametrize(
+    ("per_radian", "options"),
+    [
+        (1 / (2 * math.pi), {"wheel_unit": "rev"}),
+        (180 / math.pi * 30, {"wheel_unit": "deg", "gear_ratio": 30}),
+        (30 * 2048 / (2 * math.pi), {"wheel_unit": "ticks", "ticks_per_turn": 2048, "gear_ratio": [30]}),
+        (61440 / (2 * math.pi), {"wheel_unit": "ticks", "ticks_per_turn": 61440}),
+        (-1.0, {"wheel_unit": "rad", "wheel_signs": -1}),
+    ],
+)
+def test_positions_of_wheel_or_motor_in_any_unit_are_the_same(
+    tmp_path: Path, per_radian: float, options: dict[str, Any]
+) -> None:
+    columns = dict(DRIVE) | {"angle": DRIVE["angle"] * per_radian}
+    source = write_table(tmp_path / "log.csv", columns)
+    data = read(source, wheel_columns="angle", steering_columns="phi", **options)
+    assert odometry_error(data) < 1e-8
+
+
+def test_rates_of_the_motor_and_increments_are_read(tmp_path: Path) -> None:
+    increments = np.diff(DRIVE["angle"], prepend=0.0)
+    columns = dict(DRIVE) | {"rpm": increments / PERIOD * 30 * 60 / (2 * math.pi), "rev": increments / (2 * math.pi)}
+    source = write_table(tmp_path / "log.csv", columns)
+    for column, options in (("rpm", {"wheel_unit": "rpm", "gear_ratio": 30}), ("rev", {"wheel_unit": "rev/sample"})):
+        data = read(source, wheel_columns=column, steering_columns="phi", **options)
+        assert odometry_error(data) < 1e-8
+
+
+@pytest.mark.parametrize("bits", [16, 32])
+@pytest.mark.parametrize("signed", [False, True])
+@pytest.mark.parametrize("option", ["auto", "2^{}"])
+def test_counters_begin_again_at_any_power_of_two(tmp_path: Path, bits: int, signed: bool, option: str) -> None:
+    ticks = np.floor(DRIVE["angle"] * 30 * 2048 / (2 * math.pi))
+    ticks = (ticks + 2**bits - 20000) % 2**bits - (2 ** (bits - 1) if signed else 0)
+    source = write_table(tmp_path / "log.csv", dict(DRIVE) | {"angle": ticks})
+    options = {"wheel_unit": "ticks", "ticks_per_turn": 2048, "gear_ratio": 30, "wraps_at": option.format(bits)}
+    data = read(source, wheel_columns="angle", steering_columns="phi", **options)
+    assert odometry_error(data) < 1e-3
+    said = f"wheel positions begin again after {2**bits} ticks and were counted on (wraps_at={2**bits} says so)"
+    assert (said in data.warnings) == (option == "auto" and np.ptp(ticks) > 2 ** (bits - 1))
+
+
+def test_a_wrong_wrap_is_refused(tmp_path: Path) -> None:
+    source = write_table(tmp_path / "log.csv", DRIVE)
+    with pytest.raises(DataError, match=r"log\.csv: wraps_at is 100, but positions span \d+\.\d+ rad; correct it"):
+        read(source, wheel_columns="angle", steering_columns="phi", wheel_unit="rad", wraps_at=100)
+
+
+def test_ticks_taken_for_radians_are_told_from_a_wrong_gear(tmp_path: Path) -> None:
+    ticks = np.floor(DRIVE["angle"] * 30 * 2048 / (2 * math.pi))
+    source = write_table(tmp_path / "log.csv", dict(DRIVE) | {"angle": ticks})
+    columns = {"wheel_columns": "angle", "steering_columns": "phi"}
+    with pytest.raises(
+        DataError, match=r"log\.csv: .* positions are whole numbers: set wheel_unit=ticks and ticks_per"
+    ):
+        read(source, **columns, wheel_unit="rad")
+    with pytest.raises(
+        DataError, match=r"read in ticks, turn at up to 330 rad/s; set ticks_per_turn, gear_ratio \(turns"
+    ):
+        read(source, **columns, wheel_unit="ticks", ticks_per_turn=2048)
+
+
+def test_a_counter_that_is_set_to_zero_ends_a_run(tmp_path: Path) -> None:
+    angle = DRIVE["angle"] - np.where(np.arange(401) >= 200, DRIVE["angle"][200], 0)
+    data = read(
+        write_table(tmp_path / "log.csv", dict(DRIVE) | {"angle": angle}),
+        wheel_columns="angle",
+        steering_columns="phi",
+        wheel_unit="rad",
+    )
+    assert odometry_error(data, runs=2) < 0.01
+    assert [(run.id, run.session) for run in data.trajectories] == [("log#1", "log"), ("log#2", "log")]
+    assert "the positions begin anew 1 time, faster than any wheel turns" in data.warnings[0]
+
+
+def test_rows_that_repeat_a_time_are_left_out_and_said(tmp_path: Path) -> None:
+    twice = np.sort(np.append(np.arange(401), [7, 7, 50]))
+    data = read(
+        write_table(tmp_path / "log.csv", DRIVE, twice), wheel_columns="angle", steering_columns="phi", wheel_unit="rad"
+    )
+    assert data.warnings[0] == f"{tmp_path}/log.csv: 3 rows that repeat the t of the one before left out"
+    assert odometry_error(data) < 1e-9
+    coarse = dict(DRIVE) | {"t": np.floor(DRIVE["t"])}
+    with pytest.raises(DataError, match=r"log\.csv, row 2 \(line 3\): t is repeated: 100 after 100"):
+        read(write_table(tmp_path / "log.csv", coarse), wheel_columns="angle", steering_columns="phi", wheel_unit="rad")
+
+
+def test_wheels_that_were_logged_again_while_they_turned_are_left_out(tmp_path: Path) -> None:
+    stale = dict(DRIVE) | {key: DRIVE[key].copy() for key in ("angle", "phi")}
+    for row in (60, 150):
+        stale["angle"][row], stale["phi"][row] = stale["angle"][row - 1], stale["phi"][row - 1]
+    data = read(
+        write_table(tmp_path / "log.csv", stale), wheel_columns="angle", steering_columns="phi", wheel_unit="rad"
+    )
+    assert data.warnings[0].endswith("log.csv: 2 rows that repeat the ones before while the wheels turn left out")
+    assert len(data.trajectories[0].times) == 398
+    assert odometry_error(data) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("shown", "options"),
+    [
+        (np.degrees(DRIVE["phi"]), {"steering_unit": "deg"}),
+        (-DRIVE["phi"] - math.radians(10), {"steering_signs": -1, "steering_offsets_deg": -10}),
+        (DRIVE["phi"] * 10 % (2 * math.pi), {"steering_scale": 0.1}),
+        (
+            np.floor(DRIVE["phi"] / (2 * math.pi) * 4 * 8192) % 8192,
+            {"steering_unit": "ticks", "steering_ticks_per_turn": 8192, "steering_scale": [0.25]},
+        ),
+    ],
+    ids=["degrees", "clockwise from another zero", "absolute behind a gear", "ticks of an absolute encoder"],
+)
+def test_steering_angles_in_any_unit_are_the_same(tmp_path: Path, shown: Array, options: dict[str, Any]) -> None:
+    source = write_table(tmp_path / "log.csv", dict(DRIVE) | {"phi": shown})
+    data = read(source, wheel_columns="angle", steering_columns="phi", wheel_unit="rad", **options)
+    steering = data.trajectories[0].steering
+    assert steering is not None
+    np.testing.assert_allclose(steering[:, 0], DRIVE["phi"][1:], atol=2e-4)
+
+
+def test_a_recording_is_cut_into_equal_runs(tmp_path: Path) -> None:
+    data = read(
+        write_table(tmp_path / "log.csv", DRIVE),
+        wheel_columns="angle",
+        steering_columns="phi",
+        wheel_unit="rad",
+        window=9,
+    )
+    assert [run.id for run in data.trajectories] == ["log#1", "log#2"]
+    assert odometry_error(data, runs=2) < 0.01
+    assert [(run.split, run.session, run.started_at) for run in data.trajectories] == [
+        ("train", "log", 0),
+        ("validation", "log", pytest.approx(10)),
+    ]
+
+
+def test_the_robot_s_own_odometry_in_a_table_is_warned_of(tmp_path: Path) -> None:
+    source = write_table(tmp_path / "log.csv", DRIVE)
+    data = read(source, wheel_columns="angle", steering_columns="phi", wheel_unit="rad")
+    assert "the reference is the robot's odometry, or simulated without noise" in data.warnings[-1]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, r"column 'omega_front' is missing; .*; set wheel_time_column, wheel_columns, steering_columns, separator"),
+        ({"header_lines": 0}, r"row 1: it has 6 fields, expected 3: t omega_front steer_front; set wheel_time_column"),
+        ({"header_lines": 0, "wheel_time_column": 1}, r"column 'omega_front' is missing; found: 1, 2, 3, 4, 5, 6; set"),
+        ({"wheel_columns": "angle", "steering_columns": 9}, r"column '9' is missing; found: t, angle, phi"),
+    ],
+)
+def test_a_foreign_table_is_refused_with_the_options_that_describe_it(
+    tmp_path: Path, options: dict[str, Any], message: str
+) -> None:
+    source = write_table(tmp_path / "log.csv", DRIVE)
+    with pytest.raises(DataError, match=message) as caught:
+        read(source, **options)
+    assert "\n" not in str(caught.value)
+
+
+# The tricycle of tricycle_corelli by options alone. Its authors' first guesses: 0.0106141 m for a revolution of the
+# traction encoder of 5000 ticks, which is a wheel of 0.0106141 / (2 pi) = 0.00168929 m on the encoder's axle; a tenth
+# of the steering encoder's angle; 1.4 m between the axles; a tracked point 1.5 m ahead of the rear one.
+CORELLI_OPTIONS: dict[str, Any] = {
+    "robot": {
+        "name": "corelli",
+        "mount": {"x": 1.5},
+        "wheels": [
+            {"name": "front", "type": "steered", "radius": 0.0106141 / (2 * math.pi), "x": 1.4, "y": 0},
+            {"name": "left", "y": 0.3, **REAR},
+            {"name": "right", "y": -0.3, **REAR},
+        ],
+    },
+    "separator": "blanks",
+    "header_lines": 0,
+    "wheel_time_column": 2,
+    "wheel_columns": 5,
+    "wheel_unit": "ticks",
+    "ticks_per_turn": 5000,
+    "steering_columns": 4,
+    "steering_unit": "ticks",
+    "steering_ticks_per_turn": 8192,
+    "steering_scale": 0.1,
+    "pose_columns": [11, 12, 13],
+}
+
+
+def corelli(**options: Any) -> Trajectory:
+    if not CORELLI.is_file():
+        pytest.skip(f"the recording is not at {CORELLI}")
+    data = import_dataset("csv", CORELLI, CORELLI_OPTIONS | options)
+    assert "wheel positions begin again after 4294967296 ticks and were counted on" in data.warnings[0]
+    assert "51 rows that repeat the ones before while the wheels turn" in data.warnings[1]
+    return data.trajectories[0]
+
+
+def errors(run: Trajectory, robot: dict[str, Any]) -> Array:
+    model = OdometryModel.of_design(import_dataset("csv", CORELLI, CORELLI_OPTIONS | {"robot": robot}).robot, "arc")
+    distances: Array = np.hypot(*(model.poses([run.reference_log])[0] - run.poses[1:])[:, :2].T)
+    return distances
+
+
+def test_the_design_of_another_laboratory_s_tricycle_is_its_own_model() -> None:
+    """The robot's own pose, of its rear axle, in the log: this is odometry by Euler steps, printed to 6 digits."""
+    robot = CORELLI_OPTIONS["robot"] | {"mount": {"x": 0}}
+    distances = errors(corelli(pose_columns=[7, 8, 9], robot=robot), robot)
+    assert distances.mean() < 0.005
+    assert distances.max() < 0.04
+
+
+def test_the_first_guesses_of_another_laboratory_s_tricycle_are_far_off() -> None:
+    run = corelli()
+    assert (len(run.times), len(run.pose_times)) == (2382, 2434)
+    assert errors(run, CORELLI_OPTIONS["robot"]).mean() == pytest.approx(14.05, abs=0.01)

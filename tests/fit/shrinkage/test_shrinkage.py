@@ -1,0 +1,119 @@
+"""Shrinkage of a calibration to the design."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from motions import FLOWER, TURNS, driven
+from sample_robots import APR_02, DIFFERENTIAL, MECANUM, SKID, TRICYCLE
+
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.errors import ConfigError
+from omnibench.fit.calibrate import CalibrationRun, calibrate
+from omnibench.fit.certify import certify_optimum
+from omnibench.fit.shrinkage.prior import TOLERANCES, default_mount, default_unidentified, prior_root, tolerance_of
+from omnibench.robot.kinematics import Array
+from omnibench.testing.synthetic import synthetic_robot
+
+ROBOT = synthetic_robot(3)
+DESIGN = ROBOT.inverse_kinematic_matrix
+
+
+def recording(runs: Sequence[Trajectory]) -> Dataset:
+    return make_dataset("flower", ROBOT, 0.1, runs, simulated=True)
+
+
+RECORDING = recording(driven(FLOWER + TURNS, noise=0.01))
+
+
+def shrunk(tolerance: float | None = None, **choices: Any) -> CalibrationRun:
+    return calibrate(RECORDING, unidentified="shrink", tolerance=tolerance, **choices)
+
+
+def distance(matrix: Array) -> float:
+    """Distance from the design, in the rows' largest elements."""
+    return float(np.linalg.norm((matrix - DESIGN) / ROBOT.row_scales[:, None]))
+
+
+def test_a_design_that_may_be_anything_leaves_the_answer_as_it_is() -> None:
+    kept = calibrate(RECORDING, unidentified="keep").calibration.matrix_array
+    np.testing.assert_allclose(shrunk(1e3).calibration.matrix_array, kept, rtol=0, atol=1e-9)
+
+
+def test_a_design_that_is_exact_is_the_answer() -> None:
+    np.testing.assert_allclose(shrunk(1e-9).calibration.matrix_array, DESIGN, rtol=0, atol=1e-9)
+
+
+def test_the_better_the_design_is_known_the_closer_to_it_is_the_answer() -> None:
+    distances = [distance(shrunk(tolerance).calibration.matrix_array) for tolerance in (0.001, 0.003, 0.01, 0.03)]
+    assert distances == sorted(distances)
+
+
+def test_the_posterior_weighs_design_and_data_by_their_variances() -> None:
+    """Where covariances commute, by the textbook: each direction by its own variances."""
+    free = calibrate(RECORDING, unidentified="keep")
+    assert free.uncertainty is not None
+    prior = np.diag(np.repeat(0.01 * ROBOT.row_scales, 3) ** 2)
+    of_data = free.uncertainty.covariance
+    gain = prior @ np.linalg.inv(prior + of_data)
+    expected = DESIGN.ravel() + gain @ (free.calibration.matrix_array - DESIGN).ravel()
+    run = shrunk(0.01)
+    np.testing.assert_allclose(run.calibration.matrix_array.ravel(), expected, rtol=0, atol=1e-8)
+    assert run.uncertainty is not None
+    np.testing.assert_allclose(run.uncertainty.covariance, prior - gain @ prior, rtol=1e-5, atol=1e-12)
+
+
+def test_an_answer_that_was_not_fitted_is_not_shrunk() -> None:
+    run = shrunk(0.001, calibrator="theoretical")
+    assert run.result.shrinkage is None
+
+
+def test_the_cost_of_shrinking_is_said_and_certified() -> None:
+    run = shrunk(0.003)
+    origin = run.calibration.provenance
+    assert origin is not None
+    assert origin.training_cost is not None
+    assert origin.unshrunk_cost is not None
+    assert (origin.unidentified, origin.tolerance) == ("shrink", 0.003)
+    certificate = certify_optimum(run.calibration, RECORDING, gap=0.01).certificate
+    assert certificate.gap < 0.01
+    assert certificate.shrinking == pytest.approx(origin.training_cost / origin.unshrunk_cost - 1, rel=1e-6)
+    assert "shrunk to the design, which adds" in origin.reason
+
+
+def test_a_motion_that_is_not_driven_keeps_the_design() -> None:
+    """Runs without turns say nothing of turning."""
+    straight = recording(driven([(0.2, 0.0, 0.0), (0.0, 0.2, 0.0)]))
+    run = calibrate(straight, unidentified="shrink")
+    turning = ROBOT.signal_equations @ [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(run.calibration.matrix_array @ turning, DESIGN @ turning, rtol=0, atol=1e-9)
+
+
+def test_a_search_is_shrunk_like_the_optimum() -> None:
+    searched = shrunk(0.01, calibrator="crs").calibration.matrix_array
+    np.testing.assert_allclose(searched, shrunk(0.01).calibration.matrix_array, rtol=0, atol=1e-5)
+
+
+def test_resampled_intervals_of_a_shrunk_answer_are_refused() -> None:
+    with pytest.raises(ConfigError, match="set unidentified to keep"):
+        shrunk(intervals=True)
+
+
+def test_robots_whose_wheels_say_their_type_are_shrunk_by_default() -> None:
+    assert [default_unidentified(robot) for robot in (APR_02, MECANUM, DIFFERENTIAL)] == ["keep", "shrink", "shrink"]
+
+
+def test_the_tracked_point_of_a_tricycle_is_fitted_by_default() -> None:
+    assert [default_mount(robot) for robot in (DIFFERENTIAL, TRICYCLE)] == ["known", "fit"]
+
+
+def test_the_prior_has_the_stated_widths() -> None:
+    root = prior_root(SKID, tolerance_of(SKID))
+    deviations = np.sqrt(np.diag(root @ root.T)).reshape(3, -1) / SKID.row_scales[:, None]
+    elements, rows = TOLERANCES["skid"].elements, np.array(TOLERANCES["skid"].rows)
+    np.testing.assert_allclose(deviations[0], np.hypot(elements, rows[0]), rtol=1e-9)
+    np.testing.assert_allclose(deviations[1], elements, rtol=1e-9)  # a design of zeros has no factor
+    np.testing.assert_allclose(deviations[2], np.hypot(elements, rows[2]), rtol=1e-9)

@@ -1,0 +1,133 @@
+"""Robots that steer, with calibrations, and the messages that they send while they drive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from drives import NOISE, ORIGIN, PERIOD, SECOND
+
+from omnibench.data.dataset import Trajectory, make_dataset
+from omnibench.live.replay.played_recording import Recording
+from omnibench.live.wheels.joints import joints_of
+from omnibench.live.wire.messages import JOINT_STATE, JointState
+from omnibench.robot.calibration import Calibration, covariance_rows, matrix_rows
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.odometry import WheelLog
+
+_CORNERS = {"fl": (0.2, 0.15), "fr": (0.2, -0.15), "rl": (-0.2, 0.15), "rr": (-0.2, -0.15)}
+
+
+def _wheel(name: str, kind: str, x: float, y: float, **more: Any) -> dict[str, Any]:
+    return {"name": name, "type": kind, "radius": 0.05, "x": x, "y": y} | more
+
+
+def _robot(name: str, *wheels: dict[str, Any], **more: Any) -> Robot:
+    return Robot.model_validate({"name": name, "wheels": wheels} | more)
+
+
+SWERVE: Final = _robot("swerve", *(_wheel(name, "steered", *place) for name, place in _CORNERS.items()))
+TRICYCLE: Final = _robot(
+    "tricycle", _wheel("front", "steered", 0.4, 0.0), _wheel("back", "fixed", 0.0, 0.2, measured=False)
+)
+CAR: Final = _robot(
+    "car",
+    *(_wheel(f"rear_{side}", "fixed", 0.0, y) for side, y in (("left", 0.2), ("right", -0.2))),
+    *(_wheel(f"front_{side}", "steered", 0.5, y, driven=False) for side, y in (("left", 0.2), ("right", -0.2))),
+)
+SKID: Final = _robot("skid", *(_wheel(name, "fixed", *place) for name, place in _CORNERS.items()), skid=True)
+DIFFERENTIAL: Final = _robot("differential", _wheel("left", "fixed", 0.0, 0.1), _wheel("right", "fixed", 0.0, -0.1))
+
+
+def calibration(robot: Robot = SWERVE, **changes: Any) -> Calibration:
+    """A calibration of a robot whose matrix is some percent off the design."""
+    design = robot.inverse_kinematic_matrix
+    off = 1 + 0.03 * np.sin(np.arange(design.size)).reshape(design.shape)
+    plain = Calibration(
+        name=f"{robot.name} off",
+        robot=robot,
+        sample_period=PERIOD,
+        matrix=matrix_rows(design * off),
+        integration="arc",
+        noise=NOISE,
+        covariance=covariance_rows(1e-8 * np.eye(design.size)),
+    )
+    return plain.model_copy(update=changes)
+
+
+@dataclass(frozen=True, eq=False)
+class SteeredDrive:
+    """angles (F + 1, N) and steering (F + 1, S), rad, at 0 and at every period."""
+
+    angles: Array
+    steering: Array
+    using: Calibration
+
+    @property
+    def times(self) -> Array:
+        times: Array = PERIOD * np.arange(1, len(self.angles))
+        return times
+
+    @property
+    def log(self) -> WheelLog:
+        """The samples, with poses wanted at 0 and at every period. The baseline steers as the first sample ends."""
+        drive = self.using.robot.drive
+        stamps = np.append(0.0, self.times)
+        rates = np.diff(self.angles, axis=0) / PERIOD
+        start, session = np.zeros(3), self.using.session
+        return WheelLog(self.times, rates, start, stamps, self.angles[1:], 0.0, session, self.steering[1:], drive)
+
+    @property
+    def poses(self) -> Array:
+        """Batch odometry at 0 and at every period, (F + 1, 3)."""
+        return self.using.model.poses([self.log])[0]
+
+    def samples(self) -> list[JointState]:
+        """Every message as ros2_control sends it: positions of all joints, velocities of the wheels."""
+        rates = np.vstack([np.zeros(self.angles.shape[1]), np.diff(self.angles, axis=0) / PERIOD])
+        positions = np.hstack([self.angles, self.steering])
+        velocities = np.hstack([rates, np.full_like(self.steering, np.nan)])
+        stamps = (ORIGIN + np.round(PERIOD * np.arange(len(positions)) * SECOND).astype(int)).tolist()
+        names = joints_of(self.using.robot).names
+        return [JointState(*each) for each in zip(stamps, [names] * len(stamps), positions, velocities, strict=True)]
+
+    def payloads(self) -> list[bytes]:
+        return [JOINT_STATE.encode(sample) for sample in self.samples()]
+
+
+def drive(seconds: float = 1.0, *, seed: int = 1, using: Calibration | None = None) -> SteeredDrive:
+    """A lively drive: wheel rates that wander by some rad/s, and steering that swings within half a right angle."""
+    chosen = using or calibration()
+    rng = np.random.default_rng(seed)
+    count = round(seconds / PERIOD) + 1
+    wheels, steered = len(chosen.robot.wheel_names), len(chosen.robot.drive.steered)
+    times = PERIOD * np.arange(count)
+    phase = rng.uniform(0, 6, (wheels + steered, 1))
+    wandering = np.sin(0.8 * times + phase) + 0.1 * rng.standard_normal((len(phase), count))
+    rates, steering = 1.5 * wandering[:wheels] + 0.7, 0.7 * wandering[wheels:]
+    steering[:, 0] = steering[:, 1]
+    angles = np.vstack([np.zeros(wheels), np.cumsum(PERIOD * rates.T[1:], axis=0)]) + rng.uniform(-3, 3, wheels)
+    return SteeredDrive(angles, steering.T, chosen)
+
+
+def only(sample: JointState, *names: str) -> JointState:
+    """Some joints of a message."""
+    places = [sample.names.index(name) for name in names]
+    assert sample.positions is not None
+    assert sample.velocities is not None
+    return replace(sample, names=names, positions=sample.positions[places], velocities=sample.velocities[places])
+
+
+def recording(seed: int = 1, runs: int = 3, *, using: Calibration | None = None, pose_every: int = 10) -> Recording:
+    """Runs of 0.4 s with poses that are those of a calibration, exactly."""
+    chosen = using or calibration()
+    made = []
+    for number in range(runs):
+        path, start = drive(0.4, seed=seed + number, using=chosen), np.array([0.3 * number, 1.0, 0.7 - number])
+        log = replace(path.log, start=start, stamps=np.append(0.0, path.times[pose_every - 1 :: pose_every]))
+        rates, (poses,) = log.rates, chosen.model.poses([log])
+        made.append(
+            Trajectory(f"run {number}", "train", path.times, rates, log.stamps, poses, steering=path.steering[1:])
+        )
+    return Recording(make_dataset("steered", chosen.robot, PERIOD, made))

@@ -1,0 +1,176 @@
+"""Export of a calibration as a C header, compiled and compared with the stream."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from export_samples import CAR, DIFF, SWERVE, TRICYCLE, calibration, disturbed, mounted
+from sample_robots import APR_02
+
+from omnibench.robot.calibration import Provenance
+from omnibench.robot.export.formats import Export, export_calibration
+from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.robot.odometry import Integration, OdometryStream
+from omnibench.robot.published_matrices import published_matrix
+
+COMPILER = shutil.which("cc") or shutil.which("gcc")
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler (cc or gcc) on this machine")
+START = np.array([1.0, -2.0, 3.0])
+
+
+PROGRAM = """\
+#include <stdio.h>
+#include "{header}"
+
+int main(void)
+{{
+    double pose[3] = {{ 1.0, -2.0, 3.0 }};
+    double inputs[{count}];
+{state}\
+    for (;;) {{
+        for (int input = 0; input < {count}; ++input) {{
+            if (scanf("%lf", &inputs[input]) != 1) {{
+                return input;
+            }}
+        }}
+        {stem}_odometry_step(pose, {arguments}, inputs[{count} - 1]);
+        printf("%.17g %.17g %.17g\\n", pose[0], pose[1], pose[2]);
+    }}
+}}
+"""
+
+
+def run_header(export: Export, folder: Path, stem: str, samples: Array, wheels: int) -> Array:
+    """Poses (F, 3) that a program with the header computes from rows of rates, steering angles and duration."""
+    assert COMPILER is not None
+    steers = samples.shape[1] > wheels + 1
+    text = PROGRAM.format(
+        header=export.file_name,
+        count=samples.shape[1],
+        stem=stem,
+        state=f"    {stem}_odometry_state state = {{ {{ 0.0 }}, 0 }};\n" if steers else "",
+        arguments=f"&state, inputs, inputs + {wheels}" if steers else "inputs",
+    )
+    (folder / export.file_name).write_text(export.text)
+    source, program = folder / "main.c", folder / "main"
+    source.write_text(text)
+    flags = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]
+    subprocess.run([COMPILER, *flags, str(source), "-o", str(program), "-lm"], check=True, capture_output=True)
+    lines = "\n".join(" ".join(repr(float(value)) for value in row) for row in samples)
+    done = subprocess.run([str(program)], input=lines, capture_output=True, text=True, check=True)
+    return np.array([[float(value) for value in line.split()] for line in done.stdout.splitlines()])
+
+
+def by_lever_arm(index: int) -> Wheel:
+    """A mecanum wheel as in the paper: distance and angle of the axle."""
+    angle, roller = math.copysign(math.pi / 2, 1.5 - index), math.pi / 4 * (-1) ** index
+    return Wheel(name="abcd"[index], radius=0.148, distance=0.195, angle=angle, roller_angle=roller)
+
+
+@needs_compiler
+@pytest.mark.parametrize("integration", ["euler", "arc"])
+def test_the_compiled_step_equals_the_stream(tmp_path: Path, integration: Integration) -> None:
+    matrix = published_matrix("palacin2023_eq8")
+    rng = np.random.default_rng(1)
+    samples = np.column_stack([rng.normal(0, 4, (1000, 3)), rng.uniform(0.005, 0.02, 1000)])
+    samples[100:200, :3] = 0  # standing still
+    samples[200:300, :3] = [-1e-3, 0, 1e-3]  # hardly turning
+    export = export_calibration(calibration(APR_02, matrix, integration=integration), "c_header")
+    poses = run_header(export, tmp_path, "apr_02", samples, 3)
+    stream = OdometryStream(matrix, integration, START)
+    expected = np.array([stream.drive(row[:3] * row[3]) for row in samples])
+    np.testing.assert_allclose(poses, expected, rtol=0, atol=1e-12)
+
+
+@needs_compiler
+@pytest.mark.parametrize("robot", [TRICYCLE, CAR, SWERVE], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("integration", ["euler", "arc"])
+def test_steered_wheels_drive_as_in_the_stream(tmp_path: Path, robot: Robot, integration: Integration) -> None:
+    matrix, drive = disturbed(robot), robot.drive
+    rng = np.random.default_rng(2)
+    rates = rng.normal(0, 4, (300, len(drive.wheels)))
+    steering = np.cumsum(rng.normal(0, 0.02, (300, len(drive.steered))), axis=0)
+    durations = rng.uniform(0.005, 0.05, 300)
+    export = export_calibration(calibration(robot, matrix, integration=integration), "c_header")
+    samples = np.column_stack([rates, steering, durations])
+    poses = run_header(export, tmp_path, robot.name, samples, len(drive.wheels))
+    stream = OdometryStream(matrix, integration, START, drive)
+    expected = [stream.drive(a * d, d, steering=s) for a, s, d in zip(rates, steering, durations, strict=True)]
+    np.testing.assert_allclose(poses, expected, rtol=0, atol=1e-12)
+    assert all(f"/* {name} */" in export.text for name in drive.names)
+
+
+def test_signs_are_told_as_they_are() -> None:
+    assert (
+        "A positive rate drives the robot counter-clockwise" in export_calibration(calibration(APR_02), "c_header").text
+    )
+    assert "in the wheel's\n * direction of rolling" in export_calibration(calibration(DIFF), "c_header").text
+
+
+@needs_compiler
+def test_any_number_of_wheels_and_any_name_compiles(tmp_path: Path) -> None:
+    mecanum = Robot(name="m", wheels=tuple(map(by_lever_arm, range(4))))
+    origin = Provenance(
+        dataset="a */ b",
+        dataset_hash="f00",
+        calibrator="crs",
+        seed=1,
+        cost="final_pose",
+        box="row",
+        outcome="budget",
+    )
+    document = calibration(mecanum, name="4-wheeler: *Größe* */ #1", sample_period=1.0, provenance=origin)
+    export = export_calibration(document, "c_header")
+    assert export.file_name == "robot_4_wheeler_gr_e_1_odometry.h"
+    poses = run_header(export, tmp_path, "robot_4_wheeler_gr_e_1", np.array([[1.0, 2, 3, 4, 0.5]]), 4)
+    stream = OdometryStream(mecanum.inverse_kinematic_matrix, "arc", START)
+    np.testing.assert_allclose(poses[0], stream.drive(np.array([0.5, 1, 1.5, 2])), rtol=0, atol=1e-12)
+
+
+def test_the_matrix_reads_back_to_the_bit() -> None:
+    matrix = published_matrix("palacin2023_eq8")
+    text = export_calibration(calibration(APR_02, matrix), "c_header").text
+    rows = text.split("= {\n")[1].split("\n};")[0].splitlines()
+    read = [[float(value) for value in row.strip(" {},").split(", ")] for row in rows]
+    assert read == matrix.tolist()
+
+
+def test_provenance_wheels_and_period_are_told() -> None:
+    origin = Provenance(
+        dataset="flower",
+        dataset_hash="f00",
+        simulated=True,
+        calibrator="closed_form",
+        seed=7,
+        cost="final_pose",
+        box="row",
+        training_cost=0.0215,
+        outcome="converged",
+    )
+    text = export_calibration(calibration(APR_02, provenance=origin), "c_header").text
+    for part in ("flower (simulated)", "f00", "closed_form", "seed 7", "training cost 0.0215", "converged"):
+        assert part in text
+    assert '#define APR_02_WHEEL_NAMES { "a", "b", "c" }' in text
+    assert "#define APR_02_SAMPLE_PERIOD 0.02 /* s */" in text
+
+
+def test_effects_are_warned_of() -> None:
+    document = calibration(APR_02, effects=[{"name": "slip", "parameters": {"k": 0.1}}])
+    export = export_calibration(document, "c_header")
+    assert "slip" in export.warnings[0]
+    assert "left out: effects slip" in export.text
+
+
+def test_a_tracked_point_off_the_centre_is_warned_of() -> None:
+    export = export_calibration(calibration(mounted(DIFF)), "c_header")
+    assert "that of the tracked point" in export.warnings[0]
+    assert "that of the tracked point" in export.text
+
+
+def test_a_bare_matrix_has_no_warnings() -> None:
+    assert export_calibration(calibration(APR_02), "c_header").warnings == ()

@@ -1,0 +1,348 @@
+"""Parameters of the controllers of ros2_controllers, held against the controllers' own odometry."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from export_samples import (
+    BICYCLE,
+    CAR,
+    DIFF,
+    FORKLIFT,
+    MECANUM,
+    MOUNT,
+    ODD_DIFF,
+    SKID,
+    SWERVE,
+    TRICYCLE,
+    TRIKE,
+    calibration,
+    disturbed,
+    fixed,
+    mecanum,
+    mounted,
+    parameters,
+    steered,
+)
+from hypothesis import given
+from hypothesis import strategies as st
+
+from omnibench.errors import ConfigError
+from omnibench.robot.export.formats import Export, export_calibration
+from omnibench.robot.export.remaining import RemainingError
+from omnibench.robot.kinematics import Array, Mount, Robot
+
+Rates = dict[str, Array]  # of joints, rad/s, and angles of steering joints, rad
+
+
+def diff_drive(values: dict[str, Any], joints: Rates) -> Array:
+    """diff_drive_controller: update of diff_drive_controller.cpp and Odometry::update of odometry.cpp, 2026."""
+    left, right = (
+        np.mean([joints[name] for name in values[f"{side}_wheel_names"]], axis=0)
+        * values[f"{side}_wheel_radius_multiplier"]
+        * values["wheel_radius"]
+        for side in ("left", "right")
+    )
+    turn = (right - left) / (values["wheel_separation"] * values["wheel_separation_multiplier"])
+    return np.column_stack([(left + right) * 0.5, 0 * turn, turn])
+
+
+def mecanum_drive(values: dict[str, Any], joints: Rates) -> Array:
+    """mecanum_drive_controller: Odometry::update of odometry.cpp, 2026."""
+    places = ("front_left", "rear_left", "rear_right", "front_right")
+    fl, rl, rr, fr = (joints[values[f"{place}_wheel_command_joint_name"]] for place in places)
+    quarter = 0.25 * values["kinematics.wheels_radius"]
+    along_x, along_y = quarter * (fl + rl + rr + fr), quarter * (-fl + rl - rr + fr)
+    turn = quarter / values["kinematics.sum_of_robot_center_projection_on_X_Y_axis"] * (-fl - rl + rr + fr)
+    x, y, theta = (values[f"kinematics.base_frame_offset.{key}"] for key in ("x", "y", "theta"))
+    cosine, sine = math.cos(-theta), math.sin(-theta)
+    lever_x, lever_y = cosine * -x - sine * -y, sine * -x + cosine * -y
+    return np.column_stack(
+        [
+            cosine * along_x - sine * along_y + lever_y * turn,
+            sine * along_x + cosine * along_y - lever_x * turn,
+            turn,
+        ]
+    )
+
+
+def tricycle(values: dict[str, Any], joints: Rates) -> Array:
+    """tricycle_controller: Odometry::update of odometry.cpp, 2026."""
+    speed = joints[values["traction_joint_name"]] * values["wheel_radius"]
+    alpha = joints[values["steering_joint_name"]]
+    return np.column_stack([speed * np.cos(alpha), 0 * speed, speed * np.sin(alpha) / values["wheelbase"]])
+
+
+def steering(values: dict[str, Any], joints: Rates) -> Array:
+    """The steering controllers: the functions update_from_velocity of steering_kinematics.cpp, 2026."""
+    wheelbase = values["wheelbase"]
+    traction = [joints[name] for name in values["traction_joints_names"]]
+    angles = [joints[name] for name in values["steering_joints_names"]]
+    phi = angles[0]
+    if len(angles) == 2:
+        right, left, half = np.tan(angles[0]), np.tan(angles[1]), values["steering_track_width"] / 2
+        phi = 0.5 * (
+            np.arctan(wheelbase * right / (wheelbase - half * right))
+            + np.arctan(wheelbase * left / (wheelbase + half * left))
+        )
+    bend = np.tan(phi) / wheelbase  # the source's 1 / turning_radius
+    if len(traction) == 1:
+        speed = traction[0] * values["traction_wheel_radius"]
+    else:
+        half, radius = values["traction_track_width"] * 0.5, values["traction_wheels_radius"]
+        speed = 0.5 * radius * (traction[0] / (1 + half * bend) + traction[1] / (1 - half * bend))
+    return np.column_stack([speed, 0 * speed, bend * speed])
+
+
+OF_ALL = {"pose_covariance_diagonal", "twist_covariance_diagonal", "open_loop"}
+OF_CARS = OF_ALL | {"traction_joints_names", "steering_joints_names", "wheelbase"}
+# The controllers' odometry, and their documented parameters (src/*_parameter.yaml, 2025 and 2026).
+CONTROLLERS: dict[str, tuple[Callable[[dict[str, Any], Rates], Array], set[str]]] = {
+    "diff_drive_controller": (
+        diff_drive,
+        OF_ALL
+        | {"left_wheel_names", "right_wheel_names", "wheel_separation", "wheel_radius", "wheel_separation_multiplier"}
+        | {"left_wheel_radius_multiplier", "right_wheel_radius_multiplier"},
+    ),
+    "mecanum_drive_controller": (
+        mecanum_drive,
+        {"pose_covariance_diagonal", "twist_covariance_diagonal"}
+        | {f"{x}_{y}_wheel_command_joint_name" for x in ("front", "rear") for y in ("left", "right")}
+        | {f"kinematics.base_frame_offset.{key}" for key in ("x", "y", "theta")}
+        | {"kinematics.wheels_radius", "kinematics.sum_of_robot_center_projection_on_X_Y_axis"},
+    ),
+    "tricycle_controller": (
+        tricycle,
+        OF_ALL | {"traction_joint_name", "steering_joint_name", "wheelbase", "wheel_radius"},
+    ),
+    "ackermann_steering_controller": (
+        steering,
+        OF_CARS | {"traction_wheels_radius", "traction_track_width", "steering_track_width"},
+    ),
+    "tricycle_steering_controller": (steering, OF_CARS | {"traction_wheels_radius", "traction_track_width"}),
+    "bicycle_steering_controller": (steering, OF_CARS | {"traction_wheel_radius"}),
+}
+# Robots, and the frame in the robot's whose odometry the controller computes.
+ROBOTS = {
+    "diff": (DIFF, Mount()),
+    "odd": (ODD_DIFF, Mount(x=-0.1, y=0.05)),
+    "skid": (SKID, Mount()),
+    "mecanum": (MECANUM, Mount()),
+    "tricycle": (TRICYCLE, Mount()),
+    "forklift": (FORKLIFT, Mount()),
+    "car": (CAR, Mount(x=-0.15)),
+    "trike": (TRIKE, Mount(x=-0.15)),
+    "bicycle": (BICYCLE, Mount()),
+}
+
+
+def controller_of(export: Export) -> str:
+    return next(name for name in CONTROLLERS if f"\n{name}:\n" in export.text)
+
+
+def driven_by(export: Export, robot: Robot, signals: Array) -> Array:
+    """Twists (F, 3) that the controller computes of drive signals (F, M), joints reversed as the export says."""
+    rates, angles = robot.drive.commands(signals)
+    reverse = re.findall(r"reverse the axes of the (steering )?joints of (.*)", "\n".join(export.warnings))
+    backwards = {(kind, name) for kind, names in reverse for name in names.split(", ")}
+    joints = {
+        f"{prefix}_{name}_joint": -values if (kind, name) in backwards else values
+        for prefix, kind, names, columns in (
+            ("wheel", "", robot.drive.wheels, rates.T),
+            ("steering", "steering ", robot.drive.steered, angles.T),
+        )
+        for name, values in zip(names, columns, strict=True)
+    }
+    controller = controller_of(export)
+    return CONTROLLERS[controller][0](parameters(export, controller), joints)
+
+
+def driven_signals(robot: Robot, count: int = 20) -> Array:
+    """Random signals (F, M) of wheels that roll as designed, always ahead."""
+    rng = np.random.default_rng(8)
+    along = rng.uniform(-1, 1, (count, len(robot.motions))) + np.eye(len(robot.motions))[0] * 2
+    return along @ robot.motions @ robot.signal_equations.T
+
+
+def car_matrix(robot: Robot, radius: float, wheelbase: float) -> Array:
+    """The matrix (3, M) of a car's centre, from the middle of its rear axle, at x = -0.15 m or 0."""
+    matrix = np.zeros((3, len(robot.drive.names)))
+    matrix[0, 0], matrix[2, 1] = radius, radius / wheelbase
+    rear: Array = np.linalg.inv(ROBOTS[robot.name][1].twist) @ matrix
+    return rear
+
+
+def held_matrix(name: str) -> Array:
+    """A matrix (3, M) of the robot's centre that its controller holds: that of another robot of the kind."""
+    robots = {
+        "diff": (fixed("right", 0, -0.21, radius=0.079), fixed("left", 0, 0.21, radius=0.083)),
+        "odd": (
+            fixed("l", -0.1, 0.27, radius=0.083),
+            fixed("r", -0.1, -0.17, radius=0.079, angle=math.pi),
+        ),
+        "skid": tuple(wheel.model_copy(update={"y": 1.6 * (wheel.y or 0)}) for wheel in SKID.wheels),
+        "mecanum": tuple(mecanum(w.name, 1.1 * (w.x or 0), 0.9 * (w.y or 0)) for w in MECANUM.wheels),
+        "tricycle": (steered("front", 0.83, 0), *TRICYCLE.wheels[1:]),
+        "forklift": (steered("back", -0.95, 0), *FORKLIFT.wheels[1:]),
+    }
+    if name in robots:
+        moved = Mount(x=0.01, y=-0.02, yaw=0.03) if name == "mecanum" else None
+        other = Robot(name=name, wheels=robots[name], mount=moved, skid=name == "skid")
+        return 1.02 * other.inverse_kinematic_matrix
+    return car_matrix(ROBOTS[name][0], 0.083, {"car": 0.37, "trike": -0.47, "bicycle": 1.04}[name])
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_controller_that_can_hold_a_calibration_computes_its_twist(name: str) -> None:
+    robot, base = ROBOTS[name]
+    matrix = held_matrix(name)
+    export = export_calibration(calibration(mounted(robot), MOUNT.twist @ matrix), "ros2_controllers")
+    signals = driven_signals(robot)
+    expected = signals @ (base.twist @ matrix).T
+    np.testing.assert_allclose(driven_by(export, robot, signals), expected, rtol=0, atol=1e-9)
+    assert "that leaves up to 0.0 mm and 0.00 deg a metre, 0.0 deg and 0.0 mm a full turn;" in export.warnings[1]
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_what_is_said_to_remain_is_what_the_controller_computes_wrongly(name: str) -> None:
+    robot, base = ROBOTS[name]
+    matrix = disturbed(robot)
+    export = export_calibration(calibration(mounted(robot), MOUNT.twist @ matrix), "ros2_controllers")
+    true, possible = base.twist @ matrix, robot.motions @ robot.signal_equations.T
+    coordinates = [0, 1, 2] if name == "mecanum" else [0, 2]  # vx, vy, w of the base frame, as the robot can drive
+    units = np.linalg.solve((possible @ true.T)[:, coordinates].T, np.eye(len(coordinates))).T @ possible
+    units[1:] += units[0]  # a car cannot turn on the spot
+    errors = driven_by(export, robot, units) - units @ true.T
+    errors[1:] -= errors[0]
+    straight, turn = errors[:-1], errors[-1]
+    remains = RemainingError(
+        float(np.linalg.norm(straight[:, :2], 2)),
+        float(np.linalg.norm(straight[:, 2])),
+        float(np.linalg.norm(turn[:2])),
+        float(abs(turn[2])),
+    )
+    assert f"that leaves up to {remains};" in export.warnings[1]
+    assert max(remains.straight_position, remains.straight_heading, remains.turn_position) > 1e-4
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_every_parameter_is_one_that_the_controller_documents(name: str) -> None:
+    export = export_calibration(calibration(ROBOTS[name][0]), "ros2_controllers")
+    controller = controller_of(export)
+    found = parameters(export, controller)
+    assert set(found) <= CONTROLLERS[controller][1]
+    assert {"pose_covariance_diagonal", "twist_covariance_diagonal"} <= set(found)
+    assert export.file_name == f"{name}_{controller.removesuffix('_controller')}.yaml"
+
+
+@given(
+    left=st.floats(0.02, 0.3),
+    right=st.floats(0.02, 0.3),
+    separation=st.floats(0.05, 2),
+    wheels=st.sampled_from([DIFF, SKID]),
+)
+def test_the_three_multipliers_give_two_radii_and_a_separation_back(
+    left: float, right: float, separation: float, wheels: Robot
+) -> None:
+    on_left = np.array([(wheel.y or 0) > 0 for wheel in wheels.wheels])
+    radii = np.where(on_left, left, right) * 2 / len(on_left)
+    matrix = np.array([radii / 2, 0 * radii, radii / separation * np.where(on_left, -1, 1)])
+    found = parameters(export_calibration(calibration(wheels, matrix), "ros2_controllers"), "diff_drive_controller")
+    for side, radius in (("left", left), ("right", right)):
+        assert found["wheel_radius"] * found[f"{side}_wheel_radius_multiplier"] == pytest.approx(radius, rel=1e-9)
+    assert found["wheel_separation"] * found["wheel_separation_multiplier"] == pytest.approx(separation, rel=1e-9)
+
+
+def test_a_base_frame_at_the_stated_place_leaves_no_lever_arm() -> None:
+    shifted = Mount(x=0.03, y=-0.04).twist @ held_matrix("diff")  # nobody said that the tracked point is there
+    export = export_calibration(calibration(DIFF, shifted), "ros2_controllers")
+    assert "0.00 deg a metre, 0.0 deg and 314.2 mm a full turn" in export.warnings[1]
+    place = "x -0.0300 m, y 0.0400 m of the robot's centre would leave none"
+    assert any(warning.endswith(f"a base_frame_id at {place}") for warning in export.warnings)
+
+
+def test_a_steering_offset_is_told_with_the_parameters_that_go_with_it() -> None:
+    offset, signals = math.radians(2), driven_signals(TRICYCLE)
+    turned = np.array([[math.cos(offset), -math.sin(offset)], [math.sin(offset), math.cos(offset)]])
+    matrix = held_matrix("tricycle") @ turned
+    export = export_calibration(calibration(TRICYCLE, matrix), "ros2_controllers")
+    note = next(warning for warning in export.warnings if "its zero in the driver" in warning)
+    found = re.search(r"with (\S+) deg added .* wheelbase (\S+) and wheel_radius (\S+) would leave 0.0 mm", note)
+    assert found is not None
+    degrees, wheelbase, radius = map(float, found.groups())
+    rates, angles = TRICYCLE.drive.commands(signals)
+    values = {"traction_joint_name": "t", "steering_joint_name": "s", "wheelbase": wheelbase, "wheel_radius": radius}
+    twists = tricycle(values, {"t": rates[:, 0], "s": angles[:, 0] + math.radians(degrees)})
+    np.testing.assert_allclose(twists, signals @ matrix.T, atol=1e-5)  # six digits are told
+
+
+def test_what_a_robot_needs_beside_its_parameters_is_said() -> None:
+    said = {
+        name: " | ".join(export_calibration(calibration(robot, integration="euler"), "ros2_controllers").warnings)
+        for name, (robot, _) in ROBOTS.items()
+    }
+    assert "the robot skids" in said["skid"]
+    assert "skids" not in said["diff"]
+    assert "calibrated for Euler steps, the controller integrates arcs" in said["diff"]
+    assert "the controller integrates every step along the heading at its end" in said["mecanum"]
+    assert "base_frame_id has to be a frame at x -0.1500 m, y 0.0000 m" in said["car"]
+    assert "reverse the axes of the joints of r" in said["odd"]
+    assert "reverse the axes of the steering joints of back" in said["forklift"]
+    assert "takes the steering angle at a sample's end" in said["tricycle"]
+    unknown = export_calibration(calibration(mounted(DIFF), noise=None), "ros2_controllers")
+    assert "of the tracked point" in " | ".join(unknown.warnings)
+    assert "covariances are left at the controller's defaults" in unknown.warnings[-1]
+    assert "covariance_diagonal" not in unknown.text
+
+
+def test_mecanum_wheels_whose_rollers_form_an_o_are_told_to_be_elsewhere() -> None:
+    turned = [w.model_copy(update={"roller_angle": -w.roller_angle}) for w in MECANUM.wheels]
+    export = export_calibration(calibration(Robot(name="o", wheels=tuple(turned))), "ros2_controllers")
+    places = "front_left is fr, rear_left is rr, rear_right is rl, front_right is fl"
+    assert f"the rollers form an O seen from above, so that {places}" in export.warnings
+
+
+def test_wheels_that_the_controller_does_not_read_are_named() -> None:
+    odometer = fixed("odometer", 0, 0.0)
+    robot = Robot(name="r", wheels=(*DIFF.wheels, odometer.model_copy(update={"type": "omni", "angle": 0.0})))
+    warnings = export_calibration(calibration(robot), "ros2_controllers").warnings
+    assert "the controller does not read odometer" in warnings
+
+
+TWO_LEFT = Robot(name="r", wheels=(*DIFF.wheels, fixed("second", 0, 0.1)))
+SIDEWAYS = Robot(
+    name="r", wheels=(fixed("a", 0.27**0.5, -0.3, angle_deg=60), fixed("b", -(0.27**0.5), 0.3, angle_deg=60))
+)
+TURNED_ROLLERS = Robot(
+    name="r",
+    wheels=tuple(wheel.model_copy(update={"roller_angle": math.pi / 4}) for wheel in MECANUM.wheels[:3])
+    + MECANUM.wheels[3:],
+)
+ONE_REAR = Robot(name="r", wheels=CAR.wheels[1:])
+
+
+@pytest.mark.parametrize(
+    ("robot", "message"),
+    [
+        (SWERVE, "no released controller .* drives by the steered wheels m0, m1, m2; c_header does"),
+        (TWO_LEFT, "as many measured wheels on the left as on the right, found 2 and 1; use c_header"),
+        (SIDEWAYS, "wheels that roll along x, and a, b do not; turn the robot's frame"),
+        (ONE_REAR, "no controller holds a car that steers by sl, sr and measures rr there"),
+        (TURNED_ROLLERS, "one mecanum wheel in each corner, with rollers that form an X or an O seen from above"),
+    ],
+)
+def test_a_robot_that_no_controller_holds_is_refused_in_one_line(robot: Robot, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"^ros2_controllers: .*{message}"):
+        export_calibration(calibration(robot), "ros2_controllers")
+
+
+@pytest.mark.parametrize("name", ["diff", "mecanum", "tricycle", "car"])
+def test_a_matrix_that_drives_the_wrong_way_is_refused(name: str) -> None:
+    robot = ROBOTS[name][0]
+    with pytest.raises(ConfigError, match=r"turn.* counter-clockwise; check .*sign"):
+        export_calibration(calibration(robot, -robot.inverse_kinematic_matrix), "ros2_controllers")
