@@ -14,6 +14,13 @@ _LONGEST_STEP = 0.25  # of the range
 _LONGER, _ROUNDING = 2.0, 1e-4  # times the longest other step, and of the range
 _FEWEST_TICKS = 10  # of a step that is not slow; chosen
 _USUAL = 2.0  # periods; a longer one without a step is a rest
+# A step that lost one turn of a shorter register is one whole turn off what the wheel does before and after; all others
+# keep well away from half a turn. Of a wheel that turns on, no other cause makes one step go backwards so far (chosen).
+_AROUND = 1.0  # s before and after
+_KEPT = 0.4  # of the register's range, that other steps may be off
+_LOST = 0.6  # of the range
+_RARE = 0.01  # share of the steps
+_ROUNDS = 3  # a lost turn beside another hides it at first
 
 
 def recognised_wrap(counts: Array, ranges: tuple[float, ...]) -> float | None:
@@ -35,6 +42,57 @@ def counted_on(counts: Array, wrap: float) -> Array:
     turns = np.cumsum(np.round(np.diff(counts, prepend=counts[0]) / wrap))
     on: Array = counts - wrap * turns
     return on
+
+
+def recognised_register(counts: Array, times: Array, ranges: tuple[float, ...]) -> float | None:
+    """The one of ``ranges`` of which single steps of counts (F,), read at times (F,), s, lost a turn; None without.
+
+    So does a driver that takes the difference of two readings in a register of 16 bits, and now and then reads too
+    late. The steps go backwards while the wheel turns on.
+    """
+    for wrap in sorted(ranges):
+        if np.ptp(counts) < wrap:
+            return None
+        found = counts
+        for _ in range(_ROUNDS):
+            found = turns_restored(found, times, wrap)
+        lost = np.round((np.diff(found) - np.diff(counts)) / wrap) != 0
+        left, certain = _surprises(found, times)
+        backwards = np.diff(counts) * np.diff(found) < 0
+        others = float(np.abs(left[certain & ~lost]).max(initial=0.0))
+        if lost.any() and lost.mean() < _RARE and backwards[lost].all() and others < _KEPT * wrap:
+            return wrap
+    return None
+
+
+def turns_restored(counts: Array, times: Array, wrap: float) -> Array:
+    """Counts (F,) with the whole turns of ``wrap`` that single steps lost, by what the wheel does before and after."""
+    off, certain = _surprises(counts, times)
+    turns = np.where(certain & (np.abs(off) > _LOST * wrap), np.round(off / wrap), 0.0)
+    restored: Array = counts + wrap * np.concatenate([[0.0], np.cumsum(turns)])
+    return restored
+
+
+def _surprises(counts: Array, times: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """By how much (F - 1,) the wheel's rates before and after a step say that it is too short, and whether both do.
+
+    A step begins where the counts last changed. Of the two rates the one that surprises less counts.
+    """
+    steps = np.diff(counts)
+    count = len(steps)
+    changed = np.maximum.accumulate(np.where(steps != 0, np.arange(count), -1))
+    begin = np.concatenate([[-1], changed[:-1]]) + 1  # reading after the last step that was not 0
+    end = np.arange(1, count + 1)
+    first = np.searchsorted(times, times[begin] - _AROUND)
+    last = np.minimum(np.searchsorted(times, times[end] + _AROUND), count)
+    duration = times[end] - times[begin]
+    off = []
+    for low, high in ((first, begin), (end, last)):
+        span = times[high] - times[low]
+        rate = np.divide(counts[high] - counts[low], span, out=np.zeros(count), where=span > 0)
+        off.append(rate * duration - steps)
+    certain = (steps != 0) & (first < begin) & (end < last) & (off[0] * off[1] > 0) & (duration < _AROUND)
+    return np.where(np.abs(off[0]) < np.abs(off[1]), off[0], off[1]), certain
 
 
 def about_zero(shown: Array, turn: float) -> Array:

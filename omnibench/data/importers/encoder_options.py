@@ -11,7 +11,14 @@ import numpy as np
 from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
 
 from omnibench.config import Positive
-from omnibench.data.importers.encoder_counts import POWERS_OF_TWO, about_zero, counted_on, recognised_wrap
+from omnibench.data.importers.encoder_counts import (
+    POWERS_OF_TWO,
+    about_zero,
+    counted_on,
+    recognised_register,
+    recognised_wrap,
+    turns_restored,
+)
 from omnibench.data.importers.recording_options import RecordingOptions
 from omnibench.errors import DataError, nearest
 from omnibench.robot.kinematics import Array
@@ -122,8 +129,10 @@ class EncoderOptions(RecordingOptions):
         factors = unit / np.array(self.ticks_per_turn or 1) / np.array(self.gear_ratio or 1) * np.array(self.signs or 1)
         return np.broadcast_to(factors, len(self.robot.wheel_names))
 
-    def wheel_angles(self, shown: Array, place: str, warnings: list[str], wheels: slice = _ALL) -> Array:
+    def wheel_angles(self, shown: Array, times: Array, place: str, warnings: list[str], wheels: slice = _ALL) -> Array:
         """Angles (F, n) that count on, rad, of some wheels whose encoders show positions or increments (F, n).
+
+        times (F,): of the readings, s.
 
         Where counters were recognised to begin again is added to ``warnings``. DataError: they count beyond wraps_at.
         """
@@ -132,27 +141,28 @@ class EncoderOptions(RecordingOptions):
             return np.cumsum(shown * factors, axis=0)
         unit = self.wheel_unit
         turns = np.broadcast_to(self.ticks_per_turn or _TURNS[unit], len(self.robot.wheel_names))[wheels]
-        columns = [self._on(column, float(turn), place, warnings) for column, turn in zip(shown.T, turns, strict=True)]
+        columns = [
+            self._on(column, times, float(turn), place, warnings) for column, turn in zip(shown.T, turns, strict=True)
+        ]
         return np.column_stack(columns) * factors
 
-    def _on(self, counts: Array, turn: float, place: str, warnings: list[str]) -> Array:
+    def _on(self, counts: Array, times: Array, turn: float, place: str, warnings: list[str]) -> Array:
         """Counts (F,) of an encoder with ``turn`` counts a turn that go on."""
-        wrap: float | str | None = self.wraps_at
-        if wrap == "never":
+        if self.wraps_at == "never":
             return counts
-        if wrap == "auto":
-            wrap = recognised_wrap(counts, (turn, *(POWERS_OF_TWO if self.wheel_unit == "ticks" else ())))
-            if wrap is None:
-                return counts
-            again = f"wheel positions begin again after {wrap:.10g} {self.wheel_unit}"
-            said = f"{again} and were counted on (wraps_at={wrap:.10g} says so)"
-            warnings += [said] if said not in warnings else []
-        assert isinstance(wrap, float)
-        if (spread := float(np.ptp(counts))) > wrap * (1 + 1e-9):
+        ranges = POWERS_OF_TWO if self.wheel_unit == "ticks" else ()
+        given = self.wraps_at if isinstance(self.wraps_at, float) else None
+        wrap = given or recognised_wrap(counts, (turn, *ranges))
+        on = counts if wrap is None else counted_on(counts, wrap)
+        register = recognised_register(on, times, (given,) if given else ranges)
+        if given and register is None and (spread := float(np.ptp(counts))) > given * (1 + 1e-9):
             raise DataError(
-                f"{place}: wraps_at is {wrap:.10g}, but positions span {spread:.10g} {self.wheel_unit}; correct it"
+                f"{place}: wraps_at is {given:.10g}, but positions span {spread:.10g} {self.wheel_unit}; correct it"
             )
-        return counted_on(counts, wrap)
+        if wrap and not given:
+            again = f"wheel positions begin again after {wrap:.10g} {self.wheel_unit}"
+            _say(f"{again} and were counted on (wraps_at={wrap:.10g} says so)", warnings)
+        return on if register is None else _restored(on, times, register, place, warnings)
 
     def steering_angles(self, shown: Array, wheels: slice = _ALL) -> Array:
         """Steering angles (F, n), rad, of some steered wheels whose encoders show positions (F, n) in the unit."""
@@ -182,3 +192,22 @@ class EncoderOptions(RecordingOptions):
             return DataError(f"{what}; positions are whole numbers: set wheel_unit=ticks and ticks_per_turn")
         first = "ticks_per_turn" if "ticks" in unit else f"wheel_unit ({', '.join(_POSITIONS)}, rad/s, rpm ...)"
         return DataError(f"{what}; set {first}, gear_ratio (turns of the motor for one of the wheel), {others}")
+
+
+def _restored(counts: Array, times: Array, register: float, place: str, warnings: list[str]) -> Array:
+    """Counts (F,) with the turns of a register that single steps lost, which ``warnings`` tell."""
+    restored = counts
+    while not np.array_equal(again := turns_restored(restored, times, register), restored):
+        restored = again
+    lost = int((np.round((np.diff(restored) - np.diff(counts)) / register) != 0).sum())
+    _say(
+        f"{place}: {plural(lost, 'step')} of wheel positions ran back while the wheel turned on, as in a register of "
+        f"{register:.10g} ticks that was read late; they got a turn of it back (wraps_at=2^32 or never keeps them)",
+        warnings,
+    )
+    return restored
+
+
+def _say(sentence: str, warnings: list[str]) -> None:
+    """Add a sentence to the warnings, once."""
+    warnings += [sentence] if sentence not in warnings else []

@@ -11,8 +11,10 @@ from omnibench.data.importers.encoder_counts import (
     POWERS_OF_TWO,
     about_zero,
     counted_on,
+    recognised_register,
     recognised_wrap,
     repeated_readings,
+    turns_restored,
 )
 from omnibench.robot.kinematics import Array
 
@@ -33,6 +35,35 @@ def test_a_counter_of_any_bits_is_recognised_and_counted_on(
     wrapped = bool((np.abs(np.diff(shown)) > wrap / 2).any())
     assert recognised_wrap(shown, POWERS_OF_TWO) == (wrap if wrapped else None)
     np.testing.assert_array_equal(np.diff(counted_on(shown, wrap)), np.diff(counts))
+
+
+def late_drive(seed: int, late: int) -> tuple[Array, Array, Array]:
+    """Times, and true and shown counts of a wheel of 200,000 ticks a second by a driver whose register has 16 bits.
+
+    Every so often it reads a quarter of a second late, so that the step loses a turn of the register.
+    """
+    rng = np.random.default_rng(seed)
+    times = 0.04 * np.arange(2000) + rng.uniform(0, 0.01, 2000)
+    counts = np.round(200_000 * (times + 0.2 * np.sin(times)) + rng.normal(0, 500, 2000))
+    for begin in rng.choice(np.arange(100, 1900, 60), late, replace=False):
+        counts[begin : begin + 5] = counts[begin - 1]
+    steps = np.diff(counts)
+    shown = np.concatenate([counts[:1], counts[0] + np.cumsum(steps - 2**16 * np.round(steps / 2**16))])
+    return times, counts, shown
+
+
+@given(st.integers(0, 10**6), st.integers(1, 5))
+def test_turns_that_a_register_lost_are_restored(seed: int, late: int) -> None:
+    times, counts, shown = late_drive(seed, late)
+    lost = not np.array_equal(counts, shown)
+    assert recognised_register(shown, times, POWERS_OF_TWO) == (2**16 if lost else None)
+    np.testing.assert_array_equal(turns_restored(shown, times, 2**16), counts)
+
+
+@given(st.integers(0, 10**6), st.integers(8, 20), st.floats(0.01, 0.24))
+def test_a_wheel_that_turns_back_has_lost_no_turns(seed: int, bits: int, longest: float) -> None:
+    counts = drive(seed, longest * 2.0**bits)
+    assert recognised_register(counts, 0.05 * np.arange(len(counts)), POWERS_OF_TWO) is None
 
 
 @given(st.integers(0, 10**6), st.integers(300, 10**6))

@@ -240,8 +240,11 @@ def corelli(**options: Any) -> Trajectory:
     if not CORELLI.is_file():
         pytest.skip(f"the recording is not at {CORELLI}")
     data = import_dataset("csv", CORELLI, CORELLI_OPTIONS | options)
+    assert (
+        "4 steps of wheel positions ran back while the wheel turned on, as in a register of 65536" in data.warnings[1]
+    )
     assert "wheel positions begin again after 4294967296 ticks and were counted on" in data.warnings[0]
-    assert "51 rows that repeat the ones before while the wheels turn" in data.warnings[1]
+    assert "51 rows that repeat the ones before while the wheels turn" in data.warnings[2]
     return data.trajectories[0]
 
 
@@ -254,7 +257,8 @@ def errors(run: Trajectory, robot: dict[str, Any]) -> Array:
 def test_the_design_of_another_laboratory_s_tricycle_is_its_own_model() -> None:
     """The robot's own pose, of its rear axle, in the log: this is odometry by Euler steps, printed to 6 digits."""
     robot = CORELLI_OPTIONS["robot"] | {"mount": {"x": 0}}
-    distances = errors(corelli(pose_columns=[7, 8, 9], robot=robot), robot)
+    options = {"pose_columns": [7, 8, 9], "robot": robot, "wraps_at": "2^32"}  # it lost turns of its register, too
+    distances = errors(import_dataset("csv", CORELLI, CORELLI_OPTIONS | options).trajectories[0], robot)
     assert distances.mean() < 0.005
     assert distances.max() < 0.04
 
@@ -262,4 +266,4 @@ def test_the_design_of_another_laboratory_s_tricycle_is_its_own_model() -> None:
 def test_the_first_guesses_of_another_laboratory_s_tricycle_are_far_off() -> None:
     run = corelli()
     assert (len(run.times), len(run.pose_times)) == (2382, 2434)
-    assert errors(run, CORELLI_OPTIONS["robot"]).mean() == pytest.approx(14.05, abs=0.01)
+    assert errors(run, CORELLI_OPTIONS["robot"]).mean() == pytest.approx(14.33, abs=0.01)

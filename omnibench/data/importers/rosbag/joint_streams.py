@@ -139,7 +139,7 @@ def _read(
     if choice.steering:
         values = options.steering_angles(values, wheels)
     elif counted:
-        values = options.wheel_angles(values, f"{bag.path}: topic {topic.name}", warnings, wheels)
+        values = options.wheel_angles(values, 1e-9 * stamps[order], f"{bag.path}: topic {topic.name}", warnings, wheels)
     else:
         values = values * options.wheel_radians[wheels]
     return _JointStream(stamps[order], logged[order], values, counted)
