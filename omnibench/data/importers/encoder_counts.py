@@ -51,12 +51,17 @@ def recognised_register(counts: Array, times: Array, ranges: tuple[float, ...]) 
     late. The steps go backwards while the wheel turns on.
     """
     for wrap in sorted(ranges):
+        if np.median(np.abs(np.diff(counts))) > _LONGEST_STEP * wrap:
+            continue
         if np.ptp(counts) < wrap:
             return None
         found = counts
         for _ in range(_ROUNDS):
             found = turns_restored(found, times, wrap)
-        lost = np.round((np.diff(found) - np.diff(counts)) / wrap) != 0
+        turns = np.abs(np.round((np.diff(found) - np.diff(counts)) / wrap))
+        if turns.max() > 1:  # a shorter register loses several
+            continue
+        lost = turns > 0
         left, certain = _surprises(found, times)
         backwards = np.diff(counts) * np.diff(found) < 0
         others = float(np.abs(left[certain & ~lost]).max(initial=0.0))
