@@ -1,47 +1,49 @@
 """Shrink against keep and fit, and costs against each other, on every real recording with kinds of paths left out.
 
-    python tests/benchmarks/shrink_study.py            # the default of a robot against the other choices
-    python tests/benchmarks/shrink_study.py --widths   # half of each tolerance, and twice
+    python tests/benchmarks/shrink_study.py                 # the default of a robot against the other choices
+    python tests/benchmarks/shrink_study.py --factor 0.5    # half of each tolerance, or twice
 
 Of recordings with several kinds of paths every kind is left out once: a calibration is fitted to each other kind by
 itself, and to all others together, and judged on the kind left out. Of recordings with one kind the sessions are left
-out one by one, and of one long drive the second half. What is compared is the error of the final pose, Eq. (6) of
-Palacin et al. 2023, run by run: the mean difference to the default, with an interval from resampled sessions, widened
-by Bonferroni over all lines of a robot so that together they hold with 95 %.
+out one by one (of the Robotino quarters of the directions), and of one long drive the second half. What is compared is
+the error of the final pose, Eq. (6) of Palacin et al. 2023, run by run.
+
+A rule is judged, not one fit: other runs to train would have given other calibrations. The variance of a mean
+difference to the default is therefore the sum of two, each over sessions left out one by one (jackknife): those
+trained on, with a new fit each, and those judged. Intervals are by Student's t with the fewer of the two's degrees of
+freedom, widened by Bonferroni over all lines of all recordings so that together they hold with 95 %.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from commands import RECORDINGS, ROOT
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import OmnibenchError
-from omnibench.fit.calibrate import calibrate
-from omnibench.fit.shrinkage.prior import tolerance_of
-from omnibench.registry import load_plugin_file
+from omnibench.fit.calibrator import run_calibrator
+from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
+from omnibench.fit.shrinkage import prior
+from omnibench.fit.shrinkage.shrinkage import shrunk
+from omnibench.registry import calibrators, costs, load_plugin_file
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.import_dataset import import_dataset
 
-DEFAULT = "shrink final_pose"
-CHOICES: dict[str, dict[str, Any]] = {
-    DEFAULT: {"unidentified": "shrink"},
-    "keep final_pose": {"unidentified": "keep"},
-    "fit final_pose": {"unidentified": "fit"},
-    "shrink trajectory": {"unidentified": "shrink", "cost": "trajectory"},
-    "keep trajectory": {"unidentified": "keep", "cost": "trajectory"},
-}
-RESAMPLES = 10_000
+COSTS = ("final_pose", "trajectory")
+DEFAULT = ("final_pose", "shrink")
+FOLDS = 20  # about, over all recordings: of each the default is compared with five others
+GROUPS = 8  # at most, to leave out one by one
 
 
 @dataclass(frozen=True)
@@ -53,10 +55,14 @@ class Fold:
     judge: tuple[Trajectory, ...]
 
 
-def recordings() -> Iterator[tuple[Dataset, list[Fold]]]:
-    """Every recording that is at hand, with what is left out of it."""
+def recordings(only: Sequence[str] | None) -> Iterator[tuple[Dataset, list[Fold]]]:
+    """Every recording that is at hand, or those asked for, with what is left out of it."""
     for name in ("diff", "tricyc", "omni3", "omni4"):
+        if only and name not in only:
+            continue
         yield folds_by_kind(import_dataset("optiodom", RECORDINGS / "optiodom" / name))
+    if only and "robotino" not in only:
+        return
     assert load_plugin_file(ROOT / "plugins" / "robotino.py") is None
     robotino = import_dataset("robotino", RECORDINGS / "robotino")
     yield robotino, list(folds_by_direction(robotino))
@@ -97,65 +103,101 @@ def folds_by_direction(dataset: Dataset) -> Iterator[Fold]:
         )
 
 
-def errors(dataset: Dataset, fold: Fold, choice: dict[str, Any]) -> Array:
+def matrices(dataset: Dataset, runs: Sequence[Trajectory]) -> dict[tuple[str, str], Array]:
+    """The calibrated matrix by every cost and treatment of what the runs hardly drive."""
+    training = tuple(replace(run, split="train") for run in runs)
+    found = {}
+    for cost in COSTS:
+        answers = {}
+        for treatment in ("shrink", "fit"):
+            searched = make_parameterisation("matrix", dataset.robot, training, unidentified=treatment)
+            kept = len(getattr(searched, "null"))  # noqa: B009
+            if treatment == "fit" and kept == answers["kept"]:  # then it is the same problem
+                found[cost, "fit"] = found[cost, "keep"]
+                continue
+            problem = CalibrationProblem(
+                dataset.robot, training, costs.create(cost), searched, integration="arc", budget=Budget(), seed=1,
+                shrinks=treatment == "shrink",
+            )  # fmt: skip
+            result = run_calibrator(calibrators.create("closed_form", None), problem)
+            if result.matrix is None:
+                raise OmnibenchError(result.reason)
+            found[cost, "keep" if treatment == "shrink" else "fit"] = result.matrix
+            if treatment == "shrink":
+                answers["kept"] = kept
+                posterior = shrunk(problem, result).matrix
+                assert posterior is not None
+                found[cost, "shrink"] = posterior
+    return found
+
+
+def errors(dataset: Dataset, matrix: Array, judged: Sequence[Trajectory]) -> Array:
     """Errors (Z, 3) of the final poses of the runs that were left out, m, m, rad."""
-    training = tuple(replace(run, split="train") for run in fold.train)
-    run = calibrate(replace(dataset, trajectories=training), box="row", **choice)
-    model = OdometryModel(dataset.robot, run.calibration.matrix_array, "arc")
-    poses = model.poses([judged.final_log for judged in fold.judge])
-    return np.array([own[-1] - judged.final_pose for own, judged in zip(poses, fold.judge, strict=True)])
+    poses = OdometryModel(dataset.robot, matrix, "arc").poses([run.final_log for run in judged])
+    return np.array([own[-1] - run.final_pose for own, run in zip(poses, judged, strict=True)])
 
 
-def interval(difference: Array, sessions: Sequence[str], chance: float) -> tuple[float, float]:
-    """Interval of the mean of differences (Z,) from resampled sessions."""
-    names = sorted(set(sessions))
-    sums = np.array([[difference[np.array(sessions) == name].sum(), sessions.count(name)] for name in names])
-    drawn = np.random.default_rng(0).integers(0, len(names), (RESAMPLES, len(names)))
-    totals = sums[drawn].sum(axis=1)
-    low, high = np.quantile(totals[:, 0] / totals[:, 1], [chance / 2, 1 - chance / 2])
-    return float(low), float(high)
+def groups(runs: Sequence[Trajectory]) -> list[set[str]]:
+    """Ids of the runs of each session, or of each run where these are fewer than three; not more than GROUPS."""
+    names = [str(run.session) for run in runs]
+    if len(set(names)) < 3:
+        names = [run.id for run in runs]
+    number = {name: index % GROUPS for index, name in enumerate(dict.fromkeys(names))}
+    members: dict[int, set[str]] = {}
+    for run, name in zip(runs, names, strict=True):
+        members.setdefault(number[name], set()).add(run.id)
+    return list(members.values())
 
 
-def study(dataset: Dataset, folds: Sequence[Fold], choices: dict[str, dict[str, Any]]) -> None:
+def jackknife(values: Array) -> float:
+    """Variance of a statistic from its values (G,) with one group left out each (Efron 1982, section 3.1)."""
+    count = len(values)
+    return float((count - 1) / count * np.square(values - values.mean()).sum())
+
+
+def study(dataset: Dataset, folds: Sequence[Fold]) -> None:
     """Print one line a fold and choice."""
-    others = len(folds) * (len(choices) - 1)
     for fold in folds:
         print(f"\n{dataset.robot.name}: {fold.words} ({len(fold.train)} runs -> {len(fold.judge)})")
-        sessions = [str(run.session) for run in fold.judge]
-        if len(set(sessions)) < 3:
-            sessions = [run.id for run in fold.judge]
-        base: Array | None = None
-        for name, choice in choices.items():
-            try:
-                found = errors(dataset, fold, choice)
-            except OmnibenchError as error:
-                print(f"  {name:26s} {error}")
-                continue
-            norms = np.linalg.norm(found, axis=1)
-            position, heading = np.hypot(*found[:, :2].T).mean(), np.degrees(np.abs(found[:, 2]).mean())
-            words = f"  {name:26s} {position:.4f} m {heading:6.2f} deg"
-            if base is None:
-                base = norms
-            else:
-                low, high = interval(norms - base, sessions, 0.05 / others)
+        trained, judged = groups(fold.train), groups(fold.judge)
+        whole = matrices(dataset, fold.train)
+        others = [matrices(dataset, [run for run in fold.train if run.id not in group]) for group in trained]
+        found = {choice: errors(dataset, matrix, fold.judge) for choice, matrix in whole.items()}
+        norms = {choice: np.linalg.norm(error, axis=1) for choice, error in found.items()}
+        freedom = min(len(trained), len(judged)) - 1
+        reach = float(stdtrit(freedom, 1 - 0.05 / (FOLDS * 5) / 2))
+        for choice, error in found.items():
+            position, heading = np.hypot(*error[:, :2].T).mean(), np.degrees(np.abs(error[:, 2]).mean())
+            words = f"  {' '.join(choice):18s} {position:.4f} m {heading:6.2f} deg"
+            if choice != DEFAULT:
+                difference = norms[choice] - norms[DEFAULT]
+                refits = [
+                    float(np.diff([np.linalg.norm(errors(dataset, each[one], fold.judge), axis=1).mean()
+                                   for one in (DEFAULT, choice)])[0])
+                    for each in others
+                ]  # fmt: skip
+                without = [difference[[run.id not in group for run in fold.judge]].mean() for group in judged]
+                spread = reach * math.sqrt(jackknife(np.array(refits)) + jackknife(np.array(without)))
+                low, high = difference.mean() - spread, difference.mean() + spread
                 verdict = "default worse" if high < 0 else "default better" if low > 0 else "no difference"
-                mean = (norms - base).mean()
-                words += f"   Eq. (6) {1000 * mean:+7.1f} ({1000 * low:+.1f} to {1000 * high:+.1f}) e-3  {verdict}"
+                words += f"   {1000 * difference.mean():+7.2f} ({1000 * low:+.2f} to {1000 * high:+.2f}) e-3  {verdict}"
             print(words, flush=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--widths", action="store_true")
+    parser.add_argument("--factor", type=float, default=1.0, help="of every tolerance")
+    parser.add_argument("--robots", nargs="*", help="names of the recordings")
     arguments = parser.parse_args()
-    for dataset, folds in recordings():
-        choices = CHOICES
-        if arguments.widths:
-            width = tolerance_of(dataset.robot).elements
-            choices = {DEFAULT: CHOICES[DEFAULT]} | {
-                f"tolerance {factor:g} x": CHOICES[DEFAULT] | {"tolerance": factor * width} for factor in (0.5, 1, 2)
-            }
-        study(dataset, folds, choices)
+    prior.TOLERANCES = {
+        name: prior.Tolerance(
+            arguments.factor * each.elements,
+            tuple(arguments.factor * row for row in each.rows),  # type: ignore[arg-type]
+        )
+        for name, each in prior.TOLERANCES.items()
+    }
+    for dataset, folds in recordings(arguments.robots):
+        study(dataset, folds)
 
 
 if __name__ == "__main__":

@@ -31,19 +31,21 @@ class Tolerance:
     rows: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-# Of wheels with tyres radius and place are known to 1 or 2 % (Borenstein and Feng, IEEE T-RA 12:869, 1996). Rollers
-# lose or gain some per cent of a motion, 8 on the mecanum base of OptiOdom; a skid-steered base turns by 0.5 to 0.8 of
-# what its track says (Mandow et al., IROS 2007). Half of each and twice: tests/benchmarks/shrink_study.py.
+# Radius and place of a wheel are known to 1 or 2 %. What all wheels share is known less well: the load on tyres, which
+# changes their radii, and the track on which they turn (Borenstein and Feng, IEEE T-RA 12:869, 1996, sections 2 and 3).
+# Rollers lose or gain some per cent of a motion, 8 on the mecanum base of OptiOdom; a skid-steered base turns by 0.5 to
+# 0.8 of what its track says (Mandow et al., IROS 2007). Half of each and twice: tests/benchmarks/shrink_study.py.
+_USUAL = Tolerance(0.02, (0.05, 0.05, 0.05))
 TOLERANCES: Mapping[RobotClass, Tolerance] = MappingProxyType(
     {
-        "differential": Tolerance(0.02),
-        "tricycle": Tolerance(0.02),
-        "car": Tolerance(0.02),
-        "swerve": Tolerance(0.02),
-        "omni": Tolerance(0.02, (0.05, 0.05, 0.05)),
+        "differential": _USUAL,
+        "tricycle": _USUAL,
+        "car": _USUAL,
+        "swerve": _USUAL,
+        "omni": _USUAL,
         "mecanum": Tolerance(0.02, (0.06, 0.06, 0.06)),
         "skid": Tolerance(0.02, (0.05, 0.05, 0.2)),
-        "mixed": Tolerance(0.02, (0.05, 0.05, 0.05)),
+        "mixed": _USUAL,
     }
 )
 # The tracked point of these stands in front of the rear axle, which is the robot's centre, and is seldom known as well
