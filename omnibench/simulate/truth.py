@@ -35,6 +35,7 @@ from omnibench.simulate.mechanics import (
     turned_by_steering,
 )
 from omnibench.simulate.true_motion import TrueMotion
+from omnibench.simulate.variation import Variation
 from omnibench.simulate.wheel_contacts import WheelContacts
 
 _SETTLES = 3  # corrections of a car's rates for the effects on them, each of which leaves some 1 % of the one before
@@ -182,6 +183,7 @@ class TruthRecord(Model):
     steering_offsets: dict[str, float] = Field({}, description="drawn: true steering angle less the measured one, rad")
     mount: Mount | None = Field(None, description="the true tracked point, if it is not the robot's centre")
     lateral_friction: float = 0.0
+    variation: Variation = Field(Variation(), description="of the commands within a run")
 
     def true_robot(self, step: float | None = None) -> TrueRobot:
         """The true robot. step: of its motion, s; default: the sample period.
@@ -211,6 +213,7 @@ def true_record(
     *,
     integration: Integration = "arc",
     noise: EncoderNoise | None = None,
+    variation: Variation | None = None,
 ) -> TruthRecord:
     """The record of a data set's truth. UnknownNameError as for ``complete_effects``."""
     drawn = _drawn(truth, robot)
@@ -226,6 +229,7 @@ def true_record(
         steering_offsets={} if drawn is None else drawn.steering_offsets,
         mount=robot.mount if drawn is None else drawn.mount,
         lateral_friction=truth.lateral_friction,
+        variation=variation or Variation(),
     )
 
 
