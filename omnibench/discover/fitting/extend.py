@@ -59,10 +59,19 @@ class Extended:
 
     @property
     def residuals_without_effects(self) -> list[Array]:
-        """Nuisance-free residuals (K, 3) of each run with the effects' share put back, to first order."""
+        """Nuisance-free residuals (K, 3) of each run with the effects' share put back, to first order.
+
+        Of effects on steering angles, most of which the matrix can take up, only the rest is put back: to first order
+        the whole would lead too far.
+        """
         elements = self.fit.model.matrix.size
+        put_back = np.concatenate([np.zeros(elements), self.values])
+        if _bends(self.groups):
+            information = self.data.information[:elements]
+            put_back[:elements] = -np.linalg.pinv(information[:, :elements]) @ information[:, elements:] @ self.values
+        first = 0 if _bends(self.groups) else elements
         return [
-            residuals + columns[..., elements:] @ self.values
+            residuals + columns[..., first:] @ put_back[first:]
             for residuals, columns in zip(self.fit.nuisance_free_residuals, self.columns, strict=True)
         ]
 
