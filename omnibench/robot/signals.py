@@ -14,7 +14,7 @@ from omnibench.robot.odometry import WheelLog, advance
 from omnibench.robot.path import Path
 from omnibench.robot.planar import compose
 
-_STANDING = 1e-4  # m/s: a slower caster stands; chosen
+_STANDING = 1e-4  # m/s: a slower caster stands; and a way of its direction, of length 1, that is none; chosen
 STILL = 1e-3  # rad/s: a slower wheel counts as standing; chosen
 _SMOOTHING = 0.05  # s, time constant of the smoothed twist whose derivative is the acceleration; chosen
 # rad, half of the angle that a steering motor turns back before it takes the wheel along: above the noise and the steps
@@ -138,8 +138,12 @@ class Caster:
 
         c <- c exp(-i w d),    c <- c + (1 - exp(-abs(V) d / L)) (V / abs(V) - c),                          (1)
 
-    and the caster swings towards V at the rate abs(V) / L times the sine of the angle from c to V. Where the motion is
-    reversed exactly, c is 0 on its way, and no side is preferred. At first the caster points where the robot goes.
+    and the caster swings as c does on its straight way to V in Eq. (1): with h the distance of that way from 0, x what
+    is behind along it, and g a small number for ways that lead nearly through 0, of which the side is chance, by
+
+    integral of h / (x^2 + h^2 + g^2) dx.                                                               (2)
+
+    At first the caster points where the robot goes.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -155,11 +159,15 @@ class Caster:
             return 0.0
         ahead = pivot / speed
         before = ahead if self._direction is None else self._direction * cmath.exp(-1j * turn * duration)
-        share = -math.expm1(-speed * duration / _TRAIL)
-        self._direction = before + share * (ahead - before)
-        middle = before + share / 2 * (ahead - before)
-        across = (middle.conjugate() * ahead).imag / math.hypot(abs(middle), _REVERSED)
-        return speed / _TRAIL * across
+        way = -math.expm1(-speed * duration / _TRAIL) * (ahead - before)
+        self._direction = before + way
+        length = abs(way)
+        if length < _STANDING:
+            return (before.conjugate() * way).imag / duration  # c points ahead: abs(c) is 1
+        turned = before.conjugate() * way / length  # x and h
+        near = math.hypot(turned.imag, _REVERSED)
+        swept = math.atan((turned.real + length) / near) - math.atan(turned.real / near)
+        return turned.imag / near * swept / duration  # Eq. (2)
 
 
 def of_centre(robot: Robot, twists: Array) -> Array:
