@@ -38,7 +38,7 @@ def _config(dataset: Dataset, effect: NamedEffect, fit: Fit) -> str:
             "pose_period": max(0.2, dataset.sample_period),
             "commands": {
                 "speeds": [0.0, round(speed / 2, 3), round(speed, 3)],
-                "directions_deg": [0, 60, 120, 180, 240, 300],
+                "directions_deg": [0, 60, 120, 180, 240, 300] if len(dataset.robot.motions) == 3 else None,
                 "turn_rates": [-round(turn, 3), 0.0, round(turn, 3)],
                 "ramp": 0.3,
             },

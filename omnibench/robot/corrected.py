@@ -68,6 +68,11 @@ def corrected_twists(terms: Sequence[Term], signals: Signals, matrix: Array) -> 
     return twists + (true.body if mount is None else true.body @ mount.twist.T), true.world
 
 
+def needs_of(terms: Sequence[Term]) -> frozenset[Need]:
+    """All that the effects of some terms need."""
+    return frozenset().union(*(term.effect.needs for term in terms))
+
+
 def check_needs(terms: Sequence[Term], log: WheelLog) -> None:
     """Raise DataError, in one line, if a log lacks data that an effect needs."""
     recorded = {"wheel_angles": log.wheel_angles, "session_time": log.started_at, "session": log.session}

@@ -46,8 +46,9 @@ class EffectStream(OdometryStream):
             return self._take_at_once(angles, wheel_angles, steering)
         self._follow()
         middle = self.steer(steering)
+        steered = None if middle is None or steering is None else (middle, np.asarray(steering, dtype=float))
         self.driven = self.driven_signals(angles, middle)
-        signals = self._signals.next(angles / duration, duration, wheel_angles, self.frame_heading, middle)
+        signals = self._signals.next(angles / duration, duration, wheel_angles, self.frame_heading, steered)
         twists, drift = corrected_twists(self._terms, signals, self.matrix)
         before, moved = self.pose, twists[0] * duration
         self.pose = advance(before, moved, self.integration)

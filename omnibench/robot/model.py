@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from omnibench.robot.corrected import check_needs, corrected_twists
+from omnibench.robot.corrected import check_needs, corrected_twists, needs_of
 from omnibench.robot.effect_stream import EffectStream
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.effects.term import Term
@@ -84,7 +84,8 @@ class OdometryModel:
         if not self.motion_terms:
             return OdometryStream(self.matrix, self.integration, start, self.robot.drive)
         assert self.sample_period is not None  # there are terms
-        signals = SignalStream(self.robot, self.matrix, self.sample_period, session, session_time)
+        needs = needs_of(self.motion_terms)
+        signals = SignalStream(self.robot, self.matrix, self.sample_period, session, session_time, needs=needs)
         return EffectStream(self.motion_terms, signals, self.integration, start)
 
     def _path(self, log: WheelLog) -> Path:
@@ -94,8 +95,7 @@ class OdometryModel:
             return Path(log.times, log.start, (log.signals @ self.matrix.T) * durations, self.integration)
         assert self.sample_period is not None  # there are terms
         check_needs(self.motion_terms, log)
-        with_poses = any("poses" in term.effect.needs for term in self.motion_terms)
-        signals = signals_of(log, self.robot, self.matrix, self.sample_period, with_poses=with_poses)
+        signals = signals_of(log, self.robot, self.matrix, self.sample_period, needs_of(self.motion_terms))
         twists, drift = corrected_twists(self.motion_terms, signals, self.matrix)
         world = None if drift is None else drift * durations
         return Path(log.times, log.start, twists * durations, self.integration, world)

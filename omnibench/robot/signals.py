@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import cmath
 import math
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +14,14 @@ from omnibench.robot.odometry import WheelLog, advance
 from omnibench.robot.path import Path
 from omnibench.robot.planar import compose
 
+_STANDING = 1e-4  # m/s: a slower caster stands; and a way of its direction, of length 1, that is none; chosen
 STILL = 1e-3  # rad/s: a slower wheel counts as standing; chosen
 _SMOOTHING = 0.05  # s, time constant of the smoothed twist whose derivative is the acceleration; chosen
+# rad, half of the angle that a steering motor turns back before it takes the wheel along: above the noise and the steps
+# of usual encoders, and within the play of usual gears; chosen
+_TAKE_UP = 0.01
+_TRAIL = 0.05  # m, from a caster's pivot back to where its wheel touches the floor; chosen, as of small robots
+_REVERSED = 0.05  # length of a caster's mean direction below which the side that it swings to is chance; chosen
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -28,6 +36,11 @@ class Signals:
     not recorded. session_time (F,): s since the session's start; None if unknown. session: its name. poses (F, 3): in
     the reference's frame, m, m, rad, by the uncorrected twists and exact arcs: mean of the poses before and after the
     sample; None if no effect needs them.
+
+    Of robots that steer: steering_rates (F, S): rates of the steering angles from one sample's end to the next, rad/s.
+    steering_side (F, S): where the angle stands within the play of its gear, from -1 (it came from the right) to 1 (from
+    the left), 0 at first; None if no effect needs it. caster_rates (F,): rates at which a caster behind the centre
+    swings round, relative to the robot, to follow its motion, rad/s; None if no effect needs them.
     """
 
     robot: Robot
@@ -42,14 +55,17 @@ class Signals:
     session: str | None = None
     poses: Array | None = None
     steering: Array | None = None
+    steering_rates: Array | None = None
+    steering_side: Array | None = None
+    caster_rates: Array | None = None
 
 
 def signals_of(
-    log: WheelLog, robot: Robot, matrix: Array, sample_period: float, *, with_poses: bool = False
+    log: WheelLog, robot: Robot, matrix: Array, sample_period: float, needs: Collection[str] = ()
 ) -> Signals:
     """The signals of a log's F samples by a matrix (3, M).
 
-    sample_period: nominal, s. with_poses: compute the poses, which some effects need.
+    sample_period: nominal, s. needs: signals to compute that only some effects need, by name.
 
     With u_k the twist of sample k, d_k its duration and y_k = y_{k-1} + a (u_k - y_{k-1}), y_0 = 0, the twist smoothed
     with a = 1 - exp(-sample_period / 50 ms), its acceleration is (y_k - y_{k-1}) / d_k: causal, and
@@ -63,6 +79,13 @@ def signals_of(
     share = smoothing_share(sample_period)
     smoothed = lfilter([share], [1.0, share - 1.0], twists, axis=0)
     elapsed = log.times - durations / 2
+    steering, side, swings = log.middle_steering, None, None
+    if steering is not None and "steering_side" in needs:
+        gears = SteeringGears()
+        side = np.array([gears.turned(angles) for angles in steering])
+    if "caster_rates" in needs:
+        caster = Caster(robot)
+        swings = np.array([caster.moved(*sample) for sample in zip(twists.tolist(), durations.tolist(), strict=True)])
     return Signals(
         robot=robot,
         durations=durations,
@@ -74,9 +97,77 @@ def signals_of(
         wheel_angles=None if log.wheel_angles is None else log.wheel_angles - log.rates * (durations / 2)[:, None],
         session_time=None if log.started_at is None else log.started_at + elapsed,
         session=log.session,
-        poses=Path(log.times, log.start, tracked * durations[:, None], "arc").middles if with_poses else None,
-        steering=log.middle_steering,
+        poses=Path(log.times, log.start, tracked * durations[:, None], "arc").middles if "poses" in needs else None,
+        steering=steering,
+        steering_rates=None if log.steering is None else steering_rates(log.steering, steering, durations),
+        steering_side=side,
+        caster_rates=swings,
     )
+
+
+def steering_rates(ends: Array, middles: Array | None, durations: Array) -> Array:
+    """Rates (F, S) of steering angles from those at the samples' ends and in their middles, rad; durations (F,), s."""
+    assert middles is not None  # there are steering angles
+    rates: Array = 2 * (ends - middles) / durations[:, None]
+    return rates
+
+
+class SteeringGears:
+    """Steering gears with play, one angle (S,) after another: the play operator.
+
+    The wheel stands where the motor left it until the motor has turned back by the play. Source: M. A. Krasnosel'skii
+    and A. V. Pokrovskii, Systems with Hysteresis, 1989.
+    """
+
+    def __init__(self) -> None:
+        self._wheel: Array | None = None
+
+    def turned(self, angles: Array) -> Array:
+        """Place (S,) of the motors' angles (S,), rad, within the play, from -1 to 1."""
+        if self._wheel is None:
+            self._wheel = angles
+        self._wheel = np.clip(self._wheel, angles - _TAKE_UP, angles + _TAKE_UP)
+        return (angles - self._wheel) / _TAKE_UP
+
+
+class Caster:
+    """A caster as far behind a robot's centre as its wheels stand from there, one sample after another.
+
+    With V the velocity of its pivot and c the mean of the directions in which the pivot moved lately, both complex in
+    the robot's frame, c turns back with the robot and follows V over the trail L,
+
+        c <- c exp(-i w d),    c <- c + (1 - exp(-abs(V) d / L)) (V / abs(V) - c),                          (1)
+
+    and the caster swings as c does on its straight way to V in Eq. (1): with h the distance of that way from 0, x what
+    is behind along it, and g a small number for ways that lead nearly through 0, of which the side is chance, by
+
+    integral of h / (x^2 + h^2 + g^2) dx.                                                               (2)
+
+    At first the caster points where the robot goes.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._behind = robot.reach
+        self._direction: complex | None = None
+
+    def moved(self, twist: Sequence[float], duration: float) -> float:
+        """Mean rate of the swing, rad/s, in a sample with the twist (3,) of the robot's centre."""
+        vx, vy, turn = twist
+        pivot = complex(vx, vy - self._behind * turn)
+        speed = abs(pivot)
+        if speed < _STANDING:
+            return 0.0
+        ahead = pivot / speed
+        before = ahead if self._direction is None else self._direction * cmath.exp(-1j * turn * duration)
+        way = -math.expm1(-speed * duration / _TRAIL) * (ahead - before)
+        self._direction = before + way
+        length = abs(way)
+        if length < _STANDING:
+            return (before.conjugate() * way).imag / duration  # c points ahead: abs(c) is 1
+        turned = before.conjugate() * way / length  # x and h
+        near = math.hypot(turned.imag, _REVERSED)
+        swept = math.atan((turned.real + length) / near) - math.atan(turned.real / near)
+        return turned.imag / near * swept / duration  # Eq. (2)
 
 
 def of_centre(robot: Robot, twists: Array) -> Array:
@@ -88,7 +179,7 @@ class SignalStream:
     """The signals of ``signals_of``, one sample at a time, from rest.
 
     session_time: at the first sample's start, s. pose (3,): by the uncorrected twists so far, m, m, rad; None if no
-    effect needs it.
+    effect needs it. needs: as for ``signals_of``.
     """
 
     def __init__(
@@ -99,6 +190,7 @@ class SignalStream:
         session: str | None = None,
         session_time: float = 0.0,
         pose: Array | None = None,
+        needs: Collection[str] = (),
     ) -> None:
         self.matrix = matrix
         self.pose = pose
@@ -107,6 +199,8 @@ class SignalStream:
         self._elapsed = self._way = 0.0
         self._smoothed = np.zeros(3)
         self._angles = np.zeros(len(robot.wheel_names))
+        self._gears = SteeringGears() if "steering_side" in needs else None
+        self._caster = Caster(robot) if "caster_rates" in needs else None
 
     def turn(self, angles: Array, wheel_angles: Array | None = None) -> None:
         """Turn the wheels by angles (N,) rad, or to the absolute ``wheel_angles`` (N,) if they are known."""
@@ -127,16 +221,17 @@ class SignalStream:
         duration: float,
         wheel_angles: Array | None = None,
         frame_heading: float = 0.0,
-        steering: Array | None = None,
+        steering: tuple[Array, Array] | None = None,
     ) -> Signals:
         """The signals (F = 1) of one sample: mean rates (N,) rad/s over a duration > 0 s, absolute angles at its end.
 
         Unknown angles are integrated from the last known ones, or from 0. frame_heading: heading of the stream's frame
-        in the reference's, rad; both have the same origin. steering (S,): angles in the sample's middle, rad.
+        in the reference's, rad; both have the same origin. steering: angles (S,) in the sample's middle and at its end,
+        rad.
         """
         turned = rates * duration
         self.turn(turned, wheel_angles)
-        steered = None if steering is None else steering[None]
+        steered = None if steering is None else steering[0][None]
         tracked = self.matrix @ self.robot.drive.signals(rates[None], steered)[0]
         twist = of_centre(self.robot, tracked[None])[0]
         gained = self._share * (twist - self._smoothed)
@@ -168,6 +263,9 @@ class SignalStream:
             self._session,
             poses,
             steered,
+            None if steering is None else steering_rates(steering[1][None], steered, durations),
+            None if steering is None or self._gears is None else self._gears.turned(steering[0])[None],
+            None if self._caster is None else np.array([self._caster.moved(twist.tolist(), duration)]),
         )
 
 

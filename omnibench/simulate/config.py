@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import product
 from typing import Annotated, Generic, Literal, Self, TypeVar
 
@@ -22,6 +23,7 @@ from omnibench.simulate.command import (
     straight_and_pivot,
     within_steering,
 )
+from omnibench.simulate.variation import Variation
 from omnibench.words import plural
 
 _MOST_NOISE = 1e4  # rad/s, or a factor; chosen: a hundred thousand turns a minute
@@ -142,6 +144,10 @@ class MotionGrid(Model):
                 )
         return self.directions_deg
 
+    def extremes(self, command: Command) -> tuple[Command, ...]:
+        """The commands between which a run of this one varies."""
+        return (command,)
+
     def grid(self, robot: Robot) -> list[Command]:
         """Every direction with every rate of turn, at each speed; the direction of a turn on the spot is 0.
 
@@ -162,6 +168,10 @@ class Commands(MotionGrid):
     """Motion commands and the ramps with which they are driven."""
 
     ramp: NonNegative = Field(0.0, description="time in which wheel rates rise and fall, which is added to the run, s")
+    variation: Variation = Field(Variation(), description="of the commands within a run")
+
+    def extremes(self, command: Command) -> tuple[Command, ...]:
+        return self.variation.extremes(command)
 
 
 class EncoderNoise(Noise):
@@ -200,23 +210,32 @@ class Experiment(Model, Generic[S]):
         except ValueError as error:
             raise ValueError(f"commands.{error}") from None
         if not self.driven:
-            raise ValueError(f"commands: {beyond_steering(self.robot, grid, self.steering_limit_deg)}")
+            raise ValueError(f"commands: {self._beyond(grid)}")
         return self
 
     @property
     def driven(self) -> list[Command]:
         """The commands within the steering limit, in the order of the grid."""
-        return within_steering(self.robot, self.commands.grid(self.robot), self.steering_limit_deg)[0]
+        return [command for command in self.commands.grid(self.robot) if self._is_steered(command)]
 
     @property
     def left_out(self) -> tuple[str, ...]:
         """A warning if commands are beyond the steering limit, and are not driven."""
         grid = self.commands.grid(self.robot)
-        _, beyond = within_steering(self.robot, grid, self.steering_limit_deg)
+        beyond = [command for command in grid if not self._is_steered(command)]
         if not beyond:
             return ()
-        why = beyond_steering(self.robot, beyond, self.steering_limit_deg)
-        return (f"{len(beyond)} of {plural(len(grid), 'command')} cannot be steered and are left out: {why}",)
+        left_out = f"{len(beyond)} of {plural(len(grid), 'command')} cannot be steered and are left out"
+        return (f"{left_out}: {self._beyond(beyond)}",)
+
+    def _is_steered(self, command: Command) -> bool:
+        extremes = self.commands.extremes(command)
+        return not within_steering(self.robot, extremes, self.steering_limit_deg)[1]
+
+    def _beyond(self, left_out: Sequence[Command]) -> str:
+        extremes = self.commands.extremes(left_out[0])
+        _, beyond = within_steering(self.robot, extremes, self.steering_limit_deg)
+        return beyond_steering(self.robot, beyond, self.steering_limit_deg)
 
     @property
     def sessions(self) -> dict[Split, S]:

@@ -17,10 +17,12 @@ from omnibench.simulate.config import Commands, FlowerConfig, Session
 from omnibench.simulate.pose_noise import reference_noise
 from omnibench.simulate.simulation import Simulation
 from omnibench.simulate.truth import TrueRobot, true_record
+from omnibench.simulate.variation import Variation
 from omnibench.words import plural
 
 _MANY = 1000  # runs whose checks and tables take more than about a second; chosen
 PAUSE = 10.0  # s between runs
+_STEADY = Variation()
 
 
 def simulate_flower(
@@ -38,6 +40,7 @@ def simulate_flower(
         name,
         integration=config.integration,
         noise=config.noise,
+        variation=config.commands.variation,
     )
     robot = truth.true_robot()
     trajectories: list[Trajectory] = []
@@ -74,25 +77,38 @@ def duration_of(command: Command, session: Session, chosen: Commands) -> float:
     return driven + chosen.ramp
 
 
-def commanded_rates(robot: Robot, command: Command, times: Array, ramp: float) -> Array:
+def commanded_rates(
+    robot: Robot, command: Command, times: Array, ramp: float, variation: Variation = _STEADY
+) -> Array:
     """Mean wheel rates (F, N) by the design values, rad/s, in samples that end at times (F,), s.
 
     ramp: time in which the rates rise and fall linearly, s.
     """
-    rates: Array = np.tile(wheels_of(robot, command.twist)[0], (len(times), 1))
+    rates: Array
+    if variation.is_none:
+        rates = np.tile(wheels_of(robot, command.twist)[0], (len(times), 1))
+    else:
+        rates, _ = variation.wheels(robot, command, times, ends=False)
     return rates if not ramp else rates * _mean_shares(times, ramp)[:, None]
 
 
-def commanded_steering(robot: Robot, command: Command, times: Array) -> Array | None:
-    """Steering angles (F, S) by the design values, rad, which hold throughout a run; None for robots without any."""
-    return None if robot.drive.direct else np.tile(wheels_of(robot, command.twist)[1], (len(times), 1))
+def commanded_steering(
+    robot: Robot, command: Command, times: Array, variation: Variation = _STEADY
+) -> Array | None:
+    """Steering angles (F, S) by the design values at times (F,), rad, s; None for robots without any."""
+    if robot.drive.direct:
+        return None
+    if variation.is_none:
+        return np.tile(wheels_of(robot, command.twist)[1], (len(times), 1))
+    return variation.wheels(robot, command, times, ends=True)[1]
 
 
-def true_steering(robot: Robot, run: Trajectory) -> Array | None:
-    """True steering angles (F, S), rad, of a simulated run; None for robots without any."""
+def true_steering(robot: Robot, run: Trajectory, variation: Variation = _STEADY) -> Array | None:
+    """Steering angles (F, S), rad, that exact encoders measure in a simulated run; None for robots without any."""
     chosen = straight_and_pivot(robot)
     pivot = (0.0, 0.0) if chosen is None else chosen[1]
-    return commanded_steering(robot, Command(run.v or 0.0, run.alpha or 0.0, run.omega or 0.0, pivot), run.times)
+    command = Command(run.v or 0.0, run.alpha or 0.0, run.omega or 0.0, pivot)
+    return commanded_steering(robot, command, run.times, variation)
 
 
 def _mean_shares(times: Array, ramp: float) -> Array:
@@ -139,9 +155,10 @@ def _drive(
     command, ramp = planned.command, config.commands.ramp
     duration = duration_of(command, session, config.commands)
     times, pose_times = stamps_of_run(duration, config.sample_period, config.pose_period)
-    targets = commanded_rates(config.robot, command, times, ramp)
+    variation = config.commands.variation
+    targets = commanded_rates(config.robot, command, times, ramp, variation)
     start = _start(config, rng)
-    driven, steering = robot.driven(times, targets), commanded_steering(config.robot, command, times)
+    driven, steering = robot.driven(times, targets), commanded_steering(config.robot, command, times, variation)
     log = robot.log(times, driven, start, pose_times, planned.angles, planned.started_at, planned.split, steering)
     rates = log.rates + config.noise.encoder * rng.standard_normal(targets.shape)
     if steering is not None:

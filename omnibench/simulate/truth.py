@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,16 +13,29 @@ from omnibench.config import Model
 from omnibench.errors import UnknownNameError
 from omnibench.registry import effects
 from omnibench.robot.calibration import EffectTerm, Row, matrix_rows
-from omnibench.robot.corrected import Corrected, check_needs, corrected
+from omnibench.robot.corrected import Corrected, check_needs, corrected, needs_of
 from omnibench.robot.effects.effect import ActuatorEffect
-from omnibench.robot.effects.term import make_term
+from omnibench.robot.effects.term import Term, check_applies, make_term
 from omnibench.robot.kinematics import Array, Mount, Robot, Wheel, inverse_kinematic_matrix
 from omnibench.robot.model import OdometryModel, reported_poses
 from omnibench.robot.odometry import Integration, WheelLog
 from omnibench.robot.published_matrices import published_matrix
-from omnibench.robot.signals import signals_of
+from omnibench.robot.signals import of_centre, signals_of
+from omnibench.robot.wheels.drive import in_the_middle
 from omnibench.simulate.config import EncoderNoise, Tolerances, Truth
+from omnibench.simulate.mechanics import (
+    BODY,
+    COUPLING,
+    LIGHT_WHEEL,
+    MECHANICS,
+    STEERING,
+    body_truth,
+    lost_by_light_wheels,
+    steering_truth,
+    turned_by_steering,
+)
 from omnibench.simulate.true_motion import TrueMotion
+from omnibench.simulate.variation import Variation
 from omnibench.simulate.wheel_contacts import WheelContacts
 
 _SETTLES = 3  # corrections of a car's rates for the effects on them, each of which leaves some 1 % of the one before
@@ -82,35 +96,77 @@ class TrueRobot:
 
     def poses(self, log: WheelLog) -> Array:
         """True poses (S, 3) of the tracked point at the log's stamps."""
-        return self.model.poses([log])[0] if self.contacts is None else self._path(log).poses(log.stamps)
+        return self.model.poses([log])[0] if self._by_model else self._path(log).poses(log.stamps)
 
     def reported(self, log: WheelLog) -> Array:
         """Poses (S, 3) that an exact reference reports at the log's stamps, with the effects on it."""
-        if self.contacts is None:
+        if self._by_model:
             return self.model.reported([log])[0]
         terms = self.model.reference_terms
         return reported_poses(terms, log, self._path) if terms else self.poses(log)
 
+    @property
+    def _by_model(self) -> bool:
+        """True if the model has the whole motion: without contacts, and without mechanics beside them."""
+        return self.contacts is None and MECHANICS.isdisjoint(term.name for term in self.model.motion_terms)
+
     def _path(self, log: WheelLog) -> TrueMotion:
-        assert self.contacts is not None  # without them the model has the path
         twists, true = self._motion(log)
         if true.body is not None:
             twists = twists + true.body
-        return TrueMotion(log.times, log.start, self.contacts.tracked(twists), self.model.integration, true.world)
+        mount = self.model.robot.mount
+        if self.contacts is not None:
+            twists = self.contacts.tracked(twists)
+        elif mount is not None:
+            twists = twists @ mount.twist.T
+        return TrueMotion(log.times, log.start, twists, self.model.integration, true.world)
 
     def _motion(self, log: WheelLog) -> tuple[Array, Corrected]:
         """Twists (F, 3) of the centre that the true wheels give, and the effects of motion on a log."""
-        assert self.contacts is not None
-        terms, model = self.model.motion_terms, self.model
+        model = self.model
+        check_needs(model.motion_terms, log)
+        mechanics = [term for term in model.motion_terms if term.name in MECHANICS]
+        terms = [term for term in model.motion_terms if term.name not in MECHANICS]
         true = Corrected(log.rates, log.middle_steering)
         if terms:
             assert model.sample_period is not None  # there are terms
-            check_needs(terms, log)
-            with_poses = any("poses" in term.effect.needs for term in terms)
-            true = corrected(
-                terms, signals_of(log, model.robot, model.matrix, model.sample_period, with_poses=with_poses)
-            )
-        return self.contacts.twists(true.rates, true.steering), true
+            true = corrected(terms, signals_of(log, model.robot, model.matrix, model.sample_period, needs_of(terms)))
+        if mechanics:
+            true = self._with_mechanics(log, true, mechanics)
+        return self._twists(true), true
+
+    def _twists(self, true: Corrected) -> Array:
+        """Twists (F, 3) of the centre that wheels give by their contacts, or by the matrix."""
+        if self.contacts is not None:
+            return self.contacts.twists(true.rates, true.steering)
+        robot = self.model.robot
+        return of_centre(robot, robot.drive.signals(true.rates, true.steering) @ self.model.matrix.T)
+
+    def _with_mechanics(self, log: WheelLog, true: Corrected, terms: Sequence[Term]) -> Corrected:
+        """Wheel samples as steering, casters and grip make them besides other effects: each in its own turn."""
+        robot, durations = self.model.robot, np.diff(log.times, prepend=0.0)
+        if log.steering is not None:
+            assert true.steering is not None
+            ends = log.steering
+            for term in terms:
+                if term.name in STEERING:
+                    ends = steering_truth(term.name, term.values, ends, durations)
+            true = replace(true, steering=true.steering + in_the_middle(ends) - in_the_middle(log.steering))
+            for term in terms:
+                if term.name == COUPLING:
+                    turned = turned_by_steering(term.values, robot.wheels, log.steering, durations)
+                    true = replace(true, rates=true.rates + turned)
+        for term in terms:
+            if term.name == LIGHT_WHEEL:
+                twists = self._twists(true)
+                lost = lost_by_light_wheels(term.values, robot.wheels, true.steering, twists, durations)
+                true = replace(true, rates=true.rates - lost)
+        twists = self._twists(true)
+        for term in terms:
+            if term.name in BODY:
+                added = body_truth(term.name, term.values, robot, twists, durations)
+                true = replace(true, body=added if true.body is None else true.body + added)
+        return true
 
 
 class TruthRecord(Model):
@@ -127,6 +183,7 @@ class TruthRecord(Model):
     steering_offsets: dict[str, float] = Field({}, description="drawn: true steering angle less the measured one, rad")
     mount: Mount | None = Field(None, description="the true tracked point, if it is not the robot's centre")
     lateral_friction: float = 0.0
+    variation: Variation = Field(Variation(), description="of the commands within a run")
 
     def true_robot(self, step: float | None = None) -> TrueRobot:
         """The true robot. step: of its motion, s; default: the sample period.
@@ -156,6 +213,7 @@ def true_record(
     *,
     integration: Integration = "arc",
     noise: EncoderNoise | None = None,
+    variation: Variation | None = None,
 ) -> TruthRecord:
     """The record of a data set's truth. UnknownNameError as for ``complete_effects``."""
     drawn = _drawn(truth, robot)
@@ -171,6 +229,7 @@ def true_record(
         steering_offsets={} if drawn is None else drawn.steering_offsets,
         mount=robot.mount if drawn is None else drawn.mount,
         lateral_friction=truth.lateral_friction,
+        variation=variation or Variation(),
     )
 
 
@@ -249,7 +308,9 @@ def _drawn_mount(given: Tolerances, robot: Robot, rng: np.random.Generator) -> M
 
 
 def _complete(term: EffectTerm, robot: Robot, sessions: tuple[str, ...], where: str) -> EffectTerm:
-    parameters = effects.create(term.name, where=where).parameters(robot, sessions)
+    effect = effects.create(term.name, where=where)
+    check_applies(effect, robot, f"{where}: effect {term.name!r}")
+    parameters = effect.parameters(robot, sessions)
     known = {parameter.name for parameter in parameters}
     for given in term.parameters:
         if given not in known:

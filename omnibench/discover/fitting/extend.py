@@ -37,6 +37,7 @@ from omnibench.robot.kinematics import Array, Robot
 _ROUNDS = 4  # rounds that fit noise and plain matrix by turns, at most; fewer where the noise stays within 2 %
 _NEAR = 0.02  # share of the largest component of the noise by which two noises may differ, see is_near
 _STEPS = 4  # Gauss-Newton steps, at most
+_HALVINGS = 10  # of a step that leads too far, at most: to a thousandth of it
 _STILL = 0.05  # standard errors: a smaller step, which no interval shows, ends the fit
 
 
@@ -58,10 +59,19 @@ class Extended:
 
     @property
     def residuals_without_effects(self) -> list[Array]:
-        """Nuisance-free residuals (K, 3) of each run with the effects' share put back, to first order."""
+        """Nuisance-free residuals (K, 3) of each run with the effects' share put back, to first order.
+
+        Of effects on steering angles, most of which the matrix can take up, only the rest is put back: to first order
+        the whole would lead too far.
+        """
         elements = self.fit.model.matrix.size
+        put_back = np.concatenate([np.zeros(elements), self.values])
+        if _bends(self.groups):
+            information = self.data.information[:elements]
+            put_back[:elements] = -np.linalg.pinv(information[:, :elements]) @ information[:, elements:] @ self.values
+        first = 0 if _bends(self.groups) else elements
         return [
-            residuals + columns[..., elements:] @ self.values
+            residuals + columns[..., first:] @ put_back[first:]
             for residuals, columns in zip(self.fit.nuisance_free_residuals, self.columns, strict=True)
         ]
 
@@ -144,13 +154,27 @@ def _descend(fit: Fit, groups: Sequence[Group], values: Array) -> tuple[Fit, Arr
     data = fit.whitened(columns)
     for _ in range(_STEPS):
         step, covariance = given(data, []).estimate(range(elements + len(values)))
-        values = values + step[elements:]
-        matrix = fit.model.matrix + step[:elements].reshape(fit.model.matrix.shape)
-        fit = at_model(fit, model_with(fit.model, matrix, terms_of(groups, values)))
-        data = fit.whitened(columns)
+        before, began, seen = fit, values, _chi_square(data)
+        for _ in range(_HALVINGS if _bends(groups) else 1):
+            values = began + step[elements:]
+            matrix = before.model.matrix + step[:elements].reshape(before.model.matrix.shape)
+            fit = at_model(before, model_with(before.model, matrix, terms_of(groups, values)))
+            data = fit.whitened(columns)
+            if _chi_square(data) < seen:
+                break
+            step = step / 2
         if _size(step, covariance) < _STILL:
             break
     return fit, values, data, columns
+
+
+def _bends(groups: Sequence[Group]) -> bool:
+    """True if a motion is not linear in an effect beyond small sizes: steering angles act by their tangents."""
+    return any(group.effect is not None and group.effect.stage == "steering" for group in groups)
+
+
+def _chi_square(data: Whitened) -> float:
+    return sum(float(np.square(of_run).sum()) for of_run in data.residuals)
 
 
 def _size(step: Array, covariance: Array) -> float:

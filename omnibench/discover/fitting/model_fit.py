@@ -126,7 +126,8 @@ def _coarser(log: WheelLog, together: int) -> WheelLog:
     times = log.times[ends]
     rates = np.diff(angles, axis=0, prepend=np.zeros((1, angles.shape[1]))) / np.diff(times, prepend=0.0)[:, None]
     phases = None if log.wheel_angles is None else log.wheel_angles[ends]
-    return replace(log, times=times, rates=rates, wheel_angles=phases)
+    steering = None if log.steering is None else log.steering[ends]
+    return replace(log, times=times, rates=rates, wheel_angles=phases, steering=steering)
 
 
 def at_model(fit: Fit, model: OdometryModel) -> Fit:

@@ -104,7 +104,7 @@ class _Twists:
 
     def __init__(self, paths: Paths) -> None:
         self._paths = paths
-        self._changes = {mode: paths.changes(direction(mode, paths.signals)) for mode in MODES}
+        self._changes = {mode: paths.changes(paths.tracked(direction(mode, paths.signals))) for mode in MODES}
 
     def slopes(self, modes: Sequence[str], shares: Array) -> Array:
         """Slopes (S, 3, m J) by changes in m modes, each times shares (F, J)."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from omnibench.errors import PluginError
+from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
@@ -63,17 +65,48 @@ class Paths:
         """Times (S,) of the stamps, s."""
         return np.concatenate([log.stamps for log in self.logs])
 
+    @cached_property
+    def driven(self) -> Array:
+        """Drive signals (F, M) of all samples, rad/s."""
+        return self.robot.drive.signals(self.signals.rates, self.signals.steering)
+
     def of_twist(self, direction: Array, shares: Array) -> Array:
-        """Slopes (S, 3, J) of the poses by changes direction (F, 3) times shares (F, J) of the twist."""
+        """Slopes (S, 3, J) by changes direction (F, 3) times shares (F, J) of the tracked point's twist."""
         return self.respond(self.changes(direction), shares)
+
+    def of_body(self, direction: Array, shares: Array) -> Array:
+        """Slopes (S, 3, J) by changes direction (F, 3) times shares (F, J) of the twist of the robot's centre."""
+        return self.of_twist(self.tracked(direction), shares)
+
+    def tracked(self, twists: Array) -> Array:
+        """Twists (F, 3) of the tracked point from those of the robot's centre."""
+        mount = self.robot.mount
+        return twists if mount is None else twists @ mount.twist.T
 
     def of_wheel(self, wheel: int, changes: Array) -> Array:
         """Slopes (S, 3, J) of the poses by changes (F, J) of one wheel's rate, rad/s."""
-        return self.respond(self.changes(self.matrix[:, wheel]), changes)
+        direct = self.robot.drive.direct
+        return self.respond(self.changes(self.matrix[:, wheel] if direct else self._by_rate[..., wheel]), changes)
 
     def of_rates(self, change: Array) -> Array:
         """Slopes (S, 3, 1) by a change (F, N) of all wheel rates."""
-        return self.respond(self.changes(change @ self.matrix.T), None)
+        if self.robot.drive.direct:
+            return self.respond(self.changes(change @ self.matrix.T), None)
+        return self.respond(self.changes(np.einsum("fin,fn->fi", self._by_rate, change)), None)
+
+    def of_steering(self, change: Array) -> Array:
+        """Slopes (S, 3, 1) by a change (F, S) of all steering angles, rad."""
+        return self.respond(self.changes(np.einsum("fin,fn->fi", self._slopes[1], change)), None)
+
+    @property
+    def _by_rate(self) -> Array:
+        return self._slopes[0]
+
+    @cached_property
+    def _slopes(self) -> tuple[Array, Array]:
+        """Derivatives (F, 3, N) and (F, 3, S) of the twists by the wheel rates and by the steering angles."""
+        by_rate, by_angle = self.robot.drive.slopes(self.signals.rates, self.signals.steering)
+        return self.matrix @ by_rate, self.matrix @ by_angle
 
     def of_velocity(self, change: Array) -> Array:
         """Slopes (S, 3, 1) by a change (F, 2) of the velocity in the reference's frame, m/s."""
@@ -82,7 +115,7 @@ class Paths:
         return self.respond(column, None)
 
     def correction(self, effect: MotionEffect, values: Mapping[str, float]) -> Array:
-        """Correction of every sample by an effect: of wheel rates (F, N), twists (F, 3) or velocities (F, 2)."""
+        """Correction of every sample by an effect, (F, n) as its stage has it: of rates, angles, twist or velocity."""
         parts = []
         for session, part in self.sessions:
             parts.append(_corrected(effect, _part(self.signals, part, session), values))
@@ -92,10 +125,15 @@ class Paths:
         """Slopes (S, 3, 1) by the parameter called ``unit`` of an effect. values: its shapes, and 0 for all else."""
         if isinstance(effect, ReferenceEffect):
             return self._of_reference(effect, unit, values)
-        change = self.correction(effect, {**values, unit: 1.0})
+        return self.of_correction(effect, self.correction(effect, {**values, unit: 1.0}))
+
+    def of_correction(self, effect: MotionEffect, change: Array) -> Array:
+        """Slopes (S, 3, 1) by a correction (F, n) at the stage of an effect."""
         if effect.stage == "body":
-            return self.of_twist(change, np.ones((len(change), 1)))
-        return self.of_velocity(change) if effect.stage == "world" else self.of_rates(change)
+            return self.of_body(change, np.ones((len(change), 1)))
+        if effect.stage == "world":
+            return self.of_velocity(change)
+        return self.of_steering(change) if effect.stage == "steering" else self.of_rates(change)
 
     def _of_reference(self, effect: ReferenceEffect, unit: str, values: Mapping[str, float]) -> Array:
         step = _STEP * next(each.largest for each in effect.parameters(self.robot) if each.name == unit)
@@ -152,9 +190,10 @@ def make_paths(robot: Robot, matrix: Array, logs: Sequence[WheelLog], sample_per
     """The paths of runs by a matrix alone, with exact arcs."""
     order = sorted(range(len(logs)), key=lambda index: str(logs[index].session))
     assert order == list(range(len(logs))), "runs come by session"
-    of_runs = [signals_of(log, robot, matrix, sample_period) for log in logs]
+    needs = _needs(robot)
+    of_runs = [signals_of(log, robot, matrix, sample_period, needs) for log in logs]
     paths = [
-        Path(log.times, log.start, signals.twists * signals.durations[:, None], "arc")
+        Path(log.times, log.start, (log.signals @ matrix.T) * signals.durations[:, None], "arc")
         for log, signals in zip(logs, of_runs, strict=True)
     ]
     ends = [path.ends for path in paths]
@@ -185,6 +224,12 @@ def make_paths(robot: Robot, matrix: Array, logs: Sequence[WheelLog], sample_per
         _turns=turns,
         _lever=poses[:, :2] - starts[run, :2],
     )
+
+
+def _needs(robot: Robot) -> frozenset[str]:
+    """Signals that effects which apply to a robot need; its poses are computed in any case."""
+    trial = [effects.create(entry.name) for entry in effects.entries()]
+    return frozenset().union(*(effect.needs for effect in trial if effect.applies(robot))) - {"poses"}
 
 
 def _along(times: Array, ends: Array, values: Array) -> Array:
@@ -234,7 +279,8 @@ def _sessions(logs: Sequence[WheelLog], counts: Sequence[int]) -> tuple[tuple[st
 
 def _corrected(effect: MotionEffect, signals: Signals, values: Mapping[str, float]) -> Array:
     """Correction by an effect. Raises PluginError where it fails, has another shape, or is not finite."""
-    width = {"body": 3, "world": 2}.get(effect.stage, signals.rates.shape[1])
+    steered = len(signals.robot.drive.steered)
+    width = {"body": 3, "world": 2, "steering": steered}.get(effect.stage, signals.rates.shape[1])
     way_out = f"try omnibench plugin check, or leave it out: --without {effect.name}"
     try:
         correction = np.asarray(effect.correction(signals, values), dtype=float)

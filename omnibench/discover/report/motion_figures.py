@@ -65,7 +65,7 @@ def motion_panels(
     for direction, (name, factor, unit) in zip(directions, MODES, strict=True):
         title, y_title = f"Error {name}, over {over}", f"error ({unit})"
         panel = Panel(title, x, (), x_title, y_title, unit, words=words, ticks=ticks)
-        parts.append((paths.of_twist(direction, bins), factor, panel))
+        parts.append((paths.of_body(direction, bins), factor, panel))
     return fitted_panels(residuals, styles, parts)
 
 
@@ -154,7 +154,7 @@ def wheel_rate_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> Figur
     """The error of each wheel's rim speed over its rate."""
     paths = residuals.paths
     parts = []
-    for index, wheel in enumerate(paths.robot.wheels):
+    for index, wheel in enumerate(paths.robot.measured):
         rates = np.abs(paths.signals.rates[:, index])
         top = float(np.quantile(rates, 0.998))
         if top < _STILL:
@@ -179,7 +179,7 @@ def wheel_angle_grid(residuals: Residuals, styles: Sequence[ModelStyle]) -> Figu
     times = "" if strongest == 1 else f"{strongest:g} × "
     edges = np.linspace(0, 360, _BINS + 1)
     parts = []
-    for index, wheel in enumerate(paths.robot.wheels):
+    for index, wheel in enumerate(paths.robot.measured):
         turned = np.degrees(strongest * angles[:, index]) % 360
         title, x_title = f"Wheel {wheel.name}, over its angle", f"{times}wheel angle (°)"
         panel = Panel(title, _middles(edges), (), x_title, "error of the rate (%)", "%", ticks=90)
@@ -231,7 +231,7 @@ def _spectrum_panels(residuals: Residuals, styles: Sequence[ModelStyle], angles:
         noise[:, :, index] = np.sqrt(np.square(fitted.errors.reshape(wheels, 2, 2)).mean(axis=1)).T
     return [
         Panel(
-            f"Wheel {paths.robot.wheels[wheel].name}, amplitudes",
+            f"Wheel {paths.robot.wheel_names[wheel]}, amplitudes",
             np.array(_HARMONICS),
             tuple(
                 Curve(style, 100 * amplitudes[style.index][wheel], 100 * CIRCLE_95 * noise[style.index][wheel])

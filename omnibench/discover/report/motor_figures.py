@@ -37,7 +37,7 @@ def motor_grid(discovery: Discovery, runs: Sequence[Trajectory]) -> FigureGrid |
     top = max(float(np.quantile(np.abs(each), 0.999)) for each in targets)
     edges = np.linspace(-top, top, _BINS + 1) * (1 + 1e-9)
     panels = []
-    for index, wheel in enumerate(discovery.dataset.robot.wheels):
+    for index, wheel in enumerate(discovery.dataset.robot.measured):
         bins = [shares(each[:, index], edges) * (each[:, [index]] != 0) for each in targets]
         curves = tuple(_curve(style, bins, [each[:, index] for each in own]) for style, own in errors)
         panels.append(_panel(f"Wheel {wheel.name}, over its target", edges, curves, "target rate (rad/s)"))

@@ -15,7 +15,7 @@ from omnibench.discover.regressors.covariate_bases import generic_bases
 from omnibench.discover.regressors.paths import Paths
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import Effect, MotionEffect, ReferenceEffect
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, Robot
 
 # Shapes of an effect: with more of them, one comes near enough to any other form. tests/benchmarks/constants.py varies
 # it by 0.5 and 2: on a small set with heading drift no verdict and no name changes.
@@ -57,7 +57,7 @@ def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Seque
         return tuple(range(count - new.shape[2], count))
 
     sessions = tuple(dict.fromkeys(run.session for run in trajectories if run.session is not None))
-    for effect in _candidates(without):
+    for effect in _candidates(paths.robot, without):
         if missing := _lacks(effect, paths, sessions):
             not_looked_for.append((effect.name, missing))
             continue
@@ -80,17 +80,19 @@ def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Seque
 
 
 def _of_matrix(paths: Paths) -> Array:
-    """Slopes (S, 3, 3N) by the elements of the matrix, of the samples of the other columns."""
-    rates = paths.signals.rates
-    return np.concatenate([paths.of_twist(np.tile(row, (len(rates), 1)), rates) for row in np.eye(3)], axis=2)
+    """Slopes (S, 3, 3M) by the elements of the matrix, of the samples of the other columns."""
+    driven = paths.driven
+    return np.concatenate([paths.of_twist(np.tile(row, (len(driven), 1)), driven) for row in np.eye(3)], axis=2)
 
 
-def _candidates(without: Sequence[str]) -> Iterator[MotionEffect | ReferenceEffect]:
+def _candidates(robot: Robot, without: Sequence[str]) -> Iterator[MotionEffect | ReferenceEffect]:
     for entry in effects.entries():
         if entry.name in without:
             continue
         effect: Effect = effects.create(entry.name)
-        if isinstance(effect, MotionEffect | ReferenceEffect) and effect.in_catalogue and not effect.run_nuisance:
+        if not isinstance(effect, MotionEffect | ReferenceEffect) or effect.run_nuisance:
+            continue
+        if effect.in_catalogue and effect.applies(robot):
             yield effect
 
 
@@ -124,12 +126,7 @@ def _forms(
         change = paths.correction(effect, {**values, name: 1.0})
         for power in (share, share**2):
             varied = change * (power if power.ndim == 2 else power[:, None])
-            if effect.stage == "body":
-                slopes.append(paths.of_twist(varied, np.ones((len(varied), 1))))
-            elif effect.stage == "world":
-                slopes.append(paths.of_velocity(varied))
-            else:
-                slopes.append(paths.of_rates(varied))
+            slopes.append(paths.of_correction(effect, varied))
     return np.concatenate(slopes, axis=2)
 
 
@@ -146,6 +143,8 @@ def _covariate(paths: Paths, effect: MotionEffect) -> Array | None:
         return _unit(np.hypot(signals.accelerations[:, 0], signals.accelerations[:, 1]))
     if effect.shows_in == "wheel angle" and signals.wheel_angles is not None:
         return np.cos(signals.wheel_angles)
+    if effect.shows_in == "steering angle" and signals.steering is not None:
+        return _unit(np.abs(signals.steering).mean(axis=1))
     if effect.shows_in == "command":
         return _unit(np.abs(signals.twists[:, 2]) + np.hypot(signals.twists[:, 0], signals.twists[:, 1]))
     return None

@@ -28,6 +28,7 @@ from omnibench.fit.least_squares.repetitions import grouped
 from omnibench.fit.least_squares.whitened import given
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import rotated
+from omnibench.robot.wheels.drive import in_the_middle
 
 _FEWEST = 50  # samples in which a wheel turns (chosen): with fewer, the smallest gap need not be one tick
 _DECADES = 20.0  # -log10 of the chance, Eq. (2), that angles are multiples: no set of recordings has so many (chosen)
@@ -103,16 +104,30 @@ def _quarter_ticks(run: Trajectory, poses: Array, matrix: Array, ticks: Array) -
     for wheel in np.flatnonzero(turning.any(axis=0) & (ticks > 0)):
         moving = np.flatnonzero(turning[:, wheel])
         first, last = moving[0], moving[-1]
-        moments = (run.times[first - 1] if first else 0.0, run.times[last])
-        for column, moment in zip((wheel, wheel + len(ticks)), moments, strict=True):
+        moments = ((first, run.times[first - 1] if first else 0.0), (last, run.times[last]))
+        for column, (sample, moment) in zip((wheel, wheel + len(ticks)), moments, strict=True):
             later = stamps > moment - 1e-9
             place = [float(np.interp(moment, run.pose_times, values)) for values in known.T]
-            columns[later, :, column] = _MEAN * ticks[wheel] * _turned(matrix[:, wheel], place, poses[later])
+            moved = _column(run, matrix, wheel, sample)
+            columns[later, :, column] = _MEAN * ticks[wheel] * _turned(moved, place, poses[later])
     return columns
 
 
+def _column(run: Trajectory, matrix: Array, wheel: int, sample: int) -> Array:
+    """The motion (3,) in the robot's frame by a radian more of a wheel in a sample, m, m, rad."""
+    column: Array
+    if run.drive is None:
+        column = matrix[:, wheel]
+    else:
+        assert run.steering is not None  # the drive steers
+        part = slice(sample, sample + 1)
+        by_rate, _ = run.drive.slopes(run.rates[part], in_the_middle(run.steering)[part])
+        column = matrix @ by_rate[0, :, wheel]
+    return column
+
+
 def _turned(wheel: Array, place: Sequence[float], poses: Array) -> Array:
-    """Changes (K, 3) of later poses by a radian more of a wheel (3,), its column of the matrix, at a place."""
+    """Changes (K, 3) of later poses by a radian more of a wheel that moves the robot by (3,), at a place."""
     x, y, heading = place
     step = rotated(wheel, heading)
     turn = wheel[2] * np.column_stack([y - poses[:, 1], poses[:, 0] - x])

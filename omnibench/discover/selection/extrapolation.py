@@ -31,7 +31,7 @@ _QUANTILE = 2.45  # sqrt(-2 ln 0.05), Eq. (2)
 def training_domain(extended: Extended) -> Array:
     """Representative motions (k, 3) of the runs of a fit, m/s, m/s, rad/s."""
     model = extended.fit.model
-    motions = [motions_of(model.matrix, run.times, run.rates) for run in extended.fit.runs]
+    motions = [motions_of(model.matrix, run.times, run.signals) for run in extended.fit.runs]
     return representatives(model.robot, np.concatenate(motions))
 
 
@@ -46,7 +46,7 @@ def extrapolations_of(
     extrapolations = []
     for members in grouped([run.command or run.id for run in runs]):
         of_command = [runs[index] for index in members]
-        motions = np.concatenate([motions_of(model.matrix, run.times, run.rates) for run in of_command])
+        motions = np.concatenate([motions_of(model.matrix, run.times, run.signals) for run in of_command])
         share, words = extrapolated_share(model.robot, domain, motions)
         if share:
             extrapolations.append(

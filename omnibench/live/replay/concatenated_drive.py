@@ -288,6 +288,7 @@ class _TruthOfRuns:
             )
         self._paths = recording.paths
         self._robot = recording.truth.true_robot()
+        self._variation = recording.truth.variation
 
     def poses(self, run: Trajectory, stamps: Array) -> Array:
         """True poses (K, 3) at stamps (K,), s since the run's start."""
@@ -297,6 +298,6 @@ class _TruthOfRuns:
             raise DataError(f"run {run.id}: its set points are not recorded, so its truth is not known")
         rates = self._robot.driven(run.times, run.targets)
         angles = run.angles[0] - run.rates[0] * run.times[0]  # before its first sample
-        steering = true_steering(self._robot.model.robot, run)
+        steering = true_steering(self._robot.model.robot, run, self._variation)
         log = self._robot.log(run.times, rates, run.start, stamps, angles, run.started_at, run.session, steering)
         return self._robot.poses(log)

@@ -6,8 +6,10 @@ import numpy as np
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Parameter, ReferenceEffect, Values
-from omnibench.robot.kinematics import Array
+from omnibench.robot.effects.per_wheel import of_wheels, one_for_each_wheel
+from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Complex
+from omnibench.robot.robot_class import class_of
 from omnibench.robot.signals import Signals
 
 _CENSI = (
@@ -100,3 +102,84 @@ class SamplePeriodScale(MotionEffect):
 
     def correction(self, signals: Signals, values: Values) -> Array:
         return values["s"] * signals.rates
+
+
+@effects.register("wheel_radius")
+class WheelRadius(MotionEffect):
+    """Wheels are larger or smaller than stated: omega (1 + k_i)."""
+
+    stage = "wheel"
+    physics = "Treads are worn, pumped up or pressed flat, and no two wheels are alike."
+    source = (
+        "J. Borenstein and L. Feng, Measurement and correction of systematic odometry errors in mobile robots, 1996 "
+        "(unequal wheel diameters)"
+    )
+    shows_in = "command"
+    measurement = "a tape: the way that each wheel rolls in ten turns under load"
+    only_for = "differential and skid-steered robots, tricycles and swerve drives"
+
+    def applies(self, robot: Robot) -> bool:
+        return class_of(robot) in ("differential", "skid", "tricycle", "swerve")
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return one_for_each_wheel(robot, "k", "1", -0.05, 0.05, "by how much the radius is larger")
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return of_wheels(signals.robot, "k", values) * signals.rates
+
+
+@effects.register("wheel_position")
+class WheelPosition(MotionEffect):
+    """Fixed wheels stand farther out than stated: omega + y_i w / r to the left, in the direction of rolling ahead."""
+
+    stage = "wheel"
+    physics = "The track is not the one of the drawing: wheels touch the floor at another place of their width."
+    source = (
+        "J. Borenstein and L. Feng, Measurement and correction of systematic odometry errors in mobile robots, 1996 "
+        "(uncertainty about the effective wheelbase)"
+    )
+    shows_in = "command"
+    measurement = "a ruler from wheel to wheel, or better: ten turns on the spot against a mark on the floor"
+    only_for = "differential and skid-steered robots"
+
+    def applies(self, robot: Robot) -> bool:
+        return class_of(robot) in ("differential", "skid")
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return one_for_each_wheel(robot, "y", "m", -0.02, 0.02, "by how much farther to the left it stands")
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        robot = signals.robot
+        along = np.cos([wheel.rolling for wheel in robot.measured])
+        return of_wheels(robot, "y", values) * along / robot.radii * signals.twists[:, 2:]
+
+
+@effects.register("driven_steering_offset")
+class DrivenSteeringOffset(MotionEffect):
+    """Driven wheels that steer do not point straight ahead where the measured angle is 0: phi + c_i, for small c_i."""
+
+    stage = "steering"
+    physics = "The zero of each angle's encoder was set by eye or by a switch."
+    source = "twist = K u: an offset turns the pair omega cos phi, omega sin phi of signals"
+    shows_in = "command"
+    measurement = "a straight edge along each wheel's side at a measured angle of 0"
+    only_for = "robots with a driven wheel that steers"
+
+    def applies(self, robot: Robot) -> bool:
+        return any(pair >= 0 for pair in robot.drive.pairs)
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return tuple(
+            Parameter(f"c_{name}", "rad", -0.05, 0.05, f"true angle where 0 is measured, wheel {name}")
+            for name in _driven_and_steered(robot)
+        )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        assert signals.steering is not None  # the robot steers
+        offsets = [values.get(f"c_{name}", 0.0) for name in signals.robot.drive.steered]
+        return np.tile(offsets, (len(signals.steering), 1))
+
+
+def _driven_and_steered(robot: Robot) -> tuple[str, ...]:
+    """Names of the wheels of which both rate and steering angle are measured."""
+    return tuple(robot.drive.steered[pair] for pair in robot.drive.pairs if pair >= 0)

@@ -6,7 +6,8 @@ import numpy as np
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
-from omnibench.robot.kinematics import Array
+from omnibench.robot.effects.per_wheel import has_rollers
+from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals
 
 _KNEE = 0.05  # rad/s, half-width of the smoothed sign function; chosen
@@ -40,6 +41,10 @@ class CoulombCreep(MotionEffect):
     source = "F. W. Carter, On the action of a locomotive driving wheel, 1926; H. Olsson et al., 1998 (friction)"
     shows_in = "wheel rate"
     fixed_parameters = (Parameter("c", "1", -0.02, 0.02, "creep as a share of the robot's speed"),)
+    only_for = "robots with a wheel on rollers"
+
+    def applies(self, robot: Robot) -> bool:
+        return has_rollers(robot)
 
     def correction(self, signals: Signals, values: Values) -> Array:
         speed = np.hypot(signals.twists[:, 0], signals.twists[:, 1])

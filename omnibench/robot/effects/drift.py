@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.robot_class import class_of
 from omnibench.robot.signals import STILL, Signals
 
 
@@ -69,6 +70,35 @@ class StartTransient(MotionEffect):
         lost = values["k"] * np.exp(-signals.travelled / values["length"])
         added = np.zeros(signals.twists.shape)
         added[:, :2] = -lost[:, None] * signals.twists[:, :2]
+        return added
+
+
+@effects.register("caster_pull")
+class CasterPull(MotionEffect):
+    """A caster that swings round takes the robot along: w + k times the rate of its swing.
+
+    The caster stands as far behind the centre as the wheels beside it, and has a trail of 5 cm (signals.py). The side
+    to which it swings is that of the turn; where the robot goes straight back, it is chance, and nothing is added.
+    """
+
+    stage = "body"
+    physics = "Friction in a caster's swivel, and of its tread on the floor, turns the robot while the caster swings."
+    source = (
+        "J. Borenstein and L. Feng, Measurement and correction of systematic odometry errors in mobile robots, 1996 "
+        "(internal forces by castor wheels)"
+    )
+    shows_in = "command"
+    needs = frozenset({"caster_rates"})
+    only_for = "differential drives, which casters hold up"
+    fixed_parameters = (Parameter("k", "1", -0.05, 0.05, "turn of the robot per turn of the caster"),)
+
+    def applies(self, robot: Robot) -> bool:
+        return class_of(robot) == "differential"
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        assert signals.caster_rates is not None  # they are needed
+        added = np.zeros(signals.twists.shape)
+        added[:, 2] = values["k"] * signals.caster_rates
         return added
 
 

@@ -12,7 +12,7 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals
 
 Stage = Literal["actuator", "wheel", "steering", "clock", "body", "world", "reference"]
-Need = Literal["wheel_angles", "session_time", "session", "targets", "poses"]
+Need = Literal["wheel_angles", "session_time", "session", "targets", "poses", "steering_side", "caster_rates"]
 Values = Mapping[str, float]
 
 
@@ -42,10 +42,12 @@ class Effect(ABC):
     """A term that can be added to the odometry model. Derive from one of the three kinds below.
 
     stage: where it acts. physics: a sentence on its cause. source: literature. shows_in: the covariate on which the
-    residual depends. needs: data that must have been recorded. run_nuisance: True if it has one value for each run,
-    which is estimated and reported but is no answer of ``discover``. measurement: how to measure it, for an effect that
-    a change of the matrix can absorb. fixed_parameters: parameters that are the same for every robot; otherwise
-    override ``parameters``. in_catalogue: False for a smooth function without physics, which ``discover`` never names.
+    residual depends. needs: data that must have been recorded, and signals that are computed only on demand.
+    run_nuisance: True if it has one value for each run, which is estimated and reported but is no answer of
+    ``discover``. measurement: how to measure it, for an effect that a change of the matrix can absorb. only_for: the
+    robots to which it applies, in words, where these are not all; then override ``applies``. fixed_parameters:
+    parameters that are the same for every robot; otherwise override ``parameters``. in_catalogue: False for a smooth
+    function without physics, which ``discover`` never names.
     """
 
     name: ClassVar[str]
@@ -57,10 +59,15 @@ class Effect(ABC):
     run_nuisance: ClassVar[bool] = False
     in_catalogue: ClassVar[bool] = True
     measurement: ClassVar[str] = ""
+    only_for: ClassVar[str] = ""
     fixed_parameters: ClassVar[tuple[Parameter, ...]] = ()
 
     def __init__(self, options: Options | None = None) -> None:
         self.options = options or Options()
+
+    def applies(self, robot: Robot) -> bool:  # noqa: ARG002
+        """True for a robot that has what the effect acts on."""
+        return True
 
     def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
         """The parameters for a robot; sessions: names, in order, of the sessions that are fitted."""

@@ -8,6 +8,11 @@ from omnibench.robot.effects.effect import Parameter, Values
 from omnibench.robot.kinematics import Array, Robot
 
 
+def has_rollers(robot: Robot) -> bool:
+    """True if a wheel with a measured rate has rollers."""
+    return any(wheel.kind in ("omni", "mecanum") for wheel in robot.measured)
+
+
 def one_for_each_wheel(
     robot: Robot, prefix: str, unit: str, low: float, high: float, description: str
 ) -> tuple[Parameter, ...]:

@@ -6,10 +6,12 @@ import numpy as np
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
-from omnibench.robot.kinematics import Array
+from omnibench.robot.effects.per_wheel import of_wheels, one_for_each_wheel
+from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals
 
 _PACEJKA = "H. B. Pacejka, Tire and Vehicle Dynamics"
+_WOBBLES = 4  # wheels: three stand on any floor, of four one may be lighter
 
 
 def _centripetal(twists: Array) -> Array:
@@ -108,3 +110,65 @@ class QuadraticRotationSlip(MotionEffect):
         added = np.zeros(signals.twists.shape)
         added[:, 2] = -values["k"] * rate_of_turn * np.abs(rate_of_turn)
         return added
+
+
+@effects.register("icr_shift")
+class IcrShift(MotionEffect):
+    """The faster a skid-steered robot turns, the farther ahead it has its centre of rotation: vy - x w abs(w).
+
+    What the rate of turn itself loses by wider tracks is quadratic_rotation_slip.
+    """
+
+    stage = "body"
+    physics = "The floor's friction across the wheels turns with their load, which turning shifts between the axles."
+    source = (
+        "A. Mandow et al., Experimental kinematics for wheeled skid-steer mobile robots, 2007; J. Pentzer, S. Brennan "
+        "and K. Reichard, Model-based prediction of skid-steer robot kinematics using online estimation of track "
+        "instantaneous centers of rotation, 2014"
+    )
+    shows_in = "command"
+    only_for = "skid-steered robots"
+    fixed_parameters = (Parameter("x", "m s/rad", -0.1, 0.1, "way ahead of the centre of rotation per rate of turn"),)
+
+    def applies(self, robot: Robot) -> bool:
+        return robot.skid
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        rate_of_turn = signals.twists[:, 2]
+        added = np.zeros(signals.twists.shape)
+        added[:, 1] = -values["x"] * rate_of_turn * np.abs(rate_of_turn)
+        return added
+
+
+@effects.register("light_wheel")
+class LightWheel(MotionEffect):
+    """A wheel that stands lightly slips in proportion to the force that is asked of it: omega - k_i a.u_i / r.
+
+    u_i is the direction in which the wheel drives the robot, a the whole acceleration of the body in its own frame,
+    dv/dt + w x v.
+    """
+
+    stage = "wheel"
+    physics = "Four wheels or more share the weight as floor and frame will have it; grip goes with a wheel's share."
+    source = f"{_PACEJKA} (slip stiffness in proportion to the load)"
+    shows_in = "acceleration"
+    only_for = "robots on four measured wheels or more"
+
+    def applies(self, robot: Robot) -> bool:
+        return len(robot.wheel_names) >= _WOBBLES
+
+    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
+        return one_for_each_wheel(robot, "k", "s", 0.0, 0.1, "rim speed that is lost per acceleration")
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        robot, acceleration = signals.robot, signals.accelerations[:, :2] + _centripetal(signals.twists)
+        lost = np.empty(signals.rates.shape)
+        for index, (wheel, pair) in enumerate(zip(robot.measured, robot.drive.pairs, strict=True)):
+            rollers = wheel.roller_angle
+            angles = wheel.rolling - rollers
+            if pair >= 0:
+                assert signals.steering is not None  # the robot steers
+                angles = angles + signals.steering[:, pair]
+            driving = np.cos(angles) * acceleration[:, 0] + np.sin(angles) * acceleration[:, 1]
+            lost[:, index] = driving / (wheel.radius * np.cos(rollers))
+        return -of_wheels(robot, "k", values) * lost

@@ -39,11 +39,13 @@ def make_term(
 ) -> Term:
     """The effect called ``name`` with values of its parameters for a robot, in the given order.
 
-    UnknownNameError: no such effect, or no such parameter. DataError: a parameter is missing, is no finite number, is a
-    thousand times larger than plausible, or has ``choices`` and lies outside its range. Messages begin with ``where``.
+    UnknownNameError: no such effect, or no such parameter. DataError: the effect does not apply to the robot, or a
+    parameter is missing, is no finite number, is a thousand times larger than plausible, or has ``choices`` and lies
+    outside its range. Messages begin with ``where``.
     """
     effect = effects.create(name, where=where)
     prefix = f"{where}: effect {name!r}" if where else f"effect {name!r}"
+    check_applies(effect, robot, prefix)
     known = {parameter.name: parameter for parameter in effect.parameters(robot, sessions)}
     for given, value in parameters.items():
         if given not in known and not effect.accepts(given):
@@ -59,6 +61,12 @@ def make_term(
                 f"{prefix}: parameter {parameter.name!r} ({parameter.unit}) is missing; {parameter.description}"
             )
     return Term(effect, MappingProxyType({given: float(value) for given, value in parameters.items()}))
+
+
+def check_applies(effect: Effect, robot: Robot, prefix: str) -> None:
+    """DataError, in one line that begins with ``prefix``: the effect does not apply to the robot."""
+    if not effect.applies(robot):
+        raise DataError(f"{prefix} is for {effect.only_for}; robot {robot.name} is none, leave the effect out")
 
 
 def _is_number(value: object) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Parameter, Values
-from omnibench.robot.effects.per_wheel import one_for_each_wheel
+from omnibench.robot.effects.per_wheel import has_rollers, one_for_each_wheel
 from omnibench.robot.effects.smooth import waves
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals
@@ -83,6 +83,10 @@ class RollerRipple(MotionEffect):
     source = "first principles"
     shows_in = "wheel angle"
     needs = frozenset({"wheel_angles"})
+    only_for = "robots with a wheel on rollers"
+
+    def applies(self, robot: Robot) -> bool:
+        return has_rollers(robot)
 
     def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
         counts = tuple(float(count) for count in range(3, 17))
