@@ -164,6 +164,7 @@ def calibration_of(run: ScoredRun, result: ComparisonResult) -> Calibration:
             options=run.record.options,
             seed=run.record.seed,
             cost=result.config.cost.name,
+            loss=None if result.config.loss == "squares" else result.config.loss,
             box=run.record.box,
             on_bounds=run.record.at_bounds,
             versions=result.environment.versions,

@@ -13,6 +13,8 @@ from omnibench.fit.calibrator import Calibrator, RunResult, run_calibrator
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import verdict_on
 from omnibench.fit.geometry import FittedParameter, GeometryLimits, WheelGeometry, fitted_parameters
+from omnibench.fit.loss.losses import LossName
+from omnibench.fit.loss.robust_cost import with_loss
 from omnibench.fit.parameterisation import (
     Box,
     ParameterisationName,
@@ -58,6 +60,7 @@ def calibrate(
     *,
     options: Mapping[str, Any] | None = None,
     cost: str = "final_pose",
+    loss: LossName = "squares",
     parameterisation: ParameterisationName | None = None,
     box: Box = "row",
     limits: GeometryLimits | None = None,
@@ -87,7 +90,8 @@ def calibrate(
     chosen: Calibrator = calibrators.create(calibrator, options)
     if intervals and not chosen.exact:
         raise ConfigError("intervals are drawn about a minimum to rounding: use the calibrator closed_form")
-    objective: Cost = costs.create(cost)
+    plain: Cost = costs.create(cost)
+    objective = with_loss(plain, loss)
     training = training_split(dataset)
     unidentified = unidentified or default_unidentified(dataset.robot)
     if intervals and unidentified == "shrink":
@@ -140,6 +144,7 @@ def calibrate(
             options=chosen.options.model_dump(mode="json"),
             seed=seed,
             cost=cost,
+            loss=None if loss == "squares" else loss,
             box=problem.box,
             unidentified=unidentified,
             tolerance=tolerance,

@@ -24,7 +24,7 @@ from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array
 
 if TYPE_CHECKING:
-    from omnibench.fit.sum_of_norms import SumOfNormsProgram
+    from omnibench.fit.loss.sum_of_norms import SumOfNormsProgram
 
 # The matrices of closed_form are the same with half of each of these numbers and with twice
 # (tests/benchmarks/constants_fit.py).
@@ -51,11 +51,11 @@ class ClosedForm(Calibrator):
 
     def __init__(self, options: ClosedFormOptions) -> None:
         super().__init__(options)
-        import omnibench.fit.sum_of_norms  # noqa: F401 (importing cvxpy takes a second: do it before time is measured)
+        import omnibench.fit.loss.sum_of_norms  # noqa: F401 (importing cvxpy takes a second: do it before time is measured)
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """The optimum in the box. ConfigError for another parameterisation or a cost that is no sum of norms."""
-        from omnibench.fit.sum_of_norms import SolverError
+        from omnibench.fit.loss.sum_of_norms import SolverError
 
         if not isinstance(problem.parameterisation, MatrixElements):
             raise ConfigError("closed_form works on the matrix parameterisation; search the geometry with another")
@@ -109,7 +109,7 @@ def linear_start(problem: CalibrationProblem) -> Array:
 
 def cone_program(problem: CalibrationProblem, objective: SumOfNorms, vector: Array) -> SumOfNormsProgram:
     """A program for the best step from ``vector``: the cost with the poses linearised there."""
-    from omnibench.fit.sum_of_norms import SumOfNormsProgram
+    from omnibench.fit.loss.sum_of_norms import SumOfNormsProgram
 
     matrix = problem.matrix(vector)
     used = np.flatnonzero(objective.weights)

@@ -26,13 +26,13 @@ from pydantic import Field, model_validator
 
 from omnibench.config import Positive
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.cost_weights import cost_weightings
 from omnibench.fit.least_squares.gauss_newton import BoxedFit, Descent, descend, first_fit
 from omnibench.fit.least_squares.noise import FIRST_NOISE, NoiseEstimate, is_near, whiteners
 from omnibench.fit.least_squares.nuisance_noise import FitNoise, noise_of_fit
 from omnibench.fit.least_squares.nuisances import TURN, Nuisances
 from omnibench.fit.least_squares.trajectory_covariance import FitCovariance
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
+from omnibench.fit.loss.cost_weights import cost_weightings
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.registry import Options, calibrators
