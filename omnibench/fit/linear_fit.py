@@ -48,7 +48,7 @@ def linear_system(
     used: for each run, True (K,) for the reference poses between which headings are interpolated; default all.
     """
     moved = reference - np.array([run.start for run in runs])[odometry.trajectory]
-    chosen = [slice(None)] * len(runs) if used is None else used
+    chosen = [np.ones(len(run.poses), dtype=bool) for run in runs] if used is None else used
     headings = [
         np.interp(np.append(0.0, run.times[:-1]), run.pose_times[near], run.poses[near, 2])
         for run, near in zip(runs, chosen, strict=True)

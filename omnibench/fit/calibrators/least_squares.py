@@ -35,8 +35,6 @@ from omnibench.robot.kinematics import Array
 
 _MOST_FITS = 200  # reweighted fits of one loss; Huber's take about 20
 _STILL = 1e-7  # share of the box: a smaller change of every number ends them
-# Weight below which a pose counts as off, and its heading is not used: ten times Huber's corner.
-_OFF = 0.1
 _MOST_ROUNDS = 5  # choices of the headings that are used; two or three settle
 
 
@@ -122,16 +120,18 @@ class _LinearErrors:
 
 def _robust_minimum(problem: CalibrationProblem, objective: RobustCost) -> tuple[Array, str, bool]:
     """The vector (n,) of the least loss, how it was found, and True if the fits settled."""
-    losses = [Huber(objective.loss.coordinates)]
-    losses += [] if objective.loss.name == "huber" else [objective.loss]
-    used, fits = None, 0
+    huber: Loss = Huber(objective.loss.coordinates)
+    losses = [huber] if objective.loss.name == "huber" else [huber, objective.loss]
+    used: list[NDArray[np.bool_]] | None = None
+    fits = 0
     for _ in range(_MOST_ROUNDS):
         errors = _LinearErrors(problem, used)
         vector = errors.minimum(None)
         for loss in losses:
             vector, count, settled = _reweighted(errors, loss, vector)
             fits += count
-        before, used = used, _poses_used(problem, _weights(errors, objective.loss, vector))
+        before = used
+        used = _poses_used(problem, objective.loss.is_near(errors.norms(vector), errors.shares))
         if before is not None and all(map(np.array_equal, before, used)):
             break
     return vector, f"{fits} reweighted quadratic programs", settled
@@ -151,16 +151,16 @@ def _reweighted(errors: _LinearErrors, loss: Loss, vector: Array) -> tuple[Array
     return vector, _MOST_FITS, False
 
 
-def _poses_used(problem: CalibrationProblem, weights: Array) -> list[NDArray[np.bool_]]:
-    """The poses (K + 1,) of each run whose headings are used: those at stamps of weights (S,) that are not off.
+def _poses_used(problem: CalibrationProblem, near: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+    """The poses (K + 1,) of each run whose headings are used: all but those at the stamps that are not near (S,).
 
     Where most are, the start is, and all headings are used: a start that is off is off by a shift or turn alone.
     """
     used = []
     for index, run in enumerate(problem.trajectories):
-        near = weights[problem.odometry.trajectory == index] >= _OFF
+        of_run = near[problem.odometry.trajectory == index]
         chosen = np.ones(len(run.pose_times), dtype=bool)
-        if near.mean() > 1 / 2:
-            chosen[len(chosen) - len(near) :] = near
+        if of_run.mean() > 1 / 2:
+            chosen[len(chosen) - len(of_run) :] = of_run
         used.append(chosen)
     return used

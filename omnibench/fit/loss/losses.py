@@ -36,6 +36,7 @@ from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtr
 
 from omnibench.robot.kinematics import Array
@@ -47,6 +48,9 @@ LEAST_SCALE = 1e-9
 # Norms of d coordinates beyond which Huber's loss is linear. Each leaves 95 % of the efficiency of squares for normal
 # errors, as 1.345 does for one coordinate (Holland and Welsch, Comm. Stat. A 6:813, 1977; Huber 1981, section 4.2).
 CORNERS: Mapping[int, float] = MappingProxyType({1: 1.345, 2: 1.501, 3: 1.628})
+# Share of the weight of a small error below which a pose counts as one that has jumped, and is left out of estimates
+# that have no loss: errors of more than 8 (huber) or 4 (student_t) of their scales.
+OFF = 0.2
 DEGREES_OF_FREEDOM = 4.0  # Lange, Little and Taylor 1989
 _MOST_STEPS = (
     100  # Newton's steps for the scale; errors of one size take 5, with a twentieth of them 100 times as large 15
@@ -84,6 +88,11 @@ class Loss(ABC):
     @abstractmethod
     def weights(self, ratios: Array) -> Array:
         """Weights w (...), Eq. (5), of ratios x (...) of norms to their scale."""
+
+    def is_near(self, norms: Array, shares: Array) -> NDArray[np.bool_]:
+        """True (S,) for the norms (S,) that are not far off the others, by their weights."""
+        ratios = norms / self.scales(norms[None], shares)[0]
+        return np.asarray(self.weights(ratios) >= OFF * self.weights(np.zeros(1)))
 
     @abstractmethod
     def slopes(self, ratios: Array) -> Array:

@@ -45,6 +45,11 @@ def with_loss(cost: Cost, loss: LossName) -> Cost:
     return RobustCost(cost, chosen)
 
 
+def loss_of(cost: Cost) -> LossName:
+    """The loss of a cost."""
+    return cost.loss.name if isinstance(cost, RobustCost) else "squares"
+
+
 def norms_of(cost: Cost) -> SumOfNorms | None:
     """The sum of norms that a cost is, or whose norms a robust loss weighs; None for other costs."""
     base = cost.base if isinstance(cost, RobustCost) else cost
