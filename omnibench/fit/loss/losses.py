@@ -94,6 +94,11 @@ class Loss(ABC):
         ratios = norms / self.scales(norms[None], shares)[0]
         return np.asarray(self.weights(ratios) >= OFF * self.weights(np.zeros(1)))
 
+    def mean_curvature(self, ratios: Array, shares: Array) -> float:
+        """Mean second derivative of the loss over the d directions of errors at ratios (S,), over the mean weight."""
+        weights = self.weights(ratios)
+        return max(1 + float(self.slopes(ratios) @ shares) / (self.coordinates * float(weights @ shares)), OFF)
+
     @abstractmethod
     def slopes(self, ratios: Array) -> Array:
         """Derivatives x w'(x) (...) of the weights by the logarithm of the ratios x (...)."""

@@ -29,9 +29,13 @@ class RobustCost(Cost):
 
     def weights(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
         """Weights (S,), Eq. (5), of errors (S, 3) of one candidate; 1 or less for Huber's, for t up to (n + d) / n."""
+        return self.loss.weights(self.ratios(errors, trajectory))
+
+    def ratios(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
+        """Norms (S,) of errors (S, 3) of one candidate over their scale."""
         norms = self.base.norms(errors)
-        scale = self.loss.scales(norms[None], self.base.shares(trajectory))[0]
-        return self.loss.weights(norms / scale)
+        ratios: Array = norms / self.loss.scales(norms[None], self.base.shares(trajectory))[0]
+        return ratios
 
 
 def with_loss(cost: Cost, loss: LossName) -> Cost:
