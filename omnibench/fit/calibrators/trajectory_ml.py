@@ -145,9 +145,9 @@ class TrajectoryML(Calibrator):
             now = descend(fit, weightings, self.options.tolerance)
             moved = now.fit.vector - before.vector
             still = float(moved @ now.data.information @ moved) < _STILL**2
-            settled = now.settled and (
-                still or (earlier is not None and not heavy and is_near(noise.sizes, earlier.sizes, _NEAR))
-            )
+            if heavy is None:  # weights may still change where the noise does not
+                still = still or (earlier is not None and is_near(noise.sizes, earlier.sizes, _NEAR))
+            settled = now.settled and still
             rounds += 1
         assert noise is not None  # there is at least one round
         return self._conclude(now, noise.estimate, rounds, settled, 1.0 if heavy is None else heavy.curvature)
@@ -156,7 +156,7 @@ class TrajectoryML(Calibrator):
         self, now: Descent, noise: NoiseEstimate, rounds: int, settled: bool, curvature: float
     ) -> TrajectoryEstimate:
         """The maximum likelihood estimate, or the one weighted by the cost if the model misfits; its covariance."""
-        options, problem, fit = self.options, now.fit.problem, now.fit.trajectories
+        options, fit = self.options, now.fit.trajectories
         covariance = self._covariance(now, noise, curvature)
         misfit = covariance.scatter.words if covariance.scatter and covariance.scatter.lack_of_fit else ""
         by_cost = options.weights == "cost" or (
