@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.least_squares.gauss_newton import bounded_step
 from omnibench.fit.linear_fit import linear_system
 from omnibench.fit.loss.losses import Huber, Loss
 from omnibench.fit.loss.robust_cost import RobustCost, norms_of
@@ -57,7 +58,7 @@ class LeastSquares(Calibrator):
         if isinstance(problem.objective, RobustCost):
             vector, reason, settled = _robust_minimum(problem, problem.objective)
         else:
-            vector, reason, settled = _LinearErrors(problem).minimum(None), "one quadratic program", True
+            vector, reason, settled = _LinearErrors(problem).minimum(), "one quadratic program", True
         vector = problem.settled(vector)
         problem.cost(vector[None])
         return Solution(vector, reason, settled)
@@ -88,29 +89,33 @@ class _LinearErrors:
         self._missing = moved - rows @ problem.matrix(problem.start).ravel()
         # In units of the box the program is well scaled.
         self.unit = np.where(problem.free, (problem.upper - problem.lower) / 2, 1.0)
-        self._slopes = problem.parameterisation.slopes(problem.start) * self.unit
+        self._slopes = problem.parameterisation.slopes(problem.start)
 
     def norms(self, vector: Array) -> Array:
         """Norms (S,) of W e_s at a vector (n,)."""
-        step = (vector - self._problem.start) / self.unit
-        return np.linalg.norm((self._rows @ (self._slopes @ step) - self._missing) * self._weights, axis=1)
+        moved = self._rows @ (self._slopes @ (vector - self._problem.start))
+        return np.linalg.norm((moved - self._missing) * self._weights, axis=1)
 
-    def minimum(self, weights: Array | None) -> Array:
+    def reweighted(self, weights: Array) -> Array:
         """The vector (n,) of the box that minimises Eq. (2), its terms times weights (S,)."""
+        factors = np.sqrt(self.shares * weights)[:, None] * self._weights
+        missing = (factors * self._missing).ravel()
+        columns = (factors[..., None] * self._rows).reshape(len(missing), -1) @ self._slopes
+        start = self._problem.start
+        return start + bounded_step(self._problem, start, columns.T @ columns, -columns.T @ missing)
+
+    def minimum(self) -> Array:
+        """The vector (n,) of the box that minimises Eq. (2)."""
         import cvxpy as cp
 
         from omnibench.fit.loss.sum_of_norms import solve_program
 
         problem, unit = self._problem, self.unit
-        shares = self.shares if weights is None else self.shares * weights
-        factors = np.sqrt(shares)[:, None] * self._weights
+        factors = np.sqrt(self.shares)[:, None] * self._weights
         missing = (factors * self._missing).ravel()
         step = cp.Variable(problem.size)
-        columns = (factors[..., None] * self._rows).reshape(len(missing), -1) @ self._slopes
-        if weights is not None:  # the same program in fewer rows, which is solved many times
-            basis, columns = np.linalg.qr(columns)
-            missing = basis.T @ missing
-        errors = columns @ step - missing
+        slopes = self._slopes * unit
+        errors = (factors[..., None] * self._rows).reshape(len(missing), -1) @ slopes @ step - missing
         scale = max(float(np.abs(missing).max()), np.finfo(float).tiny)
         within = [step >= (problem.lower - problem.start) / unit, step <= (problem.upper - problem.start) / unit]
         solve_program(cp.Problem(cp.Minimize(cp.sum_squares(errors / scale)), within))
@@ -122,19 +127,18 @@ def _robust_minimum(problem: CalibrationProblem, objective: RobustCost) -> tuple
     """The vector (n,) of the least loss, how it was found, and True if the fits settled."""
     huber: Loss = Huber(objective.loss.coordinates)
     losses = [huber] if objective.loss.name == "huber" else [huber, objective.loss]
-    used: list[NDArray[np.bool_]] | None = None
-    fits = 0
+    errors = _LinearErrors(problem)
+    vector, used, fits, settled = errors.minimum(), np.ones(errors.shares.shape, dtype=bool), 0, True
     for _ in range(_MOST_ROUNDS):
-        errors = _LinearErrors(problem, used)
-        vector = errors.minimum(None)
         for loss in losses:
             vector, count, settled = _reweighted(errors, loss, vector)
             fits += count
-        before = used
-        used = _poses_used(problem, objective.loss.is_near(errors.norms(vector), errors.shares))
-        if before is not None and all(map(np.array_equal, before, used)):
+        losses, before = losses[-1:], used
+        used = objective.loss.is_near(errors.norms(vector), errors.shares)
+        if np.array_equal(before, used):
             break
-    return vector, f"{fits} reweighted quadratic programs", settled
+        errors = _LinearErrors(problem, _poses_used(problem, used))
+    return vector, f"{fits} reweighted fits", settled
 
 
 def _weights(errors: _LinearErrors, loss: Loss, vector: Array) -> Array:
@@ -145,7 +149,7 @@ def _weights(errors: _LinearErrors, loss: Loss, vector: Array) -> Array:
 def _reweighted(errors: _LinearErrors, loss: Loss, vector: Array) -> tuple[Array, int, bool]:
     """The vector (n,) that its own weights lead back to, from another one, after how many fits, and True if it does."""
     for count in range(1, _MOST_FITS + 1):
-        before, vector = vector, errors.minimum(_weights(errors, loss, vector))
+        before, vector = vector, errors.reweighted(_weights(errors, loss, vector))
         if (np.abs(vector - before) < _STILL * errors.unit).all():
             return vector, count, True
     return vector, _MOST_FITS, False
