@@ -123,6 +123,11 @@ class CompareConfig(Model):
     certificate: CertificateChoice | None = Field(CertificateChoice(), description="null: prove nothing")
     published_results: tuple[PublishedResult, ...] = ()
 
+    @property
+    def objective(self) -> str:
+        """The names of the cost and of its loss, if it has a robust one."""
+        return self.cost.name if self.loss == "squares" else f"{self.cost.name}, loss {self.loss}"
+
     @field_validator("calibrators", mode="before", json_schema_input_type=tuple[str | CalibratorEntry, ...])
     @classmethod
     def _names_stand_for_entries(cls, entries: Any) -> Any:

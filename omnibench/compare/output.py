@@ -117,6 +117,7 @@ def summary(result: ComparisonResult) -> dict[str, Any]:
         "dataset": ", ".join(result.datasets),
         "simulated": {name: dataset.simulated for name, dataset in result.datasets.items()},
         "cost": result.config.cost.name,
+        **({} if result.config.loss == "squares" else {"loss": result.config.loss}),
         "integration": result.config.integration,
         "budget": result.config.budget.model_dump(),
         "runs": [run.record.model_dump(mode="json") for run in result.runs],

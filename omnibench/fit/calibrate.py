@@ -77,6 +77,8 @@ def calibrate(
 
     intervals: also draw resampled intervals about the optimum (closed_form only), unless there are fewer than three
     commands (runs, where none is repeated) or too few for a covariance, of which a warning tells.
+    loss: of the cost's pose errors when they are fitted. squares: as the calibrator takes them; huber, student_t: poses
+    that are far off have a bounded influence (see loss/losses.py).
     unidentified: for motions that the data drive so little that slip alone may explain them, ``keep`` the design values
     or ``fit`` them (see make_parameterisation); ``shrink`` keeps them and shrinks what else is hardly known to the
     design, of the given tolerance (see shrinkage.py). The run's warnings name them. mount: ``known``, or ``fit`` where
@@ -92,6 +94,11 @@ def calibrate(
         raise ConfigError("intervals are drawn about a minimum to rounding: use the calibrator closed_form")
     plain: Cost = costs.create(cost)
     objective = with_loss(plain, loss)
+    if intervals and loss != "squares":
+        raise ConfigError(
+            f"resampled intervals are drawn about the minimum of a sum of norms: leave out the loss {loss}, or leave out "
+            "the intervals; a calibration has others without resampling"
+        )
     training = training_split(dataset)
     unidentified = unidentified or default_unidentified(dataset.robot)
     if intervals and unidentified == "shrink":
@@ -149,11 +156,11 @@ def calibrate(
             unidentified=unidentified,
             tolerance=tolerance,
             mount=None if dataset.robot.slides else mount or default_mount(dataset.robot),
-            unshrunk_cost=None if result.shrinkage is None else result.shrinkage.unshrunk_cost,
+            unshrunk_cost=result.shrinkage.unshrunk_cost if result.shrinkage and loss == "squares" else None,
             on_bounds=result.at_bounds,
             versions=package_versions(),
-            training_cost=result.cost,
-            validation_cost=objective.of_model(model, validation) if validation else None,
+            training_cost=result.cost if loss == "squares" else plain.of_model(model, training),
+            validation_cost=plain.of_model(model, validation) if validation else None,
             outcome=result.outcome,
             reason=result.reason,
             held_out=verdict_on(model, validation),
