@@ -96,8 +96,8 @@ def calibrate(
     objective = with_loss(plain, loss)
     if intervals and loss != "squares":
         raise ConfigError(
-            f"resampled intervals are drawn about the minimum of a sum of norms: leave out the loss {loss}, or leave out "
-            "the intervals; a calibration has others without resampling"
+            f"resampled intervals are drawn about the minimum of a sum of norms: leave out the loss {loss}, or the "
+            "resampling, since a calibration has other intervals, too"
         )
     training = training_split(dataset)
     unidentified = unidentified or default_unidentified(dataset.robot)

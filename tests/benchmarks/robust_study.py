@@ -3,7 +3,7 @@
     python tests/benchmarks/robust_study.py                       # every recording, trajectory cost
     python tests/benchmarks/robust_study.py --cost final_pose --only sim
 
-Runs are the real recordings in ../shared/data and simulated ones. Of every other run the poses are contaminated by this
+Runs are the real recordings in ../shared/data and simulated ones. Of half of them, drawn at random, the poses are contaminated by this
 script: each pose, starts among them, is moved with a probability of 5 % by 1 m in a random direction. A calibration is
 fitted to these runs, and judged on the others, which stay as recorded: by the mean error of the final pose, m and rad
 alike (Eq. 6 of Palacin et al. 2023). Each figure is divided by that of the fit of the same calibrator to the same runs
@@ -79,8 +79,10 @@ def main() -> None:
     for name, dataset in data_sets():
         if not name.startswith(arguments.only):
             continue
-        train = [replace(run, split="train") for run in dataset.trajectories[::2]]
-        judged = [replace(run, split="validation") for run in dataset.trajectories[1::2]]
+        order = np.random.default_rng(0).permutation(len(dataset.trajectories))
+        half = len(order) // 2
+        train = [replace(dataset.trajectories[index], split="train") for index in sorted(order[:half])]
+        judged = [replace(dataset.trajectories[index], split="validation") for index in sorted(order[half:])]
         poses = sum(len(run.poses) for run in train)
         print(f"\n{name}, cost {arguments.cost}: {len(train)} runs, {poses} poses -> {len(judged)} runs", flush=True)
         for calibrator in arguments.calibrators:

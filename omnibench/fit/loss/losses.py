@@ -84,12 +84,12 @@ class Loss(ABC):
 
         A step to the left of 0, which only a start to the right of the root can lead to, begins again at 0.
         """
-        precision = start
+        precision: Array = start
         for _ in range(_MOST_STEPS):
             value, slope = self._equation(squares * precision[:, None])
             moved = precision + (self._target - value @ shares) / ((slope * squares) @ shares)
-            moved = np.where(np.isfinite(moved) & (moved > 0), np.minimum(moved, LEAST_SCALE**-2), 0.0)
-            before, precision = precision, moved
+            before = precision
+            precision = np.where(np.isfinite(moved) & (moved > 0), np.minimum(moved, LEAST_SCALE**-2), 0.0)
             if (np.abs(precision - before) <= _SETTLED * precision).all():
                 break
         return precision
