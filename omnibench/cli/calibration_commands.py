@@ -31,6 +31,10 @@ def calibrate(
     ] = None,
     calibrator: Annotated[str, typer.Option(help="How to search; omnibench list names all.")] = "closed_form",
     cost: Annotated[str, typer.Option(help="What to minimise; omnibench list names all.")] = "final_pose",
+    loss: Annotated[
+        Literal["squares", "huber", "student_t"],
+        typer.Option(help="huber, student_t: bound the influence of reference poses that are far off."),
+    ] = "squares",
     parameterisation: Annotated[
         Literal["matrix", "geometry"] | None,
         typer.Option(help="Search the matrix elements, or the wheels' geometry. Default: the calibrator's own."),
@@ -99,6 +103,7 @@ def calibrate(
             calibrator,
             options=parse_settings(settings),
             cost=cost,
+            loss=loss,
             parameterisation=parameterisation,
             box=box,
             integration=integration,

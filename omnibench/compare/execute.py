@@ -19,7 +19,7 @@ from omnibench.words import plural
 
 _GRACE = 10.0  # s after the budget's time: a run that has not stopped by then is killed (chosen)
 # Modules that the processes share, so that they need not be imported for every run.
-PRELOAD = ("omnibench.compare.execute", "omnibench.fit.sum_of_norms", "nlopt")
+PRELOAD = ("omnibench.compare.execute", "omnibench.fit.loss.sum_of_norms", "nlopt")
 
 
 def execute(

@@ -11,6 +11,7 @@ from omnibench.compare.run_key import run_key
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import ConfigError
 from omnibench.fit.geometry import GeometryLimits
+from omnibench.fit.loss.robust_cost import with_loss
 from omnibench.fit.parameterisation import Box, ParameterisationName
 from omnibench.fit.problem import CalibrationProblem, make_parameterisation, training_split
 from omnibench.progress import Reporter, no_progress
@@ -51,7 +52,7 @@ class RunTask:
         return CalibrationProblem(
             self.robot,
             self.trajectories,
-            costs.create(self.config.cost.name, self.config.cost.options),
+            with_loss(costs.create(self.config.cost.name, self.config.cost.options), self.config.loss),
             make_parameterisation(
                 self.parameterisation,
                 self.robot,

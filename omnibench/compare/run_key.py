@@ -29,6 +29,7 @@ def run_key(config: CompareConfig, dataset: Dataset, entry: CalibratorEntry, see
         {
             "data": dataset.hash,
             "cost": config.cost,
+            **({} if config.loss == "squares" else {"loss": config.loss}),
             "integration": config.integration,
             "unidentified": config.unidentified,
             "mount": config.mount,

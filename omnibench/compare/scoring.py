@@ -178,7 +178,8 @@ def _parameters(run: PlannedRun, result: RunResult) -> tuple[FittedParameter, ..
 
 def _is_exact(run: PlannedRun, scored: ScoredRun) -> bool:
     """True if a run converged to what should be the optimum in its box of matrix elements, with a cost to divide by."""
-    exact = calibrators.entry(scored.record.calibrator).cls.exact and run.element_box is not None
+    plain = run.config.loss == "squares"  # under a robust loss no run minimises the cost by which it is scored
+    exact = calibrators.entry(scored.record.calibrator).cls.exact and run.element_box is not None and plain
     score = scored.scores.get("train")
     return exact and scored.record.outcome is Outcome.CONVERGED and score is not None and score.cost > score.rounding
 

@@ -13,6 +13,8 @@ from omnibench.fit.calibrator import Calibrator, RunResult, run_calibrator
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import verdict_on
 from omnibench.fit.geometry import FittedParameter, GeometryLimits, WheelGeometry, fitted_parameters
+from omnibench.fit.loss.losses import LossName
+from omnibench.fit.loss.robust_cost import with_loss
 from omnibench.fit.parameterisation import (
     Box,
     ParameterisationName,
@@ -58,6 +60,7 @@ def calibrate(
     *,
     options: Mapping[str, Any] | None = None,
     cost: str = "final_pose",
+    loss: LossName = "squares",
     parameterisation: ParameterisationName | None = None,
     box: Box = "row",
     limits: GeometryLimits | None = None,
@@ -74,6 +77,8 @@ def calibrate(
 
     intervals: also draw resampled intervals about the optimum (closed_form only), unless there are fewer than three
     commands (runs, where none is repeated) or too few for a covariance, of which a warning tells.
+    loss: of the cost's pose errors when they are fitted. squares: as the calibrator takes them; huber, student_t: poses
+    that are far off have a bounded influence (see loss/losses.py).
     unidentified: for motions that the data drive so little that slip alone may explain them, ``keep`` the design values
     or ``fit`` them (see make_parameterisation); ``shrink`` keeps them and shrinks what else is hardly known to the
     design, of the given tolerance (see shrinkage.py). The run's warnings name them. mount: ``known``, or ``fit`` where
@@ -87,7 +92,13 @@ def calibrate(
     chosen: Calibrator = calibrators.create(calibrator, options)
     if intervals and not chosen.exact:
         raise ConfigError("intervals are drawn about a minimum to rounding: use the calibrator closed_form")
-    objective: Cost = costs.create(cost)
+    plain: Cost = costs.create(cost)
+    objective = with_loss(plain, loss)
+    if intervals and loss != "squares":
+        raise ConfigError(
+            f"resampled intervals are drawn about the minimum of a sum of norms: leave out the loss {loss}, or the "
+            "resampling, since a calibration has other intervals, too"
+        )
     training = training_split(dataset)
     unidentified = unidentified or default_unidentified(dataset.robot)
     if intervals and unidentified == "shrink":
@@ -140,15 +151,16 @@ def calibrate(
             options=chosen.options.model_dump(mode="json"),
             seed=seed,
             cost=cost,
+            loss=None if loss == "squares" else loss,
             box=problem.box,
             unidentified=unidentified,
             tolerance=tolerance,
             mount=None if dataset.robot.slides else mount or default_mount(dataset.robot),
-            unshrunk_cost=None if result.shrinkage is None else result.shrinkage.unshrunk_cost,
+            unshrunk_cost=result.shrinkage.unshrunk_cost if result.shrinkage and loss == "squares" else None,
             on_bounds=result.at_bounds,
             versions=package_versions(),
-            training_cost=result.cost,
-            validation_cost=objective.of_model(model, validation) if validation else None,
+            training_cost=result.cost if loss == "squares" else plain.of_model(model, training),
+            validation_cost=plain.of_model(model, validation) if validation else None,
             outcome=result.outcome,
             reason=result.reason,
             held_out=verdict_on(model, validation),

@@ -98,8 +98,8 @@ def certify_optimum(
     watch: told early about how long the proof takes, then of every part.
     gap: stop when the best known matrix is proven to be this close to the optimum. seconds, parts: stop after this time
     or after so many parts of the box; the number ends a proof at the same place on every machine.
-    Raises DataError when the wheels differ, the calibration has effects or the training split is empty, ConfigError for
-    a cost that is no sum of norms.
+    Raises DataError when the wheels differ, the calibration has effects or was fitted with a robust loss, or the
+    training split is empty, ConfigError for a cost that is no sum of norms.
     """
     require_type(calibration, Calibration, "read_calibration")
     require_type(dataset, Dataset, "load_dataset")
@@ -111,6 +111,11 @@ def certify_optimum(
             "certify the calibration without them"
         )
     provenance = calibration.provenance
+    if provenance is not None and provenance.loss is not None:
+        raise DataError(
+            f"calibration {calibration.name!r} was fitted with the loss {provenance.loss}, and a bound is proven for a "
+            "cost without one; certify a calibration that was fitted without --loss"
+        )
     searched = provenance.box if provenance else ""
     chosen: Box = box or ("paper" if searched == "paper" else "row")
     training = training_split(dataset)

@@ -27,9 +27,9 @@ class Cost(ABC):
     """
 
     Options: ClassVar[type[Options]] = Options
-    name: ClassVar[str]
-    stamps: ClassVar[Literal["final", "reference"]] = "final"
-    rounding: ClassVar[float] = 0.0
+    name: str
+    stamps: Literal["final", "reference"] = "final"
+    rounding: float = 0.0
 
     def __init__(self, options: Any) -> None:
         self.options = options

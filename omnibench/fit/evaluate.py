@@ -33,6 +33,7 @@ class SplitErrors(Model):
 class Evaluation(Model):
     """Errors of a calibration and of the design values, by split; the split ``all`` is every trajectory.
 
+    loss: the robust loss that the calibration was fitted with; costs and errors are without it.
     held_out: the verdict by the runs that the calibration was not fitted to; unfitted: their number by split, None
     where they are not known. sessions: a sentence for each session that differs from the others, or on those that could
     not be compared. warnings: one sentence if runs lie outside the training domain of the calibration's effects. Fields
@@ -40,6 +41,7 @@ class Evaluation(Model):
     """
 
     dataset: str
+    loss: str | None = Field(None, exclude_if=lambda loss: loss is None)
     simulated: bool = Field(exclude=True)
     trajectories: int
     splits: dict[str, SplitErrors]
@@ -68,6 +70,7 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
     warning = extrapolation_warning(calibration, dataset.trajectories)
     return Evaluation(
         dataset=dataset.name,
+        loss=calibration.provenance.loss if calibration.provenance else None,
         simulated=dataset.simulated,
         trajectories=len(dataset.trajectories),
         splits={name: split_errors(model, group) for name, group in groups.items()},

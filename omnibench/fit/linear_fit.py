@@ -38,9 +38,19 @@ def linear_fit(
 
 
 def linear_system(
-    odometry: OdometryBatch, runs: Sequence[Trajectory], reference: Array
+    odometry: OdometryBatch,
+    runs: Sequence[Trajectory],
+    reference: Array,
+    used: Sequence[NDArray[np.bool_]] | None = None,
 ) -> tuple[Array, NDArray[np.complex128]]:
-    """The left side of Eq. (L1) and (L2): motions (S, 3) since the start; and the factor of m1 + i m2, (S, N)."""
+    """The left side of Eq. (L1) and (L2): motions (S, 3) since the start; and the factor of m1 + i m2, (S, N).
+
+    used: for each run, True (K,) for the reference poses between which headings are interpolated; default all.
+    """
     moved = reference - np.array([run.start for run in runs])[odometry.trajectory]
-    headings = [np.interp(np.append(0.0, run.times[:-1]), run.pose_times, run.poses[:, 2]) for run in runs]
+    chosen = [np.ones(len(run.poses), dtype=bool) for run in runs] if used is None else used
+    headings = [
+        np.interp(np.append(0.0, run.times[:-1]), run.pose_times[near], run.poses[near, 2])
+        for run, near in zip(runs, chosen, strict=True)
+    ]
     return moved, odometry.position_design(headings)

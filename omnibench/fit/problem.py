@@ -14,11 +14,12 @@ from pydantic import Field
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import DataError
-from omnibench.fit.cost import Cost, SumOfNorms
+from omnibench.fit.cost import Cost
 from omnibench.fit.evaluator.driven_frame import DrivenFrame
 from omnibench.fit.evaluator.element_box import ElementBox
 from omnibench.fit.evaluator.evaluator import PoseEvaluator, make_evaluator
 from omnibench.fit.geometry import GeometryLimits, WheelGeometry
+from omnibench.fit.loss.robust_cost import norms_of
 from omnibench.fit.parameterisation import (
     Box,
     MatrixElements,
@@ -254,11 +255,11 @@ class CalibrationProblem:
 
     def _relevant(self) -> NDArray[np.bool_]:
         """True (n,) for elements that the cost depends on: for a cost of headings alone, those of row 3."""
-        cost = self.objective
+        cost = norms_of(self.objective)
         if not isinstance(self.parameterisation, MatrixElements):
             return np.ones(len(self.start), dtype=bool)
         used = np.repeat(self.parameterisation.rows.any(axis=0), len(self.robot.drive.names))
-        if not isinstance(cost, SumOfNorms) or 0.0 not in cost.weights:
+        if cost is None or 0.0 not in cost.weights:
             return used
         slopes: Array = np.abs(self.odometry.jacobian(self.matrix(self.start))).max(axis=0)  # (3, 3, N)
         return np.asarray(used & ((np.abs(cost.weights) @ slopes.reshape(3, -1)) > 0))

@@ -77,6 +77,10 @@ class HeldOutVerdict(Model):
     detail: str
 
 
+def _is_none(value: object) -> bool:
+    return value is None
+
+
 class Provenance(Model):
     """Origin of a calibration: data set, calibrator with options, versions, costs, outcome, what held-out runs say.
 
@@ -91,6 +95,9 @@ class Provenance(Model):
     options: dict[str, Any] = {}
     seed: int
     cost: str
+    loss: Literal["huber", "student_t"] | None = Field(
+        None, description="of the cost's norms; None: as the calibrator takes them", exclude_if=_is_none
+    )
     box: str
     unidentified: Literal["keep", "fit", "shrink"] = Field("keep", description="what the data hardly tell")
     tolerance: float | None = Field(None, description="of the design, for shrink; None: that of the robot's class")

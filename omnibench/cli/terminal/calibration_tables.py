@@ -152,7 +152,8 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
         *(Column(f"heading, {which}", "deg") for which in ("mean", "max")),
     )
     kind = " (simulated data)" if evaluation.simulated else ""
-    print_table(console, Table(f"{evaluation.dataset}{kind}", columns, tuple(rows)))
+    note = f"fitted with the loss {evaluation.loss}; cost and errors are without it" if evaluation.loss else ""
+    print_table(console, Table(f"{evaluation.dataset}{kind}", columns, tuple(rows), note))
 
 
 def _of_all(part: int, count: int) -> str:

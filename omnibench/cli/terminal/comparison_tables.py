@@ -16,7 +16,7 @@ def print_result(console: Console, result: ComparisonResult) -> None:
     """Print the tables of every data set, and the runs without an answer."""
     for view in views(result):
         kind = "simulated data" if view.dataset.simulated else "recorded data"
-        console.print(f"{view.name} ({kind}), cost {result.config.cost.name}", soft_wrap=True)
+        console.print(f"{view.name} ({kind}), cost {result.config.objective}", soft_wrap=True)
         tables = [cost_table(view, split) for split in view.splits]
         tables += [final_error_table(view, split) for split in view.splits]
         for table in (*tables, entry_table(view), run_table(view, typical=True)):

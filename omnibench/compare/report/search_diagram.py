@@ -29,7 +29,7 @@ def search_diagram(view: DatasetView) -> FigureGrid:
         _box(start, _ROW, "<b>Start</b><br>the design values"),
         _box(candidates, _ROW, "<b>Candidates</b><br>elements or geometry,<br>within their bounds"),
         _box(odometry, _ROW, f"<b>Odometry</b><br>{plural(runs, 'training run')},<br>{euler}"),
-        _box(cost, _ROW, f"<b>Cost</b><br>{config.cost.name}" + (",<br>Eq. (6)" if is_paper else "")),
+        _box(cost, _ROW, f"<b>Cost</b><br>{config.objective}" + (",<br>Eq. (6)" if is_paper else "")),
         _box(odometry, _BELOW, "<b>Next candidates</b><br>by the search's own rule"),
         _box(
             cost,

@@ -62,7 +62,7 @@ def search_section(view: DatasetView) -> Section:
         drawn,
         points=max(24, _POINTS // len(drawn)),
         runs=Counter(run.record.label for run in view.runs),
-        theoretical=view.theoretical_cost("train"),
+        theoretical=view.theoretical_cost("train") if view.config.loss == "squares" else None,
     )
     figures = [figure(searches, axis) for figure in (_costs, _gaps, _targets) for axis in AXES]
     styles = {course.style.key: course.style for course in drawn}.values()
@@ -76,7 +76,7 @@ class _Searches:
     """The data of the figures.
 
     points: roughly how many a course is drawn with. runs: number of runs by label, with those that have no course.
-    theoretical: the training cost of the design values.
+    theoretical: the training cost of the design values; None where a robust loss takes its place.
     """
 
     courses: Sequence[Course]
@@ -95,7 +95,7 @@ def courses(view: DatasetView) -> list[Course]:
     for run in view.runs:
         if run.record.evaluations <= 1 or not run.search_space.bounded:
             continue
-        history, best_known = _with_answer(run), _best_known(run, lowest[run.search_space])
+        history, best_known = _with_answer(view, run), _best_known(run, lowest[run.search_space])
         if history and run.scores["train"].rounding < best_known < math.inf:
             drawn.append(
                 Course(
@@ -119,10 +119,10 @@ def _best_known(run: ScoredRun, lowest: float) -> float:
 
 
 def _lowest_costs(view: DatasetView) -> Mapping[SearchSpace, float]:
-    """The lowest training cost that was reached in each search space; infinite where nothing was."""
+    """The lowest training cost or loss that was reached in each search space; infinite where nothing was."""
     lowest: dict[SearchSpace, float] = {}
     for run in view.runs:
-        space, cost = run.search_space, run.record.train_cost
+        space, cost = run.search_space, _reached(view, run)
         lowest[space] = min(lowest.get(space, math.inf), math.inf if cost is None else cost)
     return lowest
 
@@ -159,13 +159,20 @@ def _first_times(course: Course, axis: Axis) -> Array:
     return times
 
 
-def _with_answer(run: ScoredRun) -> tuple[Improvement, ...]:
+def _reached(view: DatasetView, run: ScoredRun) -> float | None:
+    """The answer's training cost; under a robust loss, by which answers are not scored, the best one of the search."""
+    if view.config.loss == "squares":
+        return run.record.train_cost
+    return min((step.cost for step in run.history), default=None)
+
+
+def _with_answer(view: DatasetView, run: ScoredRun) -> tuple[Improvement, ...]:
     """The history, followed by the answer at the run's total evaluations and time."""
-    record = run.record
-    if record.train_cost is None:
+    record, reached = run.record, _reached(view, run)
+    if reached is None:
         return run.history
     lowest = min((step.cost for step in run.history), default=math.inf)
-    last = Improvement(max(record.evaluations, 1), record.seconds, min(record.train_cost, lowest))
+    last = Improvement(max(record.evaluations, 1), record.seconds, min(reached, lowest))
     return (*run.history, last)
 
 

@@ -60,8 +60,11 @@ def on_bounds(record: RunRecord) -> list[str]:
 
 
 def cost_in_words(view: DatasetView) -> str:
-    """The cost's name and its summary."""
-    return f"{view.config.cost.name}: {costs.entry(view.config.cost.name).summary.rstrip('.')}."
+    """The cost's name and its summary, and the loss, if it is a robust one."""
+    words = f"{view.config.cost.name}: {costs.entry(view.config.cost.name).summary.rstrip('.')}."
+    if view.config.loss == "squares":
+        return words
+    return f"{words} It was fitted with the loss {view.config.loss}; figures here are without it."
 
 
 def cost_decimals(view: DatasetView) -> int:

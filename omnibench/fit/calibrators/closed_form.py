@@ -5,6 +5,9 @@ headings of the reference poses the first fit is therefore two linear least squa
 linearised about the present matrix, which makes the minimisation of a sum of norms a second-order cone program. Its
 steps are so small that a few programs converge, to a local minimum: that no other is lower is proven afterwards, and
 only to a gap (certify.py).
+
+A robust loss has no cone program: its minimum is found by reweighted least squares (least_squares/reweighted.py), from
+the linear fit to Huber's loss and, where that is asked for, from there to Student's t.
 """
 
 from __future__ import annotations
@@ -17,14 +20,17 @@ from pydantic import Field
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.cost import SumOfNorms
+from omnibench.fit.least_squares.reweighted import reweighted_minimum
 from omnibench.fit.linear_fit import linear_fit
+from omnibench.fit.loss.losses import Huber
+from omnibench.fit.loss.robust_cost import RobustCost
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array
 
 if TYPE_CHECKING:
-    from omnibench.fit.sum_of_norms import SumOfNormsProgram
+    from omnibench.fit.loss.sum_of_norms import SumOfNormsProgram
 
 # The matrices of closed_form are the same with half of each of these numbers and with twice
 # (tests/benchmarks/constants_fit.py).
@@ -51,14 +57,16 @@ class ClosedForm(Calibrator):
 
     def __init__(self, options: ClosedFormOptions) -> None:
         super().__init__(options)
-        import omnibench.fit.sum_of_norms  # noqa: F401 (importing cvxpy takes a second: do it before time is measured)
+        import omnibench.fit.loss.sum_of_norms  # noqa: F401 (importing cvxpy takes a second: do it before time is measured)
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """The optimum in the box. ConfigError for another parameterisation or a cost that is no sum of norms."""
-        from omnibench.fit.sum_of_norms import SolverError
+        from omnibench.fit.loss.sum_of_norms import SolverError
 
         if not isinstance(problem.parameterisation, MatrixElements):
             raise ConfigError("closed_form works on the matrix parameterisation; search the geometry with another")
+        if isinstance(problem.objective, RobustCost):
+            return self._robust(problem, problem.objective)
         if not isinstance(problem.objective, SumOfNorms):
             raise ConfigError(f"closed_form needs a cost that is a sum of norms, which {problem.objective.name} is not")
         vector = self._better(problem, problem.start, linear_start(problem))
@@ -82,6 +90,15 @@ class ClosedForm(Calibrator):
                 return Solution(vector, f"step below {self.options.tolerance:g} after {count} cone programs")
         reason = f"step still {moved:.1e} after {self.options.programs} cone programs"
         return Solution(vector, reason, converged=False)
+
+    def _robust(self, problem: CalibrationProblem, objective: RobustCost) -> Solution:
+        """The minimum of a robust loss."""
+        huber = RobustCost(objective.base, Huber(objective.loss.coordinates))
+        vector, steps, settled = self._better(problem, problem.start, linear_start(problem)), 0, True
+        for cost in [huber] if objective.loss.name == "huber" else [huber, objective]:
+            vector, count, settled = reweighted_minimum(problem, cost, vector, self.options.tolerance)
+            steps += count
+        return Solution(vector, f"{'' if settled else 'not '}settled after {steps} reweighted steps", settled)
 
     @staticmethod
     def _better(problem: CalibrationProblem, *vectors: Array) -> Array:
@@ -109,7 +126,7 @@ def linear_start(problem: CalibrationProblem) -> Array:
 
 def cone_program(problem: CalibrationProblem, objective: SumOfNorms, vector: Array) -> SumOfNormsProgram:
     """A program for the best step from ``vector``: the cost with the poses linearised there."""
-    from omnibench.fit.sum_of_norms import SumOfNormsProgram
+    from omnibench.fit.loss.sum_of_norms import SumOfNormsProgram
 
     matrix = problem.matrix(vector)
     used = np.flatnonzero(objective.weights)

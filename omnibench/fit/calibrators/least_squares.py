@@ -11,20 +11,32 @@ and the matrix is the minimiser over the box of the quadratic program
 
 with the shares p_s and the weights W of the cost, whose norms |W e_s| it squares. Two things set it apart from the
 minimum of the cost: squares give the worst runs more weight, and positions are not charged for errors of row 3.
+
+With a robust loss the squares of Eq. (2) get the weights of fit/loss/losses.py, Eq. (5), at the errors of the matrix
+before, until it stays (iteratively reweighted least squares; Holland and Welsch, Comm. Stat. A 6:813, 1977): Huber's
+from the least squares on, since its minimum is the only one, and Student's t from Huber's. Headings of poses that come
+out far off are left out of G_s, and the rest is done again.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.cost import SumOfNorms
+from omnibench.fit.least_squares.gauss_newton import bounded_step
 from omnibench.fit.linear_fit import linear_system
+from omnibench.fit.loss.losses import Huber, Loss
+from omnibench.fit.loss.robust_cost import RobustCost, norms_of
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array
+
+_MOST_FITS = 200  # reweighted fits of one loss; Huber's take about 20
+_STILL = 1e-7  # share of the box: a smaller change of every number ends them
+_MOST_ROUNDS = 5  # choices of the headings that are used; two or three settle
 
 
 @calibrators.register("least_squares")
@@ -35,44 +47,124 @@ class LeastSquares(Calibrator):
 
     def __init__(self, options: Options) -> None:
         super().__init__(options)
-        import omnibench.fit.sum_of_norms  # noqa: F401 (importing cvxpy takes a second: do it before time is measured)
+        import omnibench.fit.loss.sum_of_norms  # noqa: F401 (importing cvxpy takes a second: before time is measured)
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Minimise Eq. (2). ConfigError for another parameterisation or a cost that is no sum of norms."""
         if not isinstance(problem.parameterisation, MatrixElements):
             raise ConfigError("least_squares works on the matrix parameterisation; search the geometry with another")
-        if not isinstance(problem.objective, SumOfNorms):
+        if norms_of(problem.objective) is None:
             raise ConfigError(f"least_squares squares the norms of a sum, which {problem.objective.name} is not")
-        vector = problem.settled(_minimum(problem, problem.objective))
+        if isinstance(problem.objective, RobustCost):
+            vector, reason, settled = _robust_minimum(problem, problem.objective)
+        else:
+            vector, reason, settled = _LinearErrors(problem).minimum(), "one quadratic program", True
+        vector = problem.settled(vector)
         problem.cost(vector[None])
-        return Solution(vector, "one quadratic program")
+        return Solution(vector, reason, settled)
 
 
-def _minimum(problem: CalibrationProblem, objective: SumOfNorms) -> Array:
-    """The vector (n,) of the box that minimises Eq. (2)."""
-    import cvxpy as cp
+class _LinearErrors:
+    """The weighted errors W e_s of Eq. (1) of a problem, whose cost is a sum of norms.
 
-    from omnibench.fit.sum_of_norms import solve_program
+    used: for each run, True (K + 1,) for the reference poses whose headings are used; default all.
+    """
 
-    moved, columns = linear_system(problem.odometry, problem.trajectories, problem.reference)
-    none = np.zeros(columns.shape)
-    rows = np.stack(  # (S, 3, 3N): Eq. (1), real and imaginary part of the position, then the heading
-        [
-            np.hstack([columns.real, -columns.imag, none]),
-            np.hstack([columns.imag, columns.real, none]),
-            np.hstack([none, none, problem.odometry.driven]),
-        ],
-        axis=1,
-    )
-    factors = np.sqrt(objective.shares(problem.odometry.trajectory))[:, None] * np.array(objective.weights)
-    missing = (factors * (moved - rows @ problem.matrix(problem.start).ravel())).ravel()
-    # In units of the box the program is well scaled.
-    unit = np.where(problem.free, (problem.upper - problem.lower) / 2, 1.0)
-    slopes = problem.parameterisation.slopes(problem.start) * unit
-    step = cp.Variable(problem.size)
-    errors = (factors[..., None] * rows).reshape(len(missing), -1) @ slopes @ step - missing
-    scale = max(float(np.abs(missing).max()), np.finfo(float).tiny)
-    within = [step >= (problem.lower - problem.start) / unit, step <= (problem.upper - problem.start) / unit]
-    solve_program(cp.Problem(cp.Minimize(cp.sum_squares(errors / scale)), within))
-    vector: Array = problem.start + unit * step.value
-    return vector
+    def __init__(self, problem: CalibrationProblem, used: list[NDArray[np.bool_]] | None = None) -> None:
+        self._problem = problem
+        objective = norms_of(problem.objective)
+        assert objective is not None  # the calibrator has checked
+        moved, columns = linear_system(problem.odometry, problem.trajectories, problem.reference, used)
+        none = np.zeros(columns.shape)
+        rows = np.stack(  # (S, 3, 3N): Eq. (1), real and imaginary part of the position, then the heading
+            [
+                np.hstack([columns.real, -columns.imag, none]),
+                np.hstack([columns.imag, columns.real, none]),
+                np.hstack([none, none, problem.odometry.driven]),
+            ],
+            axis=1,
+        )
+        self.shares = objective.shares(problem.odometry.trajectory)
+        self._rows, self._weights = rows, np.array(objective.weights)
+        self._missing = moved - rows @ problem.matrix(problem.start).ravel()
+        # In units of the box the program is well scaled.
+        self.unit = np.where(problem.free, (problem.upper - problem.lower) / 2, 1.0)
+        self._slopes = problem.parameterisation.slopes(problem.start)
+
+    def norms(self, vector: Array) -> Array:
+        """Norms (S,) of W e_s at a vector (n,)."""
+        moved = self._rows @ (self._slopes @ (vector - self._problem.start))
+        return np.linalg.norm((moved - self._missing) * self._weights, axis=1)
+
+    def reweighted(self, weights: Array) -> Array:
+        """The vector (n,) of the box that minimises Eq. (2), its terms times weights (S,)."""
+        factors = np.sqrt(self.shares * weights)[:, None] * self._weights
+        missing = (factors * self._missing).ravel()
+        columns = (factors[..., None] * self._rows).reshape(len(missing), -1) @ self._slopes
+        start = self._problem.start
+        return start + bounded_step(self._problem, start, columns.T @ columns, -columns.T @ missing)
+
+    def minimum(self) -> Array:
+        """The vector (n,) of the box that minimises Eq. (2)."""
+        import cvxpy as cp
+
+        from omnibench.fit.loss.sum_of_norms import solve_program
+
+        problem, unit = self._problem, self.unit
+        factors = np.sqrt(self.shares)[:, None] * self._weights
+        missing = (factors * self._missing).ravel()
+        step = cp.Variable(problem.size)
+        slopes = self._slopes * unit
+        errors = (factors[..., None] * self._rows).reshape(len(missing), -1) @ slopes @ step - missing
+        scale = max(float(np.abs(missing).max()), np.finfo(float).tiny)
+        within = [step >= (problem.lower - problem.start) / unit, step <= (problem.upper - problem.start) / unit]
+        solve_program(cp.Problem(cp.Minimize(cp.sum_squares(errors / scale)), within))
+        vector: Array = problem.start + unit * step.value
+        return vector
+
+
+def _robust_minimum(problem: CalibrationProblem, objective: RobustCost) -> tuple[Array, str, bool]:
+    """The vector (n,) of the least loss, how it was found, and True if the fits settled."""
+    huber: Loss = Huber(objective.loss.coordinates)
+    losses = [huber] if objective.loss.name == "huber" else [huber, objective.loss]
+    errors = _LinearErrors(problem)
+    vector, used, fits, settled = errors.minimum(), np.ones(errors.shares.shape, dtype=bool), 0, True
+    for _ in range(_MOST_ROUNDS):
+        for loss in losses:
+            vector, count, settled = _reweighted(errors, loss, vector)
+            fits += count
+        losses, before = losses[-1:], used
+        used = objective.loss.is_near(errors.norms(vector), errors.shares)
+        if np.array_equal(before, used):
+            break
+        errors = _LinearErrors(problem, _poses_used(problem, used))
+    return vector, f"{fits} reweighted fits", settled
+
+
+def _weights(errors: _LinearErrors, loss: Loss, vector: Array) -> Array:
+    norms = errors.norms(vector)
+    return loss.weights(norms / loss.scales(norms[None], errors.shares)[0])
+
+
+def _reweighted(errors: _LinearErrors, loss: Loss, vector: Array) -> tuple[Array, int, bool]:
+    """The vector (n,) that its own weights lead back to, from another one, after how many fits, and True if it does."""
+    for count in range(1, _MOST_FITS + 1):
+        before, vector = vector, errors.reweighted(_weights(errors, loss, vector))
+        if (np.abs(vector - before) < _STILL * errors.unit).all():
+            return vector, count, True
+    return vector, _MOST_FITS, False
+
+
+def _poses_used(problem: CalibrationProblem, near: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+    """The poses (K + 1,) of each run whose headings are used: all but those at the stamps that are not near (S,).
+
+    Where most are, the start is, and all headings are used: a start that is off is off by a shift or turn alone.
+    """
+    used = []
+    for index, run in enumerate(problem.trajectories):
+        of_run = near[problem.odometry.trajectory == index]
+        chosen = np.ones(len(run.pose_times), dtype=bool)
+        if of_run.mean() > 1 / 2:
+            chosen[len(chosen) - len(of_run) :] = of_run
+        used.append(chosen)
+    return used

@@ -14,10 +14,14 @@ Where the runs scatter more than their noise explains, no matrix is right, and t
 squared pose errors at the stamps of the problem's cost are then minimised, with starts and clocks kept as the
 likelihood found them. The covariance is that of the noise model, or the sandwich of the scatter
 (uncertainty/sandwich.py), also where no repetition shows the noise.
+
+With a robust loss poses and starts that are off have less weight (least_squares/robust_noise.py), and the noise is that
+of the others.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -26,13 +30,15 @@ from pydantic import Field, model_validator
 
 from omnibench.config import Positive
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.cost_weights import cost_weightings
 from omnibench.fit.least_squares.gauss_newton import BoxedFit, Descent, descend, first_fit
 from omnibench.fit.least_squares.noise import FIRST_NOISE, NoiseEstimate, is_near, whiteners
 from omnibench.fit.least_squares.nuisance_noise import FitNoise, noise_of_fit
-from omnibench.fit.least_squares.nuisances import TURN, Nuisances
+from omnibench.fit.least_squares.nuisances import TURN, Nuisances, Weighting
+from omnibench.fit.least_squares.robust_noise import RobustNoise, robust_noise
 from omnibench.fit.least_squares.trajectory_covariance import FitCovariance
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
+from omnibench.fit.loss.cost_weights import cost_weightings, mean_curvature
+from omnibench.fit.loss.robust_cost import RobustCost, loss_of
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.registry import Options, calibrators
@@ -42,6 +48,8 @@ from omnibench.robot.kinematics import Array
 # than five. In tests/benchmarks/constants_fit.py five rounds at most, or a change of 0.2, move an estimate with clocks
 # by 0.1 and 0.2 of its standard deviation; 20 rounds, a change of 0.05 and half and twice _NEAR move none.
 _MOST_ROUNDS = 10
+_FIRST_WEIGHTS = 5  # fits with Huber's weights before the noise is estimated from poses that are not off
+_MOST_REWEIGHTED = 50  # fits by the weights of a robust cost
 _NEAR = 0.01  # share of the largest component of the noise by which components of the same noise differ
 _STILL = 0.1  # standard errors: a smaller change of the vector ends the rounds
 
@@ -118,32 +126,46 @@ class TrajectoryML(Calibrator):
         fit = first_fit(problem)
         stamps = fit.trajectories.stamps
         now = descend(self._with_deviations(fit, 0.0), whiteners(FIRST_NOISE, stamps), _STILL)
+        loss = loss_of(problem.objective)
+        heavy: RobustNoise | None = None
+        for _ in range(0 if loss == "squares" else _FIRST_WEIGHTS):  # Student's t needs a start near its minimum
+            heavy = robust_noise(FIRST_NOISE, now.fit.trajectories, "huber", heavy)
+            now = descend(now.fit, heavy.weightings(stamps), _STILL)
         noise: FitNoise | None = None
         rounds, settled = 0, False
         while not settled and rounds < _MOST_ROUNDS:
             before, earlier = now.fit, noise
-            noise = self._noise(before.trajectories, earlier)
+            usual = before.trajectories if heavy is None else heavy.without_jumps(before.trajectories)
+            noise = self._noise(usual, earlier)
             fit = self._with_deviations(before, noise.deviations[TURN])
-            now = descend(fit, whiteners(noise.estimate.noise, stamps), self.options.tolerance)
+            weightings: Sequence[Weighting] = whiteners(noise.estimate.noise, stamps)
+            if heavy is not None:
+                heavy = robust_noise(noise.estimate.noise, fit.trajectories, loss, heavy)
+                weightings = heavy.weightings(stamps)
+            now = descend(fit, weightings, self.options.tolerance)
             moved = now.fit.vector - before.vector
             still = float(moved @ now.data.information @ moved) < _STILL**2
-            settled = now.settled and (still or (earlier is not None and is_near(noise.sizes, earlier.sizes, _NEAR)))
+            if heavy is None:  # weights may still change where the noise does not
+                still = still or (earlier is not None and is_near(noise.sizes, earlier.sizes, _NEAR))
+            settled = now.settled and still
             rounds += 1
         assert noise is not None  # there is at least one round
-        return self._conclude(now, noise.estimate, rounds, settled)
+        return self._conclude(now, noise.estimate, rounds, settled, 1.0 if heavy is None else heavy.curvature)
 
-    def _conclude(self, now: Descent, noise: NoiseEstimate, rounds: int, settled: bool) -> TrajectoryEstimate:
+    def _conclude(
+        self, now: Descent, noise: NoiseEstimate, rounds: int, settled: bool, curvature: float
+    ) -> TrajectoryEstimate:
         """The maximum likelihood estimate, or the one weighted by the cost if the model misfits; its covariance."""
-        options, problem, fit = self.options, now.fit.problem, now.fit.trajectories
-        covariance = self._covariance(now, noise)
+        options, fit = self.options, now.fit.trajectories
+        covariance = self._covariance(now, noise, curvature)
         misfit = covariance.scatter.words if covariance.scatter and covariance.scatter.lack_of_fit else ""
         by_cost = options.weights == "cost" or (
             options.weights == "auto" and bool(misfit) and options.covariance != "model"
         )
         if by_cost:
-            weightings = cost_weightings(problem.objective, fit.runs, fit.residuals)
-            now = descend(now.fit.with_nuisances(fit.nuisances.held()), weightings, options.tolerance)
-            covariance = self._covariance(now, noise)
+            held = now.fit.with_nuisances(fit.nuisances.held())
+            now, curvature = _descend_cost(held, options.tolerance)
+            covariance = self._covariance(now, noise, curvature)
         robust = options.covariance == "robust" or (options.covariance == "auto" and covariance.scatter_stands)
         chosen, words = covariance.chosen(by_cost or robust)
         return TrajectoryEstimate(
@@ -157,11 +179,11 @@ class TrajectoryML(Calibrator):
             settled=settled and now.settled,
         )
 
-    def _covariance(self, now: Descent, noise: NoiseEstimate) -> FitCovariance:
+    def _covariance(self, now: Descent, noise: NoiseEstimate, curvature: float) -> FitCovariance:
         """The covariances of a descent's vector, held elements with none."""
         problem = now.fit.problem
         unit = np.where(problem.free, problem.upper - problem.lower, 0.0)
-        return FitCovariance(now.data, now.fit.trajectories.runs, noise, unit)
+        return FitCovariance(now.data, now.fit.trajectories.runs, noise, unit, curvature)
 
     def _with_deviations(self, fit: BoxedFit, start_heading: float) -> BoxedFit:
         """The fit with the nuisances' standard deviations; those that are not estimated are 0."""
@@ -178,3 +200,22 @@ class TrajectoryML(Calibrator):
         found = noise_of_fit(fit, [] if start == "exact" else [TURN], near)
         least = found.estimate.noise.pose_heading if start == "noisy" else 0.0
         return replace(found, deviations=np.maximum(found.deviations, [least, 0.0, 0.0]))
+
+
+def _descend_cost(fit: BoxedFit, tolerance: float) -> tuple[Descent, float]:
+    """The minimum of the squares that imitate the problem's cost, by its weights at each fit where it is robust.
+
+    The second value is the curvature of its loss, see RobustNoise.
+    """
+    objective = fit.problem.objective
+    if not isinstance(objective, RobustCost):
+        trajectories = fit.trajectories
+        return descend(fit, cost_weightings(objective, trajectories.runs, trajectories.residuals), tolerance), 1.0
+    for _ in range(_MOST_REWEIGHTED):
+        trajectories = fit.trajectories
+        now = descend(fit, cost_weightings(objective, trajectories.runs, trajectories.residuals), tolerance)
+        moved = now.fit.vector - fit.vector
+        if float(moved @ now.data.information @ moved) < tolerance**2:
+            return now, mean_curvature(objective, now.fit.trajectories.residuals)
+        fit = now.fit
+    return replace(now, settled=False), mean_curvature(objective, now.fit.trajectories.residuals)

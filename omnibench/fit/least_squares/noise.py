@@ -40,22 +40,32 @@ _COORDINATES = (("position", slice(0, 2)), ("heading", slice(2, 3)))
 FIRST_NOISE = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.01, walk_heading=0.01)
 
 
+@dataclass(frozen=True, eq=False)
+class ExtraVariance:
+    """Variances beyond the noise, m^2 and rad^2: of each pose of a run (K,), and of all its poses together."""
+
+    position: tuple[Array, float]
+    heading: tuple[Array, float]
+
+
 class Whitener:
     """Turns the pose residuals of one run into independent ones of unit variance, exactly, in O(K).
 
     stamps (K,): s, > 0, increasing; the start pose at t = 0 is not among them. log_determinant: of the covariance of
     all 3K residuals. Without white noise and walk the covariance is singular: white noise of 1e-9 (m, rad) stands in.
+    extra: variance beyond the noise.
     """
 
     log_determinant: float
 
-    def __init__(self, noise: Noise, stamps: Array) -> None:
+    def __init__(self, noise: Noise, stamps: Array, extra: ExtraVariance | None = None) -> None:
         stamps = np.asarray(stamps, dtype=float)
         steps = np.diff(stamps, prepend=0.0)
         if stamps.ndim != 1 or len(stamps) == 0 or not (steps > 0).all():
             raise ValueError("stamps must be increasing and > 0")
-        self._position = _Factor(noise.pose_position, noise.walk_position, noise.bias_position, steps)
-        self._heading = _Factor(noise.pose_heading, noise.walk_heading, noise.bias_heading, steps)
+        position, heading = (None, None) if extra is None else (extra.position, extra.heading)
+        self._position = _Factor(noise.pose_position, noise.walk_position, noise.bias_position, steps, position)
+        self._heading = _Factor(noise.pose_heading, noise.walk_heading, noise.bias_heading, steps, heading)
         self.log_determinant = 2 * self._position.log_determinant + self._heading.log_determinant
 
     def __call__(self, residuals: Array) -> Array:
@@ -64,6 +74,23 @@ class Whitener:
         split = 2 * differences.shape[1] // 3
         white = [self._position.whiten(differences[:, :split]), self._heading.whiten(differences[:, split:])]
         return np.concatenate(white, axis=1).reshape(residuals.shape)
+
+    def left_out(self, residuals: Array) -> tuple[Array, Array]:
+        """Every error (K, 3) less what the run's others say of it, and the variances (K, 3) of that difference.
+
+        With the inverse C^-1 of a coordinate's covariance, (C^-1 r)_s / (C^-1)_ss and 1 / (C^-1)_ss.
+        """
+        errors = np.empty_like(residuals)
+        variances = np.empty_like(residuals)
+        for factor, columns in ((self._position, slice(0, 2)), (self._heading, slice(2, 3))):
+            errors[:, columns], of_each = factor.left_out(residuals[:, columns])
+            variances[:, columns] = of_each[:, None]
+        return errors, variances
+
+    def shift(self, residuals: Array) -> tuple[Array, Array]:
+        """The likeliest shift (3,) of a run whose errors have no bias, and its variances (3,)."""
+        parts = [self._position.shift(residuals[:, :2]), self._heading.shift(residuals[:, 2:])]
+        return np.concatenate([value for value, _ in parts]), np.array([parts[0][1], parts[0][1], parts[1][1]])
 
 
 def whiteners(noise: Noise, stamps: Sequence[Array]) -> list[Whitener]:
@@ -99,10 +126,13 @@ def is_near(first: Mapping[str, float], second: Mapping[str, float], share: floa
 class _Factor:
     """The Cholesky factor of one coordinate's covariance, as a lower bidiagonal matrix of the differences.
 
-    steps (K,): s from each stamp to the next, the first from t = 0.
+    steps (K,): s from each stamp to the next, the first from t = 0. extra: variances (K,) of single poses and of all
+    together, beyond the noise.
     """
 
-    def __init__(self, white: float, walk: float, bias: float, steps: Array) -> None:
+    def __init__(
+        self, white: float, walk: float, bias: float, steps: Array, extra: tuple[Array, float] | None = None
+    ) -> None:
         walked = walk**2 * (steps[1:] if bias else steps)
         if white**2 + walked.min(initial=np.inf) < LEAST_WHITE**2:
             white = LEAST_WHITE
@@ -110,6 +140,12 @@ class _Factor:
         bands[0] = 2 * white**2 + walk**2 * steps
         bands[0, 0] += bias**2 - white**2
         bands[1] = -(white**2)
+        if extra is not None:
+            of_poses, of_all = extra
+            bands[0] += of_poses
+            bands[0, 1:] += of_poses[:-1]
+            bands[0, 0] += of_all
+            bands[1] -= of_poses
         self._factor, failed = dpbtrf(bands, lower=1, overwrite_ab=1)
         if failed:
             raise ValueError("noise or stamps are not finite")
@@ -119,6 +155,37 @@ class _Factor:
         """Independent values (K, n) of differences (K, n) between successive residuals, the first from 0."""
         whitened, _ = dtbtrs(self._factor, differences, uplo="L")
         return whitened
+
+    def left_out(self, residuals: Array) -> tuple[Array, Array]:
+        """Errors (K, n) less what the others say of them, and their variances (K,); see Whitener."""
+        solved = self._solved(residuals)
+        solved[:-1] -= solved[1:]
+        inner, beside = self._inverse_bands()
+        inner[:-1] += inner[1:] - 2 * beside
+        return solved / inner[:, None], 1 / inner
+
+    def shift(self, residuals: Array) -> tuple[Array, float]:
+        """The likeliest shift (n,) of residuals (K, n), and its variance."""
+        information = float(self._inverse_bands()[0][0])
+        return self._solved(residuals)[0] / information, 1 / information
+
+    def _solved(self, residuals: Array) -> Array:
+        """The covariance of the differences, inverted, times the differences of residuals (K, n)."""
+        solved, _ = dtbtrs(self._factor, self.whiten(_differences(residuals)), uplo="L", trans="T")
+        return np.asarray(solved)
+
+    def _inverse_bands(self) -> tuple[Array, Array]:
+        """Diagonal (K,) and upper diagonal (K - 1,) of the inverse of the covariance of the differences.
+
+        From the last to the first (Takahashi, Fagan and Chin, 8th PICA Conference, 1973).
+        """
+        diagonal, below = self._factor
+        inner, beside = diagonal**-2, np.empty(len(diagonal) - 1)
+        for index in range(len(beside) - 1, -1, -1):
+            share = below[index] / diagonal[index]
+            beside[index] = -share * inner[index + 1]
+            inner[index] -= share * beside[index]
+        return inner, beside
 
 
 def _differences(residuals: Array) -> Array:

@@ -55,12 +55,15 @@ class FitCovariance:
 
     by_model: inverse of the information, zero along undetermined directions. scatter: the sandwich of
     uncertainty/sandwich.py, None if there are too few runs. Both are zero in rows and columns whose ``unit`` (n,) is 0;
-    others are the units of the numbers in which directions are judged as undetermined.
+    others are the units of the numbers in which directions are judged as undetermined. curvature: of a robust loss, as
+    a share of the information of its weights.
     """
 
     scatter: Sandwich | None = None
 
-    def __init__(self, data: Whitened, runs: Sequence[Trajectory], noise: NoiseEstimate, unit: Array) -> None:
+    def __init__(
+        self, data: Whitened, runs: Sequence[Trajectory], noise: NoiseEstimate, unit: Array, curvature: float = 1.0
+    ) -> None:
         scores, information = data.scores * unit, data.information_of_runs * np.outer(unit, unit)
         roots = roots_of(information.sum(axis=0))
         self._noise, self._roots = noise, unit[:, None] * roots
@@ -70,7 +73,7 @@ class FitCovariance:
         if not roots.size:
             return
         with suppress(DataError):
-            found = sandwich(Scores(scores, information, runs, np.zeros(len(unit)), information))
+            found = sandwich(Scores(scores, curvature * information, runs, np.zeros(len(unit)), information))
             real = float(np.square(scores @ roots).sum()) > _ROUNDING * roots.shape[1]
             self.scatter = replace(
                 found,

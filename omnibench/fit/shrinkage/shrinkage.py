@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omnibench.fit.calibrator import RunResult, Shrinkage
+from omnibench.fit.loss.robust_cost import loss_of
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.span import driven_span, unidentified_directions
@@ -89,7 +90,8 @@ def _knowledge(problem: CalibrationProblem, result: RunResult) -> _Knowledge:
             information = slopes.T @ np.linalg.pinv(told, rcond=_ROUNDING, hermitian=True) @ slopes
             freedom = np.broadcast_to(answer.of_vector.degrees_of_freedom, problem.size)
             return _Knowledge(information, np.array(freedom), answer.noise, answer.source)
-    noise = noise_of_matrix(problem.trajectories, result.matrix, problem.integration)
+    loss = loss_of(problem.objective)
+    noise = noise_of_matrix(problem.trajectories, result.matrix, problem.integration, loss)
     every = information_of_runs(problem.trajectories, result.matrix, problem.integration, noise.noise).sum(axis=0)
     columns = unit[:, None] * slopes
     words = f"the poses' noise ({noise.description})"

@@ -10,6 +10,8 @@ import numpy as np
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.least_squares.noise import NoiseEstimate, Whitener, estimate_noise
 from omnibench.fit.least_squares.repetitions import differences_between_repetitions
+from omnibench.fit.loss.jumps import without_jumps
+from omnibench.fit.loss.losses import LossName
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
@@ -17,14 +19,20 @@ from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
 Stamps = Literal["reference", "final"]
 
 
-def noise_of_matrix(runs: Sequence[Trajectory], matrix: Array, integration: Integration) -> NoiseEstimate:
-    """Noise of the reference poses, estimated from the residuals that ``matrix`` (3, N) leaves in some runs."""
+def noise_of_matrix(
+    runs: Sequence[Trajectory], matrix: Array, integration: Integration, loss: LossName = "squares"
+) -> NoiseEstimate:
+    """Noise of the reference poses, estimated from the residuals that ``matrix`` (3, N) leaves in some runs.
+
+    With a robust loss poses that are far off are left out.
+    """
     logs = [run.reference_log for run in runs]
     residuals = [
         OdometryBatch([log], integration).poses(matrix[None])[0] - run.poses[1:]
         for log, run in zip(logs, runs, strict=True)
     ]
-    return estimate_noise(differences_between_repetitions(runs, residuals))
+    near, residuals = without_jumps(runs, residuals, loss)
+    return estimate_noise(differences_between_repetitions(near, residuals))
 
 
 def information_of_run(

@@ -12,6 +12,7 @@ from omnibench.errors import DataError
 from omnibench.fit.calibrator import RunResult
 from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.geometry import WheelGeometry, unit_of
+from omnibench.fit.loss.robust_cost import RobustCost, loss_of, norms_of
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.span import driven_span, unidentified_directions
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals
@@ -23,6 +24,7 @@ from omnibench.fit.uncertainty.physical import (
     identified_parameters,
     is_invertible,
 )
+from omnibench.fit.uncertainty.robust_scores import robust_scores
 from omnibench.fit.uncertainty.sandwich import Sandwich, Scores, sandwich, scores_of_runs
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
@@ -111,7 +113,8 @@ class AnswerCovariance:
 def covariance_of_answer(problem: CalibrationProblem, result: RunResult) -> AnswerCovariance:
     """The calibrator's own covariance of its answer, or else that of the scatter. NoCovarianceError says why not."""
     assert result.matrix is not None  # callers have checked
-    noise = result.noise or noise_of_matrix(problem.trajectories, result.matrix, problem.integration).noise
+    loss = loss_of(problem.objective)
+    noise = result.noise or noise_of_matrix(problem.trajectories, result.matrix, problem.integration, loss).noise
     if result.covariance is None:
         scatter = _by_scatter(problem, result, noise)
         estimated = EstimatedCovariance(scatter.covariance, scatter.effective_freedom)
@@ -126,7 +129,8 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult, noise: Noise) ->
     """Sandwich covariance (n, n) of the vector."""
     objective = problem.objective
     assert result.vector is not None and result.matrix is not None  # noqa: PT018 (uncertainty_of has checked)
-    if not isinstance(objective, SumOfNorms):
+    base = norms_of(objective)
+    if base is None:
         raise NoCovarianceError(f"no covariance: the cost {objective.name} is no sum of norms")
     free = problem.free & ~np.isin(problem.names, result.at_bounds)
     if not problem.parameterisation.slopes(result.vector)[:, free].any():
@@ -138,10 +142,10 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult, noise: Noise) ->
             "no covariance: the answer fits the runs exactly, and their scatter about it is what a covariance rests on"
         )
     try:
-        scores = _scores(problem, objective, result.vector, free, noise)
-        numbers = len(problem.trajectories) * sum(map(bool, objective.weights))
-        answer = sandwich(_less_curved(scores, numbers))
-        _check_minimum(problem, objective, result.vector, free, scores, noise)
+        scores = _scores(problem, result.vector, free, noise)
+        numbers = len(problem.trajectories) * sum(map(bool, base.weights))
+        answer = sandwich(scores if isinstance(objective, RobustCost) else _less_curved(scores, numbers))
+        _check_minimum(problem, result.vector, free, scores, noise)
     except NoCovarianceError:
         raise
     except DataError as error:
@@ -152,14 +156,16 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult, noise: Noise) ->
     return replace(answer, covariance=covariance, effective_freedom=freedom)
 
 
-def _scores(
-    problem: CalibrationProblem, objective: SumOfNorms, vector: Array, free: NDArray[np.bool_], noise: Noise
-) -> Scores:
+def _scores(problem: CalibrationProblem, vector: Array, free: NDArray[np.bool_], noise: Noise) -> Scores:
     """Score vectors of the runs in the free numbers, at a vector (n,)."""
+    objective = problem.objective
     matrix = problem.matrix(vector)
     errors = problem.odometry.poses(matrix[None])[0] - problem.reference
     slopes = problem.parameterisation.slopes(vector)[:, free]
     jacobian = problem.odometry.jacobian(matrix).reshape(len(errors), 3, -1) @ slopes
+    if isinstance(objective, RobustCost):
+        return robust_scores(objective, problem.odometry, errors, jacobian, problem.trajectories, noise)
+    assert isinstance(objective, SumOfNorms)  # _by_scatter has checked
     return scores_of_runs(objective, problem.odometry, errors, jacobian, problem.trajectories, noise)
 
 
@@ -174,12 +180,7 @@ def _less_curved(scores: Scores, numbers: int) -> Scores:
 
 
 def _check_minimum(
-    problem: CalibrationProblem,
-    objective: SumOfNorms,
-    vector: Array,
-    free: NDArray[np.bool_],
-    scores: Scores,
-    noise: Noise,
+    problem: CalibrationProblem, vector: Array, free: NDArray[np.bool_], scores: Scores, noise: Noise
 ) -> None:
     """Raise NoCovarianceError if steps to a lower cost lead farther than a standard deviation, as estimated there."""
     better, cost = vector, float(problem.values(vector[None])[0])
@@ -190,7 +191,7 @@ def _check_minimum(
         if not value < cost * (1 - _NO_GAIN):
             break
         better, cost = moved, value
-        scores = _scores(problem, objective, better, free, noise)
+        scores = _scores(problem, better, free, noise)
     deviations = np.sqrt(np.maximum(np.diag(sandwich(scores).covariance), 0.0))
     away = np.abs(better - vector)[free]
     count = float(np.max(away[deviations > 0] / deviations[deviations > 0], initial=0.0))

@@ -1,0 +1,200 @@
+"""Robust losses of pose errors, with a scale that is estimated from the same errors.
+
+Errors have the norms r_i of d coordinates, with shares p_i that sum to one. A scale s turns them into x_i = r_i / s.
+
+``huber``, with rho(x) = x^2/2 up to c and c x - c^2/2 beyond, takes the scale and the numbers fitted that minimise
+
+    Q(s) = s (sum_i p_i rho(x_i) + b / 2),   b = E min(R, c)^2,   R^2 ~ chi2(d),                            (1)
+
+the concomitant scale of Huber's Proposal 2 (Huber, Robust Statistics, 1981, sections 7.7 and 7.8): at the minimum
+
+    sum_i p_i min(x_i, c)^2 = b,                                                                          (2)
+
+so that s is the standard deviation of a coordinate of normal errors. Q is convex in s and the errors at once.
+
+``student_t`` takes errors for multivariate t with n = 4 degrees of freedom, which serves unless their number is
+estimated (Lange, Little and Taylor, J. Am. Stat. Assoc. 84:881, 1989, section 5). Minus the log-likelihood of one
+coordinate, up to a constant, and its minimum over s are
+
+    L(s) = ln s + (n + d) / (2 d) sum_i p_i ln(1 + x_i^2 / n),                                            (3)
+    sum_i p_i (n + d) x_i^2 / (n + x_i^2) = d.                                                            (4)
+
+The cost of a candidate is min Q or exp(min L), in the unit of the errors: a function of the candidate alone, as smooth
+as the errors. Its derivatives by the errors are those of a weighted sum of squares with the weights
+
+    w(x) = min(1, c / x)   and   w(x) = (n + d) / (n + x^2).                                              (5)
+
+Both sides of (2) and (4) that depend on q = 1/s^2 are concave in it and grow, so that Newton's steps from q = 0
+approach the root from one side, without fail.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtr
+
+from omnibench.robot.kinematics import Array
+
+LossName = Literal["squares", "huber", "student_t"]
+
+# Smallest scale, m or rad: smaller errors are rounding, of which the likelihood of Eq. (3) could grow without bound. A
+# tenth of NO_ERROR in fit/cost.py, so that the costs of such errors are rounding, too.
+LEAST_SCALE = 1e-10
+# Norms of d coordinates beyond which Huber's loss is linear. Each leaves 95 % of the efficiency of squares for normal
+# errors, as 1.345 does for one coordinate (Holland and Welsch, Comm. Stat. A 6:813, 1977; Huber 1981, section 4.2).
+CORNERS: Mapping[int, float] = MappingProxyType({1: 1.345, 2: 1.501, 3: 1.628})
+# Share of the weight of a small error below which a pose counts as one that has jumped, and is left out of estimates
+# that have no loss: errors of more than 8 (huber) or 4 (student_t) of their scales.
+OFF = 0.2
+DEGREES_OF_FREEDOM = 4.0  # Lange, Little and Taylor 1989
+_MOST_STEPS = (
+    100  # Newton's steps for the scale; errors of one size take 5, with a twentieth of them 100 times as large 15
+)
+_SAMPLE = 2000  # norms of which more are not needed to find where Newton's steps begin: they then take two or three
+_SETTLED = 1e-13  # relative change of 1/s^2 that ends them
+
+
+class Loss(ABC):
+    """A loss of the norms of errors of ``coordinates`` d coordinates."""
+
+    name: LossName
+
+    def __init__(self, coordinates: int) -> None:
+        self.coordinates = coordinates
+
+    def scales(self, norms: Array, shares: Array) -> Array:
+        """Scales (P,) of P sets of norms (P, S) with shares (S,): the roots of Eq. (2) or (4)."""
+        squares = np.square(norms)
+        start = np.zeros(len(norms))
+        with np.errstate(all="ignore"):
+            if (every := len(shares) // _SAMPLE) > 1:
+                some = shares[::every]
+                start = self._precisions(squares[:, ::every], some / some.sum(), start)
+            scales: Array = self._precisions(squares, shares, start) ** -0.5
+            return np.where((squares > 0).any(axis=1), scales, LEAST_SCALE)
+
+    def _precisions(self, squares: Array, shares: Array, start: Array) -> Array:
+        """Roots q (P,) of Eq. (2) or (4) for squared norms (P, S), from a start (P,); 0 where there is none.
+
+        A step to the left of 0, which only a start to the right of the root can lead to, begins again at 0.
+        """
+        precision: Array = start
+        for _ in range(_MOST_STEPS):
+            value, slope = self._equation(squares * precision[:, None])
+            moved = precision + (self._target - value @ shares) / ((slope * squares) @ shares)
+            before = precision
+            precision = np.where(np.isfinite(moved) & (moved > 0), np.minimum(moved, LEAST_SCALE**-2), 0.0)
+            if (np.abs(precision - before) <= _SETTLED * precision).all():
+                break
+        return precision
+
+    def costs(self, norms: Array, shares: Array) -> Array:
+        """Costs (P,), in the unit of the norms (P, S), at the scales that minimise them; NaN of norms that are NaN."""
+        return self._costs(norms, self.scales(norms, shares), shares)
+
+    @abstractmethod
+    def weights(self, ratios: Array) -> Array:
+        """Weights w (...), Eq. (5), of ratios x (...) of norms to their scale."""
+
+    def is_near(self, norms: Array, shares: Array) -> NDArray[np.bool_]:
+        """True (S,) for the norms (S,) that are not far off the others, by their weights."""
+        ratios = norms / self.scales(norms[None], shares)[0]
+        return np.asarray(self.weights(ratios) >= OFF * self.weights(np.zeros(1)))
+
+    def mean_curvature(self, ratios: Array, shares: Array) -> float:
+        """Mean second derivative of the loss over the d directions of errors at ratios (S,), over the mean weight."""
+        weights = self.weights(ratios)
+        return max(1 + float(self.slopes(ratios) @ shares) / (self.coordinates * float(weights @ shares)), OFF)
+
+    @abstractmethod
+    def slopes(self, ratios: Array) -> Array:
+        """Derivatives x w'(x) (...) of the weights by the logarithm of the ratios x (...)."""
+
+    @property
+    @abstractmethod
+    def _target(self) -> float:
+        """The right side of Eq. (2) or (4)."""
+
+    @abstractmethod
+    def _equation(self, squares: Array) -> tuple[Array, Array]:
+        """The terms of the left side of Eq. (2) or (4) at squared ratios, and their derivatives by these."""
+
+    @abstractmethod
+    def _costs(self, norms: Array, scales: Array, shares: Array) -> Array:
+        """Eq. (1) or the exponential of Eq. (3)."""
+
+
+class Huber(Loss):
+    """Squares of small errors and magnitudes of large ones, Eq. (1)."""
+
+    name: LossName = "huber"
+
+    def __init__(self, coordinates: int) -> None:
+        super().__init__(coordinates)
+        self.corner = CORNERS[coordinates]
+        square = self.corner**2
+        inside = float(coordinates * chdtr(coordinates + 2, square))  # E R^2 of R < c
+        self._mean = inside + square * (1 - float(chdtr(coordinates, square)))  # b of Eq. (1)
+
+    def weights(self, ratios: Array) -> Array:
+        """min(1, c / x)."""
+        return np.asarray(self.corner / np.maximum(ratios, self.corner))
+
+    def slopes(self, ratios: Array) -> Array:
+        """-c / x beyond the corner, 0 before."""
+        return np.where(ratios > self.corner, -self.weights(ratios), 0.0)
+
+    @property
+    def _target(self) -> float:
+        return self._mean
+
+    def _equation(self, squares: Array) -> tuple[Array, Array]:
+        return np.minimum(squares, self.corner**2), np.where(squares < self.corner**2, 1.0, 0.0)
+
+    def _costs(self, norms: Array, scales: Array, shares: Array) -> Array:
+        ratios = norms / scales[:, None]
+        small = np.minimum(ratios, self.corner)
+        total: Array = scales * ((small * (ratios - small / 2)) @ shares + self._mean / 2)
+        return total
+
+
+class StudentT(Loss):
+    """Minus the log-likelihood of Student's t with four degrees of freedom, Eq. (3)."""
+
+    name: LossName = "student_t"
+
+    def weights(self, ratios: Array) -> Array:
+        """(n + d) / (n + x^2)."""
+        return np.asarray((DEGREES_OF_FREEDOM + self.coordinates) / (DEGREES_OF_FREEDOM + np.square(ratios)))
+
+    def slopes(self, ratios: Array) -> Array:
+        """-2 x^2 (n + d) / (n + x^2)^2."""
+        squares = np.square(ratios)
+        return np.asarray(-2 * squares / (DEGREES_OF_FREEDOM + squares) * self.weights(ratios))
+
+    @property
+    def _target(self) -> float:
+        return float(self.coordinates)
+
+    def _equation(self, squares: Array) -> tuple[Array, Array]:
+        total = DEGREES_OF_FREEDOM + self.coordinates
+        left = DEGREES_OF_FREEDOM + squares
+        return total * squares / left, total * DEGREES_OF_FREEDOM / np.square(left)
+
+    def _costs(self, norms: Array, scales: Array, shares: Array) -> Array:
+        logarithms = np.log1p(np.square(norms / scales[:, None]) / DEGREES_OF_FREEDOM) @ shares
+        power = (DEGREES_OF_FREEDOM + self.coordinates) / (2 * self.coordinates)
+        total: Array = scales * np.exp(power * logarithms)
+        return total
+
+
+def make_loss(name: LossName, coordinates: int) -> Loss | None:
+    """The loss of that name for errors of some coordinates; None for squares, which bound nothing."""
+    kinds: dict[str, type[Loss]] = {"huber": Huber, "student_t": StudentT}
+    return kinds[name](coordinates) if name in kinds else None
