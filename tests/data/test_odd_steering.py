@@ -155,3 +155,12 @@ def test_a_gear_of_the_steering_is_named_relative_to_the_present_scale(robot: st
     )
     told = float(warning.partition("steering_scale ")[2].partition(" times the present one, which is 1 by default")[0])
     assert told == pytest.approx(1 / gear, rel=0.15)
+
+
+@pytest.mark.parametrize(("robot", "wheel"), [("tricycle", 0), ("car", None), *(("swerve", i) for i in range(4))])
+def test_a_steering_angle_that_never_changes_is_named(robot: str, wheel: int | None) -> None:
+    (warning,) = warnings_of(robot, steering=times(0, wheel))
+    names = STEERED[robot] if wheel is None else (STEERED[robot][wheel],)
+    columns = ", ".join(f"steer_{name}" for name in names)
+    assert warning.startswith(f"{columns} never changes, which the reference contradicts; is that steering angle")
+    assert "(importer csv: steering_columns; rosbag: steering_joints, steering_topic)" in warning

@@ -15,6 +15,7 @@ from omnibench.data.checks.odd_steering import (
     LEAST_ZERO,
     best_zero,
     clockwise,
+    frozen,
     in_degrees,
     scaled,
     zero_in_words,
@@ -47,7 +48,7 @@ def contradictions(recording: Recording) -> list[str]:
         if abs(zero) >= LEAST_ZERO:
             readings.append((left, zero_in_words(recording, group, round(zero))))
     least, words = min(readings)
-    return [words] if least < EXPLAINED * present else []
+    return [words] if least < EXPLAINED * present else frozen(recording)
 
 
 def _share(recording: Recording, outside: Array) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from omnibench.data.checks.contradictions import contradictions
 from omnibench.data.checks.explanations import odd_units, odd_wheels, ticks
 from omnibench.data.checks.misfit import Explanation, Recording
-from omnibench.data.checks.odd_steering import odd_gears, odd_zeros
+from omnibench.data.checks.odd_steering import frozen, odd_gears, odd_zeros
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 
@@ -40,6 +40,7 @@ def implausible(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array]) 
         _best(recording, single, [*zeros, *high])
         or _best(recording, [*units, *gears, *odd_wheels(recording), *zeros, *high])
         or contradictions(recording)
+        or frozen(recording)
     )
 
 

@@ -114,6 +114,22 @@ def odd_zeros(recording: Recording) -> list[Explanation]:
     return [] if turning.min() <= _BETTER * best else explanations
 
 
+def frozen(recording: Recording) -> list[str]:
+    """A warning of steering angles that never change, as those do that a driver fills in; empty if there are none."""
+    steering = np.concatenate(
+        [log.steering for log in recording.logs if log.steering is not None] or [np.empty((0, 0))]
+    )
+    steered = recording.robot.drive.steered
+    names = [name for name, angles in zip(steered, steering.T, strict=True) if not np.ptp(angles)]
+    if not names:
+        return []
+    columns = ", ".join(f"steer_{name}" for name in names)
+    return [
+        f"{columns} never changes, which the reference contradicts; is that steering angle measured? (importer csv: "
+        "steering_columns; rosbag: steering_joints, steering_topic)"
+    ]
+
+
 def best_zero(group: Array, misfit: Callable[[Reading], float]) -> tuple[float, float]:
     """Degrees to add to the steering angles of a group (S,) of 0 and 1 with least misfit, and that misfit."""
 
