@@ -3,7 +3,8 @@
 Odometry has the heading k . C(t) for the angles C (M,) that the drive signals count up to its stamp and some row k,
 whatever radii, distances and rule of integration were put into it. So headings over intervals of a second are fitted by
 least squares to the signals' increments, with free k, and to the change of their rates, as odometry may be stamped
-late; once with C between two wheel samples, and once with C of the last sample.
+late; once with C between two wheel samples, and once with C of the last sample, or of one of those before. A driver may
+read the steering angles from another zero and by another scale; the signals' derivatives by these count, too.
 
 What remains of an independent reference is its noise and the wheels' slip: 2.9 mrad at least in each of 239 runs of
 four robots under motion capture (OptiOdom), and about 1 mrad of the noise alone of markers 0.4 m apart that are seen to
@@ -13,16 +14,19 @@ four robots under motion capture (OptiOdom), and about 1 mrad of the noise alone
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import interpolated
+from omnibench.robot.wheels.drive import in_the_middle
 
 _INTERVAL = 1.0  # s
 _COPIED = 5e-4  # rad; chosen between the two above, and nearer to odometry: to refuse a good reference is worse
 _DRIVEN = 0.1  # rad; in intervals in which no wheel turns by more all headings agree
+_MOST_BEHIND = 3  # samples; by rates of samples alone odometry that is late would be told to their noise
 _FEWEST = 8  # degrees of freedom, from which the residual of an independent reference is never that small by chance
 
 
@@ -33,15 +37,15 @@ def follows_the_wheels(runs: Sequence[Trajectory]) -> float | None:
     """
     headings = np.concatenate([_increments(run, run.poses[:, 2:]) for run in runs])[:, 0]
     residuals = []
-    for held in (False, True):
-        design = np.concatenate([_increments(run, _counted(run, held)) for run in runs])
+    for behind, misread in product((None, *range(_MOST_BEHIND + 1)), (False, True)):
+        design = np.concatenate([_increments(run, _counted(run, behind, misread)) for run in runs])
         driven = np.abs(design[:, : design.shape[1] // 2]).max(axis=1) > _DRIVEN
         row, _, rank, _ = np.linalg.lstsq(design[driven], headings[driven])
-        if driven.sum() - rank < _FEWEST:
-            return None
-        left = headings[driven] - design[driven] @ row
-        residuals.append(float(np.sqrt(left @ left / (driven.sum() - rank))))
-    return min(residuals) if min(residuals) < _COPIED else None
+        if driven.sum() - rank >= _FEWEST:
+            left = headings[driven] - design[driven] @ row
+            residuals.append(float(np.sqrt(left @ left / (driven.sum() - rank))))
+    least = min(residuals, default=np.inf)
+    return least if least < _COPIED else None
 
 
 def _increments(run: Trajectory, values: Array) -> Array:
@@ -51,10 +55,27 @@ def _increments(run: Trajectory, values: Array) -> Array:
     return increments
 
 
-def _counted(run: Trajectory, held: bool) -> Array:
-    """Integrals of the drive signals up to each reference pose, or to the last sample before it, and rates (K, 2 M)."""
-    edges = np.append(0.0, run.times)
-    counted = np.vstack([np.zeros(run.signals.shape[1]), np.cumsum(run.signals * np.diff(edges)[:, None], axis=0)])
+def _counted(run: Trajectory, behind: int | None, misread: bool) -> Array:
+    """Integrals of the drive signals up to each reference pose, and rates (K, 2 Q).
+
+    behind: up to the last sample before the pose, or so many samples earlier. misread: with the derivatives by zeros
+    and scales of steering angles.
+    """
+    edges, signals = np.append(0.0, run.times), _misread(run) if misread else run.signals
+    counted = np.vstack([np.zeros(signals.shape[1]), np.cumsum(signals * np.diff(edges)[:, None], axis=0)])
     last = np.searchsorted(edges, run.pose_times + 1e-6, side="right") - 1
-    rates = run.signals[np.minimum(last, len(run.signals) - 1)]
-    return np.hstack([counted[last] if held else interpolated(run.pose_times, edges, counted), rates])
+    rates = signals[np.minimum(last, len(signals) - 1)]
+    if behind is None:
+        return np.hstack([interpolated(run.pose_times, edges, counted), rates])
+    return np.hstack([counted[np.maximum(last - behind, 0)], rates])
+
+
+def _misread(run: Trajectory) -> Array:
+    """Drive signals (F, Q) and, of a robot that steers, their derivatives by each zero and scale of its angles."""
+    if run.drive is None or run.steering is None:
+        return run.signals
+    angles = in_the_middle(run.steering)
+    _, slopes = run.drive.slopes(run.rates, angles)  # (F, M, S)
+    changed = np.concatenate([slopes, slopes * angles[:, None]], axis=2).reshape(len(angles), -1)
+    columns: Array = np.hstack([run.signals, changed[:, changed.any(axis=0)]])
+    return columns
