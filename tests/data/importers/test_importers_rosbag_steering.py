@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bag_samples import EPOCH, SLAM, WHEELS, Sent, changed, edited, header, joint_state, slam_pose, write_mcap
+from bag_samples import EPOCH, SLAM, WHEELS, Sent, changed, edited, header, joint_state, pose, slam_pose, write_mcap
 from bag_samples import read as read_bag
 from tricycle_samples import TRICYCLE, tricycle_drive
 
 from omnibench.data.dataset import Dataset
+from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.model import OdometryModel
 
@@ -165,3 +166,32 @@ def test_ticks_of_a_steering_joint_taken_for_an_angle_are_refused(tmp_path: Path
         read(tmp_path, sent, steering_unit=unit)
     data = read(tmp_path, sent, steering_unit="ticks", steering_ticks_per_turn=8192)
     assert odometry_error(data) < 0.05
+
+
+def test_an_imported_robot_that_steers_comes_back_from_disk(tmp_path: Path) -> None:
+    data = read(tmp_path, [*JOINTS, *PLACES])
+    save_dataset(data, tmp_path / "data")
+    loaded = load_dataset(tmp_path / "data")
+    assert loaded.hash == data.hash
+    assert odometry_error(loaded) == odometry_error(data) < 1e-9
+    np.testing.assert_array_equal(loaded.trajectories[0].steering, data.trajectories[0].steering)
+
+
+def test_odometry_that_a_robot_made_of_its_steering_is_refused(tmp_path: Path) -> None:
+    """Its wheelbase is wrong, and it takes the newest steering angle."""
+    rates, phi = np.diff(DRIVE["angle"]), DRIVE["phi"][1:]
+    heading = np.append(0.0, np.cumsum(0.097 * rates * np.sin(phi) / 1.3))
+    steps = 0.097 * rates * np.cos(phi) * np.exp(1j * heading[:-1])
+    place = np.append(0.0, np.cumsum(steps))
+    own = [
+        Sent("/odom", "nav_msgs/msg/Odometry", {"header": header(stamp), "pose": {"pose": pose(row)}}, int(stamp))
+        for stamp, row in zip(STAMPS, np.column_stack([place.real, place.imag, heading]), strict=True)
+    ]
+    with pytest.raises(
+        ConfigError, match=r"the only poses are /odom .* if one is independent of the wheels, set pose_t"
+    ):
+        read(tmp_path, [*JOINTS, *own])
+    with pytest.raises(
+        DataError, match=r"/odom is the robot's own odometry: .* set pose_topic to an independent refer"
+    ):
+        read(tmp_path, [*JOINTS, *own], pose_topic="/odom")
