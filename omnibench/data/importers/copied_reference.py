@@ -4,7 +4,8 @@ Odometry has the heading k . C(t) for the angles C (M,) that the drive signals c
 whatever radii, distances and rule of integration were put into it. So headings over intervals of a second are fitted by
 least squares to the signals' increments, with free k, and to the change of their rates, as odometry may be stamped
 late; once with C between two wheel samples, and once with C of the last sample, or of one of those before. A driver may
-read the steering angles from another zero and by another scale; the signals' derivatives by these count, too.
+take the newest steering angle in the place of the one amid a sample, and read it from another zero and by another
+scale; the signals' derivatives by these count, too.
 
 What remains of an independent reference is its noise and the wheels' slip: 2.9 mrad at least in each of 239 runs of
 four robots under motion capture (OptiOdom), and about 1 mrad of the noise alone of markers 0.4 m apart that are seen to
@@ -37,8 +38,10 @@ def follows_the_wheels(runs: Sequence[Trajectory]) -> float | None:
     """
     headings = np.concatenate([_increments(run, run.poses[:, 2:]) for run in runs])[:, 0]
     residuals = []
-    for behind, misread in product((None, *range(_MOST_BEHIND + 1)), (False, True)):
-        design = np.concatenate([_increments(run, _counted(run, behind, misread)) for run in runs])
+    readings = [_readings(run) for run in runs]
+    for reading, behind in product(range(len(readings[0])), (None, *range(_MOST_BEHIND + 1))):
+        counted = [_counted(run, signals[reading], behind) for run, signals in zip(runs, readings, strict=True)]
+        design = np.concatenate([_increments(*pair) for pair in zip(runs, counted, strict=True)])
         driven = np.abs(design[:, : design.shape[1] // 2]).max(axis=1) > _DRIVEN
         row, _, rank, _ = np.linalg.lstsq(design[driven], headings[driven])
         if driven.sum() - rank >= _FEWEST:
@@ -55,13 +58,12 @@ def _increments(run: Trajectory, values: Array) -> Array:
     return increments
 
 
-def _counted(run: Trajectory, behind: int | None, misread: bool) -> Array:
-    """Integrals of the drive signals up to each reference pose, and rates (K, 2 Q).
+def _counted(run: Trajectory, signals: Array, behind: int | None) -> Array:
+    """Integrals of signals (F, Q) up to each reference pose, and rates (K, 2 Q).
 
-    behind: up to the last sample before the pose, or so many samples earlier. misread: with the derivatives by zeros
-    and scales of steering angles.
+    behind: up to the last sample before the pose, or so many samples earlier.
     """
-    edges, signals = np.append(0.0, run.times), _misread(run) if misread else run.signals
+    edges = np.append(0.0, run.times)
     counted = np.vstack([np.zeros(signals.shape[1]), np.cumsum(signals * np.diff(edges)[:, None], axis=0)])
     last = np.searchsorted(edges, run.pose_times + 1e-6, side="right") - 1
     rates = signals[np.minimum(last, len(signals) - 1)]
@@ -70,12 +72,15 @@ def _counted(run: Trajectory, behind: int | None, misread: bool) -> Array:
     return np.hstack([counted[np.maximum(last - behind, 0)], rates])
 
 
-def _misread(run: Trajectory) -> Array:
-    """Drive signals (F, Q) and, of a robot that steers, their derivatives by each zero and scale of its angles."""
+def _readings(run: Trajectory) -> list[Array]:
+    """Drive signals (F, Q), and, of a robot that steers, those of drivers that read its angles otherwise."""
     if run.drive is None or run.steering is None:
-        return run.signals
-    angles = in_the_middle(run.steering)
-    _, slopes = run.drive.slopes(run.rates, angles)  # (F, M, S)
-    changed = np.concatenate([slopes, slopes * angles[:, None]], axis=2).reshape(len(angles), -1)
-    columns: Array = np.hstack([run.signals, changed[:, changed.any(axis=0)]])
-    return columns
+        return [run.signals]
+    _, somewhere = run.drive.slopes(np.ones_like(run.rates[:1]), np.full_like(run.steering[:1], 0.5))
+    signal, angle = np.nonzero(somewhere[0])
+    readings = []
+    for angles in (in_the_middle(run.steering), run.steering):
+        signals = run.drive.signals(run.rates, angles)
+        slopes = run.drive.slopes(run.rates, angles)[1][:, signal, angle]
+        readings += [signals, np.hstack([signals, slopes, slopes * angles[:, angle]])]
+    return readings
