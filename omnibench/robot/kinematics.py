@@ -185,8 +185,7 @@ def _flaw(robot: Robot) -> str:
         return flaw
     allowed = _allowed(robot)
     if allowed.shape[1] < 2 or np.abs(allowed[2]).max() < _RANK:
-        names = ", ".join(wheel.name for wheel in lateral)
-        return f"fixed wheels {names} would have to slide when it turns; put them on one axle, or say skid: true"
+        return _sliding(lateral)
     if robot.skid and not lateral:
         return "skid: true is for fixed wheels; this robot has none"
     driven = _equations(robot) @ allowed
@@ -198,6 +197,25 @@ def _flaw(robot: Robot) -> str:
             f"signals {', '.join(drive.names)} do not determine how it moves; add a measured wheel or a steering angle"
         )
     return ""
+
+
+def _sliding(fixed: Sequence[Wheel]) -> str:
+    """Names the one of the fixed wheels whose axle is off the others' line, or all of them."""
+    conditions = _conditions(fixed)
+    off = [wheel.name for i, wheel in enumerate(fixed) if np.linalg.matrix_rank(np.delete(conditions, i, axis=0)) < 2]
+    one = len(off) == 1 < len(fixed) - 1
+    every = ", ".join(wheel.name for wheel in fixed)
+    which, line = (f"wheel {off[0]}", "the others' axle") if one else (f"wheels {every}", "one axle")
+    return (
+        f"fixed {which} would have to slide when it turns; put {'it' if one else 'them'} on {line} (x, y, angle), or "
+        "write skid: true beside the robot's wheels"
+    )
+
+
+def _conditions(fixed: Sequence[Wheel]) -> Array:
+    """Rows (n, 3) that are orthogonal to the twists in which wheels do not slide along their axles, Eq. (2)."""
+    rows = [np.array([math.cos(wheel.axle), math.sin(wheel.axle)]) @ _steered(*wheel.position) for wheel in fixed]
+    return np.array(rows)
 
 
 def _flaw_of_car(robot: Robot) -> str:
@@ -242,14 +260,11 @@ def _steered(x: float, y: float) -> Array:
 
 def _allowed(robot: Robot) -> Array:
     """Z (3, D): an orthonormal basis of the twists in which no fixed wheel slides, Eq. (2)."""
-    rows = [
-        np.array([math.cos(wheel.axle), math.sin(wheel.axle)]) @ _steered(*wheel.position)
-        for wheel in robot.wheels
-        if wheel.kind == "fixed"
-    ]
-    if not rows:
+    fixed = [wheel for wheel in robot.wheels if wheel.kind == "fixed"]
+    if not fixed:
         return np.eye(3)
-    conditions = np.mean(rows, axis=0, keepdims=True) if robot.skid else np.array(rows)
+    rows = _conditions(fixed)
+    conditions = np.mean(rows, axis=0, keepdims=True) if robot.skid else rows
     _, strengths, directions = np.linalg.svd(conditions)
     rank = int((strengths > _RANK * strengths[0]).sum())
     allowed: Array = directions[rank:].T

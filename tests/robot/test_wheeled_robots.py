@@ -167,7 +167,19 @@ FOUR = [fixed("a", 0.2, 0.2), fixed("b", 0.2, -0.2), fixed("c", -0.2, 0.2), fixe
     ("wheels", "words"),
     [
         ([fixed("a", 0, 0.1)], "two measured wheels are needed, or one that steers and is measured (measured: a)"),
-        (FOUR, "fixed wheels a, b, c, d would have to slide when it turns; put them on one axle, or say skid: true"),
+        (
+            FOUR,
+            "fixed wheels a, b, c, d would have to slide when it turns; put them on one axle (x, y, angle), or write "
+            "skid: true beside the robot's wheels",
+        ),
+        (
+            [fixed("a", 0, 0.1), fixed("b", 0, -0.1), fixed("c", -0.2, 0, measured=False)],
+            "fixed wheel c would have to slide when it turns; put it on the others' axle (x, y, angle), or write skid:",
+        ),
+        (
+            [fixed("a", 0, 0.1), fixed("b", 0, -0.1, angle=0.3)],
+            "fixed wheels a, b would have to slide when it turns; put them on one axle",
+        ),
         ([fixed("a", 0, 0.1), fixed("b", 0, 0.1)], "signals a, b do not determine how it moves"),
         ([fixed("a", 0, 0.1), {"name": "b", "type": "fixed", "radius": 0.1, "x": 0}], "y of a fixed wheel is missing"),
         ([steered("a", 0.5, 0, angle=1.0)], "a steered wheel has no angle"),

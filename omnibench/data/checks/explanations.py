@@ -9,25 +9,30 @@ from itertools import combinations, permutations, product
 
 import numpy as np
 
-from omnibench.data.checks.misfit import Explanation, Reading, Recording, listed, times
-from omnibench.data.checks.odd_steering import DEGREE, IN_DEGREES
+from omnibench.data.checks.misfit import Explanation, Reading, Recording, listed, rounded, times
+from omnibench.data.checks.odd_steering import DEGREE, IN_DEGREES, clockwise
 from omnibench.robot.kinematics import Array
 
 # Units that a column may have been recorded in: factor to the SI unit, and warning.
 _RATES = (
     (1.0, ""),
-    (2 * math.pi / 60, "wheel rates look like rpm; omega_* must be rad/s"),
-    (DEGREE, "wheel rates look like deg/s; omega_* must be rad/s"),
+    (2 * math.pi / 60, "wheel rates look like rpm; omega_* must be rad/s (importers csv and rosbag: wheel_unit=rpm)"),
+    (
+        DEGREE,
+        "wheel rates look like deg/s; omega_* must be rad/s (importers csv and rosbag: wheel_unit=deg/s, or deg of "
+        "positions)",
+    ),
     (
         2 * math.pi,
-        "wheel rates look like turns a second; omega_* must be rad/s (importers csv and rosbag: wheel_unit=rev/s)",
+        "wheel rates look like turns a second; omega_* must be rad/s (importers csv and rosbag: wheel_unit=rev/s, or "
+        "rev of positions)",
     ),
 )
-_HEADINGS = ((1.0, ""), (DEGREE, "theta looks like degrees; it must be rad"))
+_HEADINGS = ((1.0, ""), (DEGREE, "theta looks like degrees; it must be rad (importer csv: heading_unit=deg)"))
 _POSITIONS = (
     (1.0, ""),
-    (1e-3, "positions look like mm; x and y must be m"),
-    (1e-2, "positions look like cm; x and y must be m"),
+    (1e-3, "positions look like mm; x and y must be m (importers csv and table1: position_unit=mm)"),
+    (1e-2, "positions look like cm; x and y must be m (importer csv: position_unit=cm)"),
 )
 _ARRANGED = 4  # wheels of which every order and sign is tried, at most; of more only one mistake (chosen)
 # An explanation that changes more must fit better by this share than a simpler one (chosen); wheels on one side of a
@@ -80,10 +85,10 @@ def _arrangement(recording: Recording) -> list[Explanation]:
         f"{name} <- {'-' if sign < 0 else ''}{names[column]}"
         for name, column, sign in zip(names, order, signs, strict=True)
     )
-    warning = (
-        f"wheels look swapped or sign-flipped; the reference fits with omega of {shown} "
-        "(importer csv: wheel_columns and wheel_signs set them right; rosbag: joints and joint_signs)"
-    )
+    options = "importer csv: wheel_columns and wheel_signs set them right; rosbag: joints and joint_signs"
+    if order == tuple(range(len(names))):
+        options = _signs(signs)
+    warning = f"wheels look swapped or sign-flipped; the reference fits with omega of {shown} ({options})"
     return [Explanation((warning,), float(misfits[best]))]
 
 
@@ -107,14 +112,14 @@ class _Mistake:
 def _wrong_signs(wheels: Sequence[str], steered: Sequence[str]) -> Iterator[_Mistake]:
     """One wheel or steering angle, or all, counted the wrong way round."""
     for which, signs in _flips(wheels):
-        options = f"importer csv: wheel_signs={listed(signs)}; rosbag: joint_signs={listed(signs)}"
-        yield _Mistake(f"{which} looks counted the wrong way round ({options})", rates=_columns(signs=signs))
+        yield _Mistake(f"{which} looks counted the wrong way round ({_signs(signs)})", rates=_columns(signs=signs))
     for which, signs in _flips(steered):
-        words = (
-            f"the steering angle of {which} looks counted clockwise; it must count counter-clockwise (importers csv "
-            f"and rosbag: steering_signs={listed(signs)})"
-        )
-        yield _Mistake(words, steering=_columns(signs=signs))
+        yield _Mistake(clockwise(which, signs), steering=_columns(signs=signs))
+
+
+def _signs(signs: Sequence[int]) -> str:
+    """The options that turn wheels round, whatever they were on import."""
+    return f"importer csv: wheel_signs, 1 by default, times {listed(signs)}; rosbag: joint_signs"
 
 
 def _exchanges(wheels: Sequence[str], steered: Sequence[str]) -> Iterator[_Mistake]:
@@ -162,14 +167,12 @@ def ticks(recording: Recording) -> list[Explanation]:
     factors = _FINER[:, None, None]
     misfits = recording.reread(times(rough)).misfits(factors * design)
     factor = rough * float(_FINER[misfits.argmin()])
-    words, count = f"wheel rates look about {_rounded(1 / factor)} times too high", 2 * math.pi / factor
+    words, count = f"wheel rates look about {rounded(1 / factor)} times too high", 2 * math.pi / factor
     options = "gear_ratio, where the encoder is at the motor, or ticks_per_turn, which counts edges (4 a pulse)"
     if count > _FEWEST_TICKS:
-        words += f", as ticks would be at about {_rounded(count)} a turn of the wheel"
+        words += f", as ticks would be at about {rounded(count)} a turn of the wheel"
         options = f"wheel_unit with ticks and ticks_per_turn; or {options}"
-    return [Explanation((f"{words} (importers csv and rosbag: {options})",), float(misfits.min()))]
-
-
-def _rounded(value: float) -> str:
-    """A value to two digits."""
-    return f"{float(f'{value:.2g}'):,.12g}"
+    else:
+        words += "; omega_* must be rad/s of the wheel"
+    options = f"importers csv and rosbag: {options}; in robot.yaml or dataset.yaml: radius of the wheels, in m"
+    return [Explanation((f"{words} ({options})",), float(misfits.min()))]

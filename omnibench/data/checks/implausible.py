@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from omnibench.data.checks.contradictions import contradictions
 from omnibench.data.checks.explanations import odd_units, odd_wheels, ticks
 from omnibench.data.checks.misfit import Explanation, Recording
-from omnibench.data.checks.odd_steering import odd_gears, odd_zeros
+from omnibench.data.checks.odd_steering import frozen, odd_gears, odd_zeros
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 
@@ -29,13 +30,17 @@ def implausible(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array]) 
         return ["the wheels never turn; check the omega_* columns"]
     recording = Recording.of(robot, logs, poses)
     if recording.misfit < _SUSPICIOUS_ZERO:
-        return []
+        return contradictions(recording)
+    zeros = odd_zeros(recording)
     if recording.misfit < _SUSPICIOUS:
-        return _best(recording, odd_zeros(recording))
+        return contradictions(recording) or _best(recording, zeros)
     units, gears, high = odd_units(recording), odd_gears(recording), ticks(recording)
     single = [each for each in (*units, *gears) if each.unit and len(each.warnings) == 1]  # the simplest first
-    return _best(recording, single, high) or _best(
-        recording, [*units, *gears, *odd_wheels(recording), *odd_zeros(recording), *high]
+    return (
+        _best(recording, single, [*zeros, *high])
+        or _best(recording, [*units, *gears, *odd_wheels(recording), *zeros, *high])
+        or contradictions(recording)
+        or frozen(recording)
     )
 
 

@@ -37,6 +37,11 @@ def listed(values: Sequence[int]) -> str:
     return f"[{','.join(map(str, values))}]"
 
 
+def rounded(value: float) -> str:
+    """A value to two digits."""
+    return f"{float(f'{value:.2g}'):,.12g}"
+
+
 @dataclass(frozen=True)
 class Explanation:
     """Warnings of what may be wrong, and the misfit that remains if they are right.

@@ -257,7 +257,7 @@ def _read_wheels(file: Path, options: CsvOptions, warnings: list[str]) -> WheelS
     if counted and len(times) < 2:
         raise DataError(f"{file}: positions and increments need two rows or more")
     values = options.wheel_angles(shown, times, str(file), warnings) if counted else shown * options.wheel_radians
-    angles = options.steering_angles(table.columns(options.angle_columns)) if options.angle_columns else None
+    angles = options.steering_angles(table.columns(options.angle_columns), str(file)) if options.angle_columns else None
     readings = WheelReadings(times, values, counted, options.quantity == "positions", angles)
     period = options.sample_period or (median_period([times]) if len(times) > 1 else float(times[0]))
     samples, losses = wheel_samples(readings, options, str(file), period)

@@ -105,8 +105,10 @@ def about_zero(shown: Array, turn: float) -> Array:
 
     An axle that steers stands nearer to straight ahead than half a turn of its encoder most of the time.
     """
+    if np.ptp(shown) > turn * (1 + _ROUNDING):  # it counts several turns, or another unit
+        return shown
     on = counted_on(shown, turn)
-    if shown.min() < 0 or shown.max() > turn:  # it counts both ways, or several turns
+    if shown.min() < 0 or shown.max() > turn:  # it counts both ways
         return on
     middle: Array = on - turn * np.round(np.median(on) / turn)
     return middle

@@ -164,9 +164,19 @@ class EncoderOptions(RecordingOptions):
             _say(f"{again} and were counted on (wraps_at={wrap:.10g} says so)", warnings)
         return on if register is None else _restored(on, times, register, place, warnings)
 
-    def steering_angles(self, shown: Array, wheels: slice = _ALL) -> Array:
-        """Steering angles (F, n), rad, of some steered wheels whose encoders show positions (F, n) in the unit."""
+    def steering_angles(self, shown: Array, place: str, wheels: slice = _ALL) -> Array:
+        """Steering angles (F, n), rad, of some steered wheels whose encoders show positions (F, n) in the unit.
+
+        DataError: they are whole numbers beyond a turn, as ticks are.
+        """
         unit, count = self.steering_unit, len(self.robot.drive.steered)
+        beyond = np.ptp(shown, axis=0) > _TURNS.get(unit, math.inf)
+        if (beyond & (shown == np.round(shown)).all(axis=0)).any():
+            raise DataError(
+                f"{place}: the steering angles, read in {unit}, are whole numbers from {shown.min():g} to "
+                f"{shown.max():g}; set steering_unit=ticks and steering_ticks_per_turn, or another steering_unit "
+                f"({', '.join(_POSITIONS)})"
+            )
 
         def each(values: Sequence[float], default: float) -> Array:
             return np.broadcast_to(np.array(values or default), count)[wheels]

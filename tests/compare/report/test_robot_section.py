@@ -9,7 +9,7 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 from report_samples import config, flower, run, usual
-from wheeled_samples import CAR, ROBOTS
+from wheeled_samples import CAR, ROBOTS, TRICYCLE
 
 from omnibench.compare.report.data_section import data_section
 from omnibench.compare.report.robot_section import robot_section
@@ -64,13 +64,22 @@ def test_wheels_given_by_x_and_y_stand_there_along_their_rolling(robot: Robot) -
     assert arrows == [f"V<sub>{name}</sub>" for name in robot.wheel_names]
 
 
-def test_the_section_on_the_data_says_where_wheels_stand_and_what_is_not_measured() -> None:
+@pytest.mark.parametrize(
+    ("robot", "first", "last"),
+    [
+        (CAR, "rl: fixed, radius 0.03 m, x 0 m, y 0.1 m; ", "steered, radius 0.03 m, x 0.3 m, y −0.1 m, not driven"),
+        (TRICYCLE, "front: steered, radius 0.0325 m, x 0.15 m, y 0 m; ", "x 0 m, y −0.08 m, not measured"),
+    ],
+)
+def test_the_section_on_the_data_says_where_wheels_stand_and_which_are_not_driven_or_not_measured(
+    robot: Robot, first: str, last: str
+) -> None:
     view = usual_view()
-    facts = data_section(replace(view, dataset=replace(view.dataset, robot=CAR))).blocks[0]
+    facts = data_section(replace(view, dataset=replace(view.dataset, robot=robot))).blocks[0]
     assert isinstance(facts, Facts)
-    (robot,) = (fact for fact in facts.items if fact.name == "Robot")
-    assert "rr: fixed, radius 0.03 m, x 0 m, y −0.1 m; " in robot.note
-    assert robot.note.endswith("fr: steered, radius 0.03 m, x 0.3 m, y −0.1 m, its rate is not measured")
+    (fact,) = (fact for fact in facts.items if fact.name == "Robot")
+    assert fact.note.startswith(first)
+    assert fact.note.endswith(last)
 
 
 def test_the_arrow_at_a_wheel_points_where_a_positive_rate_drives_it() -> None:

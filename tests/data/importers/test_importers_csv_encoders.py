@@ -13,6 +13,7 @@ from commands import RECORDINGS
 from tricycle_samples import PERIOD, REAR, TRICYCLE, tricycle_drive
 
 from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
@@ -169,6 +170,22 @@ def test_steering_angles_in_any_unit_are_the_same(tmp_path: Path, shown: Array, 
     np.testing.assert_allclose(steering[:, 0], DRIVE["phi"][1:], atol=2e-4)
 
 
+@pytest.mark.parametrize("step", [1, 5])
+def test_a_steering_column_in_degrees_is_named_however_coarse_the_samples_are(tmp_path: Path, step: int) -> None:
+    rows = {key: column[::step] for key, column in DRIVE.items()} | {"phi": np.degrees(DRIVE["phi"][::step])}
+    source = write_table(tmp_path / "log.csv", rows)
+    data = read(source, wheel_columns="angle", steering_columns="phi", wheel_unit="rad")
+    assert any(warning.startswith("steering angles look like degrees; ") for warning in data.warnings)
+
+
+def test_an_imported_table_of_a_robot_that_steers_comes_back_from_disk(tmp_path: Path) -> None:
+    data = read(
+        write_table(tmp_path / "log.csv", DRIVE), wheel_columns="angle", steering_columns="phi", wheel_unit="rad"
+    )
+    save_dataset(data, tmp_path / "data")
+    assert load_dataset(tmp_path / "data").hash == data.hash
+
+
 def test_a_recording_is_cut_into_equal_runs(tmp_path: Path) -> None:
     data = read(
         write_table(tmp_path / "log.csv", DRIVE),
@@ -259,6 +276,16 @@ def test_the_design_of_another_laboratory_s_tricycle_is_its_own_model() -> None:
     distances = errors(import_dataset("csv", CORELLI, CORELLI_OPTIONS | options).trajectories[0], robot)
     assert distances.mean() < 0.005
     assert distances.max() < 0.04
+
+
+def test_the_steering_scale_of_another_laboratory_s_tricycle_is_told_relative_to_that_of_the_import() -> None:
+    if not CORELLI.is_file():
+        pytest.skip(f"the recording is not at {CORELLI}")
+    *_, warning = import_dataset("csv", CORELLI, CORELLI_OPTIONS).warnings
+    assert warning.startswith("steering angles look about 5.5 times too small")
+    assert "steering_scale 5.5 times the present one, which is 1 by default" in warning
+    *_, last = import_dataset("csv", CORELLI, CORELLI_OPTIONS | {"steering_scale": 0.55}).warnings
+    assert "steering" not in last
 
 
 def test_the_first_guesses_of_another_laboratory_s_tricycle_are_far_off() -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,11 +25,15 @@ _REPAIR = {
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag. type: as ``sensor_msgs/msg/JointState``, also where the bag writes it shorter."""
+    """A topic of a bag. type: as ``sensor_msgs/msg/JointState``, also where the bag writes it shorter.
+
+    recorded: the times of recording count, not the stamps of the headers.
+    """
 
     name: str
     type: str
     messages: int
+    recorded: bool = False
 
     def __str__(self) -> str:
         return f"{self.name} ({self.type}, {plural(self.messages, 'message')})"
@@ -47,13 +51,15 @@ class Record:
 class Bag:
     """An open bag; see :func:`open_bag`."""
 
-    def __init__(self, path: Path, reader: AnyReader) -> None:
+    def __init__(self, path: Path, reader: AnyReader, recorded: Sequence[str] = ()) -> None:
         self.path = path
         self._reader = reader
         counts: Counter[tuple[str, str]] = Counter()
         for connection in reader.connections:
             counts[connection.topic, _full_type(connection.msgtype)] += connection.msgcount
         self.topics = tuple(Topic(*names, count) for names, count in sorted(counts.items()))
+        unstamped = {self.topic(name, "recorded_stamps").name for name in recorded}
+        self.topics = tuple(replace(topic, recorded=topic.name in unstamped) for topic in self.topics)
 
     def topic(self, name: str, key: str) -> Topic:
         """The topic that the option ``key`` names, with or without its leading slash. UnknownNameError, DataError."""
@@ -96,8 +102,11 @@ class Bag:
 
 
 @contextmanager
-def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a bag for reading. DataError in one line: it is no bag, it is cut off, or it is damaged."""
+def open_bag(path: Path, recorded: Sequence[str] = ()) -> Iterator[Bag]:
+    """Open a bag for reading. DataError in one line: it is no bag, it is cut off, or it is damaged.
+
+    recorded: names of topics of which the times of recording count. UnknownNameError: there is no such topic.
+    """
     # Imported here, since they load slowly and `omnibench list` does without.
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -107,7 +116,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
     try:
-        yield Bag(path, reader)
+        yield Bag(path, reader, recorded)
     finally:
         reader.close()
 

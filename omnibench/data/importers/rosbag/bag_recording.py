@@ -59,7 +59,7 @@ class Run:
 
 def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list[str]) -> Recording:
     """Read one bag; what is left out is added to ``warnings``. DataError, ConfigError."""
-    with open_bag(path) as bag:
+    with open_bag(path, options.recorded_stamps) as bag:
         topics = joint_topics(bag, options.wheel_topic, options.steering_topic, bool(options.robot.drive.steered))
         topic = topics.wheels[0]
         scan = scan_topic(bag, options.scan_topic, topic) if options.scans else None
@@ -191,7 +191,7 @@ def _read_cuts(bag: Bag, topic: Topic, wheels: WheelStream) -> list[Cut]:
     first, origin = int(logged[0]), int(wheels.stamps[0])
     cuts = []
     for record in bag.records(topic):
-        stamp = header_stamp(record.message)
+        stamp = 0 if topic.recorded else header_stamp(record.message)
         if stamp > 0:
             time = (stamp - origin) / 1e9
         else:
@@ -209,7 +209,7 @@ def _check_clocks(path: Path, topic: Topic, wheels: WheelStream, what: str, othe
     shown = " and ".join(f"{named.name} {span}" for named, span in zip((other, topic), spans, strict=True))
     raise DataError(
         f"{path}: no two {what} while the wheels were recorded, by the stamps of their headers ({shown}); both must be "
-        "stamped by one clock"
+        f"stamped by one clock, or set recorded_stamps=[{topic.name},{other.name}] to take the times of recording"
     )
 
 

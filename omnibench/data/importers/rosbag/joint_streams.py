@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -70,7 +71,10 @@ def read_wheels(bag: Bag, topics: JointTopics, options: RosbagOptions, warnings:
     kept = np.flatnonzero(np.logical_and.reduce([_covers(each.stamps, first.stamps) for each in (first, *others)]))
     if len(kept) < 2:
         names = ", ".join(topic.name for topic in dict.fromkeys((*topics.wheels, *topics.steering)))
-        raise DataError(f"{bag.path}: topics {names} hold no messages of one time; all must be stamped by one clock")
+        raise DataError(
+            f"{bag.path}: topics {names} hold no messages of one time; all must be stamped by one clock, or be named "
+            "in recorded_stamps"
+        )
     stamps, logged, origin = first.stamps[kept], first.logged[kept], first.stamps[kept[0]]
     times = (stamps - origin) / 1e9
     values = [first.values[kept], *(interpolated(times, (each.stamps - origin) / 1e9, each.values) for each in others)]
@@ -106,7 +110,7 @@ def _read(
     bag: Bag, topic: Topic, choice: JointChoice, wheels: slice, options: RosbagOptions, warnings: list[str]
 ) -> _JointStream:
     """The joints of some wheels that come by one topic."""
-    messages = MessageFilter(bag, topic)
+    messages, place = MessageFilter(bag, topic), f"{bag.path}: topic {topic.name}"
     quantity = "positions" if choice.steering else options.quantity
     places: dict[tuple[str, ...], tuple[int, ...] | None] = {}
     rows: list[tuple[Any, ...]] = []
@@ -120,9 +124,7 @@ def _read(
     if not rows:
         if not places:
             messages.require(0)
-        raise choice.not_found(
-            f"{bag.path}: topic {topic.name}", list(dict.fromkeys(name for names in places for name in names))
-        )
+        raise choice.not_found(place, list(dict.fromkeys(chain(*places))))
     numbers, stamps, logged = (np.array([row[column] for row in rows], dtype=np.int64) for column in range(3))
     positions, velocities = (np.array([row[column] for row in rows]) for column in (3, 4))
     unit = options.steering_unit if choice.steering else options.wheel_unit
@@ -131,15 +133,20 @@ def _read(
     counted = _uses_positions(positions, velocities, use, largest)
     values = positions if counted else velocities
     kind = "position" if counted else "velocity"
-    good = messages.keep(possible(values, largest), numbers, f"without a finite {kind} of every wheel")
+    whose, way_out = "every wheel", "set joints or wheel_topic to those that are measured"
+    if choice.steering:
+        whose, way_out = "every joint that steers", "set steering_joints or steering_topic to those that are measured"
+    elif options.use != "auto":
+        way_out = f"leave use={options.use} out, or {way_out}"
+    good = messages.keep(possible(values, largest), numbers, f"without a finite {kind} of {whose}")
     order = good[messages.in_order(stamps[good], numbers[good])]
-    messages.require(len(order))
+    messages.require(len(order), f"{way_out} (joints found: {', '.join(dict.fromkeys(chain(*places)))})")
     warnings.extend(each for each in messages.warnings() if each not in warnings)
     values = values[order]
     if choice.steering:
-        values = options.steering_angles(values, wheels)
+        values = options.steering_angles(values, place, wheels)
     elif counted:
-        values = options.wheel_angles(values, 1e-9 * stamps[order], f"{bag.path}: topic {topic.name}", warnings, wheels)
+        values = options.wheel_angles(values, 1e-9 * stamps[order], place, warnings, wheels)
     else:
         values = values * options.wheel_radians[wheels]
     return _JointStream(stamps[order], logged[order], values, counted)

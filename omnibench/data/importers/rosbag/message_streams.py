@@ -69,11 +69,16 @@ def header_stamp(message: Any) -> int:
     return 0 if stamp is None else int(stamp.sec) * _SECOND + int(stamp.nanosec)
 
 
+def stamp_of(topic: Topic, record: Record, part: Any) -> int:
+    """The stamp, ns, of (a part of) a message: that of its header, or the time of recording where this counts."""
+    return record.logged if topic.recorded or not hasattr(part, "header") else header_stamp(part)
+
+
 class MessageFilter:
     """Filter of a topic's messages: drops the useless ones, and counts them by reason.
 
-    part: gives the wanted part of a message; None where that is not in it. Messages of a type without header have the
-    time of recording as their stamp.
+    part: gives the wanted part of a message; None where that is not in it. Messages of a type without header, and of
+    topics for which it is asked, have the time of recording as their stamp.
     """
 
     def __init__(self, bag: Bag, topic: Topic, part: Callable[[Any], Any] = lambda message: message) -> None:
@@ -92,12 +97,11 @@ class MessageFilter:
                 message = self._part(record.message)
                 if message is None and record.message is not None:
                     continue
-                stamp, content = header_stamp(message), unpack(message)
+                stamp, content = stamp_of(self._topic, record, message), unpack(message)
             except (AttributeError, TypeError, ValueError):  # garbage, or a type that the bag defines otherwise
                 self._drop("that cannot be decoded", record.number)
                 continue
-            if not hasattr(message, "header"):
-                stamp, self._headless = record.logged, True
+            self._headless |= not hasattr(message, "header")
             if stamp <= 0:
                 self._drop(_NO_STAMP, record.number)
             else:
@@ -126,12 +130,20 @@ class MessageFilter:
         self.keep(fresh, numbers[order], "with a repeated stamp")
         return order[fresh]
 
-    def require(self, kept: int) -> None:
-        """DataError when more messages were dropped than kept, or fewer than two kept."""
+    def require(self, kept: int, way_out: str = "") -> None:
+        """DataError when more messages were dropped than kept, or fewer than two kept.
+
+        way_out: what to do where these have stamps.
+        """
         if kept < max(2, sum(count for count, _ in self._reasons.values())):
             problem = self._dropped_in_words() or f"it has {plural(self._topic.messages, 'message')}, too few"
-            way_out = "; the publisher must fill header.stamp" if _NO_STAMP in self._reasons else ""
-            raise DataError(f"{self._place}: {problem}{way_out}")
+            if _NO_STAMP in self._reasons:
+                topics = [topic.name for topic in self._bag.topics if topic.recorded or topic == self._topic]
+                way_out = (
+                    f"set recorded_stamps=[{','.join(topics)}] to take the times of recording, or record it anew: the "
+                    "publisher must fill header.stamp"
+                )
+            raise DataError(f"{self._place}: {problem}{'; ' if way_out else ''}{way_out}")
 
     def warnings(self) -> list[str]:
         """Warnings of messages that were dropped or put in order."""

@@ -53,6 +53,9 @@ class RosbagOptions(EncoderOptions):
     )
     joint_signs: Signs = Field((), description="-1 for joints that count the other way round")
     steering_joints: Names = Field((), description="in the order of the wheels that steer; default: by their names")
+    recorded_stamps: Names = Field(
+        (), description="topics whose header stamps are missing or by another clock: the times of recording count"
+    )
     use: Use = Field("auto", description="positions or velocities of the joints; auto: positions, if they are there")
     cut: Literal["rests", "topic", "windows", "none"] = Field(
         "rests", description="where one run ends and another begins"

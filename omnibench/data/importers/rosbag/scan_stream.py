@@ -11,7 +11,7 @@ import numpy as np
 
 from omnibench.config import validate
 from omnibench.data.importers.rosbag.bag import Bag, Topic, open_bag
-from omnibench.data.importers.rosbag.message_streams import MessageFilter, Stamps, header_stamp
+from omnibench.data.importers.rosbag.message_streams import MessageFilter, Stamps, stamp_of
 from omnibench.data.importers.rosbag.scanner_frames import ScannerMounting, scanner_mounting
 from omnibench.data.scans import Mount, Ranges, Scanner, Scans, TrajectoryScans
 from omnibench.errors import ConfigError, DataError
@@ -64,10 +64,10 @@ class RunScans:
         keys = zip(stream.logged.tolist(), stream.stamps.tolist(), strict=True)
         places = {key: index for index, key in enumerate(keys)}
         ranges = np.empty((len(self.times), stream.scanner.rays), np.float32)
-        with open_bag(stream.path) as bag:
+        with open_bag(stream.path, [stream.topic.name] if stream.topic.recorded else []) as bag:
             topic = bag.topic(stream.topic.name, "scan_topic")
             for record in bag.records(topic, int(stream.logged.min()), int(stream.logged.max())):
-                place = places.pop((record.logged, header_stamp(record.message)), None)
+                place = places.pop((record.logged, stamp_of(topic, record, record.message)), None)
                 if place is not None and len(record.message.ranges) == stream.scanner.rays:
                     ranges[place] = _measured(record.message)
         if places:
