@@ -30,7 +30,10 @@ def calibrate(
         Path | None, output_option("Calibration file to write; may be left out with --json.", metavar="FILE.yaml")
     ] = None,
     calibrator: Annotated[str, typer.Option(help="How to search; omnibench list names all.")] = "closed_form",
-    cost: Annotated[str, typer.Option(help="What to minimise; omnibench list names all.")] = "final_pose",
+    cost: Annotated[
+        str | None,
+        typer.Option(help="What to minimise (see omnibench list). Default: final_pose; trajectory, of few runs."),
+    ] = None,
     loss: Annotated[
         Literal["squares", "huber", "student_t"],
         typer.Option(help="huber, student_t: bound the influence of reference poses that are far off."),
@@ -71,6 +74,9 @@ def calibrate(
         Literal["known", "fit"] | None,
         typer.Option(help="Tracked point of a robot that cannot slide. Default: fit for tricycles and cars."),
     ] = None,
+    steering: Annotated[
+        Literal["known", "fit"], typer.Option(help="fit: first find its gain, play and coupling, and a car's zero.")
+    ] = "known",
     settings: Settings = None,
     force: Force = False,
     plugins: Plugins = None,
@@ -92,7 +98,8 @@ def calibrate(
 
     load_given_plugins(plugins)
     calibrators.entry(calibrator, "--calibrator")
-    costs.entry(cost, "--cost")
+    if cost is not None:
+        costs.entry(cost, "--cost")
     if output is None and not as_json:
         raise ConfigError("say where the calibration goes: -o calibration.yaml")
     refuse_existing(output, force=force)
@@ -113,6 +120,7 @@ def calibrate(
             unidentified=unidentified,
             tolerance=tolerance,
             mount=mount,
+            steering=steering,
             watch=watch,
         )
     calibration, result = run.calibration, run.result
@@ -122,7 +130,7 @@ def calibrate(
     if result.at_bounds:
         warn([f"on a bound of the box {box!r}: {', '.join(result.at_bounds)}; a wider box may fit better"])
     if result.held:
-        warn([f"not fitted, kept at the start value (box {box!r}, cost {cost!r}): {', '.join(result.held)}"])
+        warn([f"not fitted, kept at the start value by the box {box!r} or the cost: {', '.join(result.held)}"])
     if as_json:
         return print_json(calibration)
     print_calibration(make_console(), run)

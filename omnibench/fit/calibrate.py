@@ -20,16 +20,25 @@ from omnibench.fit.parameterisation import (
     ParameterisationName,
 )
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
-from omnibench.fit.shrinkage.prior import MountChoice, default_mount, default_unidentified
+from omnibench.fit.shrinkage.prior import MountChoice, default_cost, default_mount, default_unidentified
 from omnibench.fit.shrinkage.shrinkage import shrunk
 from omnibench.fit.span import Unidentified, WheelDirection
+from omnibench.fit.steering import SteeringChoice, SteeringFit, corrected_runs, words_of
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals, bootstrap_intervals
 from omnibench.fit.uncertainty.ratio_intervals import FEWEST, Units, units_of
 from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 from omnibench.fit.uncertainty.unidentified import kept_motions, warnings_of_calibration
 from omnibench.progress import Reporter, no_progress, renamed
 from omnibench.registry import calibrators, costs
-from omnibench.robot.calibration import Calibration, Provenance, covariance_rows, fitted_calibration, matrix_rows
+from omnibench.robot.calibration import (
+    Calibration,
+    EffectTerm,
+    Provenance,
+    covariance_rows,
+    fitted_calibration,
+    matrix_rows,
+)
+from omnibench.robot.effects.term import Term
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 
@@ -59,7 +68,7 @@ def calibrate(
     calibrator: str = "closed_form",
     *,
     options: Mapping[str, Any] | None = None,
-    cost: str = "final_pose",
+    cost: str | None = None,
     loss: LossName = "squares",
     parameterisation: ParameterisationName | None = None,
     box: Box = "row",
@@ -70,6 +79,7 @@ def calibrate(
     intervals: bool = False,
     unidentified: Unidentified | None = None,
     mount: MountChoice | None = None,
+    steering: SteeringChoice = "known",
     tolerance: float | None = None,
     watch: Reporter = no_progress,
 ) -> CalibrationRun:
@@ -82,7 +92,8 @@ def calibrate(
     unidentified: for motions that the data drive so little that slip alone may explain them, ``keep`` the design values
     or ``fit`` them (see make_parameterisation); ``shrink`` keeps them and shrinks what else is hardly known to the
     design, of the given tolerance (see shrinkage.py). The run's warnings name them. mount: ``known``, or ``fit`` where
-    the tracked point stands. Default of the three: by the robot (see prior.py).
+    the tracked point stands. Default of these and of the cost: by the robot (see prior.py). steering: ``fit`` first
+    finds gain, play and coupling of the steering and a car's zero (see steering.py), which are effects from then on.
     watch: told the evaluations and the best cost so far, at most every 0.1 s.
 
     Raises UnknownNameError or ConfigError for wrong arguments, DataError for an empty training split, and ConfigError
@@ -92,6 +103,8 @@ def calibrate(
     chosen: Calibrator = calibrators.create(calibrator, options)
     if intervals and not chosen.exact:
         raise ConfigError("intervals are drawn about a minimum to rounding: use the calibrator closed_form")
+    training = training_split(dataset)
+    cost = cost or default_cost(dataset.robot, len(training))
     plain: Cost = costs.create(cost)
     objective = with_loss(plain, loss)
     if intervals and loss != "squares":
@@ -99,17 +112,22 @@ def calibrate(
             f"resampled intervals are drawn about the minimum of a sum of norms: leave out the loss {loss}, or the "
             "resampling, since a calibration has other intervals, too"
         )
-    training = training_split(dataset)
     unidentified = unidentified or default_unidentified(dataset.robot)
     if intervals and unidentified == "shrink":
         raise ConfigError(
             "resampled intervals are drawn about a minimum, which a shrunk answer is not: set unidentified to keep; a "
             "shrunk answer has intervals of its own"
         )
+    terms: tuple[Term, ...] = ()
+    driven = training
+    if steering == "fit":
+        settings = (objective, box, mount, integration, seed)
+        terms = SteeringFit(dataset.robot, training, dataset.sample_period, *settings, watch).terms()
+        driven = corrected_runs(dataset.robot, training, terms, dataset.sample_period)
     searched = make_parameterisation(
         parameterisation or chosen.parameterisation,
         dataset.robot,
-        training,
+        driven,
         box=box,
         limits=limits,
         unidentified=unidentified,
@@ -118,7 +136,7 @@ def calibrate(
     )
     problem = CalibrationProblem(
         dataset.robot,
-        training,
+        driven,
         objective,
         searched,
         integration=integration,
@@ -131,17 +149,23 @@ def calibrate(
     if result.matrix is None or result.vector is None:
         raise ConfigError(f"calibrator {calibrator!r} gave no answer ({result.outcome}): {result.reason}")
     validation = dataset.split("validation")
-    model = OdometryModel(dataset.robot, result.matrix, integration)
+    model = OdometryModel(dataset.robot, result.matrix, integration, terms, dataset.sample_period)
     uncertainty, doubts = _uncertainty(problem, result, chosen)
-    warnings = warnings_of_calibration(dataset.robot, training, searched.name, unidentified)
+    warnings = warnings_of_calibration(dataset.robot, driven, searched.name, unidentified)
+    if terms:
+        doubts += (
+            f"the steering was fitted first ({words_of(terms)}); intervals hold for "
+            "these numbers, whose own are not known, and the file has no covariance",
+        )
     calibration = fitted_calibration(
         name=f"{dataset.name} {calibrator}",
         robot=dataset.robot,
         sample_period=dataset.sample_period,
         matrix=matrix_rows(result.matrix),
         integration=integration,
+        effects=tuple(EffectTerm(name=term.name, parameters=dict(term.values)) for term in terms),
         noise=uncertainty.noise if uncertainty else None,
-        covariance=covariance_rows(uncertainty.covariance) if uncertainty else None,
+        covariance=covariance_rows(uncertainty.covariance) if uncertainty and not terms else None,
         provenance=Provenance(
             dataset=dataset.name,
             dataset_hash=dataset.hash,

@@ -89,6 +89,7 @@ def of_group(dataset: Dataset, *groups: str) -> Dataset:
         ("circular", "square", 0.028, 1.9),
         ("circular", "ivanjko", 0.0055, 0.95),
         ("square", "square", 0.0108, 1.05),
+        ("square", "circular", 0.0297, 4.06),
     ],
 )
 def test_a_real_differential_drive_errs_less_than_by_published_methods(

@@ -48,6 +48,7 @@ TOLERANCES: Mapping[RobotClass, Tolerance] = MappingProxyType(
         "mixed": _USUAL,
     }
 )
+_NUMBERS_EACH = 2  # measured ones for each that is fitted; chosen
 # The tracked point of these stands in front of the rear axle, which is the robot's centre, and is seldom known as well
 # as the middle of a body is.
 _UNKNOWN_MOUNTS: frozenset[RobotClass] = frozenset({"tricycle", "car"})
@@ -69,6 +70,16 @@ def prior_root(robot: Robot, tolerance: Tolerance) -> Array:
 def default_unidentified(robot: Robot) -> Literal["keep", "shrink"]:
     """The treatment of what data hardly drive: shrunk for robots whose wheels say their types, else kept as ever."""
     return "shrink" if any(wheel.type is not None for wheel in robot.wheels) else "keep"
+
+
+def default_cost(robot: Robot, runs: int) -> Literal["final_pose", "trajectory"]:
+    """The cost where none is given: Eq. (6); the whole trajectory for robots whose wheels say their types, of few runs.
+
+    A final pose is three numbers. A fit of nearly as many passes through them, and through the slip of single runs.
+    """
+    rows = 3 if robot.slides or default_mount(robot) == "fit" else len(robot.motions)
+    few = 3 * runs < _NUMBERS_EACH * rows * len(robot.drive.names)
+    return "trajectory" if few and default_unidentified(robot) == "shrink" else "final_pose"
 
 
 def default_mount(robot: Robot) -> MountChoice:

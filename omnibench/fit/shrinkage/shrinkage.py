@@ -86,7 +86,7 @@ def _knowledge(problem: CalibrationProblem, result: RunResult) -> _Knowledge:
         except NoCovarianceError:
             pass
         else:
-            told = slopes @ answer.of_vector.matrix @ slopes.T
+            told = slopes @ answer.steadied @ slopes.T
             information = slopes.T @ np.linalg.pinv(told, rcond=_ROUNDING, hermitian=True) @ slopes
             freedom = np.broadcast_to(answer.of_vector.degrees_of_freedom, problem.size)
             return _Knowledge(information, np.array(freedom), answer.noise, answer.source)

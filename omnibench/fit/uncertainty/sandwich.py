@@ -96,6 +96,7 @@ _FEWEST_CLUSTERS = 4
 # times the true ones with 12 runs, and twice as wide, those of Laplace's errors are a third too large
 # (tests/benchmarks/kernel_width.py).
 _KERNEL = 0.7
+_LEAST_SEEN = 0.1  # share of the working model's variance; see Sandwich.steadied
 _INTERPOLATED = 1e-6  # share of the median error: smaller ones were made zero by the fit, up to rounding
 
 
@@ -120,17 +121,28 @@ class Sandwich:
     """Sandwich covariance (n, n) and the data behind it, in words.
 
     effective_freedom (n,): degrees of freedom of each searched number's variance, Eq. (6), for intervals by Student's
-    t. freedom_of_trace: those of the mean variance of a direction, Eq. (9). clustered: True if it is the scatter
-    between commands or sessions, which seem to scatter more than their repetitions explain. lack_of_fit: True if they
-    certainly do.
+    t. freedom_of_trace: those of the mean variance of a direction, Eq. (9). model (n, n): the working model's
+    covariance at the size that the scatter shows, s^2 R (sum_z V_z) R'. clustered: True if it is the scatter between
+    commands or sessions, which seem to scatter more than their repetitions explain. lack_of_fit: True if they certainly
+    do.
     """
 
     covariance: Array
     effective_freedom: Array
     freedom_of_trace: float
+    model: Array
     words: str
     clustered: bool = False
     lack_of_fit: bool = False
+
+    @property
+    def steadied(self) -> Array:
+        """The covariance, in no direction smaller than a share of the working model's: few runs may not scatter there.
+
+        Of n runs' scatter in d directions the smallest eigenvalue is (1 - sqrt(d/n))^2 of the true one (Marchenko and
+        Pastur, Math. USSR-Sb. 1:457, 1967), which is a tenth for n near 2 d; fewer runs say nothing of that direction.
+        """
+        return wider(self.covariance, _LEAST_SEEN * self.model)
 
 
 def scores_of_runs(
@@ -263,7 +275,7 @@ class _Scatter:
     """An estimate of R'BR, Eq. (5).
 
     spread (d, d): S. expected (d, d): E. unseen (d, d): N. seen: tr(sum_z V_z - N). squares (d, d): Q, Eq. (7) or (8).
-    freedom (n,): degrees of freedom of the variances, Eq. (6).
+    freedom (n,): degrees of freedom of the variances, Eq. (6). working (d, d): sum_z V_z.
     """
 
     spread: Array
@@ -272,6 +284,7 @@ class _Scatter:
     seen: float
     squares: Array
     freedom: Array
+    working: Array
 
     @property
     def size(self) -> float:
@@ -296,7 +309,8 @@ class _Scatter:
             words += (
                 f"; directions that one {name} alone determines have the noise model's, as large as the others' tell"
             )
-        return Sandwich(roots @ self.covariance @ roots.T, self.freedom, self.freedom_of_trace, words)
+        model = roots @ (self.size * self.working) @ roots.T
+        return Sandwich(roots @ self.covariance @ roots.T, self.freedom, self.freedom_of_trace, model, words)
 
 
 @dataclass(frozen=True, eq=False)
@@ -360,7 +374,8 @@ class _Whitened:
         self, spread: Array, expected: Array, unseen: Array, squares: Array, of_numbers: Array, most: float
     ) -> _Scatter:
         """The scatter S with E, N, Q and the sums v (n,) of Eq. (6); most: degrees of freedom at most."""
-        total, seen = float(np.trace(expected)), float(np.trace(self.working.sum(axis=0) - unseen))
+        working = self.working.sum(axis=0)
+        total, seen = float(np.trace(expected)), float(np.trace(working - unseen))
         if total < _LEAST_FREE:
             raise DataError("every direction is determined by one run alone, so that nothing scatters; repeat runs")
         means, added, crosses = (
@@ -369,7 +384,7 @@ class _Whitened:
         share = added / seen
         variances = of_numbers + 2 * share * crosses + share**2 * np.trace(squares)
         freedom = (means + share * total) ** 2 / np.maximum(variances, 1e-300)  # Eq. (6); 1 of numbers that do not vary
-        return _Scatter(spread, expected, unseen, seen, squares, np.clip(freedom, 1.0, max(most, 1.0)))
+        return _Scatter(spread, expected, unseen, seen, squares, np.clip(freedom, 1.0, max(most, 1.0)), working)
 
 
 def wider(first: Array, second: Array) -> Array:

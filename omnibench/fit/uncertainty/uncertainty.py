@@ -102,9 +102,13 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
 
 @dataclass(frozen=True, eq=False)
 class AnswerCovariance:
-    """The covariance of a searched vector, the noise of the reference poses; basis and source as in Uncertainty."""
+    """The covariance of a searched vector, the noise of the reference poses; basis and source as in Uncertainty.
+
+    steadied (n, n): the covariance, where it rests on the scatter of few runs drawn to a working model's.
+    """
 
     of_vector: EstimatedCovariance
+    steadied: Array
     noise: Noise
     basis: Basis
     source: str
@@ -118,11 +122,12 @@ def covariance_of_answer(problem: CalibrationProblem, result: RunResult) -> Answ
     if result.covariance is None:
         scatter = _by_scatter(problem, result, noise)
         estimated = EstimatedCovariance(scatter.covariance, scatter.effective_freedom)
-        return AnswerCovariance(estimated, noise, "scatter", scatter.words)
+        return AnswerCovariance(estimated, scatter.steadied, noise, "scatter", scatter.words)
     freedom = np.inf if result.degrees_of_freedom is None else result.degrees_of_freedom
     basis: Basis = "likelihood" if result.shrinkage is None else "posterior"
     source = "the calibrator's own (see its reason)" if result.shrinkage is None else result.shrinkage.source
-    return AnswerCovariance(EstimatedCovariance(result.covariance, freedom), noise, basis, source)
+    estimated = EstimatedCovariance(result.covariance, freedom)
+    return AnswerCovariance(estimated, result.covariance, noise, basis, source)
 
 
 def _by_scatter(problem: CalibrationProblem, result: RunResult, noise: Noise) -> Sandwich:
@@ -150,10 +155,11 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult, noise: Noise) ->
         raise
     except DataError as error:
         raise NoCovarianceError(f"no covariance: {error}") from None
-    covariance, freedom = np.zeros((problem.size, problem.size)), np.ones(problem.size)
-    covariance[np.ix_(free, free)] = answer.covariance
+    covariance, model = np.zeros((2, problem.size, problem.size))
+    freedom = np.ones(problem.size)
+    covariance[np.ix_(free, free)], model[np.ix_(free, free)] = answer.covariance, answer.model
     freedom[free] = answer.effective_freedom
-    return replace(answer, covariance=covariance, effective_freedom=freedom)
+    return replace(answer, covariance=covariance, model=model, effective_freedom=freedom)
 
 
 def _scores(problem: CalibrationProblem, vector: Array, free: NDArray[np.bool_], noise: Noise) -> Scores:

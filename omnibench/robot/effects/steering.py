@@ -104,7 +104,9 @@ class SteeringCoupling(MotionEffect):
     source = "CTRE Phoenix 6, SwerveModuleConstants.CouplingGearRatio"
     shows_in = "steering angle"
     only_for = "robots with a driven wheel that steers"
-    fixed_parameters = (Parameter("k", "1", -0.5, 0.5, "turn of the wheel per turn of the module that is not measured"),)
+    fixed_parameters = (
+        Parameter("k", "1", -0.5, 0.5, "turn of the wheel per turn of the module that is not measured"),
+    )
 
     def applies(self, robot: Robot) -> bool:
         return any(pair >= 0 for pair in robot.drive.pairs)
