@@ -77,9 +77,7 @@ def duration_of(command: Command, session: Session, chosen: Commands) -> float:
     return driven + chosen.ramp
 
 
-def commanded_rates(
-    robot: Robot, command: Command, times: Array, ramp: float, variation: Variation = _STEADY
-) -> Array:
+def commanded_rates(robot: Robot, command: Command, times: Array, ramp: float, variation: Variation = _STEADY) -> Array:
     """Mean wheel rates (F, N) by the design values, rad/s, in samples that end at times (F,), s.
 
     ramp: time in which the rates rise and fall linearly, s.
@@ -92,9 +90,7 @@ def commanded_rates(
     return rates if not ramp else rates * _mean_shares(times, ramp)[:, None]
 
 
-def commanded_steering(
-    robot: Robot, command: Command, times: Array, variation: Variation = _STEADY
-) -> Array | None:
+def commanded_steering(robot: Robot, command: Command, times: Array, variation: Variation = _STEADY) -> Array | None:
     """Steering angles (F, S) by the design values at times (F,), rad, s; None for robots without any."""
     if robot.drive.direct:
         return None

@@ -49,7 +49,7 @@ def _with_play(values: Values, ends: Array, durations: Array) -> Array:  # noqa:
 
 
 def _with_lag(values: Values, ends: Array, durations: Array) -> Array:
-    """A first-order lag, exact for an angle that changes linearly within samples; below 0 the angle is reported late."""
+    """A first-order lag, exact for angles that change linearly within samples; below 0 they are reported late."""
     tau = values["tau"]
     if tau == 0:
         return ends.copy()

@@ -7,7 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from effect_samples import APPLIED, EVERY, EVERY_MOTION, a_drive, a_term, at_every_sample, mixture, model, streamed, term
+from effect_samples import (
+    APPLIED,
+    EVERY,
+    EVERY_MOTION,
+    a_drive,
+    a_term,
+    at_every_sample,
+    mixture,
+    model,
+    streamed,
+    term,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 from sample_robots import APR_02

@@ -29,9 +29,7 @@ CATALOGUE = {
         *("acceleration_slip", "centripetal_slip", "rotation_translation_coupling", "quadratic_rotation_slip"),
         *("heading_drift", "body_velocity_bias", "start_transient", "icr_shift", "caster_pull"),
     ),
-    "steering": (
-        *("steering_gain", "steering_play", "steering_lag", "steering_offset", "driven_steering_offset"),
-    ),
+    "steering": (*("steering_gain", "steering_play", "steering_lag", "steering_offset", "driven_steering_offset"),),
     "world": ("floor_drift",),
     "clock": ("sample_period_scale",),
     "reference": (
