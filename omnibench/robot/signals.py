@@ -38,9 +38,9 @@ class Signals:
     sample; None if no effect needs them.
 
     Of robots that steer: steering_rates (F, S): rates of the steering angles from one sample's end to the next, rad/s.
-    steering_side (F, S): where the angle stands within the play of its gear, from -1 (it came from the right) to 1 (from
-    the left), 0 at first; None if no effect needs it. caster_rates (F,): rates at which a caster behind the centre
-    swings round, relative to the robot, to follow its motion, rad/s; None if no effect needs them.
+    steering_side (F, S): the side of its gear's play on which the motor stands, from -1 (it turned to the right last)
+    to 1 (to the left), 0 at first; None if no effect needs it. caster_rates (F,): rates at which a caster behind the
+    centre swings round, relative to the robot, to follow its motion, rad/s; None if no effect needs them.
     """
 
     robot: Robot

@@ -1,6 +1,6 @@
 """Mechanics of a simulated robot behind effects of steering, casters and grip, on code of its own.
 
-The effects that find these in recordings (robot/effects/steering.py, slip.py and drift.py) are to first order and see
+The effects that find these in recordings (robot/effects/steering_angle.py, slip.py and drift.py) are to first order and see
 samples only. Here a gear with play is a gear with play, a lag is a differential equation, and a caster is drawn along
 by its pivot:
 
@@ -49,7 +49,7 @@ def _with_play(values: Values, ends: Array, durations: Array) -> Array:  # noqa:
 
 
 def _with_lag(values: Values, ends: Array, durations: Array) -> Array:
-    """A first-order lag, exact for an angle that changes linearly within samples; below 0 the angle is reported late."""
+    """A first-order lag, exact for angles that change linearly within samples; below 0 they are reported late."""
     tau = values["tau"]
     if tau == 0:
         return ends.copy()

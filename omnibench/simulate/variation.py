@@ -54,7 +54,7 @@ class Variation(Model):
 
 
 def _within_legs(angles: Array, legs: NDArray[np.intp]) -> Array:
-    """Directions (F,) of rolling, rad, either way: continuous within each leg, and within a quarter turn as it begins."""
+    """Directions (F,) of rolling, rad, either way: continuous in each leg, which begins within a quarter turn."""
     chosen = np.empty_like(angles)
     for leg in np.unique(legs):
         part = np.unwrap(angles[legs == leg], period=math.pi)

@@ -12,6 +12,7 @@ import numpy as np
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect, MotionEffect, Need, Parameter, ReferenceEffect
+from omnibench.robot.kinematics import Robot
 from omnibench.robot.signals import Signals
 from omnibench.testing.conformance import Conformance, global_random_fingerprint, global_random_state, require
 from omnibench.testing.effect_inputs import (
@@ -21,6 +22,7 @@ from omnibench.testing.effect_inputs import (
     arrays,
     changes,
     driven_signals,
+    every_robot,
     motor_input,
     one_row,
     results,
@@ -33,10 +35,11 @@ from omnibench.testing.effect_inputs import (
 )
 
 _KINDS = {
-    "MotionEffect": (MotionEffect, ("wheel", "clock", "body", "world")),
+    "MotionEffect": (MotionEffect, ("wheel", "steering", "clock", "body", "world")),
     "ReferenceEffect": (ReferenceEffect, ("reference",)),
     "ActuatorEffect": (ActuatorEffect, ("actuator",)),
 }
+_OPTIONAL = {"wheel_angles", "session_time", "session", "poses", "steering_side", "caster_rates"}
 _ROUNDING = 1e-9  # relative to the largest value
 _NOTHING = 1e-12  # m, rad, rad/s: a smaller change is rounding
 
@@ -54,13 +57,20 @@ class EffectConformance(Conformance):
             require(isinstance(text, str) and bool(text.strip()), f"{item} is missing; set it in the class")
 
     def test_stage_is_one_of_its_kind(self) -> None:
-        """A MotionEffect acts on wheels, clock, body or world."""
+        """A MotionEffect acts on wheels, steering, clock, body or world."""
         effect = self.make()
         kinds = [name for name, (kind, _) in _KINDS.items() if isinstance(effect, kind)]
         require(len(kinds) == 1, f"it must derive from one of {', '.join(_KINDS)}")
         _, stages = _KINDS[kinds[0]]
         stage = getattr(effect, "stage", None)
         require(stage in stages, f"stage is {stage!r}; of a {kinds[0]} it is one of {', '.join(stages)}")
+
+    def test_it_applies_to_robots_that_it_names(self) -> None:
+        """It applies to one of the trial robots, and says for which it is where it does not apply to all."""
+        effect = self.make()
+        require(bool(robots(effect)), "applies is False for robots on omni, mecanum, fixed and steered wheels")
+        everywhere = all(effect.applies(robot) for robot in every_robot())
+        require(everywhere or bool(effect.only_for), "only_for is missing: say in words to which robots it applies")
 
     def test_needs_are_known(self) -> None:
         """``needs`` holds names of the contract only."""
@@ -69,7 +79,7 @@ class EffectConformance(Conformance):
 
     def test_parameters_have_units_and_plausible_ranges(self) -> None:
         """Every parameter has a unit, a description and a finite range."""
-        for robot in robots():
+        for robot in robots(self.make()):
             parameters = self.make().parameters(robot, SESSIONS)
             valid = isinstance(parameters, tuple) and all(isinstance(item, Parameter) for item in parameters)
             require(valid, "parameters must give a tuple of Parameter")
@@ -81,7 +91,7 @@ class EffectConformance(Conformance):
 
     def test_parameters_have_names_of_their_own(self) -> None:
         """Names are keys of the calibration file: unique, and the same in every call."""
-        for robot in robots():
+        for robot in robots(self.make()):
             first, again = (self.make().parameters(robot, SESSIONS) for _ in range(2))
             names = [each.name for each in first]
             require(len(set(names)) == len(names), f"two parameters have one name: {', '.join(names)}")
@@ -93,7 +103,7 @@ class EffectConformance(Conformance):
         for (robot, values), samples in product(trials(effect), (1, SAMPLES)):
             given = trial_input(effect, robot, samples=samples)
             for name, result in results(effect, given, values).items():
-                shape, expected = np.shape(result), _shape(name, effect.stage, given, len(robot.wheels))
+                shape, expected = np.shape(result), _shape(name, effect.stage, given, robot)
                 require(shape == expected, f"{name} has shape {shape}, expected {expected}")
 
     def test_zero_parameters_change_nothing(self) -> None:
@@ -107,10 +117,10 @@ class EffectConformance(Conformance):
     def test_parameters_change_something(self) -> None:
         """It changes something in a varied drive."""
         effect = self.make()
-        for robot in robots():
+        for robot in robots(effect):
             given = trial_input(effect, robot)
             seen = any((np.abs(changes(effect, given, each)) > 0).any() for each in trial_values(effect, robot))
-            require(seen, f"no parameters change anything on {len(robot.wheels)} wheels")
+            require(seen, f"no parameters change anything on {len(robot.wheel_names)} wheels")
 
     def test_results_are_finite(self) -> None:
         """Results are finite while the robot drives, drives fast and stands."""
@@ -126,7 +136,7 @@ class EffectConformance(Conformance):
             raise SkipTest("only for effects that are fitted")
         # reported poses need be linear for small parameters only: rotations are not linear in their angle
         size, tolerance = (1.0, _ROUNDING) if isinstance(effect, MotionEffect) else (1e-5, 1e-3)
-        for robot in robots():
+        for robot in robots(effect):
             given = trial_input(effect, robot)
             for first, second in zip(trial_values(effect, robot, 1), trial_values(effect, robot, 2), strict=True):
                 free = [name for name in first if first[name] != second[name]]
@@ -179,7 +189,7 @@ class EffectConformance(Conformance):
         effect = self.make()
         if not isinstance(effect, MotionEffect):
             raise SkipTest("only for effects of motion")
-        unused = {"wheel_angles", "session_time", "session", "poses"} - set(effect.needs)
+        unused = _OPTIONAL - set(effect.needs)
         bare: dict[str, Any] = dict.fromkeys(unused)
         for robot, values in trials(effect):
             try:
@@ -229,8 +239,9 @@ def _check_parameter(parameter: Parameter) -> None:
         require(low <= 0 <= high, f"{place}: 0, where it does not act, is not within {low:g} and {high:g}")
 
 
-def _shape(result: str, stage: str, given: Input, wheels: int) -> tuple[int, ...]:
+def _shape(result: str, stage: str, given: Input, robot: Robot) -> tuple[int, ...]:
     """The shape that the contract gives to a result."""
     if isinstance(given, Signals):
-        return len(given.durations), {"body": 3, "world": 2}.get(stage, wheels)
+        widths = {"body": 3, "world": 2, "steering": len(robot.drive.steered)}
+        return len(given.durations), widths.get(stage, len(robot.wheel_names))
     return given[0].shape if result.startswith("delays") else given[1].shape

@@ -11,12 +11,14 @@ import numpy as np
 
 from omnibench.robot.effects.effect import ActuatorEffect, Effect, MotionEffect, Parameter, ReferenceEffect, Values
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.signals import Signals
-from omnibench.testing.synthetic import synthetic_robot
+from omnibench.robot.signals import Caster, Signals, SteeringGears
+from omnibench.robot.wheels.drive import in_the_middle
+from omnibench.testing.synthetic import synthetic_robot, synthetic_wheeled_robots
 
 PERIOD: Final = 0.01  # s, of the wheel samples
 SAMPLES: Final = 200
 SESSIONS: Final = ("morning", "evening")
+_OMNI: Final = frozenset({synthetic_robot(3).name, synthetic_robot(4).name})
 Poses = tuple[Array, Array, Array]  # stamps (K,), poses (K, 3), start (3,)
 Motors = tuple[Array, Array]  # durations (F,), targets (F, N)
 Input = Signals | Poses | Motors
@@ -26,9 +28,12 @@ def driven_signals(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> 
     """Signals (F = samples) of a varied drive with rates of about 5 ``speed`` rad/s; speed 0: the robot stands."""
     rng = np.random.default_rng(0)
     ends = PERIOD * np.arange(1, samples + 1)
-    phases = rng.uniform(0, 2 * math.pi, (2, len(robot.wheels)))
+    phases = rng.uniform(0, 2 * math.pi, (2, len(robot.wheel_names)))
     rates = 5 * speed * (np.sin(2 * ends[:, None] + phases[0]) + 0.3 * np.sin(9 * ends[:, None] + phases[1]))
-    twists = rates @ robot.inverse_kinematic_matrix.T
+    swings = 0.4 * speed * np.sin(3 * ends[:, None] + np.arange(len(robot.drive.steered)))  # rad
+    steering = in_the_middle(swings) if robot.drive.steered else None
+    gears, caster = SteeringGears(), Caster(robot)
+    twists = robot.drive.signals(rates, steering) @ robot.inverse_kinematic_matrix.T
     middle = ends - PERIOD / 2
     return Signals(
         robot=robot,
@@ -42,6 +47,10 @@ def driven_signals(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> 
         session_time=600.0 + middle,
         session=SESSIONS[1],
         poses=_poses(twists, middle),
+        steering=steering,
+        steering_rates=None if steering is None else np.diff(swings, axis=0, prepend=swings[:1]) / PERIOD,
+        steering_side=None if steering is None else np.array([gears.turned(angles) for angles in steering]),
+        caster_rates=np.array([caster.moved(twist, PERIOD) for twist in twists.tolist()]),
     )
 
 
@@ -51,9 +60,15 @@ def _poses(twists: Array, elapsed: Array) -> Array:
     return np.column_stack([0.5 + 0.8 * np.sin(elapsed), -0.4 + 0.8 * np.cos(1.3 * elapsed), heading])
 
 
-def robots() -> tuple[Robot, Robot]:
-    """A robot on three wheels, and one on four."""
-    return synthetic_robot(3), synthetic_robot(4)
+def robots(effect: Effect) -> tuple[Robot, ...]:
+    """A robot on three omni wheels and one on four; robots on other wheels for an effect that applies to neither."""
+    applies = tuple(robot for robot in every_robot() if effect.applies(robot))
+    return tuple(robot for robot in applies if robot.name in _OMNI) or applies
+
+
+def every_robot() -> tuple[Robot, ...]:
+    """Robots on omni and mecanum wheels, and others on fixed and steered ones."""
+    return synthetic_robot(3), synthetic_robot(4), *synthetic_wheeled_robots()
 
 
 def trial_values(effect: Effect, robot: Robot, seed: int = 0) -> Iterator[Values]:
@@ -68,7 +83,7 @@ def trial_values(effect: Effect, robot: Robot, seed: int = 0) -> Iterator[Values
 
 def trials(effect: Effect) -> Iterator[tuple[Robot, Values]]:
     """Every trial robot with its trial parameters."""
-    return ((robot, values) for robot in robots() for values in trial_values(effect, robot))
+    return ((robot, values) for robot in robots(effect) for values in trial_values(effect, robot))
 
 
 def without(effect: Effect, robot: Robot, values: Values) -> Values:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from typing import Any, Literal
 
@@ -19,6 +19,7 @@ from omnibench.registry import Options
 from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, WheelLog
+from omnibench.robot.wheels.wheel import WheelType
 
 PERIOD = 0.2  # s between wheel samples
 _SAMPLES = 20  # wheel samples of a run
@@ -46,6 +47,24 @@ def synthetic_robot(wheels: Literal[3, 4] = 3) -> Robot:
         for n, side, roller in corners
     )
     return Robot(name="synthetic mecanum", wheels=tuple(mecanum))
+
+
+def synthetic_wheeled_robots() -> tuple[Robot, ...]:
+    """A differential and a skid-steered robot, a tricycle, a car, and a swerve drive on two modules."""
+
+    def wheels(kind: WheelType, places: Mapping[str, tuple[float, float]], **more: bool) -> tuple[Wheel, ...]:
+        return tuple(Wheel(name=n, type=kind, radius=0.08, x=x, y=y, **more) for n, (x, y) in places.items())
+
+    rear = {"left": (0.0, 0.2), "right": (0.0, -0.2)}
+    corners = {"fl": (0.2, 0.2), "fr": (0.2, -0.2), "rl": (-0.2, 0.2), "rr": (-0.2, -0.2)}
+    guided, front = wheels("fixed", rear, measured=False), {"front": (0.5, 0.0)}
+    return (
+        Robot(name="synthetic differential", wheels=wheels("fixed", rear)),
+        Robot(name="synthetic skid", wheels=wheels("fixed", corners), skid=True),
+        Robot(name="synthetic tricycle", wheels=(*wheels("steered", front), *guided)),
+        Robot(name="synthetic car", wheels=(*wheels("fixed", rear), *wheels("steered", front, driven=False))),
+        Robot(name="synthetic swerve", wheels=wheels("steered", {"front": (0.3, 0.0), "rear": (-0.3, 0.0)})),
+    )
 
 
 def true_robot(robot: Robot) -> Robot:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from sample_robots import APR_02
+from sample_robots import APR_02, WHEELED
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import Effect, MotionEffect, ReferenceEffect
@@ -25,6 +26,7 @@ MECANUM = Robot(
     ),
 )
 ROBOTS = {"three": APR_02, "four": MECANUM}
+EVERY = ROBOTS | {robot.name: robot for robot in WHEELED}
 
 
 def built_in(*kinds: type[Effect]) -> list[str]:
@@ -38,7 +40,14 @@ def built_in(*kinds: type[Effect]) -> list[str]:
     ]
 
 
-MOTION, REFERENCE = built_in(MotionEffect), built_in(ReferenceEffect)
+def that_apply(names: Sequence[str], robot: Robot) -> list[str]:
+    return [name for name in names if effects.create(name).applies(robot)]
+
+
+# Effects of the APR-02, and of any robot; with each, the robots to which it applies.
+MOTION, REFERENCE = that_apply(built_in(MotionEffect), APR_02), built_in(ReferenceEffect)
+EVERY_MOTION = built_in(MotionEffect)
+APPLIED = [(name, robot) for robot in EVERY for name in that_apply(EVERY_MOTION, EVERY[robot])]
 
 
 def a_drive(seed: int, samples: int = 40, robot: Robot = APR_02, stamps: int = 7) -> WheelLog:
@@ -46,16 +55,19 @@ def a_drive(seed: int, samples: int = 40, robot: Robot = APR_02, stamps: int = 7
     rng = np.random.default_rng(seed)
     durations = PERIOD * rng.uniform(0.2, 2.0, samples)
     times = np.cumsum(durations)
-    rates = rng.normal(0, 4, (samples, len(robot.wheels)))
+    wheels, steered = len(robot.wheel_names), len(robot.drive.steered)
+    rates = rng.normal(0, 4, (samples, wheels))
     rates[rng.random(samples) < 0.2] = rng.choice([0.0, 5e-4])
     return WheelLog(
         times=times,
         rates=rates,
         start=rng.normal(0, 2, 3),
         stamps=np.concatenate([[0.0], np.sort(rng.uniform(0, times[-1], stamps - 2)), times[-1:]]),
-        wheel_angles=rng.uniform(-9, 9, len(robot.wheels)) + np.cumsum(rates * durations[:, None], axis=0),
+        wheel_angles=rng.uniform(-9, 9, wheels) + np.cumsum(rates * durations[:, None], axis=0),
         started_at=float(rng.uniform(0, 3600)),
         session=SESSIONS[int(rng.integers(2))],
+        steering=0.6 * np.sin(np.cumsum(rng.normal(0, 0.2, (samples, steered)), axis=0)) if steered else None,
+        drive=robot.drive if steered else None,
     )
 
 
@@ -72,7 +84,7 @@ def a_term(name: str, robot: Robot, seed: int = 0, scale: float = 1.0) -> Term:
 def mixture(seed: int, robot: Robot, scale: float = 1.0) -> list[Term]:
     """Several effects of any motion stage, some of them twice."""
     rng = np.random.default_rng(seed)
-    names = rng.choice(MOTION, size=int(rng.integers(2, 8)))
+    names = rng.choice(that_apply(EVERY_MOTION, robot), size=int(rng.integers(2, 8)))
     return [a_term(str(name), robot, seed + place, scale) for place, name in enumerate(names)]
 
 
@@ -94,5 +106,6 @@ def streamed(stream: OdometryStream, log: WheelLog) -> np.ndarray:
     """Poses (F, 3) after every sample."""
     assert log.wheel_angles is not None
     durations = np.diff(log.times, prepend=0.0)
-    samples = zip(log.rates, durations, log.wheel_angles, strict=True)
-    return np.array([stream.drive(rates * duration, duration, angles) for rates, duration, angles in samples])
+    steering = [None] * len(log.rates) if log.steering is None else log.steering
+    samples = zip(log.rates, durations, log.wheel_angles, steering, strict=True)
+    return np.array([stream.drive(rates * duration, duration, *angles) for rates, duration, *angles in samples])

@@ -7,7 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from effect_samples import MOTION, ROBOTS, a_drive, a_term, at_every_sample, mixture, model, streamed, term
+from effect_samples import (
+    APPLIED,
+    EVERY,
+    EVERY_MOTION,
+    a_drive,
+    a_term,
+    at_every_sample,
+    mixture,
+    model,
+    streamed,
+    term,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 from sample_robots import APR_02
@@ -25,23 +36,24 @@ def stream_of(given_model: OdometryModel, log: WheelLog) -> OdometryStream:
 
 
 @pytest.mark.parametrize("integration", BOTH)
-@pytest.mark.parametrize("name", MOTION)
-@given(seed=seeds, robot=st.sampled_from(sorted(ROBOTS)), samples=st.integers(1, 60))
+@pytest.mark.parametrize("name", EVERY_MOTION)
+@given(seed=seeds, data=st.data(), samples=st.integers(1, 60))
 def test_a_stream_equals_a_batch_with_every_effect(
-    name: str, integration: Integration, seed: int, robot: str, samples: int
+    name: str, integration: Integration, seed: int, data: st.DataObject, samples: int
 ) -> None:
-    log = at_every_sample(a_drive(seed, samples, ROBOTS[robot]))
-    chosen = model(a_term(name, ROBOTS[robot], seed), robot=ROBOTS[robot], integration=integration)
+    robot = EVERY[data.draw(st.sampled_from([robot for applied, robot in APPLIED if applied == name]))]
+    log = at_every_sample(a_drive(seed, samples, robot))
+    chosen = model(a_term(name, robot, seed), robot=robot, integration=integration)
     np.testing.assert_allclose(streamed(stream_of(chosen, log), log), chosen.poses([log])[0], rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("integration", BOTH)
-@given(seed=seeds, robot=st.sampled_from(sorted(ROBOTS)), samples=st.integers(1, 60))
+@given(seed=seeds, robot=st.sampled_from(sorted(EVERY)), samples=st.integers(1, 60))
 def test_a_stream_equals_a_batch_with_any_mixture_of_effects(
     integration: Integration, seed: int, robot: str, samples: int
 ) -> None:
-    log = at_every_sample(a_drive(seed, samples, ROBOTS[robot]))
-    chosen = model(*mixture(seed, ROBOTS[robot]), robot=ROBOTS[robot], integration=integration)
+    log = at_every_sample(a_drive(seed, samples, EVERY[robot]))
+    chosen = model(*mixture(seed, EVERY[robot]), robot=EVERY[robot], integration=integration)
     np.testing.assert_allclose(streamed(stream_of(chosen, log), log), chosen.poses([log])[0], rtol=0, atol=1e-12)
 
 

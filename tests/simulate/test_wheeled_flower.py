@@ -23,13 +23,17 @@ from omnibench.simulate.flower import true_steering
 from omnibench.simulate.simulate import simulate_dataset
 
 
-@effects.register("misread_steering")
+@pytest.fixture
+def misread_steering(registries_as_before: None) -> str:  # noqa: ARG001
+    """The name of an effect that is known in one test alone."""
+    return effects.register("misread_steering")(MisreadSteering).name
+
+
 class MisreadSteering(MotionEffect):
     """The true steering angle is the measured one times 1 + g."""
 
     stage = "steering"
     physics, source, shows_in = "Gain of the angle's encoder.", "first principles", "steering angle"
-    in_catalogue = False  # of this test alone: discover must not try it
     fixed_parameters = (Parameter("g", "1", -0.1, 0.1, "gain"),)
 
     def correction(self, signals: Signals, values: Values) -> Array:
@@ -89,8 +93,10 @@ def test_a_cars_rear_wheels_turn_at_different_rates_in_a_curve() -> None:
         np.testing.assert_allclose(turn, run.omega, atol=1e-9)
 
 
-def test_an_effect_on_the_steering_angle_is_hidden_in_the_motion_and_not_in_what_is_measured() -> None:
-    hidden = [{"name": "misread_steering", "parameters": {"g": 0.05}}]
+def test_an_effect_on_the_steering_angle_is_hidden_in_the_motion_and_not_in_what_is_measured(
+    misread_steering: str,
+) -> None:
+    hidden = [{"name": misread_steering, "parameters": {"g": 0.05}}]
     plain, made = (
         simulate_dataset(experiment("tricycle", truth={"tolerances": {}, "effects": effect})) for effect in ([], hidden)
     )

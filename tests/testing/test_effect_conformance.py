@@ -138,7 +138,7 @@ BROKEN: dict[str, tuple[type[Effect], str, str]] = {
     "no source": (honest(source=""), "physics and source are given", "source is missing"),
     "no covariate": (honest(shows_in=""), "physics and source are given", "shows_in is missing"),
     "an unknown stage": (honest(stage="tyre"), "stage is one of its kind", "stage is 'tyre'; of a MotionEffect"),
-    "another kind's stage": (honest(stage="reference"), "stage is one of its kind", "one of wheel, clock, body, world"),
+    "another kind's stage": (honest(stage="reference"), "stage is one of its kind", "one of wheel, steering, clock, "),
     "a reference effect on wheels": (
         type("Wrong", (HonestReference,), {"__doc__": "Wrong.", "stage": "wheel"}),
         "stage is one of its kind",

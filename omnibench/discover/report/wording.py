@@ -44,6 +44,7 @@ _UNTESTED = "nothing was found in the training runs, but whether the sessions di
 STAGES: Mapping[Stage, str] = {
     "actuator": "target to wheel rate",
     "wheel": "wheel rate to motion of the wheel",
+    "steering": "measured to true steering angle",
     "clock": "stamps of the wheel samples",
     "body": "wheels to twist",
     "world": "twist to pose",

@@ -108,7 +108,7 @@ def _quarter_ticks(run: Trajectory, poses: Array, matrix: Array, ticks: Array) -
         for column, (sample, moment) in zip((wheel, wheel + len(ticks)), moments, strict=True):
             later = stamps > moment - 1e-9
             place = [float(np.interp(moment, run.pose_times, values)) for values in known.T]
-            moved = _column(run, matrix, wheel, sample)
+            moved = _column(run, matrix, int(wheel), int(sample))
             columns[later, :, column] = _MEAN * ticks[wheel] * _turned(moved, place, poses[later])
     return columns
 

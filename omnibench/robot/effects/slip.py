@@ -165,7 +165,7 @@ class LightWheel(MotionEffect):
         lost = np.empty(signals.rates.shape)
         for index, (wheel, pair) in enumerate(zip(robot.measured, robot.drive.pairs, strict=True)):
             rollers = wheel.roller_angle
-            angles = wheel.rolling - rollers
+            angles: Array = np.full(len(lost), wheel.rolling - rollers)
             if pair >= 0:
                 assert signals.steering is not None  # the robot steers
                 angles = angles + signals.steering[:, pair]

@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from effect_samples import MOTION, REFERENCE, ROBOTS, SESSIONS, a_drive, a_term, built_in
+from effect_samples import APPLIED, EVERY, MOTION, REFERENCE, SESSIONS, a_drive, a_term, built_in
 from hypothesis import given
 from hypothesis import strategies as st
 from sample_robots import APR_02
@@ -23,11 +23,13 @@ CATALOGUE = {
     "wheel": (
         *("speed_dependent_radius", "direction_dependent_radius", "wheel_dead_zone", "coulomb_creep"),
         *("wheel_eccentricity", "roller_ripple", "thermal_radius_drift", "tyre_wear", "load_transfer"),
+        *("light_wheel", "steering_coupling", "wheel_radius", "wheel_position"),
     ),
     "body": (
         *("acceleration_slip", "centripetal_slip", "rotation_translation_coupling", "quadratic_rotation_slip"),
-        *("heading_drift", "body_velocity_bias", "start_transient"),
+        *("heading_drift", "body_velocity_bias", "start_transient", "icr_shift", "caster_pull"),
     ),
+    "steering": (*("steering_gain", "steering_play", "steering_lag", "steering_offset", "driven_steering_offset"),),
     "world": ("floor_drift",),
     "clock": ("sample_period_scale",),
     "reference": (
@@ -36,10 +38,12 @@ CATALOGUE = {
     ),
     "actuator": ("motor_lag", "motor_dead_band", "motor_gain"),
 }
-ABSORBED = {"lidar_lever_arm", "lidar_yaw", "reference_scale", "sample_period_scale"}
+ABSORBED = {"lidar_lever_arm", "lidar_yaw", "reference_scale", "sample_period_scale"} | {
+    *("wheel_radius", "wheel_position", "driven_steering_offset"),
+}
 COVARIATES = {
     *("command", "elapsed time", "heading", "place", "order of runs", "wheel rate", "wheel angle", "acceleration"),
-    "stamps",
+    *("stamps", "steering angle"),
 }
 RATES = np.array([[2.0, -1.0, 0.04]])
 VX, VY, W = 0.3, -0.2, 0.8
@@ -139,16 +143,14 @@ def test_an_effect_says_what_it_is(name: str) -> None:
     assert effects.entry(name).summary.endswith(".")
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
-@pytest.mark.parametrize("name", MOTION)
+@pytest.mark.parametrize(("name", "robot"), APPLIED)
 @given(seed=st.integers(0, 2**32 - 1), factor=st.floats(-3, 3))
 def test_a_correction_is_linear_in_its_parameters_and_vanishes_with_them(
     name: str, robot: str, seed: int, factor: float
 ) -> None:
-    chosen = ROBOTS[robot]
+    chosen, effect = EVERY[robot], effects.create(name)
     log = a_drive(seed, 12, chosen)
-    given_signals = signals_of(log, chosen, chosen.inverse_kinematic_matrix, 0.02)
-    effect = effects.create(name)
+    given_signals = signals_of(log, chosen, chosen.inverse_kinematic_matrix, 0.02, effect.needs)
     shapes = {each.name: each.choices[0] for each in effect.parameters(chosen, SESSIONS) if each.choices}
     one, other = (dict(a_term(name, chosen, seed + step).values) | shapes for step in (1, 2))
     mixed = {key: one[key] + factor * other[key] for key in one} | shapes

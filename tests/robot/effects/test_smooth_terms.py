@@ -32,7 +32,7 @@ seeds = st.integers(0, 2**32 - 1)
 def signals(**changes: Array) -> Signals:
     """One sample of an APR-02, standing at the origin but for what is said."""
     log = replace(a_drive(1, 1), rates=np.zeros((1, 3)), start=np.zeros(3))
-    return replace(signals_of(log, APR_02, APR_02.inverse_kinematic_matrix, PERIOD, with_poses=True), **changes)
+    return replace(signals_of(log, APR_02, APR_02.inverse_kinematic_matrix, PERIOD, {"poses"}), **changes)
 
 
 def added(name: str, given_signals: Signals, **values: float) -> Array:
@@ -76,7 +76,7 @@ def test_a_stream_equals_a_batch_with_every_smooth_term(
 @given(seed=seeds, samples=st.integers(1, 60))
 def test_poses_are_those_of_the_uncorrected_path_in_the_middle_of_the_samples(seed: int, samples: int) -> None:
     log, pose = a_drive(seed, samples), np.zeros(3)
-    found = signals_of(log, APR_02, APR_02.inverse_kinematic_matrix, PERIOD, with_poses=True)
+    found = signals_of(log, APR_02, APR_02.inverse_kinematic_matrix, PERIOD, {"poses"})
     assert found.poses is not None
     pose = log.start
     for twist, duration, expected in zip(found.twists, found.durations, found.poses, strict=True):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from effect_samples import MECANUM, built_in
+from effect_samples import EVERY, built_in
 from sample_robots import APR_02
 
 from omnibench.errors import DataError, OmnibenchError, UnknownNameError
@@ -37,7 +37,7 @@ def test_any_real_number_is_a_parameter(value: float) -> None:
 
 @pytest.mark.parametrize("name", built_in(Effect))
 def test_every_effect_takes_its_own_parameters(name: str) -> None:
-    for robot in (APR_02, MECANUM):
+    for robot in filter(effects.create(name).applies, EVERY.values()):
         known = effects.create(name).parameters(robot, ("x", "y"))
         given = {each.name: each.choices[-1] if each.choices else each.high for each in known}
         assert dict(make_term(name, given, robot, sessions=("x", "y")).values) == given
