@@ -97,7 +97,8 @@ def main() -> None:
                     clean, _ = errors(dataset, train, judged, loss=loss, **choice)
                     usual = float(np.linalg.norm(clean, axis=1).mean())
                     base = usual if base is None else base
-    for seed in range(arguments.seeds):
+                    ratios = []
+                    for seed in range(arguments.seeds):
                         moved = with_jumps(train, SHARE, OFF, np.random.default_rng(seed))
                         found, _ = errors(dataset, moved, judged, loss=loss, **choice)
                         ratios.append(float(np.linalg.norm(found, axis=1).mean()) / base)
