@@ -9,8 +9,8 @@ fit/loss/losses.py, at least 1, its weight w (Eq. 5 there, 1 for no error) gives
 so that V (1/w - 1) adds to its white noise: the scale mixtures of normal errors that t distributions are, and the
 weights of a robust loss, for errors that are not independent (Lange, Little and Taylor 1989, section 2). A start that
 is off shifts a run. Where the likeliest shift has a weight of less than a fifth by the same rule, over the runs, with
-the noise's bias in V, its square adds to that of the bias. A heading that is off there turns the path, too: the run then has the
-weight. Misfit of the model is in all runs, and in s.
+the noise's bias in V, its square adds to that of the bias. A heading that is off there turns the
+path, too: the run then has the weight. Misfit of the model is in all runs, and in s.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,16 +15,19 @@ from fit_samples import make_problem
 from wheeled_recordings import recorded
 from wheeled_samples import DIFF, TRICYCLE
 
+from omnibench.config import read_yaml
 from omnibench.data.dataset import Dataset, make_dataset
-from omnibench.errors import ConfigError
+from omnibench.errors import ConfigError, DataError
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.calibrator import Outcome, run_calibrator
-from omnibench.fit.evaluate import final_errors
+from omnibench.fit.certify import certify_optimum
+from omnibench.fit.evaluate import evaluate, final_errors
 from omnibench.fit.least_squares.usable_runs import usable_runs
 from omnibench.fit.loss.losses import LossName
 from omnibench.fit.loss.robust_cost import RobustCost, with_loss
 from omnibench.fit.problem import Budget
 from omnibench.registry import calibrators, costs, load_plugin_file
+from omnibench.robot.calibration import read_calibration, write_calibration
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.import_dataset import import_dataset
@@ -32,13 +36,13 @@ ROBUST: tuple[LossName, ...] = ("huber", "student_t")
 
 
 @cache
-def recording(robot: Robot) -> tuple[Dataset, Dataset, Dataset]:
+def recording(robot: Robot, seed: int = 1) -> tuple[Dataset, Dataset, Dataset]:
     """Simulated runs to train, the same with 5 % of their poses off by 1 m, and others to judge."""
-    rng = np.random.default_rng(1)
+    rng = np.random.default_rng(seed)
     design = robot.inverse_kinematic_matrix
     truth = design * (1 + 0.02 * rng.standard_normal(design.shape))
     train, judged = (recorded(robot, truth, rng, samples=120) for _ in range(2))
-    moved = with_jumps(train, 0.05, 1.0, np.random.default_rng(2))
+    moved = with_jumps(train, 0.05, 1.0, np.random.default_rng(seed + 1))
     clean, jumping, others = (make_dataset(robot.name, robot, 0.1, runs) for runs in (train, moved, judged))
     return clean, jumping, others
 
@@ -50,9 +54,9 @@ def error(run: CalibrationRun, judged: Dataset) -> float:
 
 
 @cache
-def on_clean(robot: Robot, calibrator: str, cost: str) -> float:
-    clean, _, judged = recording(robot)
-    return error(calibrate(clean, calibrator, cost=cost, budget=Budget(evaluations=8000)), judged)
+def on_clean(robot: Robot, calibrator: str, cost: str, seed: int = 1) -> float:
+    clean, _, judged = recording(robot, seed)
+    return error(calibrate(clean, calibrator, cost=cost, budget=Budget(evaluations=4000)), judged)
 
 
 @pytest.mark.parametrize("loss", ROBUST)
@@ -62,9 +66,13 @@ def on_clean(robot: Robot, calibrator: str, cost: str) -> float:
 def test_five_percent_of_poses_off_by_a_metre_cost_five_percent_at_most(
     robot: Robot, calibrator: str, cost: str, loss: LossName
 ) -> None:
-    _, jumping, judged = recording(robot)
-    run = calibrate(jumping, calibrator, cost=cost, loss=loss, budget=Budget(evaluations=8000))
-    assert error(run, judged) <= 1.05 * on_clean(robot, calibrator, cost)
+    errors, of_clean = 0.0, 0.0
+    for seed in range(1, 3 if calibrator == "crs" else 6):  # the mean, since one set of jumps costs more or less
+        _, jumping, judged = recording(robot, seed)
+        run = calibrate(jumping, calibrator, cost=cost, loss=loss, budget=Budget(evaluations=4000))
+        errors += error(run, judged)
+        of_clean += on_clean(robot, calibrator, cost, seed)
+    assert errors <= 1.05 * of_clean
 
 
 @pytest.mark.parametrize("calibrator", ["least_squares", "trajectory_ml"])
@@ -120,12 +128,12 @@ def test_intervals_of_a_robust_fit_are_about_as_wide_as_those_of_squares_on_norm
     usual = calibrate(clean, "trajectory_ml", unidentified="keep").uncertainty
     assert usual is not None
     for dataset in (clean, jumping):
-        for calibrator in ("least_squares", "trajectory_ml"):
+        for calibrator in ("closed_form", "trajectory_ml"):
             run = calibrate(dataset, calibrator, cost="trajectory", loss=loss, unidentified="keep")
             assert run.uncertainty is not None, run.warnings
             ratio = run.uncertainty.standard_deviations[[0, 2]] / usual.standard_deviations[[0, 2]]
-            assert (ratio > 0.6).all()
-            assert (ratio < 2.5).all()
+            assert (ratio > 0.9).all()  # of the efficient estimate
+            assert (ratio < 1.7).all()
 
 
 def test_starts_that_were_taken_from_other_poses_are_named() -> None:
@@ -150,6 +158,27 @@ def test_a_cost_that_is_no_sum_of_norms_has_no_robust_loss() -> None:
     with pytest.raises(ConfigError, match="no sum of norms"):
         with_loss(Odd(None), "huber")
     assert isinstance(with_loss(costs.create("trajectory"), "huber"), RobustCost)
+
+
+def test_only_a_robust_loss_is_in_the_calibration_file_and_what_evaluate_says(tmp_path: Path) -> None:
+    clean, _, _ = recording(DIFF)
+    written = {}
+    for loss in ("squares", "huber"):
+        calibration = calibrate(clean, "least_squares", loss=loss).calibration
+        write_calibration(calibration, tmp_path / f"{loss}.yaml")
+        assert read_calibration(tmp_path / f"{loss}.yaml") == calibration
+        written[loss] = read_yaml(tmp_path / f"{loss}.yaml")["provenance"]
+        assert evaluate(calibration, clean).model_dump().get("loss") == (None if loss == "squares" else loss)
+    assert "loss" not in written["squares"]
+    assert written["huber"]["loss"] == "huber"
+    assert written["huber"]["training_cost"] == pytest.approx(written["squares"]["training_cost"], rel=0.05)
+
+
+def test_certify_refuses_what_was_fitted_with_a_robust_loss() -> None:
+    clean, _, _ = recording(DIFF)
+    calibration = calibrate(clean, "least_squares", loss="student_t").calibration
+    with pytest.raises(DataError, match="fitted with the loss student_t.*without --loss"):
+        certify_optimum(calibration, clean, seconds=1.0)
 
 
 def test_resampled_intervals_of_a_robust_fit_are_refused() -> None:
