@@ -41,6 +41,7 @@ from omnibench.robot.calibration import (
 from omnibench.robot.effects.term import Term
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
+from omnibench.words import plural
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,8 +199,21 @@ def calibrate(
     geometry = problem.parameterisation
     parameters = fitted_parameters(geometry, result.vector) if isinstance(geometry, WheelGeometry) else None
     kept = kept_motions(dataset.robot, training, searched.name, unidentified)
-    warnings = (*warnings, *doubts)
+    warnings = (*warnings, *_ends_in_words(problem), *doubts)
     return CalibrationRun(calibration, result, drawn, parameters, uncertainty, warnings, kept, units)
+
+
+def _ends_in_words(problem: CalibrationProblem) -> tuple[str, ...]:
+    """A sentence on the runs whose start or end has jumped; none where none has."""
+    moved = problem.ends_moved
+    if not moved:
+        return ()
+    which = "start or end" if problem.objective.stamps == "final" else "start"
+    named = f"{', '.join(moved[:5])}{' ...' if len(moved) > 5 else ''}"
+    return (
+        f"{plural(len(moved), 'run')} of {len(problem.trajectories)} ({named}): the reference pose at the {which} is "
+        "far from what the poses beside it say, which are used in its place",
+    )
 
 
 def _uncertainty(

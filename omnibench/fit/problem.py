@@ -19,7 +19,8 @@ from omnibench.fit.evaluator.driven_frame import DrivenFrame
 from omnibench.fit.evaluator.element_box import ElementBox
 from omnibench.fit.evaluator.evaluator import PoseEvaluator, make_evaluator
 from omnibench.fit.geometry import GeometryLimits, WheelGeometry
-from omnibench.fit.loss.robust_cost import norms_of
+from omnibench.fit.loss.end_poses import with_ends_from_others
+from omnibench.fit.loss.robust_cost import RobustCost, norms_of
 from omnibench.fit.parameterisation import (
     Box,
     MatrixElements,
@@ -70,7 +71,8 @@ class Improvement:
 class CalibrationProblem:
     """Training trajectories, a start, a box, a budget and a cost to be minimised.
 
-    trajectories: the training runs; a calibrator cannot reach the validation runs.
+    trajectories: the training runs; a calibrator cannot reach the validation runs. ends_moved: names of those whose
+    start (or end) has jumped, and is taken from the poses beside it, as a robust loss does (loss/end_poses.py).
     start (n,): the vector of the design values; lower, upper (n,): its box; names: of its n elements.
     free (n,): True for elements that may be searched; the others keep their start values.
     objective: the Cost. cost(candidates): its values, counted against the budget and recorded; a search calls this.
@@ -99,6 +101,11 @@ class CalibrationProblem:
             raise DataError("no trajectories; nothing can be calibrated")
         self.robot = robot
         self.trajectories = tuple(trajectories)
+        self.ends_moved: tuple[str, ...] = ()
+        if isinstance(cost, RobustCost):
+            self.trajectories, self.ends_moved = with_ends_from_others(
+                self.trajectories, robot, integration, cost.of_poses, last=cost.stamps == "final"
+            )
         self.objective = cost
         self.parameterisation = parameterisation
         self.shrinks = shrinks

@@ -3,11 +3,11 @@
     python tests/benchmarks/robust_study.py                       # every recording, trajectory cost
     python tests/benchmarks/robust_study.py --cost final_pose --only sim
 
-Runs are the real recordings in ../shared/data and simulated ones. Of half of them, drawn at random, the poses are contaminated by this
-script: each pose, starts among them, is moved with a probability of 5 % by 1 m in a random direction. A calibration is
-fitted to these runs, and judged on the others, which stay as recorded: by the mean error of the final pose, m and rad
-alike (Eq. 6 of Palacin et al. 2023). Each figure is divided by that of the fit of the same calibrator to the same runs
-as recorded, without a robust loss.
+Runs are the real recordings in ../shared/data, of at most 80 reference poses each, and simulated ones. Of half of them,
+drawn at random, the poses are contaminated by this script: each pose, starts among them, is moved with a probability of
+5 % by 1 m in a random direction. A calibration is fitted to these runs, and judged on the others, which stay as
+recorded: by the mean error of the final pose, m and rad alike (Eq. 6 of Palacin et al. 2023). Each figure is divided by
+that of the fit of the same calibrator to the same runs as recorded, without a robust loss.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import OmnibenchError
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.evaluate import final_errors
+from omnibench.fit.least_squares.usable_runs import usable_runs
 from omnibench.fit.loss.losses import LossName
 from omnibench.fit.problem import Budget
 from omnibench.registry import load_plugin_file
@@ -60,7 +61,9 @@ def data_sets() -> Iterator[tuple[str, Dataset]]:
     yield "robotino", import_dataset("robotino", RECORDINGS / "robotino")
 
 
-def errors(dataset: Dataset, train: list[Trajectory], judged: list[Trajectory], **choice: Any) -> tuple[Array, str]:
+def errors(
+    dataset: Dataset, train: Sequence[Trajectory], judged: Sequence[Trajectory], **choice: Any
+) -> tuple[Array, str]:
     """Errors (Z, 3) of the final poses of the judged runs, m, m, rad, and the reason of the fit's end."""
     run = calibrate(
         replace(dataset, trajectories=tuple(train)), integration="arc", budget=Budget(evaluations=20_000), **choice
@@ -81,7 +84,7 @@ def main() -> None:
             continue
         order = np.random.default_rng(0).permutation(len(dataset.trajectories))
         half = len(order) // 2
-        train = [replace(dataset.trajectories[index], split="train") for index in sorted(order[:half])]
+        train = usable_runs([replace(dataset.trajectories[index], split="train") for index in sorted(order[:half])])
         judged = [replace(dataset.trajectories[index], split="validation") for index in sorted(order[half:])]
         poses = sum(len(run.poses) for run in train)
         print(f"\n{name}, cost {arguments.cost}: {len(train)} runs, {poses} poses -> {len(judged)} runs", flush=True)

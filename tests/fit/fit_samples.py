@@ -11,6 +11,8 @@ import numpy as np
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.geometry import GeometryLimits
+from omnibench.fit.loss.losses import LossName
+from omnibench.fit.loss.robust_cost import with_loss
 from omnibench.fit.parameterisation import Box, ExplicitBox, ParameterisationName
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.progress import Reporter, no_progress
@@ -43,6 +45,7 @@ def make_problem(
     *,
     wheels: Wheels = 3,
     cost: str = "final_pose",
+    loss: LossName = "squares",
     parameterisation: ParameterisationName = "matrix",
     box: Box = "row",
     limits: GeometryLimits | None = None,
@@ -58,7 +61,7 @@ def make_problem(
     return CalibrationProblem(
         robot,
         runs,
-        costs.create(cost),
+        with_loss(costs.create(cost), loss),
         make_parameterisation(parameterisation, robot, runs, box=box, limits=limits),
         integration=integration,
         budget=Budget(evaluations=evaluations, seconds=seconds),

@@ -9,8 +9,8 @@ fit/loss/losses.py, at least 1, its weight w (Eq. 5 there, 1 for no error) gives
 so that V (1/w - 1) adds to its white noise: the scale mixtures of normal errors that t distributions are, and the
 weights of a robust loss, for errors that are not independent (Lange, Little and Taylor 1989, section 2). A start that
 is off shifts a run. Where the likeliest shift has a weight of less than a fifth by the same rule, over the runs, with
-the noise's bias in V, it adds to the bias. A heading that is off there turns the path, too: the run then has the
-weight. Misfit of the model is in all runs, and in s.
+the noise's bias in V, its square adds to that of the bias. A heading that is off there turns the
+path, too: the run then has the weight. Misfit of the model is in all runs, and in s.
 """
 
 from __future__ import annotations
@@ -107,10 +107,14 @@ def robust_noise(noise: Noise, fit: TrajectoryFit, loss: LossName, before: Robus
         positions, _ = _weights(of_position, np.sqrt((np.square(shifts) / variances)[:, :2].sum(axis=1)))
         headings, _ = _weights(of_heading, np.abs(shifts[:, 2]) / np.sqrt(variances[:, 2]))
         positions, headings = (np.where(of_start < OFF, of_start, 1.0) for of_start in (positions, headings))
+        squares = np.square(shifts)
         extras = [
             ExtraVariance((of_position, float(first)), (of_heading, float(second)))
             for (of_position, of_heading), first, second in zip(
-                poses, variances[:, 0] * (1 / positions - 1), variances[:, 2] * (1 / headings - 1), strict=True
+                poses,
+                np.where(positions < 1, squares[:, :2].mean(axis=1), 0.0),
+                np.where(headings < 1, squares[:, 2], 0.0),
+                strict=True,
             )
         ]
     near = (positions == 1) & (headings == 1)

@@ -71,12 +71,12 @@ class Loss(ABC):
     def scales(self, norms: Array, shares: Array) -> Array:
         """Scales (P,) of P sets of norms (P, S) with shares (S,): the roots of Eq. (2) or (4)."""
         squares = np.square(norms)
-        start = np.zeros(len(norms))
+        start: Array = np.zeros(len(norms))
         with np.errstate(all="ignore"):
             if (every := len(shares) // _SAMPLE) > 1:
                 some = shares[::every]
                 start = self._precisions(squares[:, ::every], some / some.sum(), start)
-            scales: Array = self._precisions(squares, shares, start) ** -0.5
+            scales = self._precisions(squares, shares, start) ** -0.5
             return np.where((squares > 0).any(axis=1), scales, LEAST_SCALE)
 
     def _precisions(self, squares: Array, shares: Array, start: Array) -> Array:

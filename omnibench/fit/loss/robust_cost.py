@@ -23,6 +23,11 @@ class RobustCost(Cost):
         self.base, self.loss = base, loss
         self.name, self.stamps, self.rounding = base.name, base.stamps, base.rounding
 
+    @property
+    def of_poses(self) -> Loss:
+        """The same loss of whole poses, m, m, rad."""
+        return type(self.loss)(3)
+
     def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
         """Costs (P,), m: at the scale of each candidate's own errors."""
         return self.loss.costs(self.base.norms(errors), self.base.shares(trajectory))

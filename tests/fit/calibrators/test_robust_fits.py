@@ -1,0 +1,199 @@
+"""Calibrators with a robust loss, where reference poses jump."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import RECORDINGS, ROOT
+from contamination import with_jumps
+from fit_samples import make_problem
+from wheeled_recordings import recorded
+from wheeled_samples import DIFF, TRICYCLE
+
+from omnibench.config import read_yaml
+from omnibench.data.dataset import Dataset, make_dataset
+from omnibench.errors import ConfigError, DataError
+from omnibench.fit.calibrate import CalibrationRun, calibrate
+from omnibench.fit.calibrator import Outcome, run_calibrator
+from omnibench.fit.certify import certify_optimum
+from omnibench.fit.evaluate import evaluate, final_errors
+from omnibench.fit.least_squares.usable_runs import usable_runs
+from omnibench.fit.loss.losses import LossName
+from omnibench.fit.loss.robust_cost import RobustCost, with_loss
+from omnibench.fit.problem import Budget
+from omnibench.registry import calibrators, costs, load_plugin_file
+from omnibench.robot.calibration import read_calibration, write_calibration
+from omnibench.robot.kinematics import Robot
+from omnibench.robot.model import OdometryModel
+from omnibench.slam.import_dataset import import_dataset
+
+ROBUST: tuple[LossName, ...] = ("huber", "student_t")
+
+
+# Simulated sets of which the mean error is compared: one alone is 5 % better or worse by chance.
+SETS = {"least_squares": 16, "trajectory_ml": 3, "closed_form": 3, "crs": 2}
+
+
+@cache
+def recording(robot: Robot, seed: int = 1) -> tuple[Dataset, Dataset, Dataset]:
+    """Simulated runs to train, the same with 5 % of their poses off by 1 m, and others to judge."""
+    rng = np.random.default_rng(seed)
+    design = robot.inverse_kinematic_matrix
+    truth = design * (1 + 0.02 * rng.standard_normal(design.shape))
+    train, judged = (recorded(robot, truth, rng, samples=120) for _ in range(2))
+    moved = with_jumps(train, 0.05, 1.0, np.random.default_rng(seed + 1))
+    clean, jumping, others = (make_dataset(robot.name, robot, 0.1, runs) for runs in (train, moved, judged))
+    return clean, jumping, others
+
+
+def error(run: CalibrationRun, judged: Dataset) -> float:
+    """Mean error of the final pose, Eq. (6)."""
+    model = OdometryModel(judged.robot, run.calibration.matrix_array, "arc")
+    return float(np.linalg.norm(final_errors(model, judged.trajectories), axis=1).mean())
+
+
+@cache
+def on_clean(robot: Robot, calibrator: str, cost: str, seed: int = 1) -> float:
+    clean, _, judged = recording(robot, seed)
+    return error(calibrate(clean, calibrator, cost=cost, budget=Budget(evaluations=4000)), judged)
+
+
+@pytest.mark.parametrize("loss", ROBUST)
+@pytest.mark.parametrize(
+    ("calibrator", "cost", "robot"),
+    [
+        ("least_squares", "trajectory", TRICYCLE),
+        ("trajectory_ml", "trajectory", DIFF),
+        ("trajectory_ml", "trajectory", TRICYCLE),
+        ("closed_form", "final_pose", TRICYCLE),
+        ("crs", "trajectory", DIFF),
+    ],
+    ids=["least_squares", "trajectory_ml of diff", "trajectory_ml of tricycle", "closed_form", "crs"],
+)
+def test_five_percent_of_poses_off_by_a_metre_cost_five_percent_at_most(
+    robot: Robot, calibrator: str, cost: str, loss: LossName
+) -> None:
+    errors, of_clean = 0.0, 0.0
+    for seed in range(1, 1 + SETS[calibrator]):
+        _, jumping, judged = recording(robot, seed)
+        run = calibrate(jumping, calibrator, cost=cost, loss=loss, budget=Budget(evaluations=4000))
+        errors += error(run, judged)
+        of_clean += on_clean(robot, calibrator, cost, seed)
+    assert errors <= 1.05 * of_clean
+
+
+@pytest.mark.parametrize("calibrator", ["least_squares", "trajectory_ml"])
+def test_without_a_robust_loss_the_same_poses_spoil_least_squares(calibrator: str) -> None:
+    _, jumping, judged = recording(DIFF)
+    assert error(calibrate(jumping, calibrator, cost="trajectory"), judged) > 1.1 * on_clean(
+        DIFF, calibrator, "trajectory"
+    )
+
+
+@pytest.mark.parametrize("loss", ROBUST)
+def test_headings_that_jump_cost_five_percent_at_most(loss: LossName) -> None:
+    clean, _, judged = recording(TRICYCLE)
+    rng = np.random.default_rng(3)
+    runs = []
+    for run in clean.trajectories:
+        poses = run.poses.copy()
+        poses[1:, 2] += 0.7 * (rng.random(len(poses) - 1) < 0.05)
+        runs.append(replace(run, poses=poses))
+    jumping = replace(clean, trajectories=tuple(runs))
+    run = calibrate(jumping, "least_squares", cost="trajectory", loss=loss)
+    assert error(run, judged) <= 1.05 * on_clean(TRICYCLE, "least_squares", "trajectory")
+
+
+@pytest.mark.parametrize("calibrator", ["least_squares", "trajectory_ml", "closed_form"])
+def test_real_recordings_with_jumps_are_calibrated_as_without(calibrator: str) -> None:
+    if not RECORDINGS.exists():
+        pytest.skip(f"no real recordings: {RECORDINGS} is not there")
+    assert load_plugin_file(ROOT / "plugins" / "robotino.py") is None
+    whole = import_dataset("robotino", RECORDINGS / "robotino")
+    train = usable_runs([replace(run, split="train") for run in whole.trajectories[::2]])
+    judged = replace(whole, trajectories=tuple(replace(run, split="train") for run in whole.trajectories[1::2]))
+    moved = with_jumps(train, 0.05, 1.0, np.random.default_rng(0))
+    clean, jumping = (replace(whole, trajectories=tuple(runs)) for runs in (train, moved))
+    base = error(calibrate(clean, calibrator, cost="trajectory"), judged)
+    assert error(calibrate(jumping, calibrator, cost="trajectory", loss="huber"), judged) <= 1.05 * base
+
+
+@pytest.mark.parametrize("loss", ROBUST)
+def test_closed_form_reaches_what_a_long_search_finds(loss: LossName) -> None:
+    found = {}
+    for name in ("closed_form", "crs"):
+        problem = make_problem(cost="trajectory", loss=loss)
+        result = run_calibrator(calibrators.create(name), problem)
+        assert result.outcome is Outcome.CONVERGED, result.reason
+        found[name] = result.cost
+    assert found["closed_form"] == pytest.approx(found["crs"], rel=1e-6)
+
+
+@pytest.mark.parametrize("loss", ROBUST)
+def test_intervals_of_a_robust_fit_are_about_as_wide_as_those_of_squares_on_normal_errors(loss: LossName) -> None:
+    clean, jumping, _ = recording(DIFF)
+    usual = calibrate(clean, "trajectory_ml", unidentified="keep").uncertainty
+    assert usual is not None
+    for dataset in (clean, jumping):
+        for calibrator in ("closed_form", "trajectory_ml"):
+            run = calibrate(dataset, calibrator, cost="trajectory", loss=loss, unidentified="keep")
+            assert run.uncertainty is not None, run.warnings
+            ratio = run.uncertainty.standard_deviations[[0, 2]] / usual.standard_deviations[[0, 2]]
+            assert (ratio > 0.9).all()  # of the efficient estimate
+            assert (ratio < 1.7).all()
+
+
+def test_starts_that_were_taken_from_other_poses_are_named() -> None:
+    _, jumping, _ = recording(DIFF)
+    (warning,) = [
+        words
+        for words in calibrate(jumping, "least_squares", cost="trajectory", loss="huber").warnings
+        if "at the start is far" in words
+    ]
+    assert warning.startswith(("1 run of 36", "2 runs of 36", "3 runs of 36", "4 runs of 36"))
+
+
+def test_a_cost_that_is_no_sum_of_norms_has_no_robust_loss() -> None:
+    from omnibench.fit.cost import Cost
+
+    class Odd(Cost):
+        name = "odd"
+
+        def combine(self, errors: Any, trajectory: Any) -> Any:  # noqa: ARG002
+            return errors[:, 0, 0]
+
+    with pytest.raises(ConfigError, match="no sum of norms"):
+        with_loss(Odd(None), "huber")
+    assert isinstance(with_loss(costs.create("trajectory"), "huber"), RobustCost)
+
+
+def test_only_a_robust_loss_is_in_the_calibration_file_and_what_evaluate_says(tmp_path: Path) -> None:
+    clean, _, _ = recording(DIFF)
+    written = {}
+    for loss in ("squares", "huber"):
+        calibration = calibrate(clean, "least_squares", loss=loss).calibration
+        write_calibration(calibration, tmp_path / f"{loss}.yaml")
+        assert read_calibration(tmp_path / f"{loss}.yaml") == calibration
+        written[loss] = read_yaml(tmp_path / f"{loss}.yaml")["provenance"]
+        assert evaluate(calibration, clean).model_dump().get("loss") == (None if loss == "squares" else loss)
+    assert "loss" not in written["squares"]
+    assert written["huber"]["loss"] == "huber"
+    assert written["huber"]["training_cost"] == pytest.approx(written["squares"]["training_cost"], rel=0.05)
+
+
+def test_certify_refuses_what_was_fitted_with_a_robust_loss() -> None:
+    clean, _, _ = recording(DIFF)
+    calibration = calibrate(clean, "least_squares", loss="student_t").calibration
+    with pytest.raises(DataError, match=r"fitted with the loss student_t.*without --loss"):
+        certify_optimum(calibration, clean, seconds=1.0)
+
+
+def test_resampled_intervals_of_a_robust_fit_are_refused() -> None:
+    clean, _, _ = recording(DIFF)
+    with pytest.raises(ConfigError, match="leave out the loss huber"):
+        calibrate(clean, "closed_form", loss="huber", intervals=True, unidentified="keep")
