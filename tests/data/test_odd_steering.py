@@ -30,10 +30,11 @@ Change = Callable[[Array], Array]
 
 @cache
 def recorded(robot: str) -> Dataset:
-    """Simulated runs of every command of a config, of a robot that is a little off its design, noisy."""
+    """Simulated runs of every third command of a config, of a robot that is a little off its design, noisy."""
     (dataset,) = yaml.safe_load((CONFIGS / f"{robot}.yaml").read_text())["datasets"].values()
     settings = {**dataset["simulate"], "repetitions": 1, "validation": None}
-    return simulate_dataset(validate(FlowerConfig, settings, robot)).dataset
+    simulated = simulate_dataset(validate(FlowerConfig, settings, robot)).dataset
+    return replace(simulated, trajectories=simulated.trajectories[::3])
 
 
 def warnings_of(robot: str, *, steering: Change | None = None, rates: Change | None = None) -> tuple[str, ...]:

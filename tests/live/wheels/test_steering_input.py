@@ -122,6 +122,24 @@ def test_an_angle_that_misses_for_long_is_held_and_said_and_makes_the_path_unkno
     assert (again.blind, receiver.input.old_steering) == (0.0, 0.0)
 
 
+@pytest.mark.parametrize(("behind", "old"), [(1, 0), (10, 0), (30, 30)])
+def test_steering_that_arrives_behind_its_wheel_samples_counts_for_the_next_and_is_said_when_too_old(
+    behind: int, old: int
+) -> None:
+    """Messages of the steering that wait in a loaded network; every angle tells the number of its sample."""
+    receiver = Receiver(max_steering_age=0.2)
+    receiver.take(at(0.0, front=0.0, front_steering=0.0))
+    steps = []
+    for k in range(1, 51):
+        now = PERIOD * k
+        steps += receiver.input.take(at(now, front=0.02 * k), now)
+        if k >= behind:
+            receiver.input.take(at(PERIOD * (k - behind), front_steering=1e-3 * (k - behind)), now)
+    np.testing.assert_allclose(steering(steps), [1e-3 * max(0, k - 1 - behind) for k in range(1, 51)], atol=1e-12)
+    assert sum(bool(step.blind) for step in steps) == receiver.counts.old_steering == old
+    assert receiver.counts.late == 0
+
+
 def test_one_of_several_angles_that_misses_counts_as_old() -> None:
     receiver, path = Receiver(SWERVE), drive(0.5)
     first, *others = path.samples()

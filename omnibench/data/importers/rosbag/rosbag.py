@@ -40,7 +40,8 @@ class Rosbag(Importer):
     and without reference poses (odometry does not count as one) gets them from its scans by SLAM, with the options in
     ``slam``; each run then begins at (0, 0, 0).
 
-    times: the stamps of the headers, of all topics by one clock; when a message was recorded does not matter.
+    times: the stamps of the headers, of all topics by one clock; when a message was recorded matters for the topics in
+    ``recorded_stamps`` only.
     Messages recorded late are sorted; those without a stamp, with a stamp that was there or with values that are not
     finite are left out. Warnings say how many. Plain numbers have no stamps but the times of recording. Positions are
     preferred: their differences are exact however many samples were lost. Velocities count as the mean since the
