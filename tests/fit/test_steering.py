@@ -1,0 +1,103 @@
+"""Fits of a steering's gain, play, coupling and zero, on simulated drives and on a real tricycle."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from corelli import corelli_dataset
+from sample_robots import CAR, DIFFERENTIAL, TRICYCLE
+from wheeled_recordings import PERIOD, recorded
+
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.errors import ConfigError
+from omnibench.fit.calibrate import CalibrationRun, calibrate
+from omnibench.robot.kinematics import Robot
+
+
+def misread(robot: Robot, gain: float = 1.0, zero: float = 0.0, coupling: float = 0.0) -> Dataset:
+    """Simulated runs whose true steering angle is gain times the measured one plus a zero, rad."""
+    runs = []
+    for run in recorded(robot, robot.inverse_kinematic_matrix, np.random.default_rng(3), 0.1):
+        assert run.steering is not None
+        measured = (run.steering - zero) / gain
+        rates = np.diff(np.vstack([measured[:1], measured]), axis=0) / PERIOD
+        runs.append(replace(run, steering=measured, rates=run.rates - coupling * rates))
+    return make_dataset(robot.name, robot, PERIOD, runs, simulated=True)
+
+
+def fitted(run: CalibrationRun) -> dict[str, float]:
+    return {name: value for term in run.calibration.effects for name, value in term.parameters.items()}
+
+
+@pytest.mark.parametrize("gain", [0.4, 1.1, 5.5])
+def test_the_gain_of_a_steering_is_found_even_where_it_is_far_off(gain: float) -> None:
+    run = calibrate(misread(TRICYCLE, gain), cost="trajectory", steering="fit")
+    assert fitted(run)["g"] == pytest.approx(gain - 1, abs=0.02 * gain)
+    assert any("the steering was fitted first (steering gain" in warning for warning in run.warnings)
+
+
+def test_the_zero_of_a_car_s_steering_is_found() -> None:
+    run = calibrate(misread(CAR, 1.0, 0.03), cost="trajectory", steering="fit")
+    assert fitted(run)["c"] == pytest.approx(0.03, abs=0.003)
+
+
+def test_a_steering_that_turns_its_wheel_along_is_found() -> None:
+    run = calibrate(misread(TRICYCLE, coupling=0.4), cost="trajectory", steering="fit")
+    assert fitted(run)["k"] == pytest.approx(0.4, abs=0.1)
+
+
+def test_a_calibration_with_a_fitted_steering_predicts_what_it_was_fitted_to() -> None:
+    dataset = misread(TRICYCLE, 1.5)
+    run = calibrate(dataset, cost="trajectory", steering="fit")
+    errors = [
+        poses[-1] - each.poses[-1]
+        for poses, each in zip(
+            run.calibration.model.poses([each.reference_log for each in dataset.trajectories]),
+            dataset.trajectories,
+            strict=True,
+        )
+    ]
+    assert np.abs(errors).mean() < 0.005
+
+
+def test_a_robot_that_does_not_steer_has_no_steering_to_fit() -> None:
+    runs = recorded(DIFFERENTIAL, DIFFERENTIAL.inverse_kinematic_matrix, np.random.default_rng(3))
+    dataset = make_dataset("diff", DIFFERENTIAL, PERIOD, runs, simulated=True)
+    with pytest.raises(ConfigError, match="steering: fit is for wheels that steer; robot diff has none"):
+        calibrate(dataset, steering="fit")
+
+
+def mean_distance(run: CalibrationRun, drive: Trajectory) -> float:
+    (poses,) = run.calibration.model.poses([drive.reference_log])
+    return float(np.hypot(*(poses - drive.poses[1:])[:, :2].T).mean())
+
+
+def half(run: Trajectory, begin: float, end: float) -> Trajectory:
+    """The part of a drive between two times, s, from its own start."""
+    assert run.steering is not None
+    shown = (run.pose_times >= begin) & (run.pose_times <= end) & np.isin(run.pose_times, [0.0, *run.times])
+    zero, last = run.pose_times[shown][[0, -1]]
+    driven = (run.times > zero) & (run.times <= last)
+    return replace(
+        run, times=run.times[driven] - zero, rates=run.rates[driven], steering=run.steering[driven], angles=None,
+        pose_times=run.pose_times[shown] - zero, poses=run.poses[shown],
+    )  # fmt: skip
+
+
+def test_a_real_tricycle_with_a_steering_gain_far_off_errs_less_than_its_authors_say() -> None:
+    dataset = corelli_dataset()
+    (drive,) = dataset.trajectories
+    run = calibrate(dataset, steering="fit")
+    assert run.calibration.provenance is not None
+    assert run.calibration.provenance.cost == "trajectory"
+    assert mean_distance(run, drive) <= 0.071
+
+
+def test_the_first_half_of_a_real_drive_predicts_the_second() -> None:
+    dataset = corelli_dataset()
+    (drive,) = dataset.trajectories
+    middle, end = float(drive.pose_times[-1] / 2), float(drive.pose_times[-1])
+    first = replace(dataset, trajectories=(half(drive, 0.0, middle),))
+    assert mean_distance(calibrate(first, steering="fit"), half(drive, middle, end)) <= 0.15
