@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from config_robots import NAMES as NAMES_OF_ROBOTS
+from config_robots import settings
 from discovery_samples import simulated
 
+from omnibench.config import validate
 from omnibench.discover.fitting.extend import fit_matrix
-from omnibench.discover.fitting.model_fit import paths_of
+from omnibench.discover.fitting.model_fit import Fit, paths_of
 from omnibench.fit.least_squares.usable_runs import usable_runs
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect
 from omnibench.robot.effects.term import make_term
 from omnibench.robot.model import OdometryModel
+from omnibench.simulate.config import FlowerConfig
+from omnibench.simulate.simulate import simulate_dataset
 
 # All that odometry or reference have, in any robot; a slope of tyre_wear needs the name of a session.
 NAMES = [
@@ -24,15 +29,37 @@ NAMES = [
 ]
 
 
-@pytest.fixture(scope="module")
-def fitted():
-    dataset = simulated((), start="random")
+def on_robot(robot: str) -> Fit:
+    """The plain matrix fitted to a few runs of the APR-02 or of a config's robot, the tracked point off its centre."""
+    if robot == "three":
+        dataset = simulated((), start="random")
+    else:
+        given = settings(robot)
+        weaving = {"variation": {"weave": 0.2, "period": 2.0}, "ramp": 0.3}
+        changes = {
+            "robot": given["robot"] | {"mount": {"x": 0.1, "y": -0.05, "yaw": 0.2}},
+            "commands": given["commands"] | weaving,
+            "train": {"seed": 1, "distance": 1.0},
+        }
+        dataset = simulate_dataset(validate(FlowerConfig, given | changes, robot)).dataset
     runs = usable_runs(dataset.split("train"))[:8]
     return fit_matrix(runs, dataset.robot, dataset.sample_period, dataset.robot.inverse_kinematic_matrix)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_slopes_by_an_effect_are_the_models_own(fitted, name: str) -> None:
+@pytest.fixture(scope="module")
+def fitted() -> Fit:
+    return on_robot("three")
+
+
+@pytest.mark.parametrize("robot", ["three", *NAMES_OF_ROBOTS])
+def test_slopes_by_an_effect_are_the_models_own(robot: str) -> None:
+    fit = on_robot(robot)
+    applied = [name for name in NAMES if effects.create(name).applies(fit.model.robot)]
+    for name in applied:
+        check_slopes(fit, name)
+
+
+def check_slopes(fitted: Fit, name: str) -> None:
     paths = paths_of(fitted)
     effect = effects.create(name)
     parameters = effect.parameters(paths.robot, ("earlier", "train"))
@@ -50,10 +77,10 @@ def test_slopes_by_an_effect_are_the_models_own(fitted, name: str) -> None:
         # A reference effect's slope is taken over a tenth of its range, along a path with corners at its ramps; in the
         # others the middle of a sample (40 ms) stands for all of it.
         tolerance = 0.05 if effect.stage == "reference" else 3e-4
-        assert np.abs(slopes - expected).max() <= tolerance * np.abs(expected).max()
+        assert np.abs(slopes - expected).max() <= tolerance * np.abs(expected).max(), f"{name}, {parameter.name}"
 
 
-def test_samples_put_together_give_the_same_slopes_of_what_varies_slowly(fitted) -> None:
+def test_samples_put_together_give_the_same_slopes_of_what_varies_slowly(fitted: Fit) -> None:
     effect = effects.create("heading_drift")
     fine, coarse = (paths_of(fitted, together).of_effect(effect, "b", {"b": 0.0}) for together in (0.0, 0.12))
     assert np.abs(fine - coarse).max() < 2e-3 * np.abs(fine).max()

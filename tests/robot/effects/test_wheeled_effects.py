@@ -73,9 +73,7 @@ def test_an_effect_applies_to_the_robots_that_have_what_it_acts_on(name: str) ->
         ("light_wheel", {"k_a": 0.1}, APR_02),
     ],
 )
-def test_an_effect_on_another_kind_of_robot_is_refused_in_one_line(
-    name: str, values: Values, robot: Robot
-) -> None:
+def test_an_effect_on_another_kind_of_robot_is_refused_in_one_line(name: str, values: Values, robot: Robot) -> None:
     with pytest.raises(DataError) as refusal:
         make_term(name, values, robot, "cal.yaml")
     words = f"cal.yaml: effect '{name}' is for {effects.create(name).only_for}; robot {robot.name} is none, leave"
@@ -196,5 +194,7 @@ def test_a_stream_takes_steering_angles_that_take_no_time(seed: int) -> None:
     before = stream.drive(log.rates[0] * 0.1, 0.1, steering=log.steering[0])
     np.testing.assert_array_equal(stream.drive(np.zeros(1), 0.0, steering=log.steering[1]), before)
     plain = replace(log, times=np.array([0.1]), rates=log.rates[:1], steering=log.steering[:1], stamps=np.array([0.1]))
-    expected = OdometryModel(TRICYCLE, TRICYCLE.inverse_kinematic_matrix, "arc").poses([replace(plain, start=np.zeros(3))])
+    expected = OdometryModel(TRICYCLE, TRICYCLE.inverse_kinematic_matrix, "arc").poses(
+        [replace(plain, start=np.zeros(3))]
+    )
     np.testing.assert_allclose(before, expected[0][0], atol=1e-12)  # nothing is known of a rate in the first sample
