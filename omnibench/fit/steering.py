@@ -5,14 +5,16 @@ K(q) is found by the closed form; with C the cost, what is minimised over q is
 
     c(q) = min_K C(K, q),    dc/dq = dC/dq at K(q) held,                                                 (1)
 
-since C has no slope in K at its minimum (envelope theorem). A lag of the steering is not among them: a wrong clock of
-the reference looks alike, and ``discover`` tells when it can.
+since C has no slope in K at its minimum (envelope theorem). C is under Huber's loss, which is smooth and bears poses
+that have jumped; the matrix of the calibration is fitted afterwards, as it always is. A lag of the steering is not
+among them: a wrong clock of the reference looks alike, and ``discover`` tells when it can.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -22,6 +24,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.cost import Cost
+from omnibench.fit.loss.robust_cost import RobustCost, norms_of, with_loss
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.fit.shrinkage.prior import MountChoice
@@ -45,7 +48,8 @@ _GAINS = (-0.95, 15.0)  # bounds of the gain, which counts from 0
 _WIDER = 3.0  # times the plausible range, of play and zero
 _SCRUB = 0.1  # m: a wheel stands no farther from the axis about which it steers, by as much as which it then rolls
 _STEP = 1e-4  # of the largest plausible size: of central differences
-_MOST = 40  # steps of the search
+_MOST = 40  # matrices of the search
+_TOLERANCE = 1e-7  # m or rad per rad of wheel, of each matrix
 
 
 @dataclass(frozen=True)
@@ -104,6 +108,13 @@ class SteeringFit:
         found = minimize(cost, best, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxfun": _MOST})
         return self._as_terms(found.x)
 
+    @cached_property
+    def _smooth(self) -> Cost:
+        """The cost that is minimised. ConfigError: the one that was asked for is no sum of norms."""
+        if norms_of(self.objective) is None:
+            raise ConfigError(f"steering: fit needs a cost that is a sum of norms, which {self.objective.name} is not")
+        return self.objective if isinstance(self.objective, RobustCost) else with_loss(self.objective, "huber")
+
     @property
     def _numbers(self) -> list[_Number]:
         chosen = [effects.create(name) for name in FITTED]
@@ -128,9 +139,9 @@ class SteeringFit:
         """The matrix (3, M) of least cost, and that cost."""
         searched = make_parameterisation("matrix", self.robot, runs, box=self.box, mount=self.mount)
         problem = CalibrationProblem(
-            self.robot, runs, self.objective, searched, integration=self.integration, budget=Budget(), seed=self.seed
+            self.robot, runs, self._smooth, searched, integration=self.integration, budget=Budget(), seed=self.seed
         )
-        result = run_calibrator(calibrators.create("closed_form", None), problem)
+        result = run_calibrator(calibrators.create("closed_form", {"tolerance": _TOLERANCE}), problem)
         if result.matrix is None or result.cost is None:
             raise ConfigError(f"steering: no matrix could be fitted ({result.outcome}): {result.reason}")
         return result.matrix, result.cost
@@ -144,9 +155,9 @@ class SteeringFit:
                 moved = vector.copy()
                 moved[index] += step
                 runs = corrected_runs(self.robot, self.runs, self._as_terms(moved), self.sample_period)
-                batch = self.objective.batch(runs, self.integration)
-                errors = batch.poses(matrix[None]) - self.objective.reference(runs)
-                values.append(float(self.objective.combine(errors, batch.trajectory)[0]))
+                batch = self._smooth.batch(runs, self.integration)
+                errors = batch.poses(matrix[None]) - self._smooth.reference(runs)
+                values.append(float(self._smooth.combine(errors, batch.trajectory)[0]))
             slopes[index] = (values[1] - values[0]) / (2 * _STEP)
         return slopes
 

@@ -40,9 +40,8 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.import_dataset import import_dataset
 
-COSTS = ("final_pose", "trajectory")
 DEFAULT = ("final_pose", "shrink")
-FOLDS = 20  # about, over all recordings: of each the default is compared with five others
+FOLDS = 20  # about, over all recordings: of each the default is compared with two others
 GROUPS = 8  # at most, to leave out one by one
 
 
@@ -103,11 +102,11 @@ def folds_by_direction(dataset: Dataset) -> Iterator[Fold]:
         )
 
 
-def matrices(dataset: Dataset, runs: Sequence[Trajectory]) -> dict[tuple[str, str], Array]:
+def matrices(dataset: Dataset, runs: Sequence[Trajectory], chosen: Sequence[str]) -> dict[tuple[str, str], Array]:
     """The calibrated matrix by every cost and treatment of what the runs hardly drive."""
     training = tuple(replace(run, split="train") for run in runs)
     found = {}
-    for cost in COSTS:
+    for cost in chosen:
         answers = {}
         for treatment in ("shrink", "fit"):
             searched = make_parameterisation("matrix", dataset.robot, training, unidentified=treatment)
@@ -155,17 +154,17 @@ def jackknife(values: Array) -> float:
     return float((count - 1) / count * np.square(values - values.mean()).sum())
 
 
-def study(dataset: Dataset, folds: Sequence[Fold]) -> None:
+def study(dataset: Dataset, folds: Sequence[Fold], chosen: Sequence[str]) -> None:
     """Print one line a fold and choice."""
     for fold in folds:
         print(f"\n{dataset.robot.name}: {fold.words} ({len(fold.train)} runs -> {len(fold.judge)})")
         trained, judged = groups(fold.train), groups(fold.judge)
-        whole = matrices(dataset, fold.train)
-        others = [matrices(dataset, [run for run in fold.train if run.id not in group]) for group in trained]
+        whole = matrices(dataset, fold.train, chosen)
+        others = [matrices(dataset, [run for run in fold.train if run.id not in group], chosen) for group in trained]
         found = {choice: errors(dataset, matrix, fold.judge) for choice, matrix in whole.items()}
         norms = {choice: np.linalg.norm(error, axis=1) for choice, error in found.items()}
         freedom = min(len(trained), len(judged)) - 1
-        reach = float(stdtrit(freedom, 1 - 0.05 / (FOLDS * 5) / 2))
+        reach = float(stdtrit(freedom, 1 - 0.05 / (FOLDS * 2) / 2))
         for choice, error in found.items():
             position, heading = np.hypot(*error[:, :2].T).mean(), np.degrees(np.abs(error[:, 2]).mean())
             words = f"  {' '.join(choice):18s} {position:.4f} m {heading:6.2f} deg"
@@ -187,6 +186,7 @@ def study(dataset: Dataset, folds: Sequence[Fold]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--factor", type=float, default=1.0, help="of every tolerance")
+    parser.add_argument("--costs", nargs="*", default=["final_pose"], help="trajectory takes hours")
     parser.add_argument("--robots", nargs="*", help="names of the recordings")
     arguments = parser.parse_args()
     prior.TOLERANCES = {
@@ -197,7 +197,7 @@ def main() -> None:
         for name, each in prior.TOLERANCES.items()
     }
     for dataset, folds in recordings(arguments.robots):
-        study(dataset, folds)
+        study(dataset, folds, arguments.costs)
 
 
 if __name__ == "__main__":

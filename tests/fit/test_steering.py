@@ -7,24 +7,53 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from corelli import corelli_dataset
+from numpy.typing import NDArray
 from sample_robots import CAR, DIFFERENTIAL, TRICYCLE
-from wheeled_recordings import PERIOD, recorded
+from wheeled_recordings import PERIOD, path, recorded
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import CalibrationRun, calibrate
-from omnibench.robot.kinematics import Robot
+from omnibench.fit.cost import Cost
+from omnibench.fit.steering import SteeringFit
+from omnibench.robot.kinematics import Array, Robot
 
 
-def misread(robot: Robot, gain: float = 1.0, zero: float = 0.0, coupling: float = 0.0) -> Dataset:
+def misread(robot: Robot, gain: float = 1.0, zero: float = 0.0) -> Dataset:
     """Simulated runs whose true steering angle is gain times the measured one plus a zero, rad."""
     runs = []
     for run in recorded(robot, robot.inverse_kinematic_matrix, np.random.default_rng(3), 0.1):
         assert run.steering is not None
-        measured = (run.steering - zero) / gain
-        rates = np.diff(np.vstack([measured[:1], measured]), axis=0) / PERIOD
-        runs.append(replace(run, steering=measured, rates=run.rates - coupling * rates))
+        runs.append(replace(run, steering=(run.steering - zero) / gain))
     return make_dataset(robot.name, robot, PERIOD, runs, simulated=True)
+
+
+def weaving(coupling: float) -> Dataset:
+    """Simulated runs of a tricycle that steers all the time, by which its wheel is turned along."""
+    times, runs = PERIOD * np.arange(1, 101), []
+    for number, phase in enumerate(np.linspace(0, 6, 8)):
+        steering = 0.5 * np.sin(times + phase)[:, None]
+        rates = np.full((100, 1), 6.0)
+        middle = (np.vstack([steering[:1], steering[:-1]]) + steering) / 2
+        moved = TRICYCLE.drive.signals(rates, middle) @ TRICYCLE.inverse_kinematic_matrix.T * PERIOD
+        turned = np.diff(np.vstack([steering[:1], steering]), axis=0) / PERIOD
+        stamps = np.concatenate([[0.0], times[9::10]])
+        runs.append(
+            Trajectory(
+                str(number), "train", times, rates - coupling * turned, stamps, path(moved)[::10], steering=steering
+            )
+        )
+    return make_dataset("weaving", TRICYCLE, PERIOD, runs, simulated=True)
+
+
+class Worst(Cost):
+    """The largest pose error."""
+
+    name = "worst"
+
+    def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:  # noqa: ARG002
+        worst: Array = np.abs(errors).max(axis=(1, 2))
+        return worst
 
 
 def fitted(run: CalibrationRun) -> dict[str, float]:
@@ -44,8 +73,8 @@ def test_the_zero_of_a_car_s_steering_is_found() -> None:
 
 
 def test_a_steering_that_turns_its_wheel_along_is_found() -> None:
-    run = calibrate(misread(TRICYCLE, coupling=0.4), cost="trajectory", steering="fit")
-    assert fitted(run)["k"] == pytest.approx(0.4, abs=0.1)
+    run = calibrate(weaving(0.4), cost="trajectory", steering="fit")
+    assert fitted(run)["k"] == pytest.approx(0.4, abs=0.02)
 
 
 def test_a_calibration_with_a_fitted_steering_predicts_what_it_was_fitted_to() -> None:
@@ -60,6 +89,11 @@ def test_a_calibration_with_a_fitted_steering_predicts_what_it_was_fitted_to() -
         )
     ]
     assert np.abs(errors).mean() < 0.005
+
+
+def test_a_steering_is_fitted_by_pose_errors() -> None:
+    with pytest.raises(ConfigError, match="steering: fit needs a cost that is a sum of norms, which worst is not"):
+        SteeringFit(TRICYCLE, tuple(misread(TRICYCLE).trajectories), PERIOD, Worst(None), "row", None, "arc", 1).terms()
 
 
 def test_a_robot_that_does_not_steer_has_no_steering_to_fit() -> None:

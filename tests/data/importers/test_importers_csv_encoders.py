@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import RECORDINGS
-from tricycle_samples import PERIOD, REAR, TRICYCLE, tricycle_drive
+from corelli import CORELLI, CORELLI_OPTIONS, corelli_dataset
+from tricycle_samples import PERIOD, TRICYCLE, tricycle_drive
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.storage import load_dataset, save_dataset
@@ -19,7 +19,6 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.import_dataset import import_dataset
 
-CORELLI = RECORDINGS / "tricycle_corelli" / "dataset.txt"
 DRIVE = tricycle_drive()
 
 
@@ -226,37 +225,8 @@ def test_a_foreign_table_is_refused_with_the_options_that_describe_it(
     assert "\n" not in str(caught.value)
 
 
-# The tricycle of tricycle_corelli by options alone. Its authors' first guesses: 0.0106141 m for a revolution of the
-# traction encoder of 5000 ticks, which is a wheel of 0.0106141 / (2 pi) = 0.00168929 m on the encoder's axle; a tenth
-# of the steering encoder's angle; 1.4 m between the axles; a tracked point 1.5 m ahead of the rear one.
-CORELLI_OPTIONS: dict[str, Any] = {
-    "robot": {
-        "name": "corelli",
-        "mount": {"x": 1.5},
-        "wheels": [
-            {"name": "front", "type": "steered", "radius": 0.0106141 / (2 * math.pi), "x": 1.4, "y": 0},
-            {"name": "left", "y": 0.3, **REAR},
-            {"name": "right", "y": -0.3, **REAR},
-        ],
-    },
-    "separator": "blanks",
-    "header_lines": 0,
-    "wheel_time_column": 2,
-    "wheel_columns": 5,
-    "wheel_unit": "ticks",
-    "ticks_per_turn": 5000,
-    "steering_columns": 4,
-    "steering_unit": "ticks",
-    "steering_ticks_per_turn": 8192,
-    "steering_scale": 0.1,
-    "pose_columns": [11, 12, 13],
-}
-
-
 def corelli(**options: Any) -> Trajectory:
-    if not CORELLI.is_file():
-        pytest.skip(f"the recording is not at {CORELLI}")
-    data = import_dataset("csv", CORELLI, CORELLI_OPTIONS | options)
+    data = corelli_dataset(**options)
     assert "4 steps of wheel positions ran back while the wheel turned on, as in a register of 65" in data.warnings[1]
     assert "wheel positions begin again after 4294967296 ticks and were counted on" in data.warnings[0]
     assert "51 rows that repeat the ones before while the wheels turn" in data.warnings[2]
@@ -282,9 +252,9 @@ def test_the_steering_scale_of_another_laboratory_s_tricycle_is_told_relative_to
     if not CORELLI.is_file():
         pytest.skip(f"the recording is not at {CORELLI}")
     *_, warning = import_dataset("csv", CORELLI, CORELLI_OPTIONS).warnings
-    assert warning.startswith("steering angles look about 5.5 times too small")
-    assert "steering_scale 5.5 times the present one, which is 1 by default" in warning
-    *_, last = import_dataset("csv", CORELLI, CORELLI_OPTIONS | {"steering_scale": 0.55}).warnings
+    assert warning.startswith("steering angles look about 5 times too small")
+    assert "steering_scale 5 times the present one, which is 1 by default" in warning
+    *_, last = import_dataset("csv", CORELLI, CORELLI_OPTIONS | {"steering_scale": 0.5}).warnings
     assert "steering" not in last
 
 
