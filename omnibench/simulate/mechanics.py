@@ -1,8 +1,8 @@
 """Mechanics of a simulated robot behind effects of steering, casters and grip, on code of its own.
 
-The effects that find these in recordings (robot/effects/steering_angle.py, slip.py and drift.py) are to first order and see
-samples only. Here a gear with play is a gear with play, a lag is a differential equation, and a caster is drawn along
-by its pivot:
+The effects that find these in recordings (robot/effects/steering_angle.py, slip.py, drift.py) are to first order and
+see samples only. Here a flank of the gear pushes the wheel, a lag is a differential equation, and a caster is drawn
+along by its pivot:
 
     d(beta)/dt = -(abs(V) / L) sin(beta - gamma) - w,                                                   (1)
 
