@@ -28,9 +28,11 @@ from scipy.special import stdtrit
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from commands import RECORDINGS, ROOT
+from corelli import corelli_dataset, half
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import OmnibenchError
+from omnibench.fit.calibrate import calibrate
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
 from omnibench.fit.shrinkage import prior
@@ -183,6 +185,21 @@ def study(dataset: Dataset, folds: Sequence[Fold], chosen: Sequence[str]) -> Non
             print(words, flush=True)
 
 
+def long_drive() -> None:
+    """Print the errors along the second half of the drive of tricycle_corelli, from its own start."""
+    dataset = corelli_dataset()
+    (drive,) = dataset.trajectories
+    middle, end = float(drive.pose_times[-1] / 2), float(drive.pose_times[-1])
+    judged = half(drive, middle, end)
+    print("\ntricycle_corelli: first half of one drive -> second half, steering fitted, cost trajectory")
+    for treatment in ("keep", "shrink", "fit"):
+        train = replace(dataset, trajectories=(half(drive, 0.0, middle),))
+        model = calibrate(train, steering="fit", unidentified=treatment).calibration.model
+        error = model.poses([judged.reference_log])[0] - judged.poses[1:]
+        position, heading = np.hypot(*error[:, :2].T).mean(), np.degrees(np.abs(error[:, 2]).mean())
+        print(f"  {treatment:18s} {position:.4f} m {heading:6.2f} deg", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--factor", type=float, default=1.0, help="of every tolerance")
@@ -198,6 +215,8 @@ def main() -> None:
     }
     for dataset, folds in recordings(arguments.robots):
         study(dataset, folds, arguments.costs)
+    if not arguments.robots or "corelli" in arguments.robots:
+        long_drive()
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from corelli import corelli_dataset
+from corelli import corelli_dataset, half
 from numpy.typing import NDArray
 from sample_robots import CAR, DIFFERENTIAL, TRICYCLE
 from wheeled_recordings import PERIOD, path, recorded
@@ -106,18 +106,6 @@ def test_a_robot_that_does_not_steer_has_no_steering_to_fit() -> None:
 def mean_distance(run: CalibrationRun, drive: Trajectory) -> float:
     (poses,) = run.calibration.model.poses([drive.reference_log])
     return float(np.hypot(*(poses - drive.poses[1:])[:, :2].T).mean())
-
-
-def half(run: Trajectory, begin: float, end: float) -> Trajectory:
-    """The part of a drive between two times, s, from its own start."""
-    assert run.steering is not None
-    shown = (run.pose_times >= begin) & (run.pose_times <= end) & np.isin(run.pose_times, [0.0, *run.times])
-    zero, last = run.pose_times[shown][[0, -1]]
-    driven = (run.times > zero) & (run.times <= last)
-    return replace(
-        run, times=run.times[driven] - zero, rates=run.rates[driven], steering=run.steering[driven], angles=None,
-        pose_times=run.pose_times[shown] - zero, poses=run.poses[shown],
-    )  # fmt: skip
 
 
 def test_a_real_tricycle_with_a_steering_gain_far_off_errs_less_than_its_authors_say() -> None:
