@@ -48,6 +48,7 @@ _GAINS = (-0.95, 15.0)  # bounds of the gain, which counts from 0
 _WIDER = 3.0  # times the plausible range, of play and zero
 _SCRUB = 0.1  # m: a wheel stands no farther from the axis about which it steers, by as much as which it then rolls
 _STEP = 1e-4  # of the largest plausible size: of central differences
+_ON_BOUND = 1e-6  # share of the way between a number's bounds: what is closer to one lies on it
 _MOST = 40  # matrices of the search
 _TOLERANCE = 1e-7  # m or rad per rad of wheel, of each matrix
 
@@ -72,6 +73,17 @@ class _Number:
         return cls(effect, parameter, _WIDER * parameter.low, _WIDER * parameter.high)
 
 
+def _numbers_of(robot: Robot) -> list[_Number]:
+    """The searched numbers of a robot; none where it does not steer."""
+    chosen = [effects.create(name) for name in FITTED]
+    return [
+        _Number.of(effect.name, parameter, robot)
+        for effect in chosen
+        if effect.applies(robot)
+        for parameter in effect.parameters(robot)
+    ]
+
+
 @dataclass(frozen=True, eq=False)
 class SteeringFit:
     """The search for the steering's parameters on some runs, with one cost."""
@@ -94,10 +106,11 @@ class SteeringFit:
         def cost(vector: Array) -> tuple[float, Array]:
             nonlocal count
             terms = self._as_terms(vector)
-            matrix, value = self._best_matrix(corrected_runs(self.robot, self.runs, terms, self.sample_period))
+            runs = corrected_runs(self.robot, self.runs, terms, self.sample_period)
+            matrix, value, mended = self._best_matrix(runs)
             count += 1
             self.watch(Progress("steering", count, len(_FACTORS) + _MOST, "matrix", value))
-            return value, self._slopes(vector, matrix)
+            return value, self._slopes(vector, matrix, mended)
 
         largest = np.array([number.parameter.largest for number in numbers])
         gain = next(index for index, number in enumerate(numbers) if number.effect == _GAIN)
@@ -117,13 +130,7 @@ class SteeringFit:
 
     @property
     def _numbers(self) -> list[_Number]:
-        chosen = [effects.create(name) for name in FITTED]
-        numbers = [
-            _Number.of(effect.name, parameter, self.robot)
-            for effect in chosen
-            if effect.applies(self.robot)
-            for parameter in effect.parameters(self.robot)
-        ]
+        numbers = _numbers_of(self.robot)
         if not numbers:
             raise ConfigError(f"steering: fit is for wheels that steer; robot {self.robot.name} has none")
         return numbers
@@ -135,8 +142,8 @@ class SteeringFit:
             values.setdefault(number.effect, {})[number.parameter.name] = share * number.parameter.largest
         return tuple(Term(effects.create(name), of_effect) for name, of_effect in values.items())
 
-    def _best_matrix(self, runs: Sequence[Trajectory]) -> tuple[Array, float]:
-        """The matrix (3, M) of least cost, and that cost."""
+    def _best_matrix(self, runs: Sequence[Trajectory]) -> tuple[Array, float, tuple[Trajectory, ...]]:
+        """The matrix (3, M) of least cost, that cost, and the runs with starts and ends that have jumped mended."""
         searched = make_parameterisation("matrix", self.robot, runs, box=self.box, mount=self.mount)
         problem = CalibrationProblem(
             self.robot, runs, self._smooth, searched, integration=self.integration, budget=Budget(), seed=self.seed
@@ -144,17 +151,21 @@ class SteeringFit:
         result = run_calibrator(calibrators.create("closed_form", {"tolerance": _TOLERANCE}), problem)
         if result.matrix is None or result.cost is None:
             raise ConfigError(f"steering: no matrix could be fitted ({result.outcome}): {result.reason}")
-        return result.matrix, result.cost
+        return result.matrix, result.cost, problem.trajectories
 
-    def _slopes(self, vector: Array, matrix: Array) -> Array:
-        """Derivatives (n,) of the cost of a matrix (3, M) by a vector (n,), by central differences, Eq. (1)."""
+    def _slopes(self, vector: Array, matrix: Array, mended: Sequence[Trajectory]) -> Array:
+        """Derivatives (n,) of the cost of a matrix (3, M) by a vector (n,), by central differences, Eq. (1).
+
+        mended: the runs with the poses that the cost is of.
+        """
+        measured = [replace(run, poses=seen.poses) for run, seen in zip(self.runs, mended, strict=True)]
         slopes = np.empty(len(vector))
         for index in range(len(vector)):
             values = []
             for step in (-_STEP, _STEP):
                 moved = vector.copy()
                 moved[index] += step
-                runs = corrected_runs(self.robot, self.runs, self._as_terms(moved), self.sample_period)
+                runs = corrected_runs(self.robot, measured, self._as_terms(moved), self.sample_period)
                 batch = self._smooth.batch(runs, self.integration)
                 errors = batch.poses(matrix[None]) - self._smooth.reference(runs)
                 values.append(float(self._smooth.combine(errors, batch.trajectory)[0]))
@@ -173,6 +184,17 @@ def corrected_runs(
         signals = robot.drive.signals(true.rates, true.steering)
         made.append(replace(run, rates=signals, steering=None, drive=None, angles=None))
     return tuple(made)
+
+
+def on_bounds(robot: Robot, terms: Sequence[Term]) -> tuple[str, ...]:
+    """The fitted numbers of a robot that lie on a bound of the search, in words; 0 is none, as without the effect."""
+    values = {(term.name, name): value for term in terms for name, value in term.values.items()}
+    found = []
+    for number in _numbers_of(robot):
+        value = values[number.effect, number.parameter.name]
+        if value and min(value - number.low, number.high - value) <= _ON_BOUND * (number.high - number.low):
+            found.append(f"{number.effect.replace('_', ' ')} {value:.3g}")
+    return tuple(found)
 
 
 def words_of(terms: Sequence[Term]) -> str:

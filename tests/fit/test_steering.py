@@ -77,6 +77,34 @@ def test_a_steering_that_turns_its_wheel_along_is_found() -> None:
     assert fitted(run)["k"] == pytest.approx(0.4, abs=0.02)
 
 
+def test_a_coupling_beyond_what_is_searched_is_warned_of() -> None:
+    beyond = 0.15 / float(TRICYCLE.radii[0])
+    run = calibrate(weaving(beyond), cost="trajectory", steering="fit")
+    assert fitted(run)["k"] == pytest.approx(beyond / 1.5)
+    assert [warning for warning in run.warnings if "lies on the bound" in warning] == [
+        f"steering coupling {beyond / 1.5:.3g} lies on the bound of what is searched, so that these runs hardly tell "
+        "it, or it stands for something else; take the fit only for drives that steer as these do"
+    ]
+
+
+def test_a_number_within_its_bounds_is_not_warned_of() -> None:
+    run = calibrate(weaving(0.4), cost="trajectory", steering="fit")
+    assert not any("lies on the bound" in warning for warning in run.warnings)
+
+
+@pytest.mark.parametrize("cost", ["trajectory", "final_pose"])
+def test_starts_that_have_jumped_do_not_change_the_steering_that_is_found(cost: str) -> None:
+    dataset = weaving(0.4)
+    runs = list(dataset.trajectories)
+    for place in (1, 4):
+        poses = runs[place].poses.copy()
+        poses[0] += [0.6, -0.8, 0.3]
+        runs[place] = replace(runs[place], poses=poses)
+    jumped = calibrate(replace(dataset, trajectories=tuple(runs)), cost=cost, loss="huber", steering="fit")
+    assert fitted(jumped)["k"] == pytest.approx(0.4, abs=0.02)
+    assert fitted(jumped)["g"] == pytest.approx(0.0, abs=0.01)
+
+
 def test_a_calibration_with_a_fitted_steering_predicts_what_it_was_fitted_to() -> None:
     dataset = misread(TRICYCLE, 1.5)
     run = calibrate(dataset, cost="trajectory", steering="fit")
