@@ -24,6 +24,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.cost import Cost
+from omnibench.fit.loss.end_poses import with_ends_from_others
 from omnibench.fit.loss.robust_cost import RobustCost, norms_of, with_loss
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
@@ -105,12 +106,10 @@ class SteeringFit:
 
         def cost(vector: Array) -> tuple[float, Array]:
             nonlocal count
-            terms = self._as_terms(vector)
-            runs = corrected_runs(self.robot, self.runs, terms, self.sample_period)
-            matrix, value, mended = self._best_matrix(runs)
+            value, slopes = self.cost(vector)
             count += 1
             self.watch(Progress("steering", count, len(_FACTORS) + _MOST, "matrix", value))
-            return value, self._slopes(vector, matrix, mended)
+            return value, slopes
 
         largest = np.array([number.parameter.largest for number in numbers])
         gain = next(index for index, number in enumerate(numbers) if number.effect == _GAIN)
@@ -121,12 +120,20 @@ class SteeringFit:
         found = minimize(cost, best, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxfun": _MOST})
         return self._as_terms(found.x)
 
+    def cost(self, vector: Array) -> tuple[float, Array]:
+        """c(q) of Eq. (1) and its derivatives (n,), at a vector (n,) in units of the largest plausible sizes."""
+        terms = self._as_terms(vector)
+        matrix, value = self._best_matrix(corrected_runs(self.robot, self.runs, terms, self.sample_period))
+        return value, self._slopes(vector, matrix)
+
     @cached_property
-    def _smooth(self) -> Cost:
+    def _smooth(self) -> RobustCost:
         """The cost that is minimised. ConfigError: the one that was asked for is no sum of norms."""
         if norms_of(self.objective) is None:
             raise ConfigError(f"steering: fit needs a cost that is a sum of norms, which {self.objective.name} is not")
-        return self.objective if isinstance(self.objective, RobustCost) else with_loss(self.objective, "huber")
+        smooth = self.objective if isinstance(self.objective, RobustCost) else with_loss(self.objective, "huber")
+        assert isinstance(smooth, RobustCost)  # it is one of norms
+        return smooth
 
     @property
     def _numbers(self) -> list[_Number]:
@@ -142,8 +149,8 @@ class SteeringFit:
             values.setdefault(number.effect, {})[number.parameter.name] = share * number.parameter.largest
         return tuple(Term(effects.create(name), of_effect) for name, of_effect in values.items())
 
-    def _best_matrix(self, runs: Sequence[Trajectory]) -> tuple[Array, float, tuple[Trajectory, ...]]:
-        """The matrix (3, M) of least cost, that cost, and the runs with starts and ends that have jumped mended."""
+    def _best_matrix(self, runs: Sequence[Trajectory]) -> tuple[Array, float]:
+        """The matrix (3, M) of least cost, and that cost."""
         searched = make_parameterisation("matrix", self.robot, runs, box=self.box, mount=self.mount)
         problem = CalibrationProblem(
             self.robot, runs, self._smooth, searched, integration=self.integration, budget=Budget(), seed=self.seed
@@ -151,21 +158,23 @@ class SteeringFit:
         result = run_calibrator(calibrators.create("closed_form", {"tolerance": _TOLERANCE}), problem)
         if result.matrix is None or result.cost is None:
             raise ConfigError(f"steering: no matrix could be fitted ({result.outcome}): {result.reason}")
-        return result.matrix, result.cost, problem.trajectories
+        return result.matrix, result.cost
 
-    def _slopes(self, vector: Array, matrix: Array, mended: Sequence[Trajectory]) -> Array:
+    def _slopes(self, vector: Array, matrix: Array) -> Array:
         """Derivatives (n,) of the cost of a matrix (3, M) by a vector (n,), by central differences, Eq. (1).
 
-        mended: the runs with the poses that the cost is of.
+        Starts and ends that have jumped follow from the vector, too, as in the problem whose cost this is.
         """
-        measured = [replace(run, poses=seen.poses) for run, seen in zip(self.runs, mended, strict=True)]
         slopes = np.empty(len(vector))
         for index in range(len(vector)):
             values = []
             for step in (-_STEP, _STEP):
                 moved = vector.copy()
                 moved[index] += step
-                runs = corrected_runs(self.robot, measured, self._as_terms(moved), self.sample_period)
+                runs = corrected_runs(self.robot, self.runs, self._as_terms(moved), self.sample_period)
+                runs, _ = with_ends_from_others(
+                    runs, self.robot, self.integration, self._smooth.of_poses, last=self._smooth.stamps == "final"
+                )
                 batch = self._smooth.batch(runs, self.integration)
                 errors = batch.poses(matrix[None]) - self._smooth.reference(runs)
                 values.append(float(self._smooth.combine(errors, batch.trajectory)[0]))
@@ -187,12 +196,13 @@ def corrected_runs(
 
 
 def on_bounds(robot: Robot, terms: Sequence[Term]) -> tuple[str, ...]:
-    """The fitted numbers of a robot that lie on a bound of the search, in words; 0 is none, as without the effect."""
+    """The fitted numbers of a robot that lie on a bound of the search other than 0, in words."""
     values = {(term.name, name): value for term in terms for name, value in term.values.items()}
     found = []
     for number in _numbers_of(robot):
         value = values[number.effect, number.parameter.name]
-        if value and min(value - number.low, number.high - value) <= _ON_BOUND * (number.high - number.low):
+        near = _ON_BOUND * (number.high - number.low)
+        if any(bound and abs(value - bound) <= near for bound in (number.low, number.high)):
             found.append(f"{number.effect.replace('_', ' ')} {value:.3g}")
     return tuple(found)
 

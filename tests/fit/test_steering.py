@@ -16,6 +16,7 @@ from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.cost import Cost
 from omnibench.fit.steering import SteeringFit
+from omnibench.registry import costs
 from omnibench.robot.kinematics import Array, Robot
 
 
@@ -93,16 +94,21 @@ def test_a_number_within_its_bounds_is_not_warned_of() -> None:
 
 
 @pytest.mark.parametrize("cost", ["trajectory", "final_pose"])
-def test_starts_that_have_jumped_do_not_change_the_steering_that_is_found(cost: str) -> None:
-    dataset = weaving(0.4)
-    runs = list(dataset.trajectories)
-    for place in (1, 4):
+@pytest.mark.parametrize("jumped", [(), (1, 4)])
+def test_the_slopes_of_the_search_are_those_of_its_cost_where_starts_have_jumped_too(
+    cost: str, jumped: tuple[int, ...]
+) -> None:
+    runs = list(weaving(0.4).trajectories)
+    for place in jumped:
         poses = runs[place].poses.copy()
         poses[0] += [0.6, -0.8, 0.3]
         runs[place] = replace(runs[place], poses=poses)
-    jumped = calibrate(replace(dataset, trajectories=tuple(runs)), cost=cost, loss="huber", steering="fit")
-    assert fitted(jumped)["k"] == pytest.approx(0.4, abs=0.02)
-    assert fitted(jumped)["g"] == pytest.approx(0.0, abs=0.01)
+    fit = SteeringFit(TRICYCLE, tuple(runs), PERIOD, costs.create(cost), "row", None, "arc", 1)
+    vector, step = np.array([0.5, 0.1, 0.2]), 1e-3
+    around = [(fit.cost(vector + moved)[0], fit.cost(vector - moved)[0]) for moved in step * np.eye(3)]
+    expected = [(above - below) / (2 * step) for above, below in around]
+    slopes = fit.cost(vector)[1]
+    np.testing.assert_allclose(slopes, expected, rtol=0, atol=2e-3 * np.abs(expected).max())
 
 
 def test_a_calibration_with_a_fitted_steering_predicts_what_it_was_fitted_to() -> None:
