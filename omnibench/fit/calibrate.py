@@ -23,7 +23,7 @@ from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisat
 from omnibench.fit.shrinkage.prior import MountChoice, default_cost, default_mount, default_unidentified
 from omnibench.fit.shrinkage.shrinkage import shrunk
 from omnibench.fit.span import Unidentified, WheelDirection
-from omnibench.fit.steering import SteeringChoice, SteeringFit, corrected_runs, words_of
+from omnibench.fit.steering import SteeringChoice, SteeringFit, corrected_runs, on_bounds, words_of
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals, bootstrap_intervals
 from omnibench.fit.uncertainty.ratio_intervals import FEWEST, Units, units_of
 from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
@@ -158,6 +158,11 @@ def calibrate(
             f"the steering was fitted first ({words_of(terms)}); intervals hold for "
             "these numbers, whose own are not known, and the file has no covariance",
         )
+        doubts += tuple(
+            f"{number} lies on the bound of what is searched, so that these runs hardly tell it, or it stands for "
+            "something else; take the fit only for drives that steer as these do"
+            for number in on_bounds(dataset.robot, terms)
+        )
     calibration = fitted_calibration(
         name=f"{dataset.name} {calibrator}",
         robot=dataset.robot,
@@ -198,7 +203,7 @@ def calibrate(
         drawn = bootstrap_intervals(problem, result.vector, units=units, rng=problem.rng)
     geometry = problem.parameterisation
     parameters = fitted_parameters(geometry, result.vector) if isinstance(geometry, WheelGeometry) else None
-    kept = kept_motions(dataset.robot, training, searched.name, unidentified)
+    kept = kept_motions(dataset.robot, driven, searched.name, unidentified)
     warnings = (*warnings, *_ends_in_words(problem), *doubts)
     return CalibrationRun(calibration, result, drawn, parameters, uncertainty, warnings, kept, units)
 

@@ -138,7 +138,8 @@ def certify_optimum(
         optimum = run_calibrator(calibrators.create("closed_form"), problem)
         if optimum.vector is None or optimum.cost is None:
             raise DataError(f"calibration {calibration.name!r}: its unshrunk optimum is not found: {optimum.reason}")
-        vector, inside, shrinking, cost = optimum.vector, True, cost / optimum.cost - 1, optimum.cost
+        if optimum.cost > problem.objective.rounding:  # no share of rounding means anything
+            vector, inside, shrinking, cost = optimum.vector, True, cost / optimum.cost - 1, optimum.cost
     began = time.perf_counter()
 
     def foretell(event: Progress) -> None:

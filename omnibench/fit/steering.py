@@ -24,6 +24,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.cost import Cost
+from omnibench.fit.loss.end_poses import with_ends_from_others
 from omnibench.fit.loss.robust_cost import RobustCost, norms_of, with_loss
 from omnibench.fit.parameterisation import Box
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
@@ -48,6 +49,7 @@ _GAINS = (-0.95, 15.0)  # bounds of the gain, which counts from 0
 _WIDER = 3.0  # times the plausible range, of play and zero
 _SCRUB = 0.1  # m: a wheel stands no farther from the axis about which it steers, by as much as which it then rolls
 _STEP = 1e-4  # of the largest plausible size: of central differences
+_ON_BOUND = 1e-6  # share of the way between a number's bounds: what is closer to one lies on it
 _MOST = 40  # matrices of the search
 _TOLERANCE = 1e-7  # m or rad per rad of wheel, of each matrix
 
@@ -72,6 +74,17 @@ class _Number:
         return cls(effect, parameter, _WIDER * parameter.low, _WIDER * parameter.high)
 
 
+def _numbers_of(robot: Robot) -> list[_Number]:
+    """The searched numbers of a robot; none where it does not steer."""
+    chosen = [effects.create(name) for name in FITTED]
+    return [
+        _Number.of(effect.name, parameter, robot)
+        for effect in chosen
+        if effect.applies(robot)
+        for parameter in effect.parameters(robot)
+    ]
+
+
 @dataclass(frozen=True, eq=False)
 class SteeringFit:
     """The search for the steering's parameters on some runs, with one cost."""
@@ -93,11 +106,10 @@ class SteeringFit:
 
         def cost(vector: Array) -> tuple[float, Array]:
             nonlocal count
-            terms = self._as_terms(vector)
-            matrix, value = self._best_matrix(corrected_runs(self.robot, self.runs, terms, self.sample_period))
+            value, slopes = self.cost(vector)
             count += 1
             self.watch(Progress("steering", count, len(_FACTORS) + _MOST, "matrix", value))
-            return value, self._slopes(vector, matrix)
+            return value, slopes
 
         largest = np.array([number.parameter.largest for number in numbers])
         gain = next(index for index, number in enumerate(numbers) if number.effect == _GAIN)
@@ -108,22 +120,24 @@ class SteeringFit:
         found = minimize(cost, best, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxfun": _MOST})
         return self._as_terms(found.x)
 
+    def cost(self, vector: Array) -> tuple[float, Array]:
+        """c(q) of Eq. (1) and its derivatives (n,), at a vector (n,) in units of the largest plausible sizes."""
+        terms = self._as_terms(vector)
+        matrix, value = self._best_matrix(corrected_runs(self.robot, self.runs, terms, self.sample_period))
+        return value, self._slopes(vector, matrix)
+
     @cached_property
-    def _smooth(self) -> Cost:
+    def _smooth(self) -> RobustCost:
         """The cost that is minimised. ConfigError: the one that was asked for is no sum of norms."""
         if norms_of(self.objective) is None:
             raise ConfigError(f"steering: fit needs a cost that is a sum of norms, which {self.objective.name} is not")
-        return self.objective if isinstance(self.objective, RobustCost) else with_loss(self.objective, "huber")
+        smooth = self.objective if isinstance(self.objective, RobustCost) else with_loss(self.objective, "huber")
+        assert isinstance(smooth, RobustCost)  # it is one of norms
+        return smooth
 
     @property
     def _numbers(self) -> list[_Number]:
-        chosen = [effects.create(name) for name in FITTED]
-        numbers = [
-            _Number.of(effect.name, parameter, self.robot)
-            for effect in chosen
-            if effect.applies(self.robot)
-            for parameter in effect.parameters(self.robot)
-        ]
+        numbers = _numbers_of(self.robot)
         if not numbers:
             raise ConfigError(f"steering: fit is for wheels that steer; robot {self.robot.name} has none")
         return numbers
@@ -147,7 +161,10 @@ class SteeringFit:
         return result.matrix, result.cost
 
     def _slopes(self, vector: Array, matrix: Array) -> Array:
-        """Derivatives (n,) of the cost of a matrix (3, M) by a vector (n,), by central differences, Eq. (1)."""
+        """Derivatives (n,) of the cost of a matrix (3, M) by a vector (n,), by central differences, Eq. (1).
+
+        Starts and ends that have jumped follow from the vector, too, as in the problem whose cost this is.
+        """
         slopes = np.empty(len(vector))
         for index in range(len(vector)):
             values = []
@@ -155,6 +172,9 @@ class SteeringFit:
                 moved = vector.copy()
                 moved[index] += step
                 runs = corrected_runs(self.robot, self.runs, self._as_terms(moved), self.sample_period)
+                runs, _ = with_ends_from_others(
+                    runs, self.robot, self.integration, self._smooth.of_poses, last=self._smooth.stamps == "final"
+                )
                 batch = self._smooth.batch(runs, self.integration)
                 errors = batch.poses(matrix[None]) - self._smooth.reference(runs)
                 values.append(float(self._smooth.combine(errors, batch.trajectory)[0]))
@@ -173,6 +193,18 @@ def corrected_runs(
         signals = robot.drive.signals(true.rates, true.steering)
         made.append(replace(run, rates=signals, steering=None, drive=None, angles=None))
     return tuple(made)
+
+
+def on_bounds(robot: Robot, terms: Sequence[Term]) -> tuple[str, ...]:
+    """The fitted numbers of a robot that lie on a bound of the search other than 0, in words."""
+    values = {(term.name, name): value for term in terms for name, value in term.values.items()}
+    found = []
+    for number in _numbers_of(robot):
+        value = values[number.effect, number.parameter.name]
+        near = _ON_BOUND * (number.high - number.low)
+        if any(bound and abs(value - bound) <= near for bound in (number.low, number.high)):
+            found.append(f"{number.effect.replace('_', ' ')} {value:.3g}")
+    return tuple(found)
 
 
 def words_of(terms: Sequence[Term]) -> str:

@@ -182,6 +182,14 @@ class Calibration(Model):
         """The matrix as an array (3, M)."""
         return np.array(self.matrix)
 
+    @property
+    def effects_in_words(self) -> str:
+        """The effects with their parameters, like ``steering_gain (g 0.1)``."""
+        return ", ".join(
+            f"{term.name} ({', '.join(f'{name} {value:.6g}' for name, value in term.parameters.items())})"
+            for term in self.effects
+        )
+
     def check_wheels(self, robot: Robot, owner: str, place: str = "") -> None:
         """DataError: the calibration is for other wheels than a robot's, or for wheels that drive it in another way.
 

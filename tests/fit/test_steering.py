@@ -16,6 +16,7 @@ from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.cost import Cost
 from omnibench.fit.steering import SteeringFit
+from omnibench.registry import costs
 from omnibench.robot.kinematics import Array, Robot
 
 
@@ -75,6 +76,39 @@ def test_the_zero_of_a_car_s_steering_is_found() -> None:
 def test_a_steering_that_turns_its_wheel_along_is_found() -> None:
     run = calibrate(weaving(0.4), cost="trajectory", steering="fit")
     assert fitted(run)["k"] == pytest.approx(0.4, abs=0.02)
+
+
+def test_a_coupling_beyond_what_is_searched_is_warned_of() -> None:
+    beyond = 0.15 / float(TRICYCLE.radii[0])
+    run = calibrate(weaving(beyond), cost="trajectory", steering="fit")
+    assert fitted(run)["k"] == pytest.approx(beyond / 1.5)
+    assert [warning for warning in run.warnings if "lies on the bound" in warning] == [
+        f"steering coupling {beyond / 1.5:.3g} lies on the bound of what is searched, so that these runs hardly tell "
+        "it, or it stands for something else; take the fit only for drives that steer as these do"
+    ]
+
+
+def test_a_number_within_its_bounds_is_not_warned_of() -> None:
+    run = calibrate(weaving(0.4), cost="trajectory", steering="fit")
+    assert not any("lies on the bound" in warning for warning in run.warnings)
+
+
+@pytest.mark.parametrize("cost", ["trajectory", "final_pose"])
+@pytest.mark.parametrize("jumped", [(), (1, 4)])
+def test_the_slopes_of_the_search_are_those_of_its_cost_where_starts_have_jumped_too(
+    cost: str, jumped: tuple[int, ...]
+) -> None:
+    runs = list(weaving(0.4).trajectories)
+    for place in jumped:
+        poses = runs[place].poses.copy()
+        poses[0] += [0.6, -0.8, 0.3]
+        runs[place] = replace(runs[place], poses=poses)
+    fit = SteeringFit(TRICYCLE, tuple(runs), PERIOD, costs.create(cost), "row", None, "arc", 1)
+    vector, step = np.array([0.5, 0.1, 0.2]), 1e-3
+    around = [(fit.cost(vector + moved)[0], fit.cost(vector - moved)[0]) for moved in step * np.eye(3)]
+    expected = [(above - below) / (2 * step) for above, below in around]
+    slopes = fit.cost(vector)[1]
+    np.testing.assert_allclose(slopes, expected, rtol=0, atol=2e-3 * np.abs(expected).max())
 
 
 def test_a_calibration_with_a_fitted_steering_predicts_what_it_was_fitted_to() -> None:

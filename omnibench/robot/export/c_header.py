@@ -90,8 +90,10 @@ static inline void {prefix}_odometry_step({arguments})
 """
     warnings = []
     if calibration.effects:
-        left_out = ", ".join(term.name for term in calibration.effects)
-        warnings.append(f"the header holds the matrix only; effects of the calibration are left out: {left_out}")
+        warnings.append(
+            "the header holds the matrix only; effects of the calibration, with which it was fitted, are left out: "
+            f"{calibration.effects_in_words}"
+        )
     if robot.mount is not None:
         warnings.append("the header's pose is that of the tracked point, which is not the robot's centre (mount)")
     return text, tuple(warnings)
@@ -120,5 +122,5 @@ def _comment(calibration: Calibration) -> str:
     if calibration.robot.mount is not None:
         lines.append("the pose is that of the tracked point, which is not the robot's centre (mount)")
     if calibration.effects:
-        lines.append(f"left out: effects {', '.join(term.name for term in calibration.effects)}")
+        lines.append(f"left out: effects {calibration.effects_in_words}")
     return "\n".join(f" * {' '.join(line.split())}".replace("*/", "* /") for line in lines)

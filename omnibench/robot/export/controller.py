@@ -144,8 +144,10 @@ def _warnings(calibration: Calibration, fitted: Controller, design: Controller) 
     if integrated != fitted.integration:
         warnings.append(f"the matrix was calibrated for {integrated}, the controller integrates {fitted.integration}")
     if calibration.effects:
-        named = ", ".join(term.name for term in calibration.effects)
-        warnings.append(f"effects of the calibration are left out, the controller has none: {named}")
+        warnings.append(
+            "effects of the calibration are left out, the controller has none, and what that costs is not counted "
+            f"above: {calibration.effects_in_words}"
+        )
     return (*warnings, *_frames(robot, fitted, true), *_doubts(calibration))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from motions import FLOWER, TURNS, driven
 from sample_robots import APR_02, DIFFERENTIAL, MECANUM, SKID, TRICYCLE
+from wheeled_recordings import PERIOD, recorded
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import ConfigError
@@ -82,6 +84,21 @@ def test_the_cost_of_shrinking_is_said_and_certified() -> None:
     assert certificate.gap < 0.01
     assert certificate.shrinking == pytest.approx(origin.training_cost / origin.unshrunk_cost - 1, rel=1e-6)
     assert "shrunk to the design, which adds" in origin.reason
+
+
+def test_a_fit_without_any_error_is_shrunk_and_certified_all_the_same() -> None:
+    """A single final pose, which a matrix meets to the last bit."""
+    (run, *_) = recorded(TRICYCLE, TRICYCLE.inverse_kinematic_matrix, np.random.default_rng(3))
+    dataset = make_dataset("tricycle", TRICYCLE, PERIOD, [run], simulated=True)
+    calibration = calibrate(dataset, cost="final_pose", unidentified="shrink").calibration
+    assert calibration.provenance is not None
+    assert calibration.provenance.unshrunk_cost is not None
+    assert calibration.provenance.unshrunk_cost < 1e-9
+    assert calibration.provenance.training_cost is not None
+    assert re.search(r"which adds 0\.0\S+ to the cost", calibration.provenance.reason)
+    certificate = certify_optimum(calibration, dataset, seconds=1.0).certificate
+    assert certificate.cost == calibration.provenance.training_cost
+    assert certificate.shrinking is None
 
 
 def test_a_motion_that_is_not_driven_keeps_the_design() -> None:

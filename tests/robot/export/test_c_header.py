@@ -163,7 +163,7 @@ def test_effects_are_warned_of() -> None:
     document = calibration(APR_02, effects=[{"name": "slip", "parameters": {"k": 0.1}}])
     export = export_calibration(document, "c_header")
     assert "slip" in export.warnings[0]
-    assert "left out: effects slip" in export.text
+    assert "left out: effects slip (k 0.1)" in export.text
 
 
 def test_a_tracked_point_off_the_centre_is_warned_of() -> None:

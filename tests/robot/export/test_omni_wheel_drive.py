@@ -118,7 +118,7 @@ class TestRos2Controllers:
         document = calibration(integration="euler", effects=[{"name": "slip", "parameters": {"k": 0.1}}])
         warnings = export_calibration(document, "ros2_controllers").warnings
         assert any("Euler" in warning for warning in warnings)
-        assert any("left out" in warning and "slip" in warning for warning in warnings)
+        assert any("left out" in warning and "slip (k 0.1)" in warning for warning in warnings)
 
     def test_unequal_spacing_is_refused(self) -> None:
         with pytest.raises(
