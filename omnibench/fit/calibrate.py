@@ -23,7 +23,7 @@ from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisat
 from omnibench.fit.shrinkage.prior import MountChoice, default_cost, default_mount, default_unidentified
 from omnibench.fit.shrinkage.shrinkage import shrunk
 from omnibench.fit.span import Unidentified, WheelDirection
-from omnibench.fit.steering import SteeringChoice, SteeringFit, corrected_runs, on_bounds, words_of
+from omnibench.fit.steering_fit import SteeringChoice, SteeringFit, corrected_runs, on_bounds, words_of
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals, bootstrap_intervals
 from omnibench.fit.uncertainty.ratio_intervals import FEWEST, Units, units_of
 from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
@@ -94,7 +94,7 @@ def calibrate(
     or ``fit`` them (see make_parameterisation); ``shrink`` keeps them and shrinks what else is hardly known to the
     design, of the given tolerance (see shrinkage.py). The run's warnings name them. mount: ``known``, or ``fit`` where
     the tracked point stands. Default of these and of the cost: by the robot (see prior.py). steering: ``fit`` first
-    finds gain, play and coupling of the steering and a car's zero (see steering.py), which are effects from then on.
+    finds gain, play and coupling of the steering and a car's zero (see steering_fit.py), which are effects from then on.
     watch: told the evaluations and the best cost so far, at most every 0.1 s.
 
     Raises UnknownNameError or ConfigError for wrong arguments, DataError for an empty training split, and ConfigError

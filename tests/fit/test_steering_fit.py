@@ -15,7 +15,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.cost import Cost
-from omnibench.fit.steering import SteeringFit
+from omnibench.fit.steering_fit import SteeringFit
 from omnibench.registry import costs
 from omnibench.robot.kinematics import Array, Robot
 
@@ -79,7 +79,7 @@ def test_a_steering_that_turns_its_wheel_along_is_found() -> None:
 
 
 def test_a_coupling_beyond_what_is_searched_is_warned_of() -> None:
-    beyond = 0.15 / float(TRICYCLE.radii[0])
+    beyond = 1.2 / float(TRICYCLE.radii[0])
     run = calibrate(weaving(beyond), cost="trajectory", steering="fit")
     assert fitted(run)["k"] == pytest.approx(beyond / 1.5)
     assert [warning for warning in run.warnings if "lies on the bound" in warning] == [

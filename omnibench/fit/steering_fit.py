@@ -12,9 +12,10 @@ among them: a wrong clock of the reference looks alike, and ``discover`` tells w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import count
 from typing import Literal
 
 import numpy as np
@@ -43,12 +44,13 @@ SteeringChoice = Literal["known", "fit"]
 _GAIN = "steering_gain"
 FITTED = (_GAIN, "steering_play", "steering_offset", "steering_coupling")
 # Factors on the measured angle from which the search begins: gears between an encoder and its wheel are seldom known
-# worse than this, and between two of them the cost has one minimum (tests/fit/test_steering.py).
+# worse than this, and between two of them the cost has one minimum (tests/fit/test_steering_fit.py).
 _FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0)
 _GAINS = (-0.95, 15.0)  # bounds of the gain, which counts from 0
 _WIDER = 3.0  # times the plausible range, of play and zero
 _SCRUB = 0.1  # m: a wheel stands no farther from the axis about which it steers, by as much as which it then rolls
-_STEP = 1e-4  # of the largest plausible size: of central differences
+_WORTH = 0.01  # share of the cost that an effect beside the gain must take off; chosen
+_STEP = 1e-4  # of the usual size: of central differences
 _ON_BOUND = 1e-6  # share of the way between a number's bounds: what is closer to one lies on it
 _MOST = 40  # matrices of the search
 _TOLERANCE = 1e-7  # m or rad per rad of wheel, of each matrix
@@ -56,22 +58,23 @@ _TOLERANCE = 1e-7  # m or rad per rad of wheel, of each matrix
 
 @dataclass(frozen=True)
 class _Number:
-    """One searched number: its effect's name, its parameter and its bounds, in the parameter's unit."""
+    """One searched number: its effect's name, its parameter, its bounds and a usual size, in the parameter's unit."""
 
     effect: str
     parameter: Parameter
     low: float
     high: float
+    usual: float
 
     @classmethod
     def of(cls, effect: str, parameter: Parameter, robot: Robot) -> _Number:
         """The number of a robot; a turn of a small wheel, or of a motor in its place, couples more than of a large."""
         if effect == _GAIN:
-            return cls(effect, parameter, *_GAINS)
+            return cls(effect, parameter, *_GAINS, parameter.largest)
         if effect == "steering_coupling":
             most = _SCRUB / float(robot.radii.min())
-            return cls(effect, parameter, -most, most)
-        return cls(effect, parameter, _WIDER * parameter.low, _WIDER * parameter.high)
+            return cls(effect, parameter, -_FACTORS[-1] * most, _FACTORS[-1] * most, most)  # of the measured angle
+        return cls(effect, parameter, _WIDER * parameter.low, _WIDER * parameter.high, parameter.largest)
 
 
 def _numbers_of(robot: Robot) -> list[_Number]:
@@ -102,26 +105,38 @@ class SteeringFit:
     def terms(self) -> tuple[Term, ...]:
         """The effects of the steering that fit best. ConfigError: the robot has none, or no matrix can be fitted."""
         numbers = self._numbers
-        count = 0
-
-        def cost(vector: Array) -> tuple[float, Array]:
-            nonlocal count
-            value, slopes = self.cost(vector)
-            count += 1
-            self.watch(Progress("steering", count, len(_FACTORS) + _MOST, "matrix", value))
-            return value, slopes
-
-        largest = np.array([number.parameter.largest for number in numbers])
-        gain = next(index for index, number in enumerate(numbers) if number.effect == _GAIN)
+        usual = np.array([number.usual for number in numbers])
+        names = np.array([number.effect for number in numbers])
         starts = np.zeros((len(_FACTORS), len(numbers)))
-        starts[:, gain] = (np.array(_FACTORS) - 1) / largest[gain]
-        best = min(starts, key=lambda start: cost(start)[0])
-        bounds = [(number.low / unit, number.high / unit) for number, unit in zip(numbers, largest, strict=True)]
-        found = minimize(cost, best, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxfun": _MOST})
-        return self._as_terms(found.x)
+        starts[:, names == _GAIN] = ((np.array(_FACTORS) - 1) / usual[names == _GAIN])[:, None]
+        bounds = np.array([(number.low, number.high) for number in numbers]) / usual[:, None]
+        vector, least = self._least(min(starts, key=lambda start: self._told(start)[0]), bounds)
+        for effect in dict.fromkeys(names[names != _GAIN].tolist()):  # what hardly helps is left out, one by one
+            without = np.where((names == effect)[:, None], 0.0, bounds)
+            found, cost = self._least(np.where(names == effect, 0.0, vector), without)
+            if cost <= (1 + _WORTH) * least:
+                vector, least, bounds = found, cost, without
+        self.watch(Progress("steering", result=""))
+        kept = set(names[bounds.any(axis=1)].tolist())
+        return tuple(term for term in self._as_terms(vector) if term.name in kept)
+
+    def _least(self, start: Array, bounds: Array) -> tuple[Array, float]:
+        """The vector (n,) of least cost between bounds (n, 2), and that cost."""
+        found = minimize(self._told, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxfun": _MOST})
+        return found.x, float(found.fun)
+
+    def _told(self, vector: Array) -> tuple[float, Array]:
+        """The cost, of which ``watch`` is told."""
+        value, slopes = self.cost(vector)
+        self.watch(Progress("steering", next(self._count), None, "matrix", value))
+        return value, slopes
+
+    @cached_property
+    def _count(self) -> Iterator[int]:
+        return count(1)
 
     def cost(self, vector: Array) -> tuple[float, Array]:
-        """c(q) of Eq. (1) and its derivatives (n,), at a vector (n,) in units of the largest plausible sizes."""
+        """c(q) of Eq. (1) and its derivatives (n,), at a vector (n,) in units of the usual sizes."""
         terms = self._as_terms(vector)
         matrix, value = self._best_matrix(corrected_runs(self.robot, self.runs, terms, self.sample_period))
         return value, self._slopes(vector, matrix)
@@ -143,10 +158,10 @@ class SteeringFit:
         return numbers
 
     def _as_terms(self, vector: Array) -> tuple[Term, ...]:
-        """The effects at a vector in units of their largest plausible sizes."""
+        """The effects at a vector in units of their usual sizes."""
         values: dict[str, dict[str, float]] = {}
         for number, share in zip(self._numbers, vector.tolist(), strict=True):
-            values.setdefault(number.effect, {})[number.parameter.name] = share * number.parameter.largest
+            values.setdefault(number.effect, {})[number.parameter.name] = share * number.usual
         return tuple(Term(effects.create(name), of_effect) for name, of_effect in values.items())
 
     def _best_matrix(self, runs: Sequence[Trajectory]) -> tuple[Array, float]:
@@ -200,9 +215,9 @@ def on_bounds(robot: Robot, terms: Sequence[Term]) -> tuple[str, ...]:
     values = {(term.name, name): value for term in terms for name, value in term.values.items()}
     found = []
     for number in _numbers_of(robot):
-        value = values[number.effect, number.parameter.name]
+        value = values.get((number.effect, number.parameter.name), 0.0)
         near = _ON_BOUND * (number.high - number.low)
-        if any(bound and abs(value - bound) <= near for bound in (number.low, number.high)):
+        if value and any(bound and abs(value - bound) <= near for bound in (number.low, number.high)):
             found.append(f"{number.effect.replace('_', ' ')} {value:.3g}")
     return tuple(found)
 
