@@ -23,7 +23,7 @@ from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisat
 from omnibench.fit.shrinkage.prior import MountChoice, default_cost, default_mount, default_unidentified
 from omnibench.fit.shrinkage.shrinkage import shrunk
 from omnibench.fit.span import Unidentified, WheelDirection
-from omnibench.fit.steering import SteeringChoice, SteeringFit, corrected_runs, words_of
+from omnibench.fit.steering import SteeringChoice, SteeringFit, corrected_runs, on_bounds, words_of
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals, bootstrap_intervals
 from omnibench.fit.uncertainty.ratio_intervals import FEWEST, Units, units_of
 from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
@@ -155,8 +155,13 @@ def calibrate(
     warnings = warnings_of_calibration(dataset.robot, driven, searched.name, unidentified)
     if terms:
         doubts += (
-            f"the steering was fitted first ({words_of(terms)}); intervals hold for "
-            "these numbers, whose own are not known, and the file has no covariance",
+            f"the steering was fitted first ({words_of(terms)}); the matrix's intervals take "
+            "these numbers for exact, and the file has no covariance",
+            *(
+                f"{name} is on a bound of its search: these runs hardly tell it, so take the effect out of the file, or "
+                "record runs that change the steering angle while driving"
+                for name in on_bounds(dataset.robot, terms)
+            ),
         )
     calibration = fitted_calibration(
         name=f"{dataset.name} {calibrator}",

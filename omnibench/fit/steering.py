@@ -48,6 +48,7 @@ _GAINS = (-0.95, 15.0)  # bounds of the gain, which counts from 0
 _WIDER = 3.0  # times the plausible range, of play and zero
 _SCRUB = 0.1  # m: a wheel stands no farther from the axis about which it steers, by as much as which it then rolls
 _STEP = 1e-4  # of the largest plausible size: of central differences
+_AT = 1e-6  # of the largest plausible size: how near a bound counts as on it
 _MOST = 40  # matrices of the search
 _TOLERANCE = 1e-7  # m or rad per rad of wheel, of each matrix
 
@@ -96,7 +97,7 @@ class SteeringFit:
             terms = self._as_terms(vector)
             matrix, value = self._best_matrix(corrected_runs(self.robot, self.runs, terms, self.sample_period))
             count += 1
-            self.watch(Progress("steering", count, len(_FACTORS) + _MOST, "matrix", value))
+            self.watch(Progress("steering", count, None, "fit", value))
             return value, self._slopes(vector, matrix)
 
         largest = np.array([number.parameter.largest for number in numbers])
@@ -173,6 +174,17 @@ def corrected_runs(
         signals = robot.drive.signals(true.rates, true.steering)
         made.append(replace(run, rates=signals, steering=None, drive=None, angles=None))
     return tuple(made)
+
+
+def on_bounds(robot: Robot, terms: Sequence[Term]) -> tuple[str, ...]:
+    """Names of the fitted effects with a number on a bound of its search, other than 0: runs hardly tell these."""
+    named = []
+    for term in terms:
+        for parameter in term.effect.parameters(robot):
+            number, value = _Number.of(term.name, parameter, robot), term.values[parameter.name]
+            if value and not number.low + _AT * parameter.largest < value < number.high - _AT * parameter.largest:
+                named.append(term.name.replace("_", " "))
+    return tuple(named)
 
 
 def words_of(terms: Sequence[Term]) -> str:

@@ -15,7 +15,9 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.cost import Cost
-from omnibench.fit.steering import SteeringFit
+from omnibench.fit.steering import SteeringFit, on_bounds
+from omnibench.registry import effects
+from omnibench.robot.effects.term import Term
 from omnibench.robot.kinematics import Array, Robot
 
 
@@ -135,3 +137,10 @@ def test_the_first_half_of_a_real_drive_predicts_the_second() -> None:
     middle, end = float(drive.pose_times[-1] / 2), float(drive.pose_times[-1])
     first = replace(dataset, trajectories=(half(drive, 0.0, middle),))
     assert mean_distance(calibrate(first, steering="fit"), half(drive, middle, end)) <= 0.15
+
+
+def test_an_effect_on_a_bound_of_its_search_is_named() -> None:
+    coupling, gain = effects.create("steering_coupling"), effects.create("steering_gain")
+    most = 0.1 / float(TRICYCLE.radii.min())
+    assert on_bounds(TRICYCLE, [Term(gain, {"g": 0.1}), Term(coupling, {"k": -most})]) == ("steering coupling",)
+    assert on_bounds(TRICYCLE, [Term(gain, {"g": 0.1}), Term(coupling, {"k": 0.5 * most})]) == ()
