@@ -158,8 +158,8 @@ def calibrate(
             f"the steering was fitted first ({words_of(terms)}); the matrix's intervals take "
             "these numbers for exact, and the file has no covariance",
             *(
-                f"{name} is on a bound of its search: these runs hardly tell it, so take the effect out of the file, or "
-                "record runs that change the steering angle while driving"
+                f"{name} is on a bound of its search: these runs hardly tell it, so take the effect out of the file, "
+                "or record runs that change the steering angle while driving"
                 for name in on_bounds(dataset.robot, terms)
             ),
         )

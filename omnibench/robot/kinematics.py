@@ -193,7 +193,10 @@ def _flaw(robot: Robot) -> str:
     if len(strengths) < allowed.shape[1] or strengths[-1] < _RANK * strengths[0]:
         if not lateral and drive.direct:
             return "these wheels cannot drive the robot in every direction; check angles and roller angles"
-        return f"signals {', '.join(drive.names)} do not determine how the robot moves; add a measured wheel or a steering angle"
+        return (
+            f"signals {', '.join(drive.names)} do not determine how the robot moves; "
+            "add a measured wheel or a steering angle"
+        )
     return ""
 
 

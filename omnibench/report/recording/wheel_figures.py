@@ -43,7 +43,7 @@ class _Series:
 
 
 def wheel_rates(trajectory: Trajectory, robot: Robot) -> FigureGrid:
-    """Measured rates, targets and steering angles over time, a row for each wheel; with targets also their difference."""
+    """Measured rates, targets and steering angles over time, a row for each wheel; with targets also the difference."""
     measured = _blocks(trajectory.times, trajectory.rates, max(1, -(-len(trajectory.times) // _DRAWN)))
     period = float(np.median(np.diff(trajectory.times, prepend=0.0)))
     size = max(1, round(_MEAN_OVER / period), -(-len(trajectory.times) // _DRAWN))
