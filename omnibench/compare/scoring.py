@@ -173,7 +173,8 @@ def _improvement(score: SplitScore | None, theoretical: SplitScore | None) -> fl
 def _parameters(run: PlannedRun, result: RunResult) -> tuple[FittedParameter, ...] | None:
     if run.parameterisation != "geometry" or result.vector is None:
         return None
-    return fitted_parameters(WheelGeometry(run.dataset.robot), result.vector)
+    geometry = WheelGeometry(run.dataset.robot, fitted_mount=run.config.mount == "fit")
+    return fitted_parameters(geometry, result.vector)
 
 
 def _is_exact(run: PlannedRun, scored: ScoredRun) -> bool:

@@ -155,8 +155,8 @@ def calibrate(
     warnings = warnings_of_calibration(dataset.robot, driven, searched.name, unidentified)
     if terms:
         doubts += (
-            f"the steering was fitted first ({words_of(terms)}); intervals hold for "
-            "these numbers, whose own are not known, and the file has no covariance",
+            f"the steering was fitted first ({words_of(terms)}); the matrix's intervals take "
+            "these numbers for exact, and the file has no covariance",
         )
         doubts += tuple(
             f"{number} lies on the bound of what is searched, so that these runs hardly tell it, or it stands for "

@@ -128,7 +128,7 @@ class SteeringFit:
     def _told(self, vector: Array) -> tuple[float, Array]:
         """The cost, of which ``watch`` is told."""
         value, slopes = self.cost(vector)
-        self.watch(Progress("steering", next(self._count), None, "matrix", value))
+        self.watch(Progress("steering", next(self._count), None, "fit", value))
         return value, slopes
 
     @cached_property

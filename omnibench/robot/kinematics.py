@@ -194,7 +194,8 @@ def _flaw(robot: Robot) -> str:
         if not lateral and drive.direct:
             return "these wheels cannot drive the robot in every direction; check angles and roller angles"
         return (
-            f"signals {', '.join(drive.names)} do not determine how it moves; add a measured wheel or a steering angle"
+            f"signals {', '.join(drive.names)} do not determine how the robot moves; "
+            "add a measured wheel or a steering angle"
         )
     return ""
 

@@ -13,6 +13,7 @@ from omnibench.cli.terminal.inspection_tables import print_inspection
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.inspect import inspect_dataset
+from omnibench.fit.problem import Budget
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
@@ -38,3 +39,11 @@ def test_a_matrix_has_a_column_for_each_drive_signal() -> None:
     assert any(line.split() == ["front_cos", "front_sin"] for line in lines)
     assert any(line.startswith("directions of drive signals driven: 2 of 2") for line in lines)
     assert not any("wheel front" in line for line in lines)
+
+
+def test_the_geometry_of_a_tricycle_is_shown_with_the_place_of_its_tracked_point() -> None:
+    console = Console(file=io.StringIO(), width=160)
+    searched = calibrate(a_dataset(), "crs", parameterisation="geometry", budget=Budget(evaluations=200))
+    print_calibration(console, searched)
+    assert isinstance(console.file, io.StringIO)
+    assert any(line.startswith("mount_x") for line in console.file.getvalue().splitlines())

@@ -180,7 +180,7 @@ FOUR = [fixed("a", 0.2, 0.2), fixed("b", 0.2, -0.2), fixed("c", -0.2, 0.2), fixe
             [fixed("a", 0, 0.1), fixed("b", 0, -0.1, angle=0.3)],
             "fixed wheels a, b would have to slide when it turns; put them on one axle",
         ),
-        ([fixed("a", 0, 0.1), fixed("b", 0, 0.1)], "signals a, b do not determine how it moves"),
+        ([fixed("a", 0, 0.1), fixed("b", 0, 0.1)], "signals a, b do not determine how the robot moves"),
         ([fixed("a", 0, 0.1), {"name": "b", "type": "fixed", "radius": 0.1, "x": 0}], "y of a fixed wheel is missing"),
         ([steered("a", 0.5, 0, angle=1.0)], "a steered wheel has no angle"),
         ([fixed("a", 0, 0.1, roller_angle=0.7)], "a fixed wheel has no rollers"),

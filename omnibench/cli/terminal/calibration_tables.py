@@ -113,7 +113,10 @@ def _intervals(run: CalibrationRun) -> Iterator[tuple[str, ElementIntervals]]:
 
 def _parameter_table(robot: Robot, parameters: Sequence[ParameterEstimate]) -> Table:
     rows = []
-    for parameter, start in zip(parameters, WheelGeometry(robot).start, strict=True):
+    geometry = WheelGeometry(robot, fitted_mount=True)
+    design = dict(zip(geometry.names, geometry.start, strict=True))
+    for parameter in parameters:
+        start = design[parameter.name]
         factor, decimals, unit = (math.degrees(1.0), 3, "deg") if parameter.unit == "rad" else (1.0, 5, "m")
         interval = Cell("", parameter.untold)
         if parameter.low is not None and parameter.high is not None:

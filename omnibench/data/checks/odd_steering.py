@@ -64,7 +64,7 @@ def _gear_in_words(share: float) -> str:
         options = f"steering_unit=ticks and steering_ticks_per_turn; or {scale}"
     else:
         words += "; is there a gear between the encoder and the wheel?"
-        options = f"{scale}; or steering_unit"
+        options = f"{scale}; or steering_unit; or calibrate with --steering fit"
     return f"{words} (importers csv and rosbag: {options})"
 
 

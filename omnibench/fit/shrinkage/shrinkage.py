@@ -51,7 +51,9 @@ def shrunk(problem: CalibrationProblem, result: RunResult, *, fitted: bool = Tru
         return result
     known = _knowledge(problem, result)
     root = problem.parameterisation.prior_root * problem.free[:, None]
-    posterior = root @ np.linalg.inv(np.eye(root.shape[1]) + root.T @ known.information @ root) @ root.T
+    # eigh bears information of any size: data without noise have so much that 1 + S is singular to rounding
+    strengths, directions = np.linalg.eigh(root.T @ known.information @ root)
+    posterior = root @ directions @ np.diag(1 / (1 + np.maximum(strengths, 0.0))) @ directions.T @ root.T
     deviation = problem.parameterisation.projection @ (result.vector - problem.start)
     vector = problem.settled(problem.start + posterior @ known.information @ deviation)
     cost = float(problem.values(vector[None])[0])

@@ -27,7 +27,7 @@ class Counts:
     clock_jumps: int = _anomaly("jump", "of the wheel samples' clock")  # the stamps went on somewhere else
     bad_stamps: int = _anomaly("wheel sample", "with an unlikely stamp")  # the next stamps did not confirm it
     wraps: int = 0  # angles that started again after a turn of the counter
-    counter_restarts: int = _anomaly("restart", "of a wheel's counter")  # elsewhere, or it moved faster than max_rate
+    counter_restarts: int = _anomaly("restart", "of a wheel's counter, or jump beyond max_rate")
     not_finite: int = _anomaly("wheel sample", "not finite")  # NaN or infinity among angles and rates
     too_fast: int = _anomaly("wheel sample", "faster than max_rate")
     wrong_joints: int = _anomaly("wheel sample", "without all wheels")  # by name, or without angle and rate

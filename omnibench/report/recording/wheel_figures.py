@@ -76,17 +76,24 @@ def wheel_rates(trajectory: Trajectory, robot: Robot) -> FigureGrid:
                 _ROW * len(rows) + 60,
             )
         )
-    description = "Wheel rates over time, one row a wheel" + (", with their targets" if figures else "")
+    with_targets = bool(figures)
+    description = "Wheel rates over time, one row a wheel" + (", with their targets" if with_targets else "")
     if trajectory.steering is not None:
         every = slice(None, None, max(1, -(-len(trajectory.times) // _DRAWN)))
         degrees = np.degrees(trajectory.steering[every].T)
         hover = "steering angle<br>%{y:.2f}° at %{x:.2f} s"
-        rows += [[line(_STEERING, 1.8, trajectory.times[every], angle, hover=hover)] for angle in degrees]
-        titles += [f"{name} (°)" for name in robot.drive.steered]
+        angles = [[line(_STEERING, 1.8, trajectory.times[every], angle, hover=hover)] for angle in degrees]
         items.append(_STEERING)
-        description += "; steering angles below"
+        figures.append(
+            Figure(
+                "Steering angles",
+                _stacked(angles, [f"{name} (°)" for name in robot.drive.steered], end),
+                "Steering angles over time, one row a wheel",
+                _ROW * len(angles) + 60,
+            )
+        )
     rates = Figure("Wheel rates", _stacked(rows, titles, end), description, _ROW * len(rows) + 60)
-    return FigureGrid((rates, *figures), tuple(items), 2 if figures else 1, " ".join(words))
+    return FigureGrid((rates, *figures), tuple(items), 2 if with_targets else 1, " ".join(words))
 
 
 def rate_step(trajectory: Trajectory) -> float | None:
