@@ -94,7 +94,7 @@ def calibrate(
     or ``fit`` them (see make_parameterisation); ``shrink`` keeps them and shrinks what else is hardly known to the
     design, of the given tolerance (see shrinkage.py). The run's warnings name them. mount: ``known``, or ``fit`` where
     the tracked point stands. Default of these and of the cost: by the robot (see prior.py). steering: ``fit`` first
-    finds gain, play and coupling of the steering and a car's zero (see steering_fit.py), which are effects from then on.
+    finds gain, play and coupling of the steering and a car's zero (see steering_fit.py), effects from then on.
     watch: told the evaluations and the best cost so far, at most every 0.1 s.
 
     Raises UnknownNameError or ConfigError for wrong arguments, DataError for an empty training split, and ConfigError

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 import time
+from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -48,7 +49,7 @@ class _Numbers:
     """Numbers of one publisher: the highest that came, and those below it that did not, in increasing order."""
 
     highest: int
-    missing: dict[int, None] = field(default_factory=dict)
+    missing: OrderedDict[int, None] = field(default_factory=OrderedDict)
 
 
 class MissedMessages:
@@ -84,7 +85,7 @@ class MissedMessages:
                 self.count += gap
                 numbers.missing.update(dict.fromkeys(range(number - min(gap, _MOST_MISSING), number)))
                 while len(numbers.missing) > _MOST_MISSING:
-                    del numbers.missing[next(iter(numbers.missing))]
+                    numbers.missing.popitem(last=False)
             return gap
         if number not in numbers.missing:
             return 0 if len(content) == _HEAD.size else None  # only what is acknowledged is ever sent again

@@ -17,6 +17,7 @@ _EULER = """\
     const double stretch = 1.0;
     const double direction = pose[2];
 """
+_HELD = ("steering_gain", "steering_offset")  # effects that the header applies
 _COUNTER_CLOCKWISE = "A positive rate drives the robot counter-clockwise."
 _ROLLING = "A positive rate drives the robot in the wheel's\n * direction of rolling."
 _STEERING = (
@@ -36,7 +37,9 @@ def c_header(calibration: Calibration, prefix: str) -> tuple[str, tuple[str, ...
         arguments = f"double pose[3], {rates}, double duration"
         signs = _COUNTER_CLOCKWISE if all(wheel.lever > 0 for wheel in robot.measured) else _ROLLING
     else:
-        sizes, code, signals = definitions(upper, robot.drive), functions(prefix, robot.drive), middle(prefix)
+        sizes, code = definitions(upper, robot.drive), functions(prefix, robot.drive)
+        gain, zero = 1 + _held(calibration, "steering_gain", "g"), _held(calibration, "steering_offset", "c")
+        signals = middle(prefix, gain, zero)
         source, of, per, columns = "signals", "signal", "drive signal", f"{upper}_SIGNALS"
         arguments = (
             f"double pose[3], {prefix}_odometry_state *state, {rates},\n{' ' * (len(prefix) + 34)}"
@@ -89,14 +92,25 @@ static inline void {prefix}_odometry_step({arguments})
 #endif /* {upper}_ODOMETRY_H */
 """
     warnings = []
-    if calibration.effects:
+    if left := _left_out(calibration):
         warnings.append(
-            "the header holds the matrix only; effects of the calibration, with which it was fitted, are left out: "
-            f"{calibration.effects_in_words}"
+            "the header holds the matrix, a steering's gain and its zero; other effects of the calibration, with which "
+            f"it was fitted, are left out: {left}"
         )
     if robot.mount is not None:
         warnings.append("the header's pose is that of the tracked point, which is not the robot's centre (mount)")
     return text, tuple(warnings)
+
+
+def _held(calibration: Calibration, effect: str, parameter: str) -> float:
+    """The value of an effect that the header holds; 0 without it."""
+    return sum(term.parameters[parameter] for term in calibration.effects if term.name == effect)
+
+
+def _left_out(calibration: Calibration) -> str:
+    """The effects that the header does not hold, in words."""
+    others = tuple(term for term in calibration.effects if term.name not in _HELD)
+    return calibration.model_copy(update={"effects": others}).effects_in_words
 
 
 def _rows(matrix: Array) -> str:
@@ -121,6 +135,6 @@ def _comment(calibration: Calibration) -> str:
         lines += [f"{name} cost {cost:.6g}" for name, cost in costs if cost is not None]
     if calibration.robot.mount is not None:
         lines.append("the pose is that of the tracked point, which is not the robot's centre (mount)")
-    if calibration.effects:
-        lines.append(f"left out: effects {calibration.effects_in_words}")
+    if left := _left_out(calibration):
+        lines.append(f"left out: effects {left}")
     return "\n".join(f" * {' '.join(line.split())}".replace("*/", "* /") for line in lines)

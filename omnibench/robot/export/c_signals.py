@@ -38,15 +38,21 @@ static inline void {prefix}_drive_signals(double signals[{upper}_SIGNALS], const
 """
 
 
-def middle(prefix: str) -> str:
-    """The part of a step that takes the steering angles in the middle of the sample and makes the signals."""
+def middle(prefix: str, gain: float, zero: float) -> str:
+    """The part of a step that takes the steering angles in the middle of the sample and makes the signals.
+
+    gain: true angles for measured ones, to which zero, rad, is added.
+    """
     upper = prefix.upper()
+    turned = f"        middle[wheel] = {literal(gain)} * middle[wheel] + {literal(zero)};\n"
+    true = "" if (gain, zero) == (1, 0) else turned
     return f"""\
     double middle[{upper}_STEERED];
     double signals[{upper}_SIGNALS];
     for (int wheel = 0; wheel < {upper}_STEERED; ++wheel) {{
         middle[wheel] = state->known ? 0.5 * (state->steering[wheel] + steering[wheel]) : steering[wheel];
         state->steering[wheel] = steering[wheel];
+{true}\
     }}
     state->known = 1;
     {prefix}_drive_signals(signals, rates, middle);

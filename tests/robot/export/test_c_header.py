@@ -105,6 +105,25 @@ def test_steered_wheels_drive_as_in_the_stream(tmp_path: Path, robot: Robot, int
     assert all(f"/* {name} */" in export.text for name in drive.names)
 
 
+@needs_compiler
+def test_a_fitted_gain_and_zero_of_the_steering_are_in_the_header(tmp_path: Path) -> None:
+    effects = [
+        {"name": "steering_gain", "parameters": {"g": 4.8}},
+        {"name": "steering_offset", "parameters": {"c": 0.02}},
+    ]
+    document = calibration(CAR, disturbed(CAR), effects=effects)
+    export = export_calibration(document, "c_header")
+    rng = np.random.default_rng(2)
+    rates, steering = rng.normal(0, 4, (50, len(CAR.drive.wheels))), 0.01 * rng.normal(0, 1, (50, 2))
+    durations = np.full(50, 0.02)
+    poses = run_header(export, tmp_path, CAR.name, np.column_stack([rates, steering, durations]), 2)
+    stream = document.model.stream(START)
+    expected = [stream.drive(a * d, d, steering=s) for a, s, d in zip(rates, steering, durations, strict=True)]
+    np.testing.assert_allclose(poses, expected, rtol=0, atol=1e-12)
+    assert "left out" not in export.text
+    assert not any("left out" in warning for warning in export.warnings)
+
+
 def test_signs_are_told_as_they_are() -> None:
     assert (
         "A positive rate drives the robot counter-clockwise" in export_calibration(calibration(APR_02), "c_header").text
