@@ -114,6 +114,8 @@ def calibrate(
             "resampling, since a calibration has other intervals, too"
         )
     unidentified = unidentified or default_unidentified(dataset.robot)
+    if tolerance is not None and unidentified != "shrink":
+        raise ConfigError(f"tolerance is of the design, for unidentified: shrink, and unidentified is {unidentified}")
     if intervals and unidentified == "shrink":
         raise ConfigError(
             "resampled intervals are drawn about a minimum, which a shrunk answer is not: set unidentified to keep; a "

@@ -181,8 +181,11 @@ def direction_in_words(direction: Array, wheels: Sequence[str]) -> str:
 def motion_in_words(direction: Array, robot: Robot) -> str:
     """Motion of the design robot under wheel rates along a direction (N,), like ``turning on the spot``.
 
-    Empty if the robot would not move because the wheels only slip.
+    Empty if the robot would not move because the wheels only slip, or contradict each other.
     """
+    motions = np.linalg.qr(_motions(robot).T)[0]
+    if np.linalg.norm(direction @ motions) < _NO_MOTION * np.linalg.norm(direction):
+        return ""
     x, y, turn = robot.inverse_kinematic_matrix @ direction
     reach = robot.reach
     speed, spin = math.hypot(x, y), abs(turn) * reach

@@ -69,11 +69,12 @@ def new_state(name: str, calibration: Calibration, wheels: WheelSettings, fusion
     limit = _FARTHEST_OF_CAR if isinstance(drive, CarDrive) else _FARTHEST
     steering = SteeringInput(joints.steering, limit, counts) if drive.steered else None
     timeline = Timeline(fusion.history if fusion else _HISTORY)
+    taken = wheels.for_wheels(calibration.robot.radii)
     return RobotState(
         name=name,
         calibration=calibration,
         counts=counts,
-        wheel_input=WheelInput(joints.wheels, wheels, calibration.sample_period, counts, steering),
+        wheel_input=WheelInput(joints.wheels, taken, calibration.sample_period, counts, steering),
         odometry=LiveOdometry(calibration, (fusion or FusionSettings()).standstill),
         timeline=timeline,
         fusion=Fusion(fusion, timeline, counts) if fusion else None,

@@ -33,6 +33,8 @@ _SLOWER = 50  # samples in a row each after a missing one, as of a robot that se
 _SMOOTHING = 0.02  # share of a new period in the mean
 _IRREGULAR = 0.25  # share of the mean period by which a regular one may be off
 _MEMORY = 0.995  # share of the past in the pace of the stamps, which is 1 of a robot and more of a fast replay
+_FASTEST = 100.0  # rad/s
+_FASTEST_RIM = 5.0  # m/s, of small wheels
 
 
 class WheelSettings(Model):
@@ -47,9 +49,17 @@ class WheelSettings(Model):
     wrap: Positive | None = Field(
         None, description="angle after which angles start again, rad; default: one turn where they seem to"
     )
-    max_rate: Positive = Field(100.0, description="no wheel turns faster, rad/s")
+    max_rate: Positive | None = Field(
+        None, description=f"no wheel turns faster, rad/s; default: {_FASTEST:g}, or {_FASTEST_RIM:g} m/s at its rim"
+    )
     max_gap: Positive = Field(1.0, description="a longer silence makes the path unknown, s")
     max_steering_age: Positive = Field(0.2, description="older steering angles make the path unknown, s")
+
+    def for_wheels(self, radii: Array) -> WheelSettings:
+        """With the rate that no wheel of radii (N,), m, exceeds; a motor in the place of its wheel has a small one."""
+        if self.max_rate is not None:
+            return self
+        return self.model_copy(update={"max_rate": max(_FASTEST, _FASTEST_RIM / float(radii.min()))})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +123,8 @@ class WheelInput:
         self._counts = counts
         self._steering = steering
         self._places: dict[tuple[str, ...], NDArray[np.intp] | None] = {}
-        self._angles = WheelAngles(len(self._joints), settings.wrap, settings.max_rate, counts)
+        self._fastest = settings.max_rate or _FASTEST
+        self._angles = WheelAngles(len(self._joints), settings.wrap, self._fastest, counts)
         self._counting = settings.use == "positions"  # True: angles come from counters, False: from rates
         self._last: _Sample | None = None
         self._rates: Array = np.zeros(len(self._joints))
@@ -199,12 +210,10 @@ class WheelInput:
             if values is not None and not all(map(math.isfinite, values.tolist())):
                 self._counts.not_finite += 1
                 raise MessageError(f"wheels say {values.tolist()}")
-        if velocities is not None and not all(abs(rate) <= self._settings.max_rate for rate in velocities.tolist()):
+        if velocities is not None and not all(abs(rate) <= self._fastest for rate in velocities.tolist()):
             if positions is None:
                 self._counts.too_fast += 1
-                raise MessageError(
-                    f"wheel rates {velocities.tolist()} rad/s exceed max_rate {self._settings.max_rate:g}"
-                )
+                raise MessageError(f"wheel rates {velocities.tolist()} rad/s exceed max_rate {self._fastest:g}")
             velocities = None
         if self._steering is None:
             return _Sample(message.stamp, arrival, positions, velocities, skipped)

@@ -134,3 +134,10 @@ def test_the_prior_has_the_stated_widths() -> None:
     np.testing.assert_allclose(deviations[0], np.hypot(elements, rows[0]), rtol=1e-9)
     np.testing.assert_allclose(deviations[1], elements, rtol=1e-9)  # a design of zeros has no factor
     np.testing.assert_allclose(deviations[2], np.hypot(elements, rows[2]), rtol=1e-9)
+
+
+def test_a_tolerance_is_refused_where_nothing_is_shrunk() -> None:
+    with pytest.raises(
+        ConfigError, match="tolerance is of the design, for unidentified: shrink, and unidentified is keep"
+    ):
+        calibrate(RECORDING, unidentified="keep", tolerance=0.01)
