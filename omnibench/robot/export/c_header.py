@@ -94,8 +94,8 @@ static inline void {prefix}_odometry_step({arguments})
     warnings = []
     if left := _left_out(calibration):
         warnings.append(
-            "the header holds the matrix, a steering's gain and its zero; other effects of the calibration, with which "
-            f"it was fitted, are left out: {left}"
+            "the header holds the matrix, and a steering's gain and zero; other effects of the calibration are left out: "
+            f"{left}; the matrix was fitted with them"
         )
     if robot.mount is not None:
         warnings.append("the header's pose is that of the tracked point, which is not the robot's centre (mount)")
