@@ -94,7 +94,7 @@ static inline void {prefix}_odometry_step({arguments})
     warnings = []
     if left := _left_out(calibration):
         warnings.append(
-            "the header holds the matrix, and a steering's gain and zero; other effects of the calibration are left out: "
+            "it holds the matrix, and a steering's gain and zero; other effects of the calibration are left out: "
             f"{left}; the matrix was fitted with them"
         )
     if robot.mount is not None:
