@@ -61,7 +61,7 @@ def calibrate(
         Literal["keep", "fit", "shrink"] | None,
         typer.Option(
             help="What the data hardly tell: keep the design where motions are hardly driven, fit it all the same, or "
-            "shrink all to the design in proportion to what is known. Default: shrink where the wheels say their type."
+            "shrink all to the design in proportion to what is known. Default: shrink where wheels say a type but omni."
         ),
     ] = None,
     tolerance: Annotated[

@@ -121,6 +121,8 @@ def test_resampled_intervals_of_a_shrunk_answer_are_refused() -> None:
 
 def test_robots_whose_wheels_say_their_type_are_shrunk_by_default() -> None:
     assert [default_unidentified(robot) for robot in (APR_02, MECANUM, DIFFERENTIAL)] == ["keep", "shrink", "shrink"]
+    wheels = tuple(wheel.model_copy(update={"type": "omni"}) for wheel in APR_02.wheels)
+    assert default_unidentified(APR_02.model_copy(update={"wheels": wheels})) == "keep"
 
 
 def test_the_tracked_point_of_a_tricycle_is_fitted_by_default() -> None:
