@@ -58,7 +58,9 @@ def motion_system(robot: Robot) -> tuple[Figure, list[LegendItem]]:
     ]
     for wheel, start, way in zip(robot.measured, starts, ways, strict=True):
         labels.append(_label(start + 0.3 * size * way, f"V<sub>{text(wheel.name)}</sub>", _ROLLING.colour))
-    labels += [_label(np.array(wheel.position), text(wheel.name), INK) for wheel in robot.wheels]
+    for wheel in robot.wheels:
+        behind = (wheel.radius + 0.1 * size) * _along(wheel.rolling)  # beside the rectangle, which names would cross
+        labels.append(_label(np.array(wheel.position) - behind, text(wheel.name), INK))
     figure = _seen_from_above(traces, labels, size)
     names = ", ".join(wheel.name for wheel in robot.wheels)
     description = f"{robot.name} from above: wheels {names}, frame, directions of rolling"
@@ -80,11 +82,14 @@ def parameters(robot: Robot, fitted: Sequence[tuple[LegendItem, Robot]] = ()) ->
             traces.append(line(_FRAME, 1.0, *_up(_arc(reach, 0.0, angle)).T))
             labels.append(_label((reach + 0.08 * size) * _along(before), f"δ<sub>{name}</sub>", QUIET))
             labels.append(_label(0.6 * place + 0.1 * size * _along(wheel.rolling), f"R<sub>{name}</sub>", INK))
-            values = f"r {wheel.radius:g} m<br>R {wheel.distance:g} m<br>δ {fixed(math.degrees(angle), 1)}°"
+            values, apart = (
+                f"r {wheel.radius:g} m<br>R {wheel.distance:g} m<br>δ {fixed(math.degrees(angle), 1)}°",
+                0.65,
+            )
         else:
             x, y = map(plain, wheel.position)
-            values = f"r {wheel.radius:g} m<br>x {x} m<br>y {y} m"
-        labels.append(_label(place + 0.65 * size * _along(wheel.outward), f"<b>{name}</b> {values}", DESIGN.colour))
+            values, apart = f"r {wheel.radius:g} m<br>x {x} m<br>y {y} m", 0.5  # wheels to the sides: within the plot
+        labels.append(_label(place + apart * size * _along(wheel.outward), f"<b>{name}</b> {values}", DESIGN.colour))
     description = f"Radius and place of each wheel of {robot.name}"
     return Figure("Its parameters", _seen_from_above(traces, labels, size), description, 460)
 

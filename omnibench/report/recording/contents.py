@@ -20,8 +20,8 @@ def contents_table(dataset: Dataset) -> Table:
     number = sum(map(len, samples))
     rows = [
         _commands(runs),
-        _wheels("Target wheel rates", "(ωMa, ωMb, ωMc)", runs, "targets", "what the motor controllers were told"),
-        _row("Measured wheel rates", "(ωa, ωb, ωc)", number, "samples", _every(samples, first=0.0), _steps(runs)),
+        _wheels("Target wheel rates", _rates("ωM", dataset), runs, "targets", "what the motor controllers were told"),
+        _row("Measured wheel rates", _rates("ω", dataset), number, "samples", _every(samples, first=0.0), _steps(runs)),
         _wheels("Wheel angles", "beyond Table 1", runs, "angles", "absolute, continuous within a session"),
         *_steering(runs),
         _row("Odometry", "(x, y, θ)", number, "poses", _every(samples, first=0.0), "computed from the wheel rates"),
@@ -40,6 +40,14 @@ def contents_table(dataset: Dataset) -> Table:
         note="After Table 1 of the paper, whose symbols stand in small print. Every: the median interval; where they "
         "vary, in brackets the range that holds 98 % of them.",
     )
+
+
+def _rates(symbol: str, dataset: Dataset) -> str:
+    """The paper's symbols of wheel rates; those of wheels with longer names than its a, b, c as words."""
+    names = dataset.robot.wheel_names
+    if all(len(name) == 1 for name in names):
+        return f"({', '.join(symbol + name for name in names)})"
+    return f"{symbol} of {', '.join(names)}"
 
 
 def _commands(runs: Sequence[Trajectory]) -> Row:
