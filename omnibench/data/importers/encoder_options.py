@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, get_args
 
@@ -22,6 +23,7 @@ from omnibench.data.importers.encoder_counts import (
 from omnibench.data.importers.recording_options import RecordingOptions
 from omnibench.errors import DataError, nearest
 from omnibench.robot.kinematics import Array
+from omnibench.robot.wheels.fastest import fastest_rates
 from omnibench.words import plural
 
 Position = Literal["rad", "deg", "rev", "ticks"]
@@ -36,8 +38,6 @@ _POWER = re.compile(r"2\s*(?:\^|\*\*)\s*(\d{1,2})")
 _WORDS = ("auto", "never")
 _POSITIONS = get_args(Position)
 _ALL = slice(None)
-_FASTEST = 100.0  # rad/s; chosen, as is
-_FASTEST_RIM = 5.0  # m/s, of small wheels
 _WHOLE = 1e-6  # largest distance of whole numbers, which went through rad, from such
 
 
@@ -62,7 +62,7 @@ Offsets = Annotated[tuple[FiniteFloat, ...], BeforeValidator(_listed)]
 Wrap = Annotated[float | Literal["auto", "never"], BeforeValidator(_as_wrap)]
 
 
-class EncoderOptions(RecordingOptions):
+class EncoderOptions(RecordingOptions, ABC):
     """What the encoders of wheels and of steering axles count. A subclass has the signs of the wheels."""
 
     wheel_unit: WheelUnit = Field(
@@ -118,9 +118,9 @@ class EncoderOptions(RecordingOptions):
         return "increments" if self.wheel_unit in get_args(Increment) else "positions"
 
     @property
+    @abstractmethod
     def signs(self) -> Signs:
         """Signs of the wheels; empty if all are positive."""
-        raise NotImplementedError
 
     @property
     def wheel_radians(self) -> Array:
@@ -190,7 +190,7 @@ class EncoderOptions(RecordingOptions):
     def fastest_rates(self) -> Array:
         """Rates (N,), rad/s, that no wheel exceeds."""
         radii = self.robot.radii
-        return np.maximum(_FASTEST, _FASTEST_RIM / radii) if self.fastest is None else np.full(len(radii), self.fastest)
+        return fastest_rates(radii) if self.fastest is None else np.full(len(radii), self.fastest)
 
     def misread(self, place: str, rates: Array, durations: Array) -> DataError:
         """The error of mean rates (F, N), rad/s, over durations (F,), s, that are too fast to be in the unit."""

@@ -22,6 +22,7 @@ from omnibench.live.wheels.steering_input import REORDERED, SteeringInput
 from omnibench.live.wheels.wheel_angles import WheelAngles
 from omnibench.live.wire.messages import JointState, MessageError
 from omnibench.robot.kinematics import Array
+from omnibench.robot.wheels.fastest import FASTEST, FASTEST_RIM, fastest_rates
 
 _SECOND = 1e9  # ns
 # All of these are chosen.
@@ -33,8 +34,6 @@ _SLOWER = 50  # samples in a row each after a missing one, as of a robot that se
 _SMOOTHING = 0.02  # share of a new period in the mean
 _IRREGULAR = 0.25  # share of the mean period by which a regular one may be off
 _MEMORY = 0.995  # share of the past in the pace of the stamps, which is 1 of a robot and more of a fast replay
-_FASTEST = 100.0  # rad/s
-_FASTEST_RIM = 5.0  # m/s, of small wheels
 
 
 class WheelSettings(Model):
@@ -50,7 +49,7 @@ class WheelSettings(Model):
         None, description="angle after which angles start again, rad; default: one turn where they seem to"
     )
     max_rate: Positive | None = Field(
-        None, description=f"no wheel turns faster, rad/s; default: {_FASTEST:g}, or {_FASTEST_RIM:g} m/s at its rim"
+        None, description=f"no wheel turns faster, rad/s; default: {FASTEST:g}, or {FASTEST_RIM:g} m/s at its rim"
     )
     max_gap: Positive = Field(1.0, description="a longer silence makes the path unknown, s")
     max_steering_age: Positive = Field(0.2, description="older steering angles make the path unknown, s")
@@ -59,7 +58,7 @@ class WheelSettings(Model):
         """With the rate that no wheel of radii (N,), m, exceeds; a motor in the place of its wheel has a small one."""
         if self.max_rate is not None:
             return self
-        return self.model_copy(update={"max_rate": max(_FASTEST, _FASTEST_RIM / float(radii.min()))})
+        return self.model_copy(update={"max_rate": float(fastest_rates(radii).max())})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,7 +122,7 @@ class WheelInput:
         self._counts = counts
         self._steering = steering
         self._places: dict[tuple[str, ...], NDArray[np.intp] | None] = {}
-        self._fastest = settings.max_rate or _FASTEST
+        self._fastest = settings.max_rate or FASTEST
         self._angles = WheelAngles(len(self._joints), settings.wrap, self._fastest, counts)
         self._counting = settings.use == "positions"  # True: angles come from counters, False: from rates
         self._last: _Sample | None = None
