@@ -1,0 +1,329 @@
+"""Offset and drift of a reference's clock against the wheels', run by run, from what both show of the same motion.
+
+A pose stamped t by the reference's clock was taken at
+
+    tau(t) = t + offset + drift (t - t0)                                                        (1)
+
+of the wheels' clock, t0 being the run's first stamp. Between stamps t_i and t_j about a second apart the heading
+changes by
+
+    theta_j - theta_i = h . (C(tau_j) - C(tau_i)) + e,                                          (2)
+
+C (M) being the integrals of the drive signals, and the tracked point moves by
+
+    |p_j - p_i| = s . (A(tau_j) - A(tau_i)) + e,                                                (3)
+
+A (M + 1) being the integrals of the design's speed and of the signals' magnitudes. h and s are fitted with the clocks,
+so that a wrong matrix, swapped wheels, other units and a mirrored reference do not matter: shapes are matched, not
+values. They are common to all runs that are given: a run that drives one command alone may hide its clock in them.
+
+Eq. (2) and (3) are solved by Gauss-Newton with Huber's weights. Standard errors are of the sandwich kind, of scores
+that are summed over blocks, as slip lasts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.data.dataset import Trajectory
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.planar import interpolated
+
+_WINDOW = (
+    1.0  # s between the stamps of Eq. (2): long beside the noise of a pose, short beside the drift by slip; chosen
+)
+_BIN = 0.2  # s: poses within are averaged, so that dense ones cost no more than sparse ones; chosen
+_BLOCK = 2.0  # s: residuals that are nearer count as correlated; chosen, twice the window
+_SEARCH = 2.0  # s: offsets are looked for within this on either side, unless the caller says more; chosen
+_COARSE = 0.1  # s between the offsets that are tried first, a tenth of the window
+_HUBER = 1.5  # standard deviations from which on a residual counts less
+_ROUNDS, _STEPS = 4, 4  # of h and s in turns with the clocks, and of Gauss-Newton in each
+_FEWEST = 10  # windows of a run, below which its clock is not told; chosen
+_LEAST_DRIFTING = 10.0  # s: the drift of a shorter run is not told apart from its offset; chosen
+_LARGEST_DRIFT = 0.05  # s per s: no clock goes more wrong; OptiOdom's tricycle has 0.014
+_DELTA = 0.01  # s: half the step of derivatives by time
+# Robust cost that an offset _AWAY, s, from the best one must add, as a share. Chosen: every run of four robots under
+# motion capture (OptiOdom) adds 0.43 or more, and the 72 of a Robotino that drives evenly throughout add 0.07 or less.
+_AWAY, _TOLD = 0.5, 0.2
+_RANK = 1e-3  # of the strongest direction of the signals: what is weaker is noise; chosen
+
+
+@dataclass(frozen=True, eq=False)
+class Streams:
+    """Wheels and reference of one run, each by its own clock.
+
+    edges (F + 1,): begin of the first wheel sample and end of each, s. driven (F + 1, M): integrals of the drive
+    signals up to then, rad. pose_times (K,): s. poses (K, 3): m, m and rad, headings continuous.
+    """
+
+    edges: Array
+    driven: Array
+    pose_times: Array
+    poses: Array
+
+    @classmethod
+    def of_run(cls, run: Trajectory) -> Streams:
+        """The streams of a run of a data set."""
+        edges = np.append(0.0, run.times)
+        moved = run.signals * np.diff(edges)[:, None]
+        return cls(edges, np.vstack([np.zeros(moved.shape[1]), np.cumsum(moved, axis=0)]), run.pose_times, run.poses)
+
+
+@dataclass(frozen=True)
+class ClockMatch:
+    """The clock of a run's reference against its wheels', Eq. (1), with standard errors.
+
+    middle, middle_error: s to add to the poses' times in the run's middle, where it shows best. drift, drift_error: s
+    per s; 0 and infinite where the run is too short to tell. length: of the reference, s.
+    """
+
+    middle: float
+    middle_error: float
+    drift: float
+    drift_error: float
+    length: float
+
+    @property
+    def offset(self) -> float:
+        """Seconds to add to the times of the run's first pose."""
+        return self.middle - self.drift * self.length / 2
+
+    @property
+    def offset_error(self) -> float:
+        """Standard error of ``offset``, s."""
+        return float(np.hypot(self.middle_error, self.drift_error * self.length / 2 if self.drift else 0.0))
+
+    def corrected(self, pose_times: Array) -> Array:
+        """Pose times (K,) by the wheels' clock, s, Eq. (1)."""
+        times: Array = pose_times + self.offset + self.drift * (pose_times - pose_times[0])
+        return times
+
+
+def match_clocks(robot: Robot, runs: Sequence[Streams], search: float = _SEARCH) -> list[ClockMatch | None]:
+    """The clock of the reference in every run; None where a run is too short or too even to tell.
+
+    search: s, the largest offset that is looked for. Runs of one robot are told better together than alone.
+    """
+    windows = [_Windows.of(robot, run) for run in runs]
+    usable = [each for each in windows if each is not None]
+    if not usable:
+        return [None] * len(runs)
+    clocks = [each.scanned(search) for each in usable]
+    for _ in range(_ROUNDS):
+        fitted = _coefficients(usable, clocks)
+        clocks = [each.improved(fitted, clock) for each, clock in zip(usable, clocks, strict=True)]
+    matches = iter([each.match(fitted, clock) for each, clock in zip(usable, clocks, strict=True)])
+    return [None if each is None else next(matches) for each in windows]
+
+
+Clock = tuple[float, float]
+"""Seconds to add in the middle of a run, and drift, s per s."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Windows:
+    """The windows of a run: first and last (W,) of its bins, and what the reference shows between them.
+
+    edges (F + 1,), counted (F + 1, C): times, s, and integrals of the signals, then of the design's speed and of the
+    signals' magnitudes. stamps (K,): s. starts (B,): first stamp of each bin. shown (2, W): change of heading, rad, and
+    way, m. heading: number of the columns that tell the heading.
+    """
+
+    edges: Array
+    counted: Array
+    heading: int
+    stamps: Array
+    starts: NDArray[np.intp]
+    first: NDArray[np.intp]
+    last: NDArray[np.intp]
+    shown: Array
+
+    @classmethod
+    def of(cls, robot: Robot, run: Streams) -> _Windows | None:
+        """The windows of a run; None if there are too few, or the wheels or the reference stand."""
+        if len(run.pose_times) < _FEWEST or len(run.edges) < _FEWEST:
+            return None
+        bins = np.floor((run.pose_times - run.pose_times[0]) / _BIN)
+        starts = np.flatnonzero(np.diff(bins, prepend=-1.0))
+        moments = _means(run.pose_times[:, None], starts)[:, 0]
+        apart = max(_WINDOW, 1.5 * float(np.median(np.diff(moments)))) if len(moments) > 1 else _WINDOW
+        last = np.searchsorted(moments, moments + apart - _BIN / 2)
+        first = np.flatnonzero(last < len(moments))
+        last = last[first]
+        near = moments[last] - moments[first] < 1.5 * apart  # others have a gap between them
+        first, last = first[near], last[near]
+        if len(first) < _FEWEST:
+            return None
+        poses = _means(run.poses, starts)
+        moved = poses[last] - poses[first]
+        driven = np.diff(run.driven, axis=0)
+        twists = driven @ robot.inverse_kinematic_matrix.T
+        speeds = np.column_stack([np.hypot(twists[:, 0], twists[:, 1]), np.abs(driven)])
+        counted = np.hstack([run.driven, np.vstack([np.zeros(speeds.shape[1]), np.cumsum(speeds, axis=0)])])
+        shown = np.array([moved[:, 2], np.hypot(moved[:, 0], moved[:, 1])])
+        return cls(run.edges, counted, driven.shape[1], run.pose_times, starts, first, last, shown)
+
+    @property
+    def middle(self) -> float:
+        """Middle of the run by the reference's clock, s."""
+        return float(self.stamps[0] + self.stamps[-1]) / 2
+
+    @property
+    def length(self) -> float:
+        """Length of the run by the reference's clock, s."""
+        return float(self.stamps[-1] - self.stamps[0])
+
+    def columns(self, clock: Clock, later: float = 0.0) -> Array:
+        """Changes (W, C) of what the wheels count over the windows, so much ``later``, s, than by a clock."""
+        taken = self.stamps + clock[0] + clock[1] * (self.stamps - self.middle) + later
+        means = _means(interpolated(taken, self.edges, self.counted), self.starts)
+        changes: Array = means[self.last] - means[self.first]
+        return changes
+
+    def within(self, clock: Clock) -> NDArray[np.bool_]:
+        """True (W,) for windows that lie within the wheels' samples by a clock."""
+        taken = self.stamps[self.starts] + clock[0] + clock[1] * (self.stamps[self.starts] - self.middle)
+        inside = (taken >= self.edges[0]) & (taken <= self.edges[-1] - _BIN)
+        both: NDArray[np.bool_] = inside[self.first] & inside[self.last]
+        return both
+
+    def channels(self) -> tuple[slice, slice]:
+        """The columns that tell the heading, and those that tell the way."""
+        return slice(0, self.heading), slice(self.heading, None)
+
+    def scanned(self, search: float) -> Clock:
+        """The offset by which the run itself fits best, with coefficients of its own."""
+        steps = int(np.ceil(search / _COARSE))
+        offsets = np.arange(-steps, steps + 1) * _COARSE
+        return float(offsets[int(np.argmin([self._unexplained(offset) for offset in offsets.tolist()]))]), 0.0
+
+    def _unexplained(self, offset: float) -> float:
+        """Product of the shares of heading and way that the wheels do not explain by an offset, s."""
+        columns, within = self.columns((offset, 0.0)), self.within((offset, 0.0))
+        if within.sum() < max(_FEWEST, len(within) / 2):
+            return np.inf
+        share = 1.0
+        for channel, shown in zip(self.channels(), self.shown, strict=True):
+            wanted = shown[within]
+            if (whole := float(wanted @ wanted)) > 0:
+                left = wanted - columns[within, channel] @ _solved(columns[within, channel], wanted)
+                share *= max(float(left @ left) / whole, 1e-9)
+        return share
+
+    def residuals(self, fitted: Sequence[Array], clock: Clock) -> tuple[Array, Array, Array]:
+        """Residuals (2, W), in their standard deviations, their slopes by the middle's offset, and Huber's weights."""
+        rates = (self.columns(clock, _DELTA) - self.columns(clock, -_DELTA)) / (2 * _DELTA)
+        deviations = self._deviations(fitted, clock)[:, None]
+        residuals = self._left(fitted, clock) / deviations
+        slopes = np.array([rates[:, channel] @ each for channel, each in zip(self.channels(), fitted, strict=True)])
+        weights: Array = np.where(
+            self.within(clock), np.minimum(1.0, _HUBER / np.maximum(np.abs(residuals), 1e-12)), 0.0
+        )
+        return residuals, slopes / deviations, weights
+
+    def _left(self, fitted: Sequence[Array], clock: Clock) -> Array:
+        """What (2, W) the wheels do not explain by a clock, rad and m."""
+        columns = self.columns(clock)
+        told = [columns[:, channel] @ each for channel, each in zip(self.channels(), fitted, strict=True)]
+        return self.shown - np.array(told)
+
+    def _deviations(self, fitted: Sequence[Array], clock: Clock) -> Array:
+        """Robust standard deviations (2,) of what is left."""
+        left = np.abs(self._left(fitted, clock)[:, self.within(clock)])
+        least = 1e-6 + 1e-3 * np.sqrt(np.mean(self.shown**2, axis=1))
+        return least if not left.size else np.maximum(1.4826 * np.median(left, axis=1), least)
+
+    def improved(self, fitted: Sequence[Array], clock: Clock) -> Clock:
+        """The clock after some steps of Gauss-Newton."""
+        for _ in range(_STEPS):
+            residuals, slopes, weights = self.residuals(fitted, clock)
+            design = self._design(slopes)
+            normal, wanted = (design * weights.ravel()) @ design.T, design @ (weights * residuals).ravel()
+            step = np.linalg.lstsq(normal, wanted)[0]
+            clock = (
+                clock[0] + float(np.clip(step[0], -0.2, 0.2)),
+                float(np.clip(clock[1] + (step[1] if len(step) > 1 else 0.0), -_LARGEST_DRIFT, _LARGEST_DRIFT)),
+            )
+        return clock
+
+    def _told(self, fitted: Sequence[Array], clock: Clock) -> bool:
+        """True if other offsets fit clearly worse."""
+        best, _, counted = self.residuals(fitted, clock)
+        deviations = self._deviations(fitted, clock)
+        for away in (-_AWAY, _AWAY):
+            other = clock[0] + away, clock[1]
+            both = (counted > 0).all(axis=0) & self.within(other)
+            if both.sum() < _FEWEST:
+                return False
+            left = self._left(fitted, other) / deviations[:, None]
+            cost, least = (float(_huber(each[:, both]).sum()) for each in (left, best))
+            if cost - least < _TOLD * least:
+                return False
+        return True
+
+    def _design(self, slopes: Array) -> Array:
+        """Derivatives (P, 2 W) of the shown changes by the offset and, of a run that is long enough, by the drift."""
+        moments = (self.stamps[self.starts][self.first] + self.stamps[self.starts][self.last]) / 2 - self.middle
+        rows = [slopes.ravel()]
+        if self.length >= _LEAST_DRIFTING:
+            rows.append((slopes * moments).ravel())
+        return np.array(rows)
+
+    def match(self, fitted: Sequence[Array], clock: Clock) -> ClockMatch | None:
+        """The clock with its standard errors; None if the run does not tell it."""
+        if not self._told(fitted, clock):
+            return None
+        residuals, slopes, weights = self.residuals(fitted, clock)
+        design = self._design(slopes)
+        normal = (design * weights.ravel()) @ design.T
+        scores = (design * (weights * residuals).ravel()).reshape(len(design), *residuals.shape)
+        blocks = np.floor((self.stamps[self.starts][self.first] - self.stamps[0]) / _BLOCK)
+        sums = np.add.reduceat(scores, np.flatnonzero(np.diff(blocks, prepend=-1.0)), axis=2)
+        sums = sums.reshape(len(design), -1)
+        inverse = np.linalg.inv(normal)
+        errors = np.sqrt(np.diag(inverse @ (sums @ sums.T) @ inverse))
+        drift_error = float(errors[1]) if len(errors) > 1 else np.inf
+        return ClockMatch(clock[0], float(errors[0]), clock[1], drift_error, self.length)
+
+
+def _coefficients(windows: Sequence[_Windows], clocks: Sequence[Clock]) -> list[Array]:
+    """The coefficients h and s of Eq. (2) and (3) that fit all runs best by their clocks."""
+    fitted = []
+    for row in range(2):
+        columns, wanted = [], []
+        for each, clock in zip(windows, clocks, strict=True):
+            within = each.within(clock)
+            columns.append(each.columns(clock)[within, each.channels()[row]])
+            wanted.append(each.shown[row][within])
+        fitted.append(_solved(np.concatenate(columns), np.concatenate(wanted)))
+    return fitted
+
+
+def _huber(residuals: Array) -> Array:
+    """Huber's loss of residuals in their standard deviations."""
+    sizes = np.abs(residuals)
+    loss: Array = np.where(sizes < _HUBER, sizes**2 / 2, _HUBER * sizes - _HUBER**2 / 2)
+    return loss
+
+
+def _solved(columns: Array, wanted: Array) -> Array:
+    """Least squares with Huber's weights, along the directions of the columns that are driven."""
+    solution: Array = np.linalg.lstsq(columns, wanted, rcond=_RANK)[0]
+    for _ in range(2):
+        left = wanted - columns @ solution
+        deviation = 1.4826 * float(np.median(np.abs(left))) if len(left) else 0.0
+        roots = np.sqrt(np.minimum(1.0, _HUBER * deviation / np.maximum(np.abs(left), 1e-300)))
+        if deviation:
+            solution = np.linalg.lstsq(columns * roots[:, None], wanted * roots, rcond=_RANK)[0]
+    return solution
+
+
+def _means(values: Array, starts: NDArray[np.intp]) -> Array:
+    """Means (B, n) of the rows of values (K, n) from each start to the next."""
+    counts = np.diff(np.append(starts, len(values)))
+    means: Array = np.add.reduceat(values, starts, axis=0) / counts[:, None]
+    return means
