@@ -11,6 +11,8 @@ _PUBLIC = {
     "Dataset": "data.dataset",
     "LiveNode": "live.node",
     "OmnibenchError": "errors",
+    "Reference": "data.references.run_references",
+    "References": "data.references.run_references",
     "Robot": "robot.kinematics",
     "Trajectory": "data.dataset",
     "calibrate": "fit.calibrate",
@@ -42,6 +44,8 @@ if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py hol
     from omnibench.data.dataset import Dataset as Dataset
     from omnibench.data.dataset import Trajectory as Trajectory
     from omnibench.data.dataset import make_dataset as make_dataset
+    from omnibench.data.references.run_references import Reference as Reference
+    from omnibench.data.references.run_references import References as References
     from omnibench.data.storage import load_dataset as load_dataset
     from omnibench.data.storage import save_dataset as save_dataset
     from omnibench.design.design import design_experiment as design_experiment

@@ -12,6 +12,10 @@ import numpy as np
 
 from omnibench.data.checks.implausible import implausible
 from omnibench.data.headings import unwrap
+from omnibench.data.references.reference_flaws import reference_flaw
+from omnibench.data.references.reference_headings import with_whole_turns
+from omnibench.data.references.reference_units import odd_references
+from omnibench.data.references.run_references import References
 from omnibench.data.run_checks import check_sample_period, pose_times_flaw, reach_flaw, values_flaw, wheel_times_flaw
 from omnibench.data.scans import Scans
 from omnibench.errors import DataError, nearest
@@ -35,7 +39,8 @@ class Trajectory:
     """One recorded run.
 
     times (F,): end of each wheel sample, s, > 0. rates (F, N): mean wheel rates over each sample, rad/s.
-    pose_times (K,): s, the first is 0. poses (K, 3): reference poses x, y (m) and heading (rad).
+    pose_times (K,): s, the first is 0. poses (K, 3): reference poses x, y (m) and heading (rad). A run without
+    motion capture has one, its start: the origin of a frame of its own where it is not known.
     The fields from ``command`` on may be unknown (None).
     """
 
@@ -59,6 +64,7 @@ class Trajectory:
     pose_covariances: Array | None = None  # (K, 3, 3)
     steering: Array | None = None  # steering angles at ``times`` (F, S), rad
     drive: Drive | None = None  # the robot's drive signals where it steers; ``make_dataset`` sets it
+    references: References | None = None  # distances, turns and the like that were measured in the place of poses
 
     @cached_property
     def signals(self) -> Array:
@@ -67,6 +73,16 @@ class Trajectory:
             return self.rates
         assert self.steering is not None  # the drive steers
         return self.drive.signals(self.rates, in_the_middle(self.steering))
+
+    @property
+    def has_poses(self) -> bool:
+        """True if there is a reference pose after the start."""
+        return len(self.pose_times) > 1
+
+    @property
+    def start_known(self) -> bool:
+        """True if the start pose is one of the reference's frame; False: the origin of a frame of the run's own."""
+        return self.references is None or self.has_poses or self.references.start_known
 
     @property
     def start(self) -> Array:
@@ -89,6 +105,8 @@ class Trajectory:
         for digest, arrays in ((wheels, sampled), (reference, (self.pose_times, self.poses))):
             for array in arrays:
                 digest.update(np.ascontiguousarray(array, dtype=float).tobytes())
+        if self.references is not None:
+            reference.update(repr(self.references.content).encode())
         return wheels.hexdigest()[:WHEEL_DIGITS] + reference.hexdigest()[:8]
 
     def log(self, stamps: Sequence[float] | Array) -> WheelLog:
@@ -161,10 +179,12 @@ class Dataset:
         for trajectory in self.trajectories:
             for item in fields(trajectory):
                 value = getattr(trajectory, item.name)
-                if item.name == "drive" or (item.name == "steering" and value is None):
-                    continue  # the robot has it; a robot that does not steer keeps the hash of earlier versions
+                if item.name == "drive" or (item.name in ("steering", "references") and value is None):
+                    continue  # the robot has it; runs without steering or references keep the hash of earlier versions
                 if isinstance(value, np.ndarray):
                     digest.update(np.ascontiguousarray(value, dtype=float).tobytes())
+                elif isinstance(value, References):
+                    digest.update(repr(value.content).encode())
                 else:  # 6, 6.0 and a NumPy 6.0 are the same number
                     digest.update(repr(float(value) if isinstance(value, (int, float)) else value).encode())
         return digest.hexdigest()
@@ -209,9 +229,18 @@ def make_dataset(
         ]
     warnings += [] if warnings else _standing(robot, raw)  # in other units all runs seem to move too far
     warnings += _late_references(raw) + _other_periods(median, sample_period)
-    unwrapped = (
+    unwrapped = [
         replace(trajectory, poses=np.column_stack([trajectory.poses[:, :2], heading]))
         for trajectory, heading in zip(raw, headings, strict=True)
+    ]
+    unwrapped = [
+        run
+        if run.references is None
+        else replace(run, references=with_whole_turns(robot, run.log([0.0]), run.references))
+        for run in unwrapped
+    ]
+    warnings += odd_references(
+        robot, [(run.log([0.0]), run.references) for run in unwrapped if run.references is not None]
     )
     dataset = Dataset(name, robot, sample_period, tuple(unwrapped), description, source, licence, simulated, (), scans)
     return replace(dataset, warnings=(*warnings, *_copied(dataset)))
@@ -259,6 +288,8 @@ def _check_run(place: str, robot: Robot, trajectory: Trajectory) -> None:
         if flaw is not None:
             raise DataError(f"{where}: {name}, row {flaw[0] + 1}: {flaw[1]}")
     run = trajectory
+    if run.references is not None and (flaw := reference_flaw(run.references, run.times)) is not None:
+        raise DataError(f"{where}: references, row {flaw[0] + 1}: {flaw[1]}")
     if (flaw := reach_flaw(robot, run.times, run.rates, run.pose_times, run.poses)) is not None:
         raise DataError(f"{where}: {flaw[1]}")
 

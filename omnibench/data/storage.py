@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, cast
@@ -14,7 +14,9 @@ from pydantic import Field, model_validator
 
 from omnibench.config import Model, Positive, read_yaml, to_yaml, validate
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, make_dataset
-from omnibench.data.run_checks import Flaw, stored_pose_times_flaw, wheel_times_flaw
+from omnibench.data.references.reference_table import TABLE, read_references, reference_frame
+from omnibench.data.references.run_references import References
+from omnibench.data.run_checks import Flaw, pose_times_flaw, stored_pose_times_flaw, wheel_times_flaw
 from omnibench.data.scan_files import ScansOnDisk, write_scans
 from omnibench.data.scans import Scanner, Scans
 from omnibench.data.table import Table, read_table, table_file
@@ -24,6 +26,7 @@ from omnibench.robot.kinematics import Array, Robot
 
 FORMAT: Final = "omnibench-dataset/1"
 _RUN_NUMBERS = ("started_at", "v", "alpha", "omega", "duration", "distance")
+_Rows = np.ndarray[Any, np.dtype[np.intp]]  # indices of rows of a table
 _COVARIANCE = ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
 
 
@@ -62,16 +65,19 @@ def load_dataset(path: Path | str) -> Dataset:
     rates = [f"omega_{wheel}" for wheel in header.wheels]
     wheels = read_table(folder, "wheels", ("trajectory", "t", *rates))
     _check_steering(wheels, header.robot)
-    poses = read_table(folder, "poses", ("trajectory", "t", "x", "y", "theta"))
+    poses = _poses(folder)
     _check_runs(runs)
     wheel_rows = _rows_by_trajectory(runs, wheels)
-    pose_rows = _rows_by_trajectory(runs, poses)
     _check_times(wheels, wheel_rows, wheel_times_flaw)
-    _check_times(poses, pose_rows, stored_pose_times_flaw)
     samples = _WheelColumns(wheels, header.robot)
-    reference = _PoseColumns(poses)
+    ids = runs.frame["trajectory"].to_list()
+    ends = {run: samples.times[rows] for run, rows in zip(ids, wheel_rows, strict=True)}
+    started = set() if poses is None else set(poses.frame["trajectory"])
+    references = read_references(folder, ends, started, runs.file.name)
+    pose_rows = _pose_rows(runs, poses, references)
+    reference = None if poses is None else _PoseColumns(poses)
     trajectories = [
-        _trajectory(row, samples, wheel_rows[index], reference, pose_rows[index])
+        _trajectory(row, samples, wheel_rows[index], reference, pose_rows[index], references.get(row["trajectory"]))
         for index, row in enumerate(runs.frame.iter_rows(named=True))
     ]
     return make_dataset(
@@ -102,8 +108,12 @@ def save_dataset(
             f"data set {dataset.name}: it has no reference poses; make them from its scans with slam_dataset, as "
             "omnibench.import_dataset does"
         )
+    measured = [(run.id, run.references) for run in dataset.trajectories if run.references is not None]
     for trajectory in dataset.trajectories:
-        if (flaw := stored_pose_times_flaw(trajectory.pose_times, trajectory.id)) is not None:
+        if (
+            trajectory.references is None
+            and (flaw := stored_pose_times_flaw(trajectory.pose_times, trajectory.id)) is not None
+        ):
             raise DataError(f"data set {dataset.name}: {flaw[1]}; leave it out")
     check_dataset_folder(folder)
     if not overwrite:
@@ -113,12 +123,15 @@ def save_dataset(
             [_run_row(trajectory) for trajectory in dataset.trajectories], infer_schema_length=None
         ),
         "wheels": pl.concat([_wheel_frame(trajectory, dataset.robot) for trajectory in dataset.trajectories]),
-        "poses": pl.concat([_pose_frame(trajectory) for trajectory in dataset.trajectories]),
     }
+    if placed := [_pose_frame(trajectory) for trajectory in dataset.trajectories if trajectory.start_known]:
+        tables["poses"] = pl.concat(placed)
+    if measured:
+        tables[TABLE] = reference_frame(measured)
     contents: dict[Path, FileContent] = {folder / "dataset.yaml": to_yaml(header_of(dataset)).encode()}
     for name, frame in tables.items():
         # A column that only some trajectories have is left out of the sample tables, which may have no gaps.
-        allowed = len(frame) - 1 if name == "trajectories" else 0
+        allowed = len(frame) - 1 if name in ("trajectories", TABLE) else 0
         kept = frame.select(column for column in frame.iter_columns() if column.null_count() <= allowed)
         contents[folder / f"{name}.{table_format}"] = encode_table(kept, table_format)
     scans = _recorded_scans(dataset)
@@ -126,9 +139,10 @@ def save_dataset(
         ids = [trajectory.id for trajectory in dataset.trajectories]
         contents[folder / f"scans.{table_format}"] = partial(write_scans, scans, table_format, ids)
     write_files(contents)
-    if scans is None:
-        remove(folder / f"scans.{table_format}")
-    for name in (*tables, "scans"):  # remove tables in the other format that an earlier data set left
+    for name in ("poses", TABLE, "scans"):  # that an earlier data set had
+        if folder / f"{name}.{table_format}" not in contents:
+            remove(folder / f"{name}.{table_format}")
+    for name in ("trajectories", "wheels", "poses", TABLE, "scans"):  # in the other format, of an earlier data set
         remove(folder / f"{name}.{'csv' if table_format == 'parquet' else 'parquet'}")
 
 
@@ -259,8 +273,30 @@ def _refuse_infinite(runs: Table, values: pl.Series) -> None:
     runs.refuse(infinite, lambda row: f"{values.name} is {values[row]}; leave it empty if it is not known")
 
 
-def _rows_by_trajectory(runs: Table, table: Table) -> list[np.ndarray[Any, np.dtype[np.intp]]]:
-    """The rows of ``table`` that belong to each run, in the file's order."""
+def _poses(folder: Path) -> Table | None:
+    """The table of poses; None where there is none, and references in its place."""
+    if table_file(folder, "poses") is None and table_file(folder, TABLE) is not None:
+        return None
+    return read_table(folder, "poses", ("trajectory", "t", "x", "y", "theta"))
+
+
+def _pose_rows(runs: Table, poses: Table | None, referenced: Collection[str]) -> list[_Rows]:
+    """The rows of poses of each run; runs that have references may have none, or the start alone."""
+    ids = runs.frame["trajectory"].to_list()
+    if poses is None:
+        for index, run in enumerate(ids):
+            if run not in referenced:
+                raise runs.fail(index, f"trajectory {run} has neither references nor, without poses.parquet, poses")
+        return [np.zeros(0, dtype=np.intp) for _ in ids]
+    rows = _rows_by_trajectory(runs, poses, referenced)
+    given = [(run in referenced, of_run) for run, of_run in zip(ids, rows, strict=True) if len(of_run)]
+    _check_times(poses, [of_run for has_references, of_run in given if not has_references], stored_pose_times_flaw)
+    _check_times(poses, [of_run for has_references, of_run in given if has_references], pose_times_flaw)
+    return rows
+
+
+def _rows_by_trajectory(runs: Table, table: Table, others: Collection[str] = ()) -> list[_Rows]:
+    """The rows of ``table`` that belong to each run, in the file's order; a run among the others may have none."""
     ids = runs.frame["trajectory"].to_list()
     number = {identity: index for index, identity in enumerate(ids)}
     named = table.frame["trajectory"]
@@ -269,15 +305,13 @@ def _rows_by_trajectory(runs: Table, table: Table) -> list[np.ndarray[Any, np.dt
     order = np.argsort(codes, kind="stable")
     counts = np.bincount(codes, minlength=len(ids))
     for index, count in enumerate(counts):
-        if count == 0:
+        if count == 0 and ids[index] not in others:
             what = "wheel samples" if table.file.stem == "wheels" else "reference poses"
             raise DataError(f"{table.file}: trajectory {ids[index]} ({runs.file.name}, row {index + 1}) has no {what}")
     return np.split(order, np.cumsum(counts)[:-1])
 
 
-def _check_times(
-    table: Table, groups: Sequence[np.ndarray[Any, np.dtype[np.intp]]], find_flaw: Callable[[Array, str], Flaw | None]
-) -> None:
+def _check_times(table: Table, groups: Sequence[_Rows], find_flaw: Callable[[Array, str], Flaw | None]) -> None:
     """DataError for the first run whose times in ``table`` have a flaw. groups: the rows of each run."""
     times = table.numbers("t")
     for rows in groups:
@@ -288,24 +322,32 @@ def _check_times(
 def _trajectory(
     run: dict[str, Any],
     wheels: _WheelColumns,
-    wheel_rows: np.ndarray[Any, np.dtype[np.intp]],
-    reference: _PoseColumns,
-    pose_rows: np.ndarray[Any, np.dtype[np.intp]],
+    wheel_rows: _Rows,
+    reference: _PoseColumns | None,
+    pose_rows: _Rows,
+    references: References | None,
 ) -> Trajectory:
+    pose_times: Array = np.zeros(1)
+    poses: Array = np.zeros((1, 3))
+    covariances: Array | None = None
+    if reference is not None and len(pose_rows):
+        pose_times, poses = reference.times[pose_rows], reference.poses[pose_rows]
+        covariances = None if reference.covariances is None else reference.covariances[pose_rows]
     return Trajectory(
         id=run["trajectory"],
         split=cast(Split, run["split"]),
         times=wheels.times[wheel_rows],
         rates=wheels.rates[wheel_rows],
-        pose_times=reference.times[pose_rows],
-        poses=reference.poses[pose_rows],
+        pose_times=pose_times,
+        poses=poses,
         command=None if run.get("command") is None else str(run["command"]),
         repetition=None if run.get("repetition") is None else round(run["repetition"]),
         session=None if run.get("session") is None else str(run["session"]),
         angles=None if wheels.angles is None else wheels.angles[wheel_rows],
         targets=None if wheels.targets is None else wheels.targets[wheel_rows],
         steering=None if wheels.steering is None else wheels.steering[wheel_rows],
-        pose_covariances=None if reference.covariances is None else reference.covariances[pose_rows],
+        pose_covariances=covariances,
+        references=references,
         **_run_numbers(run),
     )
 

@@ -74,6 +74,10 @@ class OdometryModel:
             return self.poses(logs)
         return [reported_poses(self.reference_terms, log, self._path) for log in logs]
 
+    def lengths(self, logs: Sequence[WheelLog]) -> list[Array]:
+        """Distances driven along the path up to each log's stamps: a list of (S,) in m. DataError as for ``poses``."""
+        return [self._path(log).lengths(log.stamps) for log in logs]
+
     def stream(
         self, start: Array | None = None, session: str | None = None, session_time: float = 0.0
     ) -> OdometryStream:

@@ -49,6 +49,14 @@ class Path:
         position = self._positions[sample] + self._steps(piece, heading) + share * self._drift[sample]
         return np.column_stack([position.real, position.imag, heading + piece[:, 2]])
 
+    def lengths(self, stamps: Array) -> Array:
+        """Distances driven along the path, backwards too, up to stamps (S,) in s, in any order, m."""
+        sample, share = locate(self._times, stamps)
+        speeds = np.abs(self._moved[:, 0] + 1j * self._moved[:, 1] + self._drift * np.exp(-1j * self._headings[:-1]))
+        before = np.concatenate([[0.0], np.cumsum(speeds)])
+        lengths: Array = before[sample] + share * speeds[sample]
+        return lengths
+
     def _steps(self, moved: Array, headings: Array) -> Complex:
         """x + iy of motions (n, 3) that begin with headings (n,)."""
         steps: Complex = moved[:, 0] + 1j * moved[:, 1]

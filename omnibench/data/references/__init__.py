@@ -1,0 +1,1 @@
+"""References other than poses: distances, turns, displacements, positions and headings of a run."""

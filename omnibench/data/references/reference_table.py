@@ -1,0 +1,96 @@
+"""The table references.parquet (or .csv) of a data set: a row for each measurement of a run's motion.
+
+Columns: trajectory, kind, value and sigma of kinds of one number, value_x, value_y, sigma_x and sigma_y of those of two
+(sigma stands for both where these are empty), t0 and t1, which may be missing or empty: the run's start and end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from omnibench.data.references.reference_flaws import reference_flaw
+from omnibench.data.references.run_references import AT_ONE_TIME, PLANAR, References
+from omnibench.data.table import Table, read_table, table_file
+from omnibench.robot.kinematics import Array
+
+TABLE = "references"
+_NUMBERS = ("t0", "t1", "value", "value_x", "value_y", "sigma", "sigma_x", "sigma_y")
+
+
+def read_references(
+    folder: Path, wheel_times: Mapping[str, Array], started: Collection[str], runs_file: str
+) -> dict[str, References]:
+    """The references of each run that has some; none where there is no such table.
+
+    wheel_times: ends of the wheel samples (F,) of each run, s. started: ids of the runs whose start pose is known.
+    runs_file: the table that names the runs. DataError in one line names the file, the row and what is wrong.
+    """
+    if table_file(folder, TABLE) is None:
+        return {}
+    table = read_table(folder, TABLE, ("trajectory", "kind"))
+    owners, kinds = table.frame["trajectory"], table.frame["kind"]
+    table.refuse(~owners.is_in(list(wheel_times)), lambda row: f"trajectory {owners[row]} is not in {runs_file}")
+    numbers = {name: _column(table, name) for name in _NUMBERS}
+    texts = np.array(["" if kind is None else str(kind).strip() for kind in kinds], dtype=str)
+    found: dict[str, References] = {}
+    names = owners.to_list()
+    for run, times in wheel_times.items():
+        rows = np.array([index for index, name in enumerate(names) if name == run], dtype=np.intp)
+        if not len(rows):
+            continue
+        references = _of_rows(rows, texts, numbers, float(times[-1]), run in started)
+        if (flaw := reference_flaw(references, times)) is not None:
+            raise table.fail(int(rows[flaw[0]]), flaw[1])
+        found[run] = references.by_time()
+    return found
+
+
+def reference_frame(references: Sequence[tuple[str, References]]) -> pl.DataFrame:
+    """The table of the references of some runs, given with their ids."""
+    rows: list[dict[str, Any]] = []
+    for run, of_run in references:
+        for kind, t0, t1, value, sigma in zip(
+            of_run.kinds.tolist(), of_run.t0, of_run.t1, of_run.values, of_run.sigmas, strict=True
+        ):
+            start = None if kind in AT_ONE_TIME and t0 == t1 else t0
+            numbers = (
+                {"value_x": value[0], "value_y": value[1], "sigma_x": sigma[0], "sigma_y": sigma[1]}
+                if kind in PLANAR
+                else {"value": value[0], "sigma": sigma[0]}
+            )
+            rows.append({"trajectory": run, "t0": start, "t1": t1, "kind": kind} | numbers)
+    schema = {"trajectory": pl.String, "t0": pl.Float64, "t1": pl.Float64, "kind": pl.String}
+    frame = pl.DataFrame(rows, schema=schema | dict.fromkeys(_NUMBERS[2:], pl.Float64))
+    return frame.select(column for column in frame.iter_columns() if column.null_count() < len(frame))
+
+
+def _column(table: Table, name: str) -> Array:
+    """A column of numbers (rows,), NaN where a cell is empty or the column is missing."""
+    if name not in table.frame.columns:
+        return np.full(len(table.frame), np.nan)
+    return table.floats(name).fill_null(np.nan).to_numpy()
+
+
+def _of_rows(rows: Any, kinds: Any, numbers: Mapping[str, Array], end: float, start_known: bool) -> References:
+    """The references in some rows of a table, of a run that ends after ``end`` s."""
+    chosen = {name: values[rows] for name, values in numbers.items()}
+    of_rows = kinds[rows]
+    planar, instant = np.isin(of_rows, list(PLANAR)), np.isin(of_rows, list(AT_ONE_TIME))
+    t1 = np.where(np.isnan(chosen["t1"]), end, chosen["t1"])
+    t0 = np.where(np.isnan(chosen["t0"]), np.where(instant, t1, 0.0), chosen["t0"])
+    both = chosen["sigma"]
+    values = np.column_stack([np.where(planar, chosen["value_x"], chosen["value"]), chosen["value_y"]])
+    sigmas = np.column_stack(
+        [np.where(planar, _filled(chosen["sigma_x"], both), both), _filled(chosen["sigma_y"], both)]
+    )
+    values[~planar, 1] = sigmas[~planar, 1] = np.nan
+    return References(of_rows, t0, t1, values, sigmas, start_known)
+
+
+def _filled(values: Array, others: Array) -> Array:
+    return np.where(np.isnan(values), others, values)
