@@ -17,8 +17,7 @@ from omnibench.cli.options import (
     load_given_plugins,
     output_option,
 )
-from omnibench.cli.terminal.console import make_console, print_json, print_verdict, warn
-from omnibench.errors import ConfigError
+from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_verdict, warn
 
 calibration_app = typer.Typer()
 
@@ -27,7 +26,7 @@ calibration_app = typer.Typer()
 def calibrate(
     dataset: DatasetFolder,
     output: Annotated[
-        Path | None, output_option("Calibration file to write; may be left out with --json.", metavar="FILE.yaml")
+        Path | None, output_option("Calibration file to write. Default: it is only shown.", metavar="FILE.yaml")
     ] = None,
     calibrator: Annotated[str, typer.Option(help="How to search; omnibench list names all.")] = "closed_form",
     cost: Annotated[
@@ -82,11 +81,11 @@ def calibrate(
     plugins: Plugins = None,
     as_json: Json = False,
 ) -> None:
-    """Fit a robot's odometry model and write the calibration file.
+    """Fit a robot's odometry model; write it with -o.
 
     The fit uses the training split of the data set, and never its validation split.
     """
-    from omnibench.cli.terminal.calibration_tables import print_calibration
+    from omnibench.cli.terminal.calibration_tables import print_calibration, print_verdict_ending
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.config import parse_settings
     from omnibench.data.storage import load_dataset
@@ -100,8 +99,6 @@ def calibrate(
     calibrators.entry(calibrator, "--calibrator")
     if cost is not None:
         costs.entry(cost, "--cost")
-    if output is None and not as_json:
-        raise ConfigError("say where the calibration goes: -o calibration.yaml")
     refuse_existing(output, force=force)
     recordings = load_dataset(dataset)
     with redirect_stdout(sys.stderr), ProgressDisplay() as watch:
@@ -134,10 +131,15 @@ def calibrate(
     if as_json:
         return print_json(calibration)
     print_calibration(make_console(), run)
-    typer.echo(f"calibration: {output}")
-    if calibration.provenance is not None and calibration.provenance.held_out is not None:
-        print_verdict(calibration.provenance.held_out)
-    return None
+    if output is not None:
+        typer.echo(f"calibration: {output}")
+    assert calibration.provenance is not None  # a fit has one, with its verdict
+    assert calibration.provenance.held_out is not None
+    print_verdict(calibration.provenance.held_out)
+    if output is None:
+        again = ("omnibench", *sys.argv[1:], "-o", "calibration.yaml")
+        return print_ending("the calibration above is written nowhere", "write it to a file", *again)
+    return print_verdict_ending(calibration.provenance.held_out, calibration, output, dataset)
 
 
 @calibration_app.command()
@@ -151,20 +153,22 @@ def evaluate(
 
     On each split: the cost, and the errors of the final pose, beside those of the robot's design values.
     """
-    from omnibench.cli.terminal.calibration_tables import print_evaluation
+    from omnibench.cli.terminal.calibration_tables import print_evaluation, print_verdict_ending
     from omnibench.data.storage import load_dataset
     from omnibench.fit.evaluate import evaluate as evaluate_calibration
     from omnibench.robot.calibration import read_calibration
 
     load_given_plugins(plugins)
     recordings = load_dataset(dataset)
-    evaluation = evaluate_calibration(read_calibration(calibration), recordings)
+    evaluated = read_calibration(calibration)
+    evaluation = evaluate_calibration(evaluated, recordings)
     warnings = [*recordings.warnings, *evaluation.warnings]
     warn(warnings)
     if as_json:
         return print_json(evaluation.model_dump() | {"warnings": warnings})
     print_evaluation(make_console(), evaluation)
-    return print_verdict(evaluation.held_out, sessions=evaluation.sessions)
+    print_verdict(evaluation.held_out, sessions=evaluation.sessions)
+    return print_verdict_ending(evaluation.held_out, evaluated, calibration, dataset)
 
 
 @calibration_app.command()
@@ -191,7 +195,7 @@ def certify(
 
     Gives a lower bound on the cost of every matrix in the box, on the training split, whatever the optimiser.
     """
-    from omnibench.cli.terminal.calibration_tables import print_certificate
+    from omnibench.cli.terminal.calibration_tables import print_certificate, print_certificate_ending
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.data.storage import load_dataset
     from omnibench.fit.certify import certify_optimum
@@ -208,7 +212,8 @@ def certify(
         warn([f"the calibration is outside the box {certified.certificate.box!r}; the bound is for matrices inside it"])
     if as_json:
         return print_json(certified.certificate.model_dump(exclude_none=True))
-    return print_certificate(make_console(), certified)
+    print_certificate(make_console(), certified)
+    return print_certificate_ending(certified, calibration, dataset)
 
 
 @calibration_app.command()
@@ -234,8 +239,9 @@ def export(
     warn(exported.warnings)
     if output is None:
         typer.echo(exported.text, nl=False)
+        print_ending(f"{to}: printed, not written", "write it to a file with -o FILE")
     else:
         file = output / exported.file_name if output.is_dir() else output
         refuse_existing(file, force=force)
         write_text(file, exported.text)
-        typer.echo(f"{to}: {file}")
+        print_ending(f"{file} is written for {to}", "load it where the robot's odometry is computed")

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from omnibench.cli.options import Force, output_option
-from omnibench.cli.terminal.console import make_console, print_verdict, warn
+from omnibench.cli.terminal.console import make_console, print_ending, print_verdict, warn
 from omnibench.errors import ConfigError
 
 comparison_app = typer.Typer()
@@ -36,7 +36,7 @@ def compare(
     All calibrators of the config get the same data and the same budget. Run again with the same -o, it goes on
     where it was stopped.
     """
-    from omnibench.cli.terminal.comparison_tables import print_result
+    from omnibench.cli.terminal.comparison_tables import print_comparison_ending, print_result
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.compare.read_config import read_compare_config
     from omnibench.compare.run import run_comparison
@@ -52,8 +52,11 @@ def compare(
         print_verdict(entry.verdict, f"{name}, {entry.label}: ", result.sessions.get(name, ()))
     typer.echo(f"report: {result.output / 'report.html'}")
     if result.every_search_failed:
-        typer.echo(f"every search failed, the first: {result.failures[0]}", err=True)
+        print_ending(
+            f"every search failed, the first: {result.failures[0]}", "mend what its reason names, and run again"
+        )
         raise typer.Exit(1)
+    print_comparison_ending(result)
 
 
 def _named_paths(data: list[str] | None) -> dict[str, Path]:

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from omnibench.cli.options import Force, output_option
+from omnibench.cli.terminal.console import print_ending
 from omnibench.errors import ConfigError
 
 guide_app = typer.Typer()
@@ -28,6 +29,7 @@ def guide(
         _list_topics()
     else:
         _show(find_topic(topic).text)
+        print_ending(f"this was the page {topic!r}", "see what else there is to read", "omnibench", "guide")
 
 
 @guide_app.command()
@@ -57,7 +59,7 @@ def example(
         typer.echo(f"  cd {shlex.quote(str(output))}")
     for command in chosen.commands:
         typer.echo(f"  {command}")
-    return None
+    return print_ending(f"{output} holds the example {name}", "type the lines above")
 
 
 def _list_topics() -> None:
@@ -67,14 +69,14 @@ def _list_topics() -> None:
     for group in dict.fromkeys(topic.group for topic in listed):
         typer.echo(f"{group}:")
         _print_names({topic.name: topic.summary for topic in listed if topic.group == group})
-    typer.echo("to read one, type: omnibench guide getting-started")
+    print_ending("these are the pages of the handbook", "read one", "omnibench", "guide", "getting-started")
 
 
 def _list_examples() -> None:
     from omnibench.cli.examples import EXAMPLES
 
     _print_names({each.name: each.summary for each in EXAMPLES})
-    typer.echo("to write one, type: omnibench example small -o demo")
+    print_ending("these are the examples", "write one into a folder", "omnibench", "example", "small", "-o", "demo")
 
 
 def _print_names(summaries: Mapping[str, str]) -> None:

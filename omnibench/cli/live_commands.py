@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from omnibench.cli.options import Force, Plugins, load_given_plugins, output_option, plugin_folders
-from omnibench.cli.terminal.console import make_console
+from omnibench.cli.terminal.console import make_console, print_ending, warn
 from omnibench.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -119,6 +119,8 @@ def replay(
     print_counted(make_console(), report)
     if report.interrupted:
         raise typer.Exit(130)
+    heard = "all was taken by the node" if report.taken is not None else "no omnibench node said that it took anything"
+    print_ending(f"the recording was played, and {heard}", "listen while it plays", "omnibench", "listen", robot)
 
 
 @live_app.command()
@@ -136,6 +138,10 @@ def listen(
 
     with _client(config, connect, profile, "listen") as (session, keys), stop_on_signals() as stop:
         show(robot, session, keys, make_console(), stop, seconds, as_json)
+    if not as_json:
+        print_ending(
+            "listening has ended", "keep what is sent", "omnibench", "record", robot or "ROBOT", "-o", "drive.mcap"
+        )
 
 
 @live_app.command()
@@ -155,9 +161,9 @@ def swap(
     load_given_plugins(plugins)
     with _client(config, connect, None, "swap") as (session, _):
         swapped = swap_calibration(session, robot, calibration)
-    typer.echo(f"{robot}: {swapped.calibration} runs")
     if not swapped.kept:
-        typer.echo(f"warning: after a restart the node begins with the old calibration: {swapped.reason}", err=True)
+        warn([f"after a restart the node begins with the old calibration: {swapped.reason}"])
+    print_ending(f"{robot} runs {swapped.calibration} now", "watch its odometry", "omnibench", "listen", robot)
 
 
 @live_app.command()
@@ -191,6 +197,7 @@ def record(
         if force and output.is_file():
             remove(output)
         write(session, keys, robots, output, make_console(), stop, seconds=seconds, topics=topics or tuple(TOPICS))
+    print_ending(f"{output} is complete", "open it in Foxglove, or make a data set of it (omnibench guide data)")
 
 
 @live_app.command()
@@ -218,6 +225,7 @@ def keys(
     made = make_keys(folder, chosen, router=router, hosts=hosts or (), days=days, users=users, overwrite=force)
     for file in made:
         typer.echo(f"written: {file}")
+    print_ending(f"{folder} holds keys for {', '.join(chosen)}", "read how to use them", "omnibench", "guide", "live")
 
 
 def _run(config: "LiveConfig", seconds: float | None) -> None:
@@ -275,6 +283,9 @@ def _replay_to_node(
     print_demonstration(make_console(), shown)
     if shown.report.interrupted:
         raise typer.Exit(130)
+    print_ending(
+        "the node computed what the batch odometry computes", "run it for the robot", "omnibench", "live", file
+    )
 
 
 @contextmanager

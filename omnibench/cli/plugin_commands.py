@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from omnibench.cli.options import Force, Json, Plugins, load_given_plugins
-from omnibench.cli.terminal.console import make_console, print_json
+from omnibench.cli.terminal.console import make_console, print_ending, print_json
 from omnibench.errors import ConfigError
+from omnibench.words import plural
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -38,7 +39,10 @@ def list_(plugins: Plugins = None, as_json: Json = False) -> None:
     failures = load_given_plugins(plugins)
     if as_json:
         return print_json(registry_document(failures))
-    return print_registries(make_console())
+    print_registries(make_console())
+    return print_ending(
+        "all of these may be named in configs", "read how to choose", "omnibench", "guide", "calibrators"
+    )
 
 
 @plugin_app.command()
@@ -72,7 +76,9 @@ def plugin_new(
         raise ConfigError(f"--effect and --kind {kind} contradict each other; leave one out")
     for file in new_plugin(name, "effect" if effect else kind or "calibrator", folder, force=force):
         typer.echo(f"written: {file}")
-    typer.echo(f"check it: omnibench plugin check {folder / name}.py")
+    print_ending(
+        f"{name} runs as it is", "change it, then check it", "omnibench", "plugin", "check", f"{folder / name}.py"
+    )
 
 
 @_plugin.command("check")
@@ -94,4 +100,8 @@ def plugin_check(
     counts = Counter(str(result.outcome) for result in report.results)
     typer.echo(", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
     if report.failures:
+        print_ending(
+            f"{file} failed {plural(len(report.failures), 'test')}", "mend what the lines above say and check again"
+        )
         raise typer.Exit(1)
+    print_ending(f"{file} passes", "use it where its folder is named", "omnibench", "list", "--plugins", file.parent)

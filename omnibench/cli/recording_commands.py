@@ -16,7 +16,7 @@ from omnibench.cli.options import (
     load_given_plugins,
     output_option,
 )
-from omnibench.cli.terminal.console import make_console, print_json, warn
+from omnibench.cli.terminal.console import make_console, print_ending, print_json, warn
 from omnibench.errors import ConfigError
 from omnibench.words import plural
 
@@ -165,7 +165,9 @@ def design(
     print_design(make_console(), chosen)
     if output is not None:
         typer.echo(f"report: {output / 'report.html'}")
-    return None
+    what = plural(chosen.sets[0].step.effort.runs, "run")
+    drive = "drive them and make a data set of the recordings (omnibench guide data)"
+    return print_ending(f"{what} tell the most of {chosen.robot}", drive)
 
 
 @recording_app.command()
@@ -232,7 +234,10 @@ def slam(
     for what, file in (("report", report), (plural(result.summary.runs, "trajectory"), output)):
         if file is not None:
             typer.echo(f"{what}: {file}")
-    return None
+    poses = f"{plural(result.summary.scans, 'scan')} gave poses"
+    if output is None:
+        return print_ending(f"{poses}, which are written nowhere", "write a data set with them with -o DATASET")
+    return print_ending(poses, "calibrate with them", "omnibench", "calibrate", output, "-o", "calibration.yaml")
 
 
 @recording_app.command()
@@ -297,3 +302,4 @@ def simulate(
     if report is not None:
         typer.echo(f"report: {report}")
     typer.echo(f"{plural(len(made.dataset.trajectories), 'simulated trajectory')}: {output}")
+    print_ending(f"{output} is a data set like any other", "see what it tells", "omnibench", "inspect", output)

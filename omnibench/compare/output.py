@@ -86,11 +86,24 @@ def write_results(result: ComparisonResult) -> None:
         write_table(result.output / f"{name}.parquet", table)
     for file in earlier:  # the config may have other entries now
         remove(file)
-    fitted = [entry for entry in result.statistics if entry.answers and entry.calibrator != THEORETICAL_NAME]
+    fitted = _fitted(result)
     files = _calibration_files(result.output, [(entry.dataset, entry.label) for entry in fitted])
     for entry, file in zip(fitted, files, strict=True):
         assert entry.typical is not None  # an entry with an answer has a typical run
         write_calibration(calibration_of(entry.typical, result), file)
+
+
+def calibration_file(result: ComparisonResult, dataset: str, label: str) -> Path | None:
+    """The file with the calibration of an entry's typical run; None for one that has none."""
+    fitted = _fitted(result)
+    files = _calibration_files(result.output, [(entry.dataset, entry.label) for entry in fitted])
+    keys = ((entry.dataset, entry.label) for entry in fitted)
+    return dict(zip(keys, files, strict=True)).get((dataset, label))
+
+
+def _fitted(result: ComparisonResult) -> list[EntryStatistics]:
+    """The entries that have a calibration file."""
+    return [entry for entry in result.statistics if entry.answers and entry.calibrator != THEORETICAL_NAME]
 
 
 def _calibration_files(folder: Path, entries: Iterable[tuple[str, str]]) -> list[Path]:

@@ -226,7 +226,8 @@ def test_no_plugins_are_loaded_where_none_are_wanted(
         monkeypatch.setenv("OMNIBENCH_PLUGINS", "none")
     printed = command("list", *([] if by_variable else ["--plugins", "none"]))
     assert "closed_form" in printed.stdout
-    assert printed.stderr == ""
+    assert "unwanted" not in printed.stderr
+    assert "plug-ins of ./plugins" not in printed.stderr
 
 
 def test_list_goes_on_past_a_plugin_that_cannot_be_imported(command: Command, tmp_path: Path) -> None:
@@ -244,7 +245,8 @@ def test_export_writes_to_standard_output_or_to_a_file(command: Command, prepare
     assert shown.returncode == 0
     written = command("export", prepared.calibration, "--to", "c_header", "-o", tmp_path / "m.h")
     assert (tmp_path / "m.h").read_text() == shown.stdout
-    assert written.stdout == f"c_header: {tmp_path / 'm.h'}\n"
+    assert written.stdout == ""
+    assert written.stderr.startswith(f"{tmp_path / 'm.h'} is written for c_header; next, ")
 
 
 def test_export_to_ros2_says_what_its_parameters_cannot_hold(command: Command, prepared: Prepared) -> None:
@@ -295,7 +297,6 @@ def test_a_new_plugin_is_checked_and_compared(command: Command, tmp_path: Path) 
     assert new.stdout.splitlines() == [
         "written: plugins/my_search.py",
         "written: plugins/test_my_search.py",
-        "check it: omnibench plugin check plugins/my_search.py",
     ]
     check = command("plugin", "check", "plugins/my_search.py")
     assert check.returncode == 0, check.stdout

@@ -139,7 +139,7 @@ def test_a_recording_goes_out_and_comes_back_as_a_calibration_that_is_swapped_in
         )
         swapped = command("swap", "apr", workplace / "again.yaml", "--connect", endpoint(config))
         assert swapped.returncode == 0, swapped.stderr
-        assert swapped.stdout == f"apr: {again.name} runs\n"
+        assert f"apr runs {again.name} now; next, " in swapped.stderr
         assert "begins with the old calibration" in swapped.stderr  # the config has no state
         assert ask(session, "omnibench/apr/info")["calibration"] == again.name
         for name, file, reason in (

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
+from omnibench.cli.terminal.console import print_ending
 from omnibench.cli.terminal.tables import print_table
 from omnibench.discover.report.wording import noise_in_words
+from omnibench.errors import ConfigError
 from omnibench.fit.bounds.stamp_sums import QUADRATURE
 from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.certify import CertifiedCalibration
@@ -18,10 +21,13 @@ from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals
 from omnibench.fit.uncertainty.physical import ParameterEstimate
 from omnibench.report.blocks import Cell, Column, Row, Table
+from omnibench.robot.calibration import Calibration, HeldOutVerdict
+from omnibench.robot.export.formats import export_calibration
 from omnibench.robot.kinematics import Robot
 from omnibench.words import plural
 
 _NONE = "no interval"
+_NOTHING_TO_GAIN = 0.01  # share of the cost that is not worth another search; chosen
 _TOUCHED = 1e-6  # share of a direction of drive signals: a smaller one is rounding
 
 
@@ -157,6 +163,45 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     kind = " (simulated data)" if evaluation.simulated else ""
     note = f"fitted with the loss {evaluation.loss}; cost and errors are without it" if evaluation.loss else ""
     print_table(console, Table(f"{evaluation.dataset}{kind}", columns, tuple(rows), note))
+
+
+def print_verdict_ending(verdict: HeldOutVerdict, calibration: Calibration, file: Path, dataset: Path) -> None:
+    """Print the last sentence of ``calibrate`` and ``evaluate``: use a calibration, record more, or look for faults."""
+    if verdict.verdict == "better":
+        use = ("omnibench", "export", file, "--to", _format_for(calibration))
+        print_ending(f"{file} is better than the design on runs that were held out", "use it on the robot", *use)
+    elif verdict.verdict == "worse":
+        look = ("omnibench", "inspect", dataset)
+        print_ending(f"{file} is worse than the design: do not use it", "see what the recordings lack", *look)
+    elif verdict.verdict == "undecided":
+        more = "record more runs for validation; what these tell"
+        print_ending(f"whether {file} is better than the design is open", more, "omnibench", "inspect", dataset)
+    else:
+        other = ("omnibench", "evaluate", file, "DATASET")
+        print_ending(f"{file} was not judged by other runs", "try it on a recording that it was not fitted to", *other)
+
+
+def _format_for(calibration: Calibration) -> str:
+    """The export format to try first: parameters of a ROS 2 controller where one suits the robot."""
+    try:
+        export_calibration(calibration, "ros2_controllers")
+    except ConfigError:
+        return "c_header"
+    return "ros2_controllers"
+
+
+def print_certificate_ending(certified: CertifiedCalibration, file: Path, dataset: Path) -> None:
+    """Print the last sentence of ``certify``: whether a better search is worth the time."""
+    gap = max(certified.certificate.gap, 0.0)
+    if gap <= _NOTHING_TO_GAIN:
+        found = ("omnibench", "discover", dataset, "--model", file)
+        print_ending(f"no search can gain more than {gap:.2%} on {file}", "look for what a matrix lacks", *found)
+    elif not certified.proof.finished:
+        longer = ("omnibench", "certify", file, dataset, "--seconds", "600")
+        print_ending(f"a better matrix may save up to {gap:.1%} of the cost", "prove more, with more time", *longer)
+    else:
+        exact = ("omnibench", "calibrate", dataset, "-o", "better.yaml")
+        print_ending(f"a better matrix may save up to {gap:.1%} of the cost", "search for it", *exact)
 
 
 def _of_all(part: int, count: int) -> str:

@@ -1,7 +1,8 @@
-"""The console that commands print on, and what all of them print alike: warnings and JSON documents."""
+"""The console that commands print on, and what all of them print alike: warnings, JSON documents, the last sentence."""
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -20,11 +21,15 @@ _PIPED_WIDTH = 160  # columns of a table in a pipe or a file, where nobody's win
 def make_console(error: bool = False) -> Console:
     """A console that shows texts as they are, and does not squeeze tables into 80 columns when it is piped.
 
+    On a terminal text wraps between words; in a pipe a text with ``soft_wrap`` stays one line.
     error: on standard error, where progress goes; work goes on in silence when nobody reads it any more.
     """
     from rich.console import Console as RichConsole
 
     class Console(RichConsole):
+        def print(self, *objects: Any, soft_wrap: bool | None = None, **settings: Any) -> None:
+            super().print(*objects, soft_wrap=bool(soft_wrap) and not self.is_terminal, **settings)
+
         def on_broken_pipe(self) -> None:
             if not error:
                 super().on_broken_pipe()
@@ -38,7 +43,7 @@ def make_console(error: bool = False) -> Console:
 def warn(messages: Iterable[str]) -> None:
     """A line on standard error for each message."""
     for message in messages:
-        typer.echo(f"warning: {message}", err=True)
+        make_console(error=True).print(f"warning: {message}", soft_wrap=True)
 
 
 def print_json(document: Mapping[str, Any] | BaseModel) -> None:
@@ -57,3 +62,22 @@ def print_verdict(verdict: HeldOutVerdict, subject: str = "", sessions: Iterable
     typer.echo(verdict.detail)
     for sentence in sessions:
         typer.echo(sentence)
+
+
+def print_ending(outcome: str, then: str = "", *command: object) -> None:
+    """The sentence that a command ends with, on standard error, so that what is piped stays clean.
+
+    outcome: what came out, without a full stop. then: what to do next, as an imperative. command: the words to type
+    for it, which stand on a line of their own, quoted for a shell. Not for ``--json``, which a program reads.
+
+    >>> print_ending("data/robot holds 24 runs", "see what they tell", "omnibench", "inspect", "data/robot")
+    ... # data/robot holds 24 runs; next, see what they tell:
+    ... #   omnibench inspect data/robot
+    """
+    console = make_console(error=True)
+    if not then:
+        console.print(f"{outcome}.", soft_wrap=True)
+        return
+    console.print(f"{outcome}; next, {then}{':' if command else '.'}", soft_wrap=True)
+    if command:
+        typer.echo(f"  {shlex.join(map(str, command))}", err=True)

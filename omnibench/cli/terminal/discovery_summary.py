@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from omnibench.cli.terminal.console import print_ending
 from omnibench.cli.terminal.tables import in_brief, print_table
 from omnibench.discover.report.tables import (
     dependence_table,
@@ -23,7 +24,7 @@ from omnibench.discover.report.wording import (
     verdict_in_words,
     worst_of_each,
 )
-from omnibench.discover.result import Discovery, experiment_file
+from omnibench.discover.result import CALIBRATION_FILES, Discovery, experiment_file
 from omnibench.report.blocks import Table
 from omnibench.report.numbers import listing
 from omnibench.words import plural
@@ -48,6 +49,7 @@ def print_discovery(console: Console, discovery: Discovery, folder: Path) -> Non
     for line in _remarks(discovery):
         console.print(line, width=width)
     _print_files(console, discovery, folder)
+    _print_ending(discovery, folder)
 
 
 def _tables(discovery: Discovery) -> Iterator[Table]:
@@ -104,3 +106,16 @@ def _print_files(console: Console, discovery: Discovery, folder: Path) -> None:
         file = folder / experiment_file(number)
         console.print(f"to separate {listing(list(experiment.separates))}:\n{file}", soft_wrap=True)
     console.print(f"report: {folder / 'report.html'}", soft_wrap=True)
+
+
+def _print_ending(discovery: Discovery, folder: Path) -> None:
+    """Print the last sentence: run the extended model, drive what separates look-alikes, or keep the plain matrix."""
+    if discovery.experiments:
+        drive = f"drive the commands of {folder / experiment_file(1)}, and discover in those runs, too"
+        print_ending("more than one effect explains these data", drive)
+    elif discovery.extends:
+        use = ("omnibench", "export", folder / CALIBRATION_FILES["extended"], "--to", "c_header")
+        print_ending("the extended calibration holds what the matrix lacked", "use it on the robot", *use)
+    else:
+        use = ("omnibench", "export", folder / CALIBRATION_FILES["plain"], "--to", "ros2_controllers")
+        print_ending("nothing was added to the matrix", "use the plain calibration", *use)
