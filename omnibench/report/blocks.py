@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -138,13 +138,17 @@ class Figure:
 
 @dataclass(frozen=True, eq=False)
 class FigureGrid:
-    """Plots side by side where the page is wide enough, with one legend for all."""
+    """Plots side by side where the page is wide enough, with one legend for all.
+
+    name: of the file that ``--figures`` writes, without its ending; empty: made of the section's or figure's title.
+    """
 
     kind: ClassVar[str] = "figures"
     figures: tuple[Figure, ...]
     legend: tuple[LegendItem, ...] = ()
     columns: Literal[1, 2, 3] = 2
     caption: str = ""
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -194,13 +198,26 @@ Block = Paragraph | Callout | Facts | Table | FigureGrid | Code | Details | Choi
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """A part of the report with its line in the table of contents. ``key`` is unique in the document."""
+    """A part of the report with its line in the table of contents. ``key`` is unique in the document.
+
+    about: its content in a line under the title. folded: only title and line are shown until the reader opens it.
+    """
 
     key: str
     title: str
     blocks: tuple[Block, ...] = ()
     sections: tuple[Section, ...] = ()
     badges: tuple[Badge, ...] = ()
+    about: str = ""
+    folded: bool = False
+
+
+def answer_section(
+    sentence: str, tiles: Sequence[Fact], picture: FigureGrid | None, *more: Block, title: str = "Answer"
+) -> Section:
+    """The section that a report begins with: the answer in a sentence, a few numbers, one picture, then the rest."""
+    pictures: tuple[Block, ...] = () if picture is None else (picture,)
+    return Section("answer", title, (Paragraph(sentence, "lead"), Facts(tuple(tiles), "tiles"), *pictures, *more))
 
 
 @dataclass(frozen=True, eq=False)

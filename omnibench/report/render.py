@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from datetime import UTC, datetime
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from plotly.offline import get_plotlyjs
 from omnibench.environment import package_versions
 from omnibench.files import write_text
 from omnibench.report.blocks import Document
+from omnibench.report.glossary import Glossary
 
 _PLOT_OPTIONS = {
     "responsive": True,
@@ -34,13 +34,13 @@ def write_document(document: Document, path: Path) -> None:
 
 def render(document: Document) -> str:
     """The HTML of a report, with the version of omnibench and the time in its footer."""
-    template = _environment().get_template("report.html.j2")
+    template = _environment(Glossary()).get_template("report.html.j2")
     footer = f"omnibench {package_versions().get('omnibench', '')}, written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
     return template.render(document=document, plot_options=_json(_PLOT_OPTIONS), footer=footer)
 
 
-@cache
-def _environment() -> Environment:
+def _environment(glossary: Glossary) -> Environment:
+    """Templates and what they call; a glossary serves one report."""
     environment = Environment(
         loader=PackageLoader("omnibench.report"),
         autoescape=select_autoescape(default=True, default_for_string=True),
@@ -48,6 +48,8 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["explained"] = glossary.marked
+    environment.globals["new_terms"] = glossary.fresh
     environment.filters["plot_json"] = _plot_json
     environment.filters["script_json"] = _json
     environment.globals["plotly_js"] = Markup(get_plotlyjs())

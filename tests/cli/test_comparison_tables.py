@@ -48,7 +48,7 @@ def table(text: str, title: str) -> dict[str, list[str]]:
 def test_the_tables_of_costs_agree_with_the_summary(result: ComparisonResult, split: str) -> None:
     text = printed(result)
     assert text.startswith("flower (simulated data), cost final_pose\n")
-    found = table(text, f"Cost of 6 trajectories, {'training' if split == 'train' else split}")
+    found = table(text, f"Cost of 6 {'training' if split == 'train' else 'held-out'} runs")
     for run in summary(result.output)["runs"]:
         if run["matrix"] is not None and run["label"] != "theoretical":
             theoretical, cost, improvement = found[run["label"]]
@@ -61,8 +61,8 @@ def test_the_tables_of_costs_agree_with_the_summary(result: ComparisonResult, sp
 
 def test_the_final_errors_are_in_millimetres_and_degrees(result: ComparisonResult) -> None:
     (run,) = (run for run in summary(result.output)["runs"] if run["label"] == "closed_form")
-    for split, name in (("train", "training"), ("validation", "validation")):
-        mean, _, heading, _ = table(printed(result), f"Error of the final pose, {name}")["closed_form"]
+    for split, name in (("train", "training"), ("validation", "held-out")):
+        mean, _, heading, _ = table(printed(result), f"Error of the final pose, {name} runs")["closed_form"]
         assert mean == f"{1000 * run[f'{split}_position_m']:.1f}"
         assert heading == f"{math.degrees(run[f'{split}_heading_rad']):.2f}"
     assert "mean (mm)" in printed(result)
@@ -79,7 +79,7 @@ def test_a_practically_equal_entry_is_marked(result: ComparisonResult) -> None:
 
 def test_a_run_without_an_answer_is_in_every_table_and_told_with_its_reason(result: ComparisonResult) -> None:
     text = printed(result)
-    for title in ("Cost of 6 trajectories, training", "Cost of 6 trajectories, validation"):
+    for title in ("Cost of 6 training runs", "Cost of 6 held-out runs"):
         assert table(text, title)["refused (geometry within limits)"][1:] == ["no answer (failed)", "–"]
     assert table(printed(result, 240), "Entries over their seeds")["refused (geometry within limits)"][0] == "0 of 1"
     assert table(text, "The run of each entry")["refused"][:2] == ["1", "failed"]
@@ -101,11 +101,11 @@ def test_a_narrow_terminal_wraps_words_and_cuts_no_number(result: ComparisonResu
 
 def test_forty_columns_keep_the_calibrated_costs_and_the_improvement(result: ComparisonResult) -> None:
     text = printed(result, 40)
-    heading = text[text.index("M⁻¹") :].split("─")[0]
+    heading = text[text.index("Entry") :].split("─")[0]
     assert "training" in heading
     assert "Improvement" in heading
-    assert "theoretical" not in heading
-    assert "left out for want of room: CF theoretical;" in " ".join(text.split())
+    assert "design" not in heading
+    assert "left out for want of room: Cost, design values;" in " ".join(text.split())
 
 
 def test_data_sets_are_told_apart_where_there_are_several(tmp_path: Path) -> None:
@@ -114,7 +114,7 @@ def test_data_sets_are_told_apart_where_there_are_several(tmp_path: Path) -> Non
     assert [line for line in text.splitlines() if "(simulated data)" in line] == [
         f"{name} (simulated data), cost final_pose" for name in sets
     ]
-    assert text.count("Cost of 6 trajectories, training\n") == 2
+    assert text.count("Cost of 6 training runs\n") == 2
 
 
 def test_a_pipe_gets_one_plain_line_for_each_run_and_the_tables(tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_a_pipe_gets_one_plain_line_for_each_run_and_the_tables(tmp_path: Path) 
     ]
     assert "\x1b" not in run.stdout + run.stderr
     assert run.stdout.splitlines()[-1] == f"report: {tmp_path / 'out' / 'report.html'}"
-    assert table(run.stdout, "Cost of 6 trajectories, training")["closed_form"][0] == "0.13873"
+    assert table(run.stdout, "Cost of 6 training runs")["closed_form"][0] == "0.13873"
 
 
 def on_a_terminal(*arguments: object, **others: Any) -> tuple[int, str]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from omnibench.compare.report.cost_tables import cost_section
 from omnibench.compare.report.data_section import data_section
 from omnibench.compare.report.error_figures import error_section
-from omnibench.compare.report.headline import result_section
+from omnibench.compare.report.headline import answer_of, path_picture
 from omnibench.compare.report.matrices import matrix_section
 from omnibench.compare.report.outcome_tables import outcome_section
 from omnibench.compare.report.path_figures import path_section
@@ -33,6 +33,7 @@ from omnibench.report.blocks import (
     Row,
     Section,
     Table,
+    answer_section,
     simulated_badge,
 )
 from omnibench.report.numbers import NOTHING, count, fixed, listing
@@ -47,7 +48,7 @@ def comparison_document(result: ComparisonResult) -> Document:
         body = _sections(datasets[0], "")
     else:
         body = (
-            Section("overview", "Overview", (_overview(datasets),)),
+            _overview(datasets),
             *(
                 Section(
                     f"data-{index}",
@@ -65,7 +66,7 @@ def comparison_document(result: ComparisonResult) -> Document:
     return Document(
         title=f"Odometry calibrations compared: {result.config.name}",
         subtitle=result.config.description,
-        sections=(*_about(result), *body, _reproduction(result)),
+        sections=(body[0], *_about(result), *body[1:], _reproduction(result)),
         badges=badges,
     )
 
@@ -73,24 +74,24 @@ def comparison_document(result: ComparisonResult) -> Document:
 def _about(result: ComparisonResult) -> tuple[Section, ...]:
     blocks: list[Block] = []
     if result.config.notes:
-        blocks.append(Callout("Before you read on", result.config.notes))
+        blocks.append(Callout("Notes of the config", result.config.notes))
     if result.warnings:
         blocks.append(Callout("Warnings", result.warnings, "warning"))
-    return (Section("notes", "Notes", tuple(blocks)),) if blocks else ()
+    return (Section("notes", "Before you rely on it", tuple(blocks)),) if blocks else ()
 
 
 def _sections(view: DatasetView, prefix: str) -> tuple[Section, ...]:
     """The sections on one data set; ``prefix`` makes their keys unique in the document."""
     sections = (
-        result_section(view),
+        answer_of(view),
         cost_section(view),
         error_section(view),
-        *robot_section(view),
         path_section(view),
-        *_recording(view),
-        search_section(view),
         outcome_section(view),
+        search_section(view),
         matrix_section(view),
+        *robot_section(view),
+        *_recording(view),
         data_section(view),
     )
     return tuple(_prefixed(section, prefix) for section in sections)
@@ -111,7 +112,19 @@ def _recording(view: DatasetView) -> tuple[Section, ...]:
         return (Section("recording", "Recording", (Callout("No pictures", (str(error),), "warning"),)),)
 
 
-def _overview(datasets: list[DatasetView]) -> Table:
+def _overview(datasets: list[DatasetView]) -> Section:
+    """The answer on several data sets: the best entry of each, and the paths of the first."""
+    tiles = []
+    for view in datasets:
+        best = view.best
+        gained = improvement_in_words(best, view.scored, 1) if best is not None else (NOTHING, "")
+        label = "" if best is None else f"{best.label}{f', {words}' if (words := level_in_words(view)) else ''}"
+        tiles.append(Fact(f"{view.name}: the cost fell by", gained[0], label))
+    sentence = f"Calibrators compared on {plural(len(datasets), 'data set')}; each has a part of its own below."
+    return answer_section(sentence, tiles, path_picture(datasets[0]), _overview_table(datasets))
+
+
+def _overview_table(datasets: list[DatasetView]) -> Table:
     rows = []
     for view in datasets:
         best = view.best
@@ -132,13 +145,13 @@ def _overview(datasets: list[DatasetView]) -> Table:
         (
             Column("Data set", numeric=False),
             Column("Best entry", numeric=False),
-            Column("Scored on", numeric=False),
-            Column("CF theoretical"),
-            Column("CF best"),
+            Column("Runs scored", numeric=False),
+            Column("Cost, design values"),
+            Column("Cost, best entry"),
             Column("Improvement"),
         ),
         tuple(rows),
-        f"CF is the cost {cost_in_words(datasets[0])} Small print: 95 % intervals. Of several that are "
+        f"The cost is {cost_in_words(datasets[0])} Small print: 95 % intervals. Of several that are "
         "level, the entry of lowest training cost is named.",
     )
 
@@ -175,4 +188,6 @@ def _reproduction(result: ComparisonResult) -> Section:
             facts,
             Details("Effective config", (Code(to_yaml(config)),)),
         ),
+        about="Config, versions and machine.",
+        folded=True,
     )

@@ -14,15 +14,23 @@ from omnibench.compare.report.wording import (
 )
 from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
 from omnibench.data.dataset import Split
-from omnibench.report.blocks import Cell, Column, Row, Section, Table
+from omnibench.report.blocks import Cell, Column, Details, Row, Section, Table
 from omnibench.report.numbers import NOTHING, fixed, percent
 from omnibench.words import plural
 
 
 def cost_section(view: DatasetView) -> Section:
     """A table of costs for each split, then what is like the published results and what is not."""
-    tables = (cost_table(view, split) for split in view.splits)
-    return Section("costs", "Costs", (*tables, *published_blocks(view)))
+    scored = cost_table(view, view.scored)
+    others = (
+        Details(f"Costs of the {SPLIT_NAMES[split]} runs", (cost_table(view, split),))
+        for split in view.splits
+        if split != view.scored
+    )
+    published = published_blocks(view)
+    beside = (Details("Beside the published figures", published),) if published else ()
+    about = "Every entry's cost, and how far it lies below that of the design values."
+    return Section("costs", "Costs", (scored, *others, *beside), about=about, folded=True)
 
 
 def cost_table(view: DatasetView, split: Split) -> Table:
@@ -36,16 +44,17 @@ def cost_table(view: DatasetView, split: Split) -> Table:
     rows += [_cost_row(view, entry, split, before) for entry in searched]
     rows += _published_rows(view, split)
     number = len(view.dataset.split(split))
+    paper = f"As Table {2 if split == 'train' else 3} of the paper. " if view.of_the_paper else ""
     return Table(
-        caption=f"Cost of {plural(number, 'trajectory')}, {SPLIT_NAMES[split]}",
+        caption=f"Cost of {plural(number, f'{SPLIT_NAMES[split]} run')}",
         columns=(
-            Column("M⁻¹", numeric=False),
-            Column("CF theoretical", priority=1),
-            Column(f"CF {SPLIT_NAMES[split]}"),
+            Column("Entry", numeric=False),
+            Column("Cost, design values", priority=1),
+            Column(f"Cost, {SPLIT_NAMES[split]}"),
             Column("Improvement"),
         ),
         rows=tuple(rows),
-        note=f"As Table {2 if split == 'train' else 3} of the paper. CF is the cost {cost_in_words(view)} "
+        note=f"{paper}The cost is {cost_in_words(view)} "
         f"Small print: 95 % intervals, {interval_basis(view, split)}, of the run with the median training cost.",
     )
 

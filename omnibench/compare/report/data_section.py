@@ -43,7 +43,7 @@ def data_section(view: DatasetView) -> Section:
         Facts(tuple(fact for fact in facts if fact.value)),
         Callout("Warnings on reading the data", warnings, "warning"),
     )
-    return Section("data", "Data", blocks)
+    return Section("data", "Data", blocks, about="Where the recordings come from, and what they hold.", folded=True)
 
 
 def _wheel(wheel: Wheel) -> str:

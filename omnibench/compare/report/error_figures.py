@@ -37,12 +37,13 @@ _MANY_GROUPS = 12  # commands or sessions: with more, all trajectories of a spli
 def error_section(view: DatasetView) -> Section:
     """Final errors on the scored split as table and figures; the table of the other split is folded away."""
     others = (
-        Details(f"Final errors on the {SPLIT_NAMES[split]} data", (final_error_table(view, split),))
+        Details(f"Final errors on the {SPLIT_NAMES[split]} runs", (final_error_table(view, split),))
         for split in view.splits
         if split != view.scored
     )
     blocks = (final_error_table(view, view.scored), *_figures(view), *others)
-    return Section("errors", "Final errors", blocks)
+    about = "How far from the reference the odometry ends: every entry, and by direction of motion."
+    return Section("errors", "Final errors", blocks, about=about, folded=True)
 
 
 def final_error_table(view: DatasetView, split: Split) -> Table:
@@ -61,9 +62,9 @@ def final_error_table(view: DatasetView, split: Split) -> Table:
         is_best = entry_or_none is not None and entry_or_none.is_best
         rows.append(Row.of(entry_cell(view, entry_or_none), *cells, role="best" if is_best else "plain"))
     return Table(
-        caption=f"Error of the final pose, {SPLIT_NAMES[split]}",
+        caption=f"Error of the final pose, {SPLIT_NAMES[split]} runs",
         columns=(
-            Column("M⁻¹", numeric=False),
+            Column("Entry", numeric=False),
             Column("position, mean", unit),
             Column("position, worst", unit),
             Column("heading, mean", "°"),
@@ -129,7 +130,7 @@ def _flower_blocks(
         largest = max(float(max(before.max(), values.max())) for _, before, values in means)
         reached = max(float(values.max()) for _, _, values in means)
         for title, column, limit in (
-            ("theoretical", 1, largest),
+            ("design values", 1, largest),
             (f"{label}, same scale", 2, largest),
             (f"{label}, enlarged", 2, reached),
         ):
@@ -143,7 +144,7 @@ def _flower_blocks(
                 )
             )
     caption = (
-        f"Mean over the repetitions of each command, {SPLIT_NAMES[view.scored]} data. The angle is the commanded "
+        f"Mean over the repetitions of each command, {SPLIT_NAMES[view.scored]} runs. The angle is the commanded "
         "direction α in the robot's frame, forward up and left to the left; the radius is the error."
     )
     grid = FigureGrid(tuple(figures), tuple(legend), 3, caption)

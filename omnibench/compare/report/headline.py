@@ -1,4 +1,4 @@
-"""The section on the result: the verdict in a sentence, the main figures, and what to keep in mind."""
+"""The answer of a comparison: a sentence, the main figures, paths before and after, all entries, doubts."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from omnibench.compare.report.view import SPLIT_NAMES, DatasetView
+from omnibench.compare.report.entry_chart import entry_chart
+from omnibench.compare.report.view import SPLIT_NAMES, THEORETICAL_STYLE, DatasetView
 from omnibench.compare.report.wording import (
     NO_INTERVAL,
     cost_decimals,
@@ -18,8 +19,10 @@ from omnibench.compare.report.wording import (
 )
 from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
 from omnibench.fit.evaluate import positions_and_headings
-from omnibench.report.blocks import Block, Callout, Fact, Facts, Paragraph, Section
+from omnibench.report.blocks import Block, Callout, Fact, FigureGrid, LegendItem, Paragraph, Section, answer_section
 from omnibench.report.numbers import fixed, listing, percent, span
+from omnibench.report.path_pictures import CALIBRATED, choice_in_words, paths_before_after
+from omnibench.report.recording.runs import runs_with_paths
 from omnibench.words import plural
 
 _ARRIVED = 0.01  # relative: a search whose training cost is further above the lowest one missed the minimum (chosen)
@@ -27,17 +30,30 @@ _ARRIVED = 0.01  # relative: a search whose training cost is further above the l
 _SEEDS_DIFFER = 0.25
 
 
-def result_section(view: DatasetView) -> Section:
-    """The section with the result: the best calibrator, its improvement with an interval, and equally good ones."""
-    return Section("result", "Result", _blocks(view))
-
-
-def _blocks(view: DatasetView) -> tuple[Block, ...]:
+def answer_of(view: DatasetView) -> Section:
+    """The section with the answer: what calibration gained, paths before and after, all entries, and doubts."""
     best = view.best
-    said = _held_out(view)
+    chart = entry_chart(view)
+    more: list[Block] = [*_held_out(view), _remarks(view, best)]
     if best is None or best.calibrator == THEORETICAL_NAME:
-        return (Paragraph(_no_winner(view, best), "lead"), *said, _remarks(view, best))
-    return (Paragraph(_verdict(view, best), "lead"), Facts(_tiles(view, best), "tiles"), *said, _remarks(view, best))
+        drawn = None if best is None else path_picture(view)
+        return answer_section(_no_winner(view, best), (), drawn, *((chart,) if chart else ()), *more)
+    standing = Paragraph(_standing_at_length(view, best))
+    return answer_section(
+        _verdict(view, best), _tiles(view, best), path_picture(view), *((chart,) if chart else ()), standing, *more
+    )
+
+
+def path_picture(view: DatasetView) -> FigureGrid | None:
+    """Paths of a few runs of the scored split: reference, design values and the best calibration."""
+    runs = runs_with_paths(view.dataset.split(view.scored), view.dataset.robot)
+    models = [(THEORETICAL_STYLE, view.model(view.design_matrix))]
+    best = view.best
+    if best is not None and best.calibrator != THEORETICAL_NAME and best.typical is not None:
+        matrix = best.typical.matrix
+        if matrix is not None:
+            models.append((LegendItem("calibrated", f"calibrated by {best.label}", CALIBRATED), view.model(matrix)))
+    return paths_before_after(runs, models, f"{choice_in_words(runs)}, from the {SPLIT_NAMES[view.scored]} runs.")
 
 
 def _held_out(view: DatasetView) -> tuple[Block, ...]:
@@ -57,68 +73,83 @@ def _no_winner(view: DatasetView, best: EntryStatistics | None) -> str:
     if not answers:
         return "Only the design values gave an answer; there is no calibration to compare them with."
     return (
-        f"No calibrator did better than the design values on the {SPLIT_NAMES[view.scored]} data: {listing(answers)} "
+        f"No calibrator did better than the design values on the {SPLIT_NAMES[view.scored]} runs: {listing(answers)} "
         f"ended above their cost, or level with it."
     )
 
 
 def _verdict(view: DatasetView, best: EntryStatistics) -> str:
-    split, decimals = view.scored, cost_decimals(view)
-    reached, before = best.cost(split), view.theoretical_cost(split)
-    words = f"{_standing(view, best)}."
-    if reached is not None and before is not None:
+    split = view.scored
+    runs = plural(len(view.dataset.split(split)), f"{SPLIT_NAMES[split]} run")
+    errors = _errors(view, best)
+    words = f"On the {runs}, "
+    if errors is not None:
+        (before, turned_before), (after, turned_after) = errors
         words += (
-            f" On the {SPLIT_NAMES[split]} data its cost is {fixed(reached.value, decimals)}, where the design values "
-            f"give {fixed(before, decimals)}"
+            f"the odometry calibrated by {best.label} ends {after} and {turned_after} from the reference, where the "
+            f"design values end {before} and {turned_before} off"
         )
-        interval = best.improvement(split)
-        if interval is not None:
-            fell, sure = improvement_in_words(best, split, 1)
-            words += f": the error fell by {fell}{_with_interval(sure)}, {view.units[split].words}"
-            chance = interval.known is not None and interval.holds(0.0)
-            words += ", which the noise alone could explain" if chance else ""
-        words += "."
-    return words
+    else:
+        words += f"{best.label} has the best calibration"
+    interval = best.improvement(split)
+    if interval is not None:
+        fell, sure = improvement_in_words(best, split, 1)
+        words += f": the error fell by {fell}{_with_interval(sure)}"
+        chance = interval.known is not None and interval.holds(0.0)
+        words += ", which the noise alone could explain" if chance else ""
+    return f"{words}. {_standing(view, best)}."
+
+
+def _errors(view: DatasetView, best: EntryStatistics) -> tuple[tuple[str, str], tuple[str, str]] | None:
+    """Mean final errors in words, position and heading, by the design values and by the best entry."""
+    after = None if best.typical is None else view.errors(best.typical, view.scored)
+    if after is None:
+        return None
+    (p0, h0), (p1, h1) = positions_and_headings(view.design_errors[view.scored]), positions_and_headings(after)
+    factor, unit, digits = position_unit(float(p0.mean()), float(p1.mean()))
+    before, now = (
+        (f"{fixed(factor * p.mean(), digits)} {unit}", f"{fixed(np.degrees(h.mean()), 2)}°")
+        for p, h in ((p0, h0), (p1, h1))
+    )
+    return before, now
 
 
 def _standing(view: DatasetView, best: EntryStatistics) -> str:
-    """The best entry, in words; where several are level, the lowest training cost decides."""
+    """The best entry beside the others, in short."""
     if len(view.calibrated) == 1:
         return f"{best.label} is the only calibrator with an answer"
     if view.undecided:
-        return (
-            f"Which entry is best cannot be said ({view.units[view.scored].words}); {best.label} has the lowest "
-            "training cost"
-        )
-    level = [entry.label for entry in view.level]
-    if len(level) == 1:
+        return f"Which entry is best cannot be said ({view.units[view.scored].words})"
+    others = len(view.level) - 1
+    if not others:
         return f"{best.label} is best"
+    entries = "other entry is" if others == 1 else "other entries are"
+    return f"{_number(others)} {entries} level with it"
+
+
+def _standing_at_length(view: DatasetView, best: EntryStatistics) -> str:
+    """The entries that are level with the best one; of these the lowest training cost decides."""
+    basis = f"The intervals: {view.units[view.scored].words}."
+    if len(view.calibrated) > 1 and view.undecided:
+        return f"{best.label} has the lowest training cost. {basis}"
+    level = [entry.label for entry in view.level]
+    if len(level) < 2:
+        return basis
     return (
-        f"{_number(len(level))} entries are level on the {SPLIT_NAMES[view.scored]} data: {listing(level, 20)}; "
-        f"{best.label} has the lowest training cost of them"
+        f"Level on the {SPLIT_NAMES[view.scored]} runs: {listing(level, 20)}; {best.label} has the lowest training "
+        f"cost of them. {basis}"
     )
 
 
 def _number(number: int) -> str:
-    words = ("Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve")
-    return words[number - 2] if number <= 12 else str(number)
+    words = ("One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve")
+    return words[number - 1] if number <= 12 else str(number)
 
 
 def _tiles(view: DatasetView, best: EntryStatistics) -> tuple[Fact, ...]:
     split, decimals = view.scored, cost_decimals(view)
     reached, before = best.cost(split), view.theoretical_cost(split)
     tiles = []
-    if reached is not None:
-        tiles.append(
-            Fact(
-                f"Cost, {SPLIT_NAMES[split]}",
-                f"{fixed(before, decimals)} → {fixed(reached.value, decimals)}",
-                _with_interval(interval_in_words(reached, decimals)),
-            )
-        )
-    if best.improvement(split) is not None:
-        fell, sure = improvement_in_words(best, split, 1)
-        tiles.append(Fact("Improvement", fell, _with_interval(sure)))
     after = None if best.typical is None else view.errors(best.typical, split)
     if after is not None:
         (p0, h0), (p1, h1) = positions_and_headings(view.design_errors[split]), positions_and_headings(after)
@@ -135,6 +166,17 @@ def _tiles(view: DatasetView, best: EntryStatistics) -> tuple[Fact, ...]:
                 f"worst {fixed(np.degrees(h1.max()), 2)}°",
             ),
         ]
+    if reached is not None:
+        tiles.append(
+            Fact(
+                f"Cost, {SPLIT_NAMES[split]} runs",
+                f"{fixed(before, decimals)} → {fixed(reached.value, decimals)}",
+                _with_interval(interval_in_words(reached, decimals)).strip(" ()"),
+            )
+        )
+    if best.improvement(split) is not None:
+        fell, sure = improvement_in_words(best, split, 1)
+        tiles.append(Fact("Improvement of the cost", fell, _with_interval(sure).strip(" ()")))
     return tuple(tiles)
 
 
@@ -199,7 +241,7 @@ def _worse_commands(view: DatasetView, best: EntryStatistics) -> list[str]:
     changes = [f"{name} {fixed(was, digits)} → {fixed(now, digits)}" for name, was, now in worse]
     return [
         f"{best.label} does worse than the design values on {len(worse)} of {plural(len(means), 'command')} of the "
-        f"{SPLIT_NAMES[split]} data, as the mean cost of each, design values → {best.label}: "
+        f"{SPLIT_NAMES[split]} runs, as the mean cost of each, design values → {best.label}: "
         f"{listing(changes, len(changes))}."
     ]
 
@@ -214,7 +256,7 @@ def _remarks(view: DatasetView, best: EntryStatistics | None) -> Callout:
     doubts: list[str] = []
     split = view.scored
     if split == "train":
-        items.append("There is no validation split: costs and errors are those of the data that were fitted.")
+        items.append("No runs are held out: costs and errors are those of the data that were fitted.")
     if best is not None:
         doubts = _doubts(view, best) + _worse_commands(view, best)
         items += doubts

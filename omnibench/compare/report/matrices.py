@@ -22,7 +22,8 @@ _ZERO_SHARE = 1e-9
 
 def matrix_section(view: DatasetView) -> Section:
     """Matrices, their differences from the design values and from the reference entry, parameters, all digits."""
-    return Section("matrices", "Matrices", _blocks(view))
+    about = "All elements, their differences from the design values, and the wheels that they stand for."
+    return Section("matrices", "Matrices", _blocks(view), about=about, folded=True)
 
 
 def _blocks(view: DatasetView) -> tuple[Block, ...]:
@@ -79,7 +80,8 @@ def parameter_table(view: DatasetView) -> Table | None:
         "Physical parameters and their deviation from the design values",
         columns,
         tuple(rows),
-        "As section 4.2 of the paper. Each matrix has one such geometry, but it takes up whatever else is wrong "
+        ("As section 4.2 of the paper. " if view.of_the_paper else "")
+        + "Each matrix has one such geometry, but it takes up whatever else is wrong "
         "with the model, so a parameter by itself is not a measurement of the robot. † on a bound of its limits."
         + (" ‡ held by limits without width." if any(record.held for _, record in fitted) else ""),
     )
@@ -100,7 +102,7 @@ def _element_table(view: DatasetView) -> Table:
     held = any(run.record.held for entry, run in view.calibrated if entry.parameterisation == "matrix")
     return Table(
         "Inverse kinematic matrices M⁻¹",
-        (Column("M⁻¹", numeric=False), *_element_columns(view, with_units=True)),
+        (Column("Entry", numeric=False), *_element_columns(view, with_units=True)),
         tuple(rows),
         f"Columns of each row in the order of the {'wheels' if drive.direct else 'drive signals'}: "
         f"{', '.join(drive.names)}. "
@@ -123,13 +125,14 @@ def _difference_table(view: DatasetView, against: str | None) -> Table:
         cells = tuple(_difference_cell(float(s), float(d)) for s, d in zip(share, moved, strict=True))
         rows.append(Row.of(entry_cell(view, entry), *cells))
     name = "the design values" if against is None else against
-    note = "Eq. (10) and (11) of the paper, element by element. Where the reference is 0 the change itself is given."
+    note = "Element by element, as a share of the value compared with; where that is 0, the change itself is given."
+    note += " Eq. (10) and (11) of the paper." if view.of_the_paper else ""
     if project is not None:
         what = "wheel rates" if view.dataset.robot.drive.direct else "drive signals"
         note += f" Compared on the span of {what} that the data drive; across it the matrix is not determined."
     return Table(
         f"Differences from {name}",
-        (Column("M⁻¹", numeric=False), *_element_columns(view, with_units=False)),
+        (Column("Entry", numeric=False), *_element_columns(view, with_units=False)),
         tuple(rows),
         note,
     )

@@ -29,7 +29,8 @@ def outcome_section(view: DatasetView) -> Section:
     runs: Block = run_table(view)
     if len(view.runs) > _FOLDED_ABOVE:
         runs = Details(f"Every run ({len(view.runs)})", (runs,))
-    return Section("outcomes", "Outcomes", (entry_table(view), *proofs, runs))
+    about = "Every entry over its seeds, beside the best; what no optimiser can beat; every run."
+    return Section("outcomes", "Outcomes", (entry_table(view), *proofs, runs), about=about, folded=True)
 
 
 def entry_table(view: DatasetView) -> Table:
@@ -54,10 +55,10 @@ def entry_table(view: DatasetView) -> Table:
         columns=(
             Column("Entry", numeric=False),
             Column("Answers of runs", priority=1),
-            Column("CF training, median"),
+            Column("Cost, training, median"),
             Column(gap_title(view), "relative", priority=2),
             Column("Evaluations and time, median", priority=3),
-            Column(f"Difference from the best in CF {SPLIT_NAMES[view.scored]}"),
+            Column(f"Difference from the best in {SPLIT_NAMES[view.scored]} cost"),
             Column("Verdict", numeric=False),
         ),
         rows=tuple(rows),
@@ -90,8 +91,8 @@ def run_table(view: DatasetView, typical: bool = False) -> Table:
             Column("Entry", numeric=False),
             Column("Seed"),
             Column("Outcome", numeric=False),
-            Column("CF training", priority=1),
-            Column("CF validation", priority=2),
+            Column("Cost, training", priority=1),
+            Column("Cost, held-out", priority=2),
             Column("Gap"),
             Column("Evaluations and time"),
             Column("On a bound", numeric=False),
@@ -116,7 +117,7 @@ def certificate_table(certificates: Sequence[BoxCertificate]) -> Table:
         caption="What no optimiser can beat",
         columns=(
             Column("Box", numeric=False),
-            Column("Lowest CF training found"),
+            Column("Lowest training cost found"),
             Column("No matrix of the box is below"),
             Column("Left to gain, at most"),
             Column("Parts of the box, time"),

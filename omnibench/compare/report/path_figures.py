@@ -1,9 +1,10 @@
-"""The section on paths, as Fig. 5 to 7 of the paper: reference, theoretical and calibrated, and their ends."""
+"""The section on paths, as Fig. 5 to 7 of the paper: reference, design values and calibrations, and their ends."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import plotly.graph_objects as go
@@ -11,36 +12,76 @@ import plotly.graph_objects as go
 from omnibench.compare.report.view import REFERENCE_STYLE, SPLIT_NAMES, THEORETICAL_STYLE, DatasetView
 from omnibench.data.dataset import Trajectory
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem, Section
+from omnibench.report.numbers import listing
 from omnibench.report.recording.runs import describe
 from omnibench.report.recording.scan_points import evenly
 from omnibench.report.style import plan, text
 from omnibench.report.traces import START, line, marks, path
 from omnibench.robot.kinematics import Array
+from omnibench.words import plural
 
 _SHOWN = 4  # trajectories that are drawn, as many as in Fig. 6 of the paper
 _POINTS = 160  # points that a path is drawn with (chosen)
 _TAIL = 0.15  # last share of a run's duration, which the figure of its end shows (chosen)
+_SEEN = 0.02  # share of a detail's window: ends that are nearer to each other are one mark on a screen
 _PAPER_DIRECTIONS = (30, 210, 120, 300)  # deg, of Fig. 6 (a) to (d)
 _PAPER_TURN_RATE = 0.35  # rad/s
 
 
+@dataclass(frozen=True, eq=False)
+class DrawnModel:
+    """A matrix that stands for every entry whose paths cannot be told from its own. entries: their labels."""
+
+    style: LegendItem
+    matrix: Array
+    entries: tuple[str, ...] = ()
+
+
 def path_section(view: DatasetView) -> Section:
     """A few trajectories of the scored split: whole paths, each beside the detail of its end."""
-    figures = [
-        figure(view, trajectory)
-        for trajectory in chosen_trajectories(view.dataset.split(view.scored))
-        for figure in (_path_figure, _end_figure)
-    ]
-    styles = [REFERENCE_STYLE, THEORETICAL_STYLE, *(view.styles[entry.label] for entry, _ in view.calibrated)]
-    grid = FigureGrid(
-        tuple(figures),
-        tuple(styles),
-        2,
-        f"As Fig. 5 to 7 of the paper, on {SPLIT_NAMES[view.scored]} trajectories. Right: final poses about the "
-        "reference's final position, the short strokes show the headings. The window holds the nearer ends; "
-        "Autoscale, at the top right of a plot, shows all.",
+    chosen = chosen_trajectories(view.dataset.split(view.scored))
+    models = drawn_models(view, chosen)
+    figures = [figure(view, trajectory, models) for trajectory in chosen for figure in (_path_figure, _end_figure)]
+    several = [each for each in models if len(each.entries) > 1]
+    groups = "; ".join(f"{each.style.label}: {listing(list(each.entries[1:]), 20)}" for each in several)
+    whence = "As Fig. 5 to 7 of the paper, of" if view.of_the_paper else "Of"
+    caption = (
+        f"{whence} the {SPLIT_NAMES[view.scored]} runs. Right: final poses about the reference's final position; short "
+        "strokes show headings. The window holds the nearer ends; Autoscale, at the top right of a plot, shows all."
     )
-    return Section("paths", "Paths", (grid,))
+    if groups:
+        near = f"within {100 * _SEEN:.0f} % of the window of each other"
+        caption += f" Entries that end {near} are drawn as one. {groups}."
+    grid = FigureGrid(tuple(figures), (REFERENCE_STYLE, *(each.style for each in models)), 2, caption, "paths-and-ends")
+    about = "The paths of every entry that can be told from the others, and where they end."
+    return Section("paths", "Paths of all entries", (grid,), about=about, folded=True)
+
+
+def drawn_models(view: DatasetView, trajectories: Sequence[Trajectory]) -> list[DrawnModel]:
+    """The design values, then one matrix for each group of entries with the same ends as far as can be seen."""
+    finals = [trajectory.final_log for trajectory in trajectories]
+    last = np.array([trajectory.final_pose[:2] for trajectory in trajectories])
+    calibrated = sorted(view.calibrated, key=lambda pair: not pair[0].is_best)  # the best one leads its group
+    ends = {
+        entry.label: np.array([poses[-1, :2] for poses in view.model(run.matrix).poses(finals)])
+        for entry, run in calibrated
+        if run.matrix is not None
+    }
+    off = [1e3 * np.linalg.norm(end - last, axis=1) for end in ends.values()]
+    seen = [2e-3 * _SEEN * _window(list(of_run)) for of_run in np.transpose(off)]  # m, of each run
+    groups: dict[str, list[str]] = {}
+    for label, end in ends.items():
+        near = (leader for leader in groups if (np.linalg.norm(end - ends[leader], axis=1) < seen).all())
+        groups.setdefault(next(near, label), []).append(label)
+    matrices = {entry.label: run.matrix for entry, run in calibrated if run.matrix is not None}
+    drawn = [_group(view.styles[leader], matrices[leader], members) for leader, members in groups.items()]
+    return [DrawnModel(THEORETICAL_STYLE, view.design_matrix), *reversed(drawn)]  # the best on top
+
+
+def _group(style: LegendItem, matrix: Array, members: Sequence[str]) -> DrawnModel:
+    if len(members) > 1:
+        style = replace(style, label=f"{style.label} and {plural(len(members) - 1, 'other')}")
+    return DrawnModel(style, matrix, tuple(members))
 
 
 def chosen_trajectories(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
@@ -69,23 +110,16 @@ def _with_command(trajectories: Sequence[Trajectory], degrees: float) -> Traject
     return None
 
 
-def _models(view: DatasetView) -> list[tuple[LegendItem, Array]]:
-    drawn = [(THEORETICAL_STYLE, view.design_matrix)]
-    calibrated = sorted(view.calibrated, key=lambda pair: pair[0].is_best)  # the best on top
-    drawn += [(view.styles[entry.label], run.matrix) for entry, run in calibrated if run.matrix is not None]
-    return drawn
-
-
-def _path_figure(view: DatasetView, trajectory: Trajectory) -> Figure:
+def _path_figure(view: DatasetView, trajectory: Trajectory, models: Sequence[DrawnModel]) -> Figure:
     reference = trajectory.poses[evenly(len(trajectory.poses), 2 * _POINTS)]
     stamps = np.linspace(0.0, trajectory.pose_times[-1], _POINTS)
     traces = [path(REFERENCE_STYLE, reference, 3.5), _end_mark(REFERENCE_STYLE, reference, 9)]
-    for style, matrix in _models(view):
-        (poses,) = view.model(matrix).poses([trajectory.log(stamps)])
-        traces += [path(style, poses, 1.8), _end_mark(style, poses, 7)]
+    for each in models:
+        (poses,) = view.model(each.matrix).poses([trajectory.log(stamps)])
+        traces += [path(each.style, poses, 1.8), _end_mark(each.style, poses, 7)]
     traces.append(marks(START, 9, trajectory.start[:1], trajectory.start[1:2], hover="start"))
     title = describe(trajectory)
-    description = f"Paths of {title}: reference, theoretical and calibrated odometry, x and y in metres"
+    description = f"Paths of {title}: reference, odometry by the design values and calibrated, x and y in metres"
     return Figure(title, plan(*traces), description, 400)
 
 
@@ -93,14 +127,14 @@ def _end_mark(style: LegendItem, poses: Array, size: int) -> go.Scatter:
     return marks(style, size, poses[-1:, 0], poses[-1:, 1], marker_line_width=2)
 
 
-def _end_figure(view: DatasetView, trajectory: Trajectory) -> Figure:
+def _end_figure(view: DatasetView, trajectory: Trajectory, models: Sequence[DrawnModel]) -> Figure:
     final = trajectory.final_pose
     duration = trajectory.pose_times[-1]
     stamps = np.linspace((1 - _TAIL) * duration, duration, 60)
-    tails = [(style, view.model(matrix).poses([trajectory.log(stamps)])[0]) for style, matrix in _models(view)]
+    tails = [(each.style, view.model(each.matrix).poses([trajectory.log(stamps)])[0]) for each in models]
     calibrated = tails[1:] or tails  # the design values come first, and are far away
     half = _window([_distance_mm(poses[-1], final) for _, poses in calibrated])
-    late = trajectory.poses[trajectory.pose_times >= min(stamps[0], trajectory.pose_times[-2])]
+    late = trajectory.poses[trajectory.pose_times >= min(stamps[0], trajectory.pose_times[-2:][0])]
     traces = _tail_traces(REFERENCE_STYLE, late, final, half, width=2.6)
     for style, poses in tails:
         traces += _tail_traces(style, poses, final, half, width=1.6)
@@ -128,7 +162,7 @@ def _tail_traces(style: LegendItem, poses: Array, final: Array, half: float, wid
 def _ends_in_words(view: DatasetView, trajectory: Trajectory) -> str:
     """Distances of the theoretical end and the best entry's end from the reference's, in words."""
     (design,) = view.model(view.design_matrix).poses([trajectory.final_log])
-    parts = [f"theoretical {_distance_mm(design[-1], trajectory.final_pose):.0f} mm off"]
+    parts = [f"design values {_distance_mm(design[-1], trajectory.final_pose):.0f} mm off"]
     best = view.best
     if best is not None and best.typical is not None and best.typical.matrix is not None:
         (pose,) = view.model(best.typical.matrix).poses([trajectory.final_log])

@@ -31,14 +31,16 @@ def robot_section(view: DatasetView) -> tuple[Section, ...]:
         system, items = motion_system(robot)
         fitted = _fitted(view)
         legend = (*items, *(item for item, _ in fitted))
-        words = "As Fig. 2 and 3 of the paper. A wheel's width is not known; its length is its diameter."
+        words = "As Fig. 2 and 3 of the paper. " if view.of_the_paper else ""
+        words += "A wheel's width is not known; its length is its diameter."
         if fitted:
             words += (
                 f" {fitted[0][0].label}: the geometry that has its matrix. It takes up whatever else is wrong with the "
                 "model, so that its wheels need not stand there."
             )
         grids.insert(0, FigureGrid((system, parameters(robot, fitted)), legend, 2, words))
-    return (Section("robot", "Robot", tuple(grids)),) if grids else ()
+    about = "Its wheels as designed and as fitted."
+    return (Section("robot", "Robot", tuple(grids), about=about, folded=True),) if grids else ()
 
 
 def _fitted(view: DatasetView) -> list[tuple[LegendItem, Robot]]:

@@ -49,7 +49,8 @@ def search_diagram(view: DatasetView) -> FigureGrid:
     hidden = {"visible": False}
     figure.update_layout(annotations=[*boxes, *arrows], xaxis=hidden, yaxis=hidden, margin_l=10, margin_b=10)
     words = "Start, candidates, odometry, cost; then stop, or the next candidates"
-    caption = f"As Fig. 4 of the paper, for every search here. The cost is {cost_in_words(view)}"
+    paper = "As Fig. 4 of the paper, for every search here. " if view.of_the_paper else ""
+    caption = f"{paper}The cost is {cost_in_words(view)}"
     return FigureGrid((Figure("How a search runs", figure, words, 240),), (), 1, caption)
 
 

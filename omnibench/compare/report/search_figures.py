@@ -1,10 +1,10 @@
-"""The section on searches: best cost, gap above the best known cost, and share of targets reached."""
+"""The section on searches: share of targets reached, and the gap above the best known cost."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,7 +13,7 @@ import plotly.graph_objects as go
 
 from omnibench.compare.plan import SearchSpace
 from omnibench.compare.report.search_diagram import search_diagram
-from omnibench.compare.report.view import THEORETICAL_STYLE, DatasetView
+from omnibench.compare.report.view import DatasetView
 from omnibench.compare.result import ScoredRun
 from omnibench.fit.problem import Improvement
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem, Paragraph, Section
@@ -21,12 +21,14 @@ from omnibench.report.numbers import listing, significant
 from omnibench.report.style import logarithmic, plot, text
 from omnibench.report.traces import joined, line, marks
 from omnibench.robot.kinematics import Array
+from omnibench.words import plural
 
 TARGETS: Array = np.logspace(0, -8, 81)  # relative gaps above the best known cost (chosen)
 Axis = Literal["evaluations", "time"]
 AXES: tuple[Axis, ...] = ("evaluations", "time")
 _TITLES: Mapping[Axis, str] = {"evaluations": "evaluations", "time": "time (s)"}
 _FLOOR = 1e-10  # relative gap; smaller ones are drawn at this value
+_ABOUT = "How fast each search came how near the best known cost."
 _POINTS = 12_000  # points of one plot, shared by its runs: keeps the file small
 
 
@@ -57,18 +59,17 @@ def search_section(view: DatasetView) -> Section:
     drawn = courses(view)
     if not drawn:
         words = "There is no course to draw: no entry searched, or the lowest cost is rounding."
-        return Section("searches", "Searches", (Paragraph(words, "note"),))
-    searches = _Searches(
-        drawn,
-        points=max(24, _POINTS // len(drawn)),
-        runs=Counter(run.record.label for run in view.runs),
-        theoretical=view.theoretical_cost("train") if view.config.loss == "squares" else None,
+        return Section("searches", "Searches", (Paragraph(words, "note"),), about=_ABOUT, folded=True)
+    searches = _Searches(drawn, max(24, _POINTS // len(drawn)), Counter(run.record.label for run in view.runs))
+    targets = FigureGrid(
+        tuple(_targets(searches, axis) for axis in AXES),
+        tuple({course.style.key: course.style for course in drawn}.values()),
+        2,
+        "Targets are relative gaps above the best known cost in the same box, from 1 down to 1e-8 in equal steps of "
+        "the exponent; a share counts all targets of all seeds.",
+        "targets-reached",
     )
-    figures = [figure(searches, axis) for figure in (_costs, _gaps, _targets) for axis in AXES]
-    styles = {course.style.key: course.style for course in drawn}.values()
-    legend = (*styles, THEORETICAL_STYLE)
-    curves = FigureGrid(tuple(figures), legend, 2, _caption(drawn))
-    return Section("searches", "Searches", (curves, search_diagram(view)))
+    return Section("searches", "Searches", (targets, _gaps(searches), search_diagram(view)), about=_ABOUT, folded=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,13 +77,11 @@ class _Searches:
     """The data of the figures.
 
     points: roughly how many a course is drawn with. runs: number of runs by label, with those that have no course.
-    theoretical: the training cost of the design values; None where a robust loss takes its place.
     """
 
     courses: Sequence[Course]
     points: int
     runs: Mapping[str, int]
-    theoretical: float | None
 
 
 def courses(view: DatasetView) -> list[Course]:
@@ -183,35 +182,20 @@ def _groups(drawn: Sequence[Course]) -> Mapping[LegendItem, list[Course]]:
     return groups
 
 
-def _costs(searches: _Searches, axis: Axis) -> Figure:
-    traces = _steps(searches, axis, "cost", lambda course: course.costs)
-    low = min(course.costs.min() for course in searches.courses)
-    high = max(course.costs.max() for course in searches.courses)
-    design = searches.theoretical
-    if design is not None:
-        high = max(high, design)
-        extent = _extent(searches.courses, axis)
-        traces.append(line(THEORETICAL_STYLE, 1.8, extent, [design] * 2, hover=f"theoretical, cost {design:.5g}"))
-    figure = _against(axis, searches, traces, "best training cost so far")
-    logarithmic(figure, "y", float(low), float(high))
-    return Figure(
-        f"Best training cost against {axis}",
-        figure,
-        f"Best training cost found so far by each run against {axis}, both axes logarithmic",
-        360,
-    )
-
-
-def _gaps(searches: _Searches, axis: Axis) -> Figure:
-    traces = _steps(searches, axis, "gap", lambda course: course.gaps)
-    figure = _against(axis, searches, traces, "relative gap above best known cost")
-    logarithmic(figure, "y", _FLOOR, float(max(course.gaps.max() for course in searches.courses)))
-    return Figure(
-        f"Gap above the best known cost against {axis}",
-        figure,
-        f"Relative gap above the best known cost in the same box against {axis}, both axes logarithmic",
-        360,
-    )
+def _gaps(searches: _Searches) -> FigureGrid:
+    """A plot for each entry of the gap above the best known cost, all on the same axes, a line a seed."""
+    highest = float(max(course.gaps.max() for course in searches.courses))
+    figures = []
+    for style, group in _groups(searches.courses).items():
+        figure = plot(*_steps(searches, style, group), x_title=_TITLES["evaluations"], y_title="relative gap")
+        logarithmic(figure, "x", *_extent(searches.courses, "evaluations"))
+        logarithmic(figure, "y", _FLOOR, highest)
+        seeds = plural(len(group), "seed")
+        description = f"Relative gap of {style.label} above the best known cost in the same box against evaluations"
+        figures.append(Figure(f"{style.label}, {seeds}", figure, description, 230))
+    caption = "Gap above the best known cost, a line a seed, marked where the run ended. "
+    caption += _best_in_words(searches.courses)
+    return FigureGrid(tuple(figures), (), 3, caption, "gap-above-the-best-cost")
 
 
 def _targets(searches: _Searches, axis: Axis) -> Figure:
@@ -224,7 +208,8 @@ def _targets(searches: _Searches, axis: Axis) -> Figure:
         keep = np.append(np.flatnonzero(np.diff(x) > 0), len(x) - 1)
         hover = f"{text(style.label)}<br>%{{y:.1f}} % by %{{x:.4g}}"
         traces.append(line(style, 2.2, x[keep], 100 * y[keep], hover=hover, line_shape="hv"))
-    figure = _against(axis, searches, traces, "targets reached (%)")
+    figure = plot(*traces, x_title=_TITLES[axis], y_title="targets reached (%)")
+    logarithmic(figure, "x", low, high)
     figure.update_yaxes(range=[-1, 104])
     return Figure(
         f"Targets reached against {axis}",
@@ -234,30 +219,22 @@ def _targets(searches: _Searches, axis: Axis) -> Figure:
     )
 
 
-def _against(axis: Axis, searches: _Searches, traces: Sequence[go.Scatter], y_title: str) -> go.Figure:
-    figure = plot(*traces, x_title=_TITLES[axis], y_title=y_title)
-    logarithmic(figure, "x", *_extent(searches.courses, axis))
-    return figure
-
-
-def _steps(searches: _Searches, axis: Axis, name: str, values: Callable[[Course], Array]) -> list[go.Scatter]:
-    """Traces, one an entry, of all its seeds with a break between them, and marks at their ends."""
+def _steps(searches: _Searches, style: LegendItem, group: Sequence[Course]) -> list[go.Scatter]:
+    """The courses of an entry's seeds as one trace with a break between them, and marks at their ends."""
+    steps = []
+    for course in group:
+        seed = np.full(len(course.costs), course.run.record.seed)
+        picks = thinned(course.evaluations, course.gaps, searches.points)
+        steps.append(np.column_stack([course.evaluations, course.gaps, seed])[picks])
+    ends = np.array([each[-1] for each in steps])
+    hover = "seed %{customdata}<br>%{x:.4g} evaluations, gap %{y:.5g}"
     traces = []
-    for style, group in _groups(searches.courses).items():
-        steps = []
-        for course in group:
-            along, seed = _along(course, axis), np.full(len(course.costs), course.run.record.seed)
-            picks = thinned(along, course.gaps, searches.points)
-            steps.append(np.column_stack([along, values(course), seed])[picks])
-        ends = np.array([each[-1] for each in steps])
-        unit = " s" if axis == "time" else " evaluations"
-        hover = f"{text(style.label)}, seed %{{customdata}}<br>%{{x:.4g}}{unit}, {name} %{{y:.5g}}"
-        for points, trace, size, looks in (
-            (joined(steps), line, 1.8, {"line_shape": "hv", "opacity": 0.8}),
-            (ends, marks, 8, {"marker_line_width": 1.8}),
-        ):
-            seeds = [None if np.isnan(seed) else int(seed) for seed in points[:, 2]]
-            traces.append(trace(style, size, *points[:, :2].T, hover=hover, customdata=seeds, **looks))
+    for points, trace, size, looks in (
+        (joined(steps), line, 1.8, {"line_shape": "hv", "opacity": 0.8}),
+        (ends, marks, 8, {"marker_line_width": 1.8}),
+    ):
+        seeds = [None if np.isnan(seed) else int(seed) for seed in points[:, 2]]
+        traces.append(trace(style, size, *points[:, :2].T, hover=hover, customdata=seeds, **looks))
     return traces
 
 
@@ -271,7 +248,7 @@ def _along(course: Course, axis: Axis) -> Array:
     return course.evaluations if axis == "evaluations" else course.seconds
 
 
-def _caption(drawn: Sequence[Course]) -> str:
+def _best_in_words(drawn: Sequence[Course]) -> str:
     known: dict[tuple[str, str], list[str]] = {}
     for course in drawn:
         record = course.run.record
@@ -282,8 +259,4 @@ def _caption(drawn: Sequence[Course]) -> str:
         f"box {box}{f' of {listing(labels)}' if shared[box] > 1 else ''}: {value}"
         for (box, value), labels in known.items()
     )
-    return (
-        f"One line a seed, marked where the run ended. Best known training cost: {costs}. Gaps below {_FLOOR:.0e} are "
-        "drawn at that value. Targets are relative gaps above the best known cost in the same box, from 1 down to 1e-8 "
-        "in equal steps of the exponent; a share counts all targets of all seeds."
-    )
+    return f"Best known training cost: {costs}. Gaps below {_FLOOR:.0e} are drawn at that value."

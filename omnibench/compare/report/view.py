@@ -23,7 +23,7 @@ from omnibench.report.style import REFERENCE, SYMBOLS, THEORETICAL, colours
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 
-SPLIT_NAMES: Mapping[Split, str] = {"train": "training", "validation": "validation"}
+SPLIT_NAMES: Mapping[Split, str] = {"train": "training", "validation": "held-out"}
 
 # Colours by calibrator. The paper draws its non-parametric (genetic) result in magenta, the parametric one in brown.
 _CUSTOMARY = {
@@ -37,7 +37,7 @@ _CUSTOMARY = {
 
 
 REFERENCE_STYLE = LegendItem("reference", "reference", REFERENCE)
-THEORETICAL_STYLE = LegendItem("theoretical", "theoretical (design values)", THEORETICAL, "dash")
+THEORETICAL_STYLE = LegendItem("theoretical", "design values", THEORETICAL, "dash")
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +83,11 @@ class DatasetView:
     def level(self) -> list[EntryStatistics]:
         """Entries that are practically equal to the best, itself among them."""
         return [entry for entry in self.statistics if entry.practically_equal or entry.is_best]
+
+    @property
+    def of_the_paper(self) -> bool:
+        """True if the paper's figures are set beside these: only then is the paper spoken of."""
+        return bool(self.config.published_results)
 
     @property
     def undecided(self) -> bool:

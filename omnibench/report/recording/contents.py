@@ -22,7 +22,7 @@ def contents_table(dataset: Dataset) -> Table:
         _commands(runs),
         _wheels("Target wheel rates", _rates("ωM", dataset), runs, "targets", "what the motor controllers were told"),
         _row("Measured wheel rates", _rates("ω", dataset), number, "samples", _every(samples, first=0.0), _steps(runs)),
-        _wheels("Wheel angles", "beyond Table 1", runs, "angles", "absolute, continuous within a session"),
+        _wheels("Wheel angles", "φ", runs, "angles", "absolute, continuous within a session"),
         *_steering(runs),
         _row("Odometry", "(x, y, θ)", number, "poses", _every(samples, first=0.0), "computed from the wheel rates"),
         _scans(dataset),
@@ -37,7 +37,7 @@ def contents_table(dataset: Dataset) -> Table:
             Column("Remarks", numeric=False),
         ),
         rows=tuple(rows),
-        note="After Table 1 of the paper, whose symbols stand in small print. Every: the median interval; where they "
+        note="Small print: symbols. Every: the median interval; where they "
         "vary, in brackets the range that holds 98 % of them.",
     )
 
@@ -73,7 +73,7 @@ def _wheels(name: str, symbol: str, runs: Sequence[Trajectory], field: str, rema
 def _steering(runs: Sequence[Trajectory]) -> list[Row]:
     if runs[0].steering is None:
         return []
-    return [_wheels("Steering angles", "beyond Table 1", runs, "steering", "at the samples' ends")]
+    return [_wheels("Steering angles", "steer", runs, "steering", "at the samples' ends")]
 
 
 def _steps(runs: Sequence[Trajectory]) -> str:

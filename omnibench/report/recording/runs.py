@@ -8,11 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.report.motions import motion_in_words
 from omnibench.report.numbers import fixed
+from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
 
 _SHOWN = 4  # runs, where kinds of motion are not known
 _STRAIGHT = 1e-3  # rad/s; a slower turn counts as straight
+ON_THE_SPOT = "on the spot"
 
 
 def describe(trajectory: Trajectory) -> str:
@@ -35,26 +38,47 @@ def representative_runs(dataset: Dataset) -> dict[str, Trajectory]:
     if dataset.scans is not None:
         scanned = set(dataset.scans.trajectories)
         runs = [run for run in runs if run.id in scanned]
-    by_kind = {
-        f"{kind}: {describe(run)}": run
-        for kind, like in _kinds(runs).items()
-        for run in [_of_median_error(like, OdometryModel.of_design(dataset.robot, "arc"))]
-    }
+    by_kind = typical_runs(runs, dataset.robot)
     if len(by_kind) > 1:
-        return by_kind
-    picks = np.unique(np.linspace(0, len(runs) - 1, min(_SHOWN, len(runs))).round().astype(int))
-    return {describe(runs[index]): runs[index] for index in picks}
+        return {f"{kind}: {describe(run)}": run for kind, run in by_kind.items()}
+    return {describe(run): run for run in spread(runs)}
+
+
+def runs_with_paths(runs: Sequence[Trajectory], robot: Robot) -> dict[str, Trajectory]:
+    """A few runs whose paths can be drawn, by what they drive: one of each kind of motion, or a spread of all."""
+    drawn = [run for run in runs if len(run.poses) > 1]
+    by_kind = {kind: run for kind, run in typical_runs(drawn, robot).items() if kind != ON_THE_SPOT}
+    if len(by_kind) > 1:
+        return {f"{kind[0].upper()}{kind[1:]}": run for kind, run in by_kind.items()}
+    first = {run.command or run.session or run.id: run for run in reversed(drawn)}
+    several = list(first.values())[::-1] if len(first) > 2 else drawn
+    chosen = spread(several, 3) if several else []
+    words = [motion_in_words(run.id, run.v, run.alpha, run.omega) for run in chosen]
+    unique = len(set(words)) == len(words)
+    return {name if unique else f"{name}, {run.id}": run for name, run in zip(words, chosen, strict=True)}
+
+
+def typical_runs(runs: Sequence[Trajectory], robot: Robot) -> dict[str, Trajectory]:
+    """The run of each kind of commanded motion whose final position error by the design odometry is the median."""
+    design = OdometryModel.of_design(robot, "arc")
+    return {kind: _of_median_error(like, design) for kind, like in _kinds(runs).items()}
+
+
+def spread(runs: Sequence[Trajectory], number: int = _SHOWN) -> list[Trajectory]:
+    """Some runs, evenly spaced, the first and the last among them."""
+    picks = np.unique(np.linspace(0, len(runs) - 1, min(number, len(runs))).round().astype(int))
+    return [runs[index] for index in picks]
 
 
 def _kinds(runs: Sequence[Trajectory]) -> dict[str, list[Trajectory]]:
     """The runs of each kind of commanded motion; of turning ones only those at the highest rate."""
-    kinds: dict[str, list[Trajectory]] = {"straight": [], "turning left": [], "turning right": [], "on the spot": []}
+    kinds: dict[str, list[Trajectory]] = {"straight": [], "turning left": [], "turning right": [], ON_THE_SPOT: []}
     for run in runs:
         if run.omega is None or run.alpha is None:
             continue
         turns = abs(run.omega) >= _STRAIGHT
         if run.v == 0 and turns:
-            kinds["on the spot"].append(run)
+            kinds[ON_THE_SPOT].append(run)
         elif run.v != 0:
             kinds["straight" if not turns else "turning left" if run.omega > 0 else "turning right"].append(run)
     fastest = {kind: max((abs(run.omega or 0.0) for run in like), default=0.0) for kind, like in kinds.items()}

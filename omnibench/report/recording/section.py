@@ -85,7 +85,8 @@ def has_recording(dataset: Dataset) -> bool:
 def recording_section(dataset: Dataset) -> Section:
     """The section on a recording for another report. DataError in one line: broken scans."""
     parts = _pictures(dataset, "recording-", {}, None, {})
-    return Section("recording", "Recording", (contents_table(dataset),), tuple(parts))
+    about = "What was recorded, all paths, wheel rates, and runs step by step."
+    return Section("recording", "Recording", (contents_table(dataset),), tuple(parts), about=about, folded=True)
 
 
 def _about(dataset: Dataset, notes: Sequence[str]) -> tuple[Block, ...]:

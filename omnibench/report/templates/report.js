@@ -1,8 +1,9 @@
 "use strict";
 
-// One plot after the other, so that the page can be read and scrolled while they are drawn.
+// One plot after the other, so that the page can be read and scrolled while they are drawn; folded ones last.
 async function drawPlots() {
-  for (const canvas of document.querySelectorAll(".canvas")) {
+  const folded = (canvas) => Number(canvas.closest("details:not([open])") !== null);
+  for (const canvas of [...document.querySelectorAll(".canvas")].sort((a, b) => folded(a) - folded(b))) {
     const { data, layout } = JSON.parse(document.getElementById(canvas.dataset.source).textContent);
     await Plotly.newPlot(canvas, data, layout, PLOT_OPTIONS);
     await new Promise((resolve) => setTimeout(resolve));
@@ -32,6 +33,15 @@ function fitPlots(part) {
   for (const canvas of part.querySelectorAll(".canvas")) {
     if (canvas.data && canvas.offsetParent) Plotly.Plots.resize(canvas);
   }
+}
+
+// A link to a part that is folded away opens it.
+function openTarget() {
+  const target = document.getElementById(location.hash.slice(1));
+  if (!target) return;
+  for (const fold of target.querySelectorAll(":scope > details.fold")) fold.open = true;
+  for (let fold = target.closest("details"); fold; fold = fold.parentElement.closest("details")) fold.open = true;
+  target.scrollIntoView();
 }
 
 function copy(button) {
@@ -76,6 +86,9 @@ for (const choice of document.querySelectorAll(".choice")) {
   choice.querySelector("select").addEventListener("change", () => choose(choice));
   choose(choice);
 }
+for (const fold of document.querySelectorAll("details")) fold.addEventListener("toggle", () => fold.open && fitPlots(fold));
+window.addEventListener("hashchange", openTarget);
 for (const player of document.querySelectorAll(".player")) startPlayer(player);
 markCurrentSection();
+openTarget();
 drawPlots();

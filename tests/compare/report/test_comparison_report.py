@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import opened
+from browser import first_picture, opened
 from recording_samples import sample
 from report_page import Page
 from report_samples import config, flower, page, run, statistics
@@ -58,28 +58,28 @@ def test_recorded_data_wear_no_badge(result: ComparisonResult, tmp_path: Path) -
     assert "SIMULATED" not in page(replace(result, datasets=recorded), tmp_path).text
 
 
-@pytest.mark.parametrize(("split", "number"), [("training", 2), ("validation", 3)])
+@pytest.mark.parametrize(("split", "number"), [("training", 2), ("held-out", 3)])
 def test_costs_stand_in_tables_like_the_papers(result: ComparisonResult, report: Page, split: str, number: int) -> None:
-    caption = f"Cost of 16 trajectories, {split}"
+    caption = f"Cost of 16 {split} runs"
     entry = statistics(result, "closed_form")
     interval = entry.cost("train" if split == "training" else "validation")
     cells = report.row(caption, "closed_form")
-    assert report.tables[caption][0] == ["M⁻¹", "CF theoretical", f"CF {split}", "Improvement"]
+    assert report.tables[caption][0] == ["Entry", "Cost, design values", f"Cost, {split}", "Improvement"]
     assert cells[2] == f"{fixed(interval.value, 4)} | {fixed(interval.low, 4)} to {fixed(interval.high, 4)}"
     assert f"As Table {number} of the paper" in report.text
 
 
 def test_published_figures_stand_apart_and_are_said_to_be_of_other_data(report: Page) -> None:
-    rows = report.tables["Cost of 16 trajectories, training"]
+    rows = report.tables["Cost of 16 training runs"]
     assert rows[-2] == ["Published, on other data: not comparable row by row"]
     assert rows[-1] == ["GA | an article", "0.1234", "0.0215", "82.58 %"]
-    assert "Published" not in str(report.tables["Cost of 16 trajectories, validation"])
+    assert "Published" not in str(report.tables["Cost of 16 held-out runs"])
 
 
 def test_a_run_without_an_answer_is_a_row_with_its_reason(result: ComparisonResult, report: Page) -> None:
     record = next(run.record for run in result.runs if run.record.label == "hopeless")
     assert report.row("Every run", "hopeless")[2] == f"failed | {record.reason}"
-    assert report.row("Cost of 16 trajectories, training", "hopeless")[2] == "no answer | failed"
+    assert report.row("Cost of 16 training runs", "hopeless")[2] == "no answer | failed"
     assert f"hopeless gave no answer in 2 of 2 runs (failed: {record.reason})" in report.text
 
 
@@ -97,7 +97,7 @@ def test_entries_are_compared_with_the_best(result: ComparisonResult, report: Pa
 
 def test_final_errors_are_in_millimetres_and_degrees(result: ComparisonResult, report: Page) -> None:
     errors = statistics(result, "closed_form").typical.scores["validation"].errors
-    cells = report.row("Error of the final pose, validation", "closed_form")
+    cells = report.row("Error of the final pose, held-out runs", "closed_form")
     assert cells[1] == f"{1e3 * np.hypot(errors[:, 0], errors[:, 1]).mean():.1f}"
     assert cells[3] == f"{np.degrees(np.abs(errors[:, 2]).mean()):.2f}"
 
@@ -147,10 +147,10 @@ def test_the_design_values_lead_the_tables_even_if_no_entry_asks_for_them(tmp_pa
     told = page(result, tmp_path)
     theoretical = fixed(result.runs[0].record.theoretical_validation_cost, 4)
     listed = run(config(calibrators=["theoretical", "closed_form"])).statistics[0].cost("validation")
-    assert told.row("Cost of 16 trajectories, validation", "theoretical")[1].split(" | ")[0] == theoretical
-    assert told.row("Cost of 16 trajectories, validation", "closed_form")[1] == theoretical
+    assert told.row("Cost of 16 held-out runs", "theoretical")[1].split(" | ")[0] == theoretical
+    assert told.row("Cost of 16 held-out runs", "closed_form")[1] == theoretical
     interval = f"{fixed(listed.low, 4)} to {fixed(listed.high, 4)}"
-    assert told.row("Cost of 16 trajectories, validation", "theoretical")[1] == f"{theoretical} | {interval}"
+    assert told.row("Cost of 16 held-out runs", "theoretical")[1] == f"{theoretical} | {interval}"
 
 
 def test_an_element_that_the_box_holds_is_marked_and_named(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_several_data_sets_have_an_overview_and_a_part_each(tmp_path: Path) -> N
     one = {"simulate": flower(repetitions=1)}
     told = page(run(config(datasets={"one": one, "two": one}, calibrators=["theoretical", "closed_form"])), tmp_path)
     assert [row[0] for row in told.tables["Best entry of each data set"][1:]] == ["one | simulated", "two | simulated"]
-    assert {"overview", "data-1-result", "data-2-result"} <= set(told.sections)
+    assert {"answer", "data-1-answer", "data-2-answer"} <= set(told.sections)
     assert len(told.sections) == len(set(told.sections))
 
 
@@ -259,3 +259,10 @@ def test_a_browser_draws_every_plot_and_finds_no_fault(result: ComparisonResult,
     assert len(plots) >= 20
     assert all('class="main-svg"' in plot and ("<path" in plot) for plot in plots)
     assert not complaints
+
+
+def test_the_paths_before_and_after_stand_in_the_first_900_pixels(result: ComparisonResult, tmp_path: Path) -> None:
+    write_document(comparison_document(result), tmp_path / "report.html")
+    bottom, width = first_picture(tmp_path / "report.html")
+    assert bottom <= 900
+    assert width <= 1280

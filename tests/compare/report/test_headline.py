@@ -39,9 +39,9 @@ def test_the_headline_names_the_best_and_the_improvement_with_its_interval(
 def test_without_a_validation_split_the_training_data_are_judged(tmp_path: Path) -> None:
     datasets = {"flower": {"simulate": flower(validation=None)}}
     told = page(run(config(datasets=datasets, calibrators=["theoretical", "closed_form"])), tmp_path)
-    assert "There is no validation split" in told.text
-    assert "closed_form is the only calibrator with an answer. On the training data" in told.text
-    assert not [caption for caption in told.tables if "validation" in caption]
+    assert "No runs are held out" in told.text
+    assert "closed_form is the only calibrator with an answer" in told.text
+    assert not [caption for caption in told.tables if "held-out" in caption]
 
 
 def test_the_design_values_alone_are_no_calibration(tmp_path: Path) -> None:
@@ -65,7 +65,7 @@ def test_entries_that_noise_could_swap_are_level_and_the_training_cost_decides(t
     result = run(config(calibrators=["theoretical", *twins], seeds=[1]))
     told = page(result, tmp_path)
     best = next(entry.label for entry in result.statistics if entry.is_best)
-    assert f"Two entries are level on the validation data: one and other; {best} has the lowest" in told.text
+    assert f"Level on the held-out runs: one and other; {best} has the lowest" in told.text
     assert "is best." not in told.text
     assert told.row("Entries over their seeds", best)[-1] == "best | of 2 that are level"
 
@@ -79,7 +79,7 @@ def test_an_entry_below_the_best_by_more_than_noise_is_not_called_worse(
         for e in result.statistics
     ]
     told = page(replace(result, statistics=tuple(lower)), tmp_path)
-    assert "Below closed_form in validation cost" in told.text
+    assert "Below closed_form in held-out cost" in told.text
     assert told.row("Entries over their seeds", "random_search")[-1] == "lower cost here | higher training cost"
 
 
@@ -99,7 +99,7 @@ def test_commands_that_the_best_makes_worse_are_listed_with_both_costs(
     ]
     was = design.costs[spoilt].mean()
     told = page(replace(result, statistics=tuple(changed)), tmp_path).text
-    assert f"worse than the design values on 1 of {len(set(commands))} commands of the validation data" in told
+    assert f"worse than the design values on 1 of {len(set(commands))} commands of the held-out runs" in told
     assert f"{commands[0]} {was:.4f} → {was + 0.01:.4f}." in told
 
 
@@ -127,7 +127,7 @@ def test_one_validation_run_gives_no_interval_and_no_best(tmp_path: Path) -> Non
     assert "95 % interval" not in told.text.split("Costs")[0]
     assert "undecided: 1 run cannot show it, hold out 3 or more" in told.text
     assert told.row("Entries over their seeds", "random_search")[-1] == "undecided | no interval from 1 run"
-    assert told.row("Cost of 1 trajectory, validation", "closed_form")[-1].endswith("no interval")
+    assert told.row("Cost of 1 held-out run", "closed_form")[-1].endswith("no interval")
 
 
 def test_what_held_out_runs_say_stands_under_the_result(report: Page) -> None:

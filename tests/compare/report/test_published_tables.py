@@ -124,14 +124,14 @@ def test_a_published_floor_twice_as_high_is_not_as_ours(result: ComparisonResult
     assert list(differ) == [
         "Calibrated cost, training (closed_form)",
         "Improvement, training (closed_form)",
-        "Calibrated cost, validation (closed_form)",
-        "Improvement, validation (closed_form)",
+        "Calibrated cost, held-out (closed_form)",
+        "Improvement, held-out (closed_form)",
     ]
     assert differ["Calibrated cost, training (closed_form)"].difference == "−50.0 %"
     improvement = differ["Improvement, training (closed_form)"].difference
     assert improvement.startswith("+")
     assert improvement.endswith(" points")
-    assert {"Theoretical cost, training", "Theoretical cost, validation"} <= set(figures(view, alike=True))
+    assert {"Theoretical cost, training", "Theoretical cost, held-out"} <= set(figures(view, alike=True))
 
 
 def test_a_published_theoretical_cost_half_of_ours_is_not_as_ours(result: ComparisonResult) -> None:

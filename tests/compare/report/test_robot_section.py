@@ -111,7 +111,7 @@ def test_without_a_section_on_the_recording_the_tracks_of_every_command_are_draw
     assert len(grids(view)) == 1
     bare = [replace(run, targets=None, angles=None) for run in view.dataset.trajectories]
     _, tracks = grids(replace(view, dataset=replace(view.dataset, trajectories=tuple(bare))))
-    assert tracks.figures[0].title == "Reference paths of 8 runs from one start, validation"
+    assert tracks.figures[0].title == "Reference paths of 8 runs from one start, held-out"
     assert [item.label for item in tracks.legend] == ["ω = −0.35 rad/s", "ω = 0.35 rad/s"]
 
 
