@@ -120,7 +120,7 @@ def clock(recording: Recording, run: Run, matrix: Array) -> Clock | None:
         return None
     best = minimize(
         lambda pair: error(*pair), start, method="Nelder-Mead",
-        options={"initial_simplex": np.array(start) + [[0, 0], [0.1, 0], [0, 0.1]], "xatol": 2e-3, "fatol": 0},
+        options={"initial_simplex": np.add(start, [[0, 0], [0.1, 0], [0, 0.1]]), "xatol": 2e-3, "fatol": 0},
     )  # fmt: skip
     begin, end = map(float, best.x)
     around = [error(begin + away, end + late) for away, late in ((0.5, 0.5), (-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5))]

@@ -20,6 +20,8 @@ TURN = 2 * math.pi  # rad
 # The authors' first guess of the steering encoder's scale is 0.1, with which the design's motions are 75 % wrong; a fit
 # of scale, zero, radius and wheelbase to motions over 1 s (soft L1) gives 0.564, -3.5 deg, 0.00169 m and 1.38 m.
 _CORELLI_STEERING = 0.564
+_ALIKE = 0.25  # of the numbers that a drive is summed up in: farther apart are other commands
+_LEAST_WAY = 0.1  # m, of turns on the spot
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,4 +216,35 @@ _READERS: dict[str, Callable[[], Recording]] = {
 @cache
 def recording(robot: str) -> Recording:
     """All runs of a robot."""
-    return _READERS[robot]()
+    read = _READERS[robot]()
+    if robot == "robotino":  # each run drives another direction
+        return read.of([replace(run, command=f"c{number:02d}") for number, run in enumerate(read.runs)])
+    return commanded(read)
+
+
+def commanded(recording: Recording) -> Recording:
+    """The recording with a command for each run: runs that drive the same motions for the same way share one."""
+    leaders: list[tuple[str, Array]] = []
+    runs = []
+    for run in recording.runs:
+        drive = _outline(run)
+        found = next((name for name, other in leaders if (np.abs(drive - other) < _ALIKE).all()), None)
+        if found is None:
+            found = f"c{len(leaders) + 1:02d}"
+            leaders.append((found, drive))
+        runs.append(replace(run, command=found))
+    return recording.of(runs)
+
+
+def _outline(run: Run) -> Array:
+    """A drive in nine numbers: logarithm of its way; in each third turn (rad) and mean direction of travel, as x, y."""
+    track = np.column_stack([run.poses[:, :2], np.unwrap(run.poses[:, 2])])[::5]
+    step, heading = np.diff(track, axis=0), track[:-1, 2]
+    ways = np.hypot(*step[:, :2].T)
+    done = np.cumsum(ways + 0.1 * np.abs(step[:, 2]))
+    third = np.minimum((3 * done / done[-1]).astype(int), 2)
+    numbers = [math.log(max(float(ways.sum()), _LEAST_WAY))]
+    for part in (third == index for index in range(3)):
+        along = np.exp(-1j * heading[part]) @ (step[part, 0] + 1j * step[part, 1]) / max(ways[part].sum(), 0.03)
+        numbers += [0.2 * float(step[part, 2].sum()), along.real, along.imag]
+    return np.array(numbers)

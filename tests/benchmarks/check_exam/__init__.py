@@ -1,0 +1,1 @@
+"""The exam of check: a table, makers of faults, a judge."""
