@@ -4,18 +4,20 @@ import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import fill
 from typing import Annotated
 
 import typer
 
 from omnibench.cli.options import Force, output_option
-from omnibench.cli.terminal.console import print_ending
+from omnibench.cli.terminal.console import make_console, print_ending, say
 from omnibench.errors import ConfigError
 
 guide_app = typer.Typer()
 
 _READING_WIDTH = 100  # columns: longer lines are hard to follow
 _NAME_WIDTH = 15  # columns, of the longest topic
+_NAMES = _NAME_WIDTH + 4  # columns, with the spaces around it
 
 
 @guide_app.command()
@@ -53,7 +55,7 @@ def example(
     for path in write_example(chosen, output, force=force):
         typer.echo(f"written: {path}")
     if chosen.note:
-        typer.echo(f"note: {chosen.note}")
+        say(f"note: {chosen.note}")
     typer.echo("to go on, type:")
     if resolved(output) != Path.cwd():
         typer.echo(f"  cd {shlex.quote(str(output))}")
@@ -80,8 +82,9 @@ def _list_examples() -> None:
 
 
 def _print_names(summaries: Mapping[str, str]) -> None:
+    width = make_console().width
     for name, summary in summaries.items():
-        typer.echo(f"  {name:{_NAME_WIDTH}}  {summary}")
+        typer.echo(fill(summary, width, initial_indent=f"  {name:{_NAME_WIDTH}}  ", subsequent_indent=" " * _NAMES))
 
 
 def _show(markdown: str) -> None:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from omnibench.cli.terminal.console import warn
+
 if TYPE_CHECKING:
     from omnibench.registry import PluginFailure
 
@@ -60,5 +62,5 @@ def load_given_plugins(given: Sequence[Path] | None) -> list[PluginFailure]:
     with redirect_stdout(sys.stderr):  # a plug-in that prints must not spoil our output
         failures = load_plugins(plugin_folders(given))
     for failure in failures:
-        typer.echo(f"warning: plug-in {failure.origin} cannot be imported: {failure.error}", err=True)
+        warn([f"plug-in {failure.origin} cannot be imported: {failure.error}"])
     return failures

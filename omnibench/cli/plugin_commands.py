@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from omnibench.cli.options import Force, Json, Plugins, load_given_plugins
-from omnibench.cli.terminal.console import make_console, print_ending, print_json
+from omnibench.cli.terminal.console import make_console, print_ending, print_json, say
 from omnibench.errors import ConfigError
 from omnibench.words import plural
 
@@ -96,7 +96,7 @@ def plugin_check(
     report = check_plugin_apart(file, sample, seconds)
     for result in report.results:
         message = f": {result.message}" if result.message else ""
-        typer.echo(f"{result.outcome:7} {result.kind} {result.name}: {result.case}{message}")
+        say(f"{result.outcome:7} {result.kind} {result.name}: {result.case}{message}")
     counts = Counter(str(result.outcome) for result in report.results)
     typer.echo(", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
     if report.failures:

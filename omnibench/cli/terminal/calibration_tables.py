@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 
 from omnibench.cli.terminal.console import print_ending
@@ -28,6 +29,7 @@ from omnibench.words import plural
 
 _NONE = "no interval"
 _NOTHING_TO_GAIN = 0.01  # share of the cost that is not worth another search; chosen
+_COLUMNS = 3  # columns with an interval each that 80 columns of a terminal hold
 _TOUCHED = 1e-6  # share of a direction of drive signals: a smaller one is rounding
 
 
@@ -79,7 +81,10 @@ def print_calibration(console: Console, run: CalibrationRun) -> None:
 
 
 def _matrix_table(run: CalibrationRun) -> Table:
-    """The matrix with its deviation from the design values, each row followed by its intervals."""
+    """The matrix with its deviation from the design values, each row followed by its intervals.
+
+    It has a column for each drive signal; of more than three it is turned, so that a terminal shows all.
+    """
     calibration = run.calibration
     simulated = calibration.provenance is not None and calibration.provenance.simulated
     labels = ("x (m/rad)", "y (m/rad)", "w (rad/rad)")
@@ -92,18 +97,35 @@ def _matrix_table(run: CalibrationRun) -> Table:
         notes.append(only if listed else f"the design values are kept along {motions}, of which these data say nothing")
     if stopped := [*run.result.held, *run.result.at_bounds] if listed else []:
         notes.append(f"{_NONE} of what rests on {', '.join(stopped)}, held by the box or on a bound of it")
+    drive, design = calibration.robot.drive, calibration.robot.inverse_kinematic_matrix
+    signals = [f"wheel {name}" if drive.direct else name for name in drive.names]
+    values = _cells(
+        [
+            [Cell(f"{value:+.7f}", _deviation(value, first)) for value, first in zip(row, of_design, strict=True)]
+            for row, of_design in zip(calibration.matrix, design, strict=True)
+        ]
+    )
+    bounds = [
+        (name, _cells([[Cell("", _interval(*each)) for each in zip(*row, marks, strict=True)] for row in ends]))
+        for name, ends in ((name, zip(each.low, each.high, strict=True)) for name, each in listed)
+    ]
+    turned = len(signals) > _COLUMNS
+    headings, lines = (labels, signals) if turned else (signals, labels)
     rows = []
-    for number, (label, values) in enumerate(zip(labels, calibration.matrix, strict=True)):
-        design = calibration.robot.inverse_kinematic_matrix[number]
-        cells = (Cell(f"{value:+.7f}", _deviation(value, first)) for value, first in zip(values, design, strict=True))
-        rows.append(Row.of(label, *cells))
-        for name, intervals in listed:
-            bounds = zip(intervals.low[number], intervals.high[number], marks, strict=True)
-            rows.append(Row.of(f"  {name}", *(Cell("", _interval(*each)) for each in bounds)))
-    drive = calibration.robot.drive
-    signals = (Column(f"wheel {name}" if drive.direct else name) for name in drive.names)
+    for number, label in enumerate(lines):
+        rows.append(Row.of(label, *(values.T if turned else values)[number]))
+        rows += [Row.of(f"  {name}", *(cells.T if turned else cells)[number]) for name, cells in bounds]
     caption = f"{calibration.name}{' (simulated data)' if simulated else ''}"
-    return Table(caption, (Column("", numeric=False), *signals), tuple(rows), "; ".join(notes))
+    columns = (Column("", numeric=False), *map(Column, headings))
+    return Table(caption, columns, tuple(rows), "; ".join(notes))
+
+
+def _cells(rows: Sequence[Sequence[Cell]]) -> npt.NDArray[np.object_]:
+    """Cells as an array (3, M), which can be turned."""
+    table = np.empty((len(rows), len(rows[0])), dtype=object)
+    for number, row in enumerate(rows):
+        table[number] = row
+    return table
 
 
 def _interval(low: float, high: float, mark: str) -> str:

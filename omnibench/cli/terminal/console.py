@@ -46,6 +46,11 @@ def warn(messages: Iterable[str]) -> None:
         make_console(error=True).print(f"warning: {message}", soft_wrap=True)
 
 
+def say(text: str) -> None:
+    """Running text on standard output, wrapped between words on a terminal and as one line in a pipe."""
+    make_console().print(text, soft_wrap=True)
+
+
 def print_json(document: Mapping[str, Any] | BaseModel) -> None:
     """The document as strict JSON on standard output."""
     from omnibench.config import to_json
@@ -58,10 +63,8 @@ def print_verdict(verdict: HeldOutVerdict, subject: str = "", sessions: Iterable
 
     sessions: sentences on sessions that differ from the others or could not be compared.
     """
-    typer.echo(f"{subject}{verdict.sentence}")
-    typer.echo(verdict.detail)
-    for sentence in sessions:
-        typer.echo(sentence)
+    for sentence in (f"{subject}{verdict.sentence}", verdict.detail, *sessions):
+        say(sentence)
 
 
 def print_ending(outcome: str, then: str = "", *command: object) -> None:

@@ -16,6 +16,7 @@ from rich.text import Text
 from omnibench.report.blocks import Cell, Column, Table
 
 _UNBROKEN: Final = 30  # columns; a longer word, such as a path, may be broken
+_READABLE: Final = 18  # columns of text; lesser columns are left out before text is squeezed into fewer; chosen
 _STYLES: Final[Mapping[str, str]] = {"best": "bold", "failed": "yellow", "muted": "dim"}
 _SMALL: Final = "dim"  # style of small print
 _NO_BREAK: Final = "\u00a0"
@@ -79,10 +80,14 @@ class _Layout:
 
 @dataclass(frozen=True)
 class _Extent:
-    """Width of a column: ``natural`` for a heading of two lines, ``cells`` for cells of one, ``least`` for words."""
+    """Width of a column: ``natural`` for a heading of two lines, ``cells`` for cells of one, ``least`` for words.
+
+    readable: for words that do not stand one below the other.
+    """
 
     natural: int
     cells: int
+    readable: int
     least: int
 
 
@@ -90,10 +95,10 @@ def _layout(table: Table, width: int) -> _Layout:
     """The most comfortable layout that fits: notes beside, notes below, narrow gaps, and at last fewer columns."""
     beside = [_extent(table, index, "beside").natural for index in range(len(table.columns))]
     below = {index: _extent(table, index, "below") for index in range(len(table.columns))}
-    needed = sum(extent.least for extent in below.values()) + len(below) - 1
+    needed = _needed(table, below)
     if sum(beside) + 2 * (len(beside) - 1) <= width:
         return _Layout(dict(enumerate(beside)), 2, "beside", needed)
-    while len(below) > 1 and sum(extent.least for extent in below.values()) + len(below) - 1 > width:
+    while len(below) > 1 and _needed(table, below) > width:
         del below[max(list(below)[1:], key=lambda index: (table.columns[index].priority, index))]
     gap = 2 if sum(extent.least for extent in below.values()) + 2 * (len(below) - 1) <= width else 1
     widths = {index: extent.natural for index, extent in below.items()}
@@ -105,6 +110,13 @@ def _layout(table: Table, width: int) -> _Layout:
     return _Layout(widths, gap, "below", needed)
 
 
+def _needed(table: Table, extents: Mapping[int, _Extent]) -> int:
+    """Width in which columns can stand: text stays readable as long as there are lesser columns to leave out."""
+    lesser = any(table.columns[index].priority for index in extents)
+    widths = (extent.readable if lesser else extent.least for extent in extents.values())
+    return sum(widths) + len(extents) - 1
+
+
 def _extent(table: Table, index: int, notes: Place) -> _Extent:
     column = table.columns[index]
     cells = [row.cells[index] for row in table.rows if row.role != "group"]
@@ -114,7 +126,8 @@ def _extent(table: Table, index: int, notes: Place) -> _Extent:
     numbers = [cell.text for cell in cells] if column.numeric else []
     least = max(map(len, (*words, *numbers)), default=1)
     of_cells = max((least, *map(len, lines)))
-    return _Extent(max(of_cells, (len(heading) + 1) // 2), of_cells, least)
+    readable = least if column.numeric else max(least, min(of_cells, _READABLE))
+    return _Extent(max(of_cells, (len(heading) + 1) // 2), of_cells, readable, least)
 
 
 def _heading(column: Column) -> str:
