@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 
 def plural(number: int, noun: str) -> str:
     """A number with its noun: ``1 run``, ``2 runs``, ``2,000 trajectories``."""
     return f"{number:,} {noun_for(number, noun)}"
+
+
+def some(names: Sequence[str], most: int = 12) -> str:
+    """Names in a sentence; of many the first ones, and how many more there are."""
+    more = f" and {len(names) - most:,} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def noun_for(number: int, noun: str) -> str:

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from omnibench.data.checks.implausible import implausible
+from omnibench.data.header import Imported
 from omnibench.data.headings import unwrap
 from omnibench.data.references.reference_flaws import reference_flaw
 from omnibench.data.references.reference_headings import with_whole_turns
@@ -154,6 +155,7 @@ class Dataset:
     warnings: tuple[str, ...] = field(default=())
     scans: Scans | None = None
     referenced: bool = True
+    imported: Imported | None = None
 
     def split(self, name: Split) -> tuple[Trajectory, ...]:
         """The trajectories of one split; may be empty. Copies of training runs are not for validation."""

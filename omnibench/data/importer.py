@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -23,6 +24,16 @@ class Importer(ABC):
 
     def __init__(self, options: Any) -> None:
         self.options = options
+
+    @classmethod
+    def completed(cls, options: Mapping[str, Any], source: Path) -> dict[str, Any]:
+        """The options with those that the source says itself: the robot by ``robot.yaml`` in it or beside it."""
+        given = dict(options)
+        robot = (source if source.is_dir() else source.parent) / "robot.yaml"
+        field = cls.Options.model_fields.get("robot")
+        if field is not None and field.is_required() and robot.is_file():
+            given.setdefault("robot", robot)
+        return given
 
     @abstractmethod
     def read(self, source: Path) -> Dataset:

@@ -61,6 +61,28 @@ def complete(runs: Sequence[Trajectory]) -> list[Trajectory]:
     return [replace(run, **missing) for run in runs]
 
 
+def remaining(names: Sequence[str], patterns: Sequence[str], kind: str) -> set[str]:
+    """The names that match none of the shell patterns; ``run3`` stands for its parts ``run3#1`` ..., too.
+
+    ConfigError: a pattern matches nothing, or all names match.
+    """
+    matched: set[str] = set()
+    for pattern in patterns:
+        matching = {name for name in names if fnmatchcase(name, pattern) or fnmatchcase(name, f"{pattern}#*")}
+        if not matching:
+            raise _unmatched("leave_out", pattern, names, kind)
+        matched |= matching
+    if matched >= set(names):
+        raise ConfigError(f"leave_out: every {kind} matches {', '.join(patterns)}; keep one at least")
+    return set(names) - matched
+
+
+def _unmatched(option: str, pattern: str, names: Sequence[str], kind: str) -> ConfigError:
+    known = sorted(set(names))
+    shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
+    return ConfigError(f"{option}: no {kind} matches {pattern!r}; {nearest(pattern, known)}found: {shown}")
+
+
 def split_by_name(
     names: Sequence[str], train: Sequence[str], validation: Sequence[str], kind: str
 ) -> list[Split | None]:
@@ -73,9 +95,7 @@ def split_by_name(
     for side, patterns in sides.items():
         for pattern in patterns:
             if not any(fnmatchcase(name, pattern) for name in names):
-                known = sorted(set(names))
-                shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
-                raise ConfigError(f"{side}: no {kind} matches {pattern!r}; {nearest(pattern, known)}found: {shown}")
+                raise _unmatched(side, pattern, names, kind)
     rest: Split | None = "validation" if not validation else "train" if not train else None
     return [_split_of(name, train, validation, rest, kind) for name in names]
 

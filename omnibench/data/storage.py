@@ -4,54 +4,38 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Literal, cast
+from typing import Any, cast
 
 import numpy as np
 import polars as pl
-from pydantic import Field, model_validator
 
-from omnibench.config import Model, Positive, read_yaml, to_yaml, validate
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory, make_dataset
+from omnibench.data.header import Header, read_header
 from omnibench.data.references.reference_table import TABLE, read_references, reference_frame
 from omnibench.data.references.run_references import References
 from omnibench.data.run_checks import Flaw, pose_times_flaw, stored_pose_times_flaw, wheel_times_flaw
 from omnibench.data.scan_files import ScansOnDisk, write_scans
-from omnibench.data.scans import Scanner, Scans
+from omnibench.data.scans import Scans
 from omnibench.data.table import Table, read_table, table_file
-from omnibench.errors import ConfigError, DataError, nearest, require_type
+from omnibench.errors import DataError, nearest, require_type
 from omnibench.files import FileContent, TableFormat, encode_table, remove, resolved, write_files
 from omnibench.robot.kinematics import Array, Robot
 
-FORMAT: Final = "omnibench-dataset/1"
 _RUN_NUMBERS = ("started_at", "v", "alpha", "omega", "duration", "distance")
 _Rows = np.ndarray[Any, np.dtype[np.intp]]  # indices of rows of a table
 _COVARIANCE = ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
 
 
-class Header(Model):
-    """The content of dataset.yaml."""
+@dataclass(frozen=True, eq=False)
+class RecordedDataset:
+    """The content of a data set folder as it was recorded: headings are not unwrapped, and no units are checked."""
 
-    format: Literal["omnibench-dataset/1"] = FORMAT
-    name: str = Field(min_length=1)
-    description: str = ""
-    source: str = ""
-    licence: str = ""
-    simulated: bool = Field(False, description="true for simulated data")
-    robot: Robot
-    sample_period: Positive = Field(description="s")
-    wheels: tuple[str, ...] = Field(description="the wheels with a measured rate; column names: omega_<wheel>")
-    scanner: Scanner | None = Field(None, description="the scanner, if there are scans")
-
-    @model_validator(mode="after")
-    def _wheels_are_the_robots(self) -> Header:
-        if self.wheels != self.robot.wheel_names:
-            raise ValueError(
-                f"wheels are {', '.join(self.wheels)}, but the robot's wheels with a measured rate are "
-                f"{', '.join(self.robot.wheel_names)}; name the same wheels in the same order"
-            )
-        return self
+    header: Header
+    trajectories: list[Trajectory]
+    scans: ScansOnDisk | None
 
 
 def load_dataset(path: Path | str) -> Dataset:
@@ -59,8 +43,25 @@ def load_dataset(path: Path | str) -> Dataset:
 
     DataError names the file, the row (1 is the first after the header) and what is wrong.
     """
-    folder = Path(path)
-    header = _read_header(folder)
+    recorded = read_recorded(Path(path))
+    header = recorded.header
+    dataset = make_dataset(
+        header.name,
+        header.robot,
+        header.sample_period,
+        recorded.trajectories,
+        description=header.description,
+        source=header.source,
+        licence=header.licence,
+        simulated=header.simulated,
+        scans=recorded.scans,
+    )
+    return replace(dataset, imported=header.imported)
+
+
+def read_recorded(folder: Path) -> RecordedDataset:
+    """Read a data set folder and check its tables. DataError as for ``load_dataset``."""
+    header = read_header(folder)
     runs = read_table(folder, "trajectories", ("trajectory", "split"))
     rates = [f"omega_{wheel}" for wheel in header.wheels]
     wheels = read_table(folder, "wheels", ("trajectory", "t", *rates))
@@ -80,17 +81,7 @@ def load_dataset(path: Path | str) -> Dataset:
         _trajectory(row, samples, wheel_rows[index], reference, pose_rows[index], references.get(row["trajectory"]))
         for index, row in enumerate(runs.frame.iter_rows(named=True))
     ]
-    return make_dataset(
-        header.name,
-        header.robot,
-        header.sample_period,
-        trajectories,
-        description=header.description,
-        source=header.source,
-        licence=header.licence,
-        simulated=header.simulated,
-        scans=_scans(folder, header, [trajectory.id for trajectory in trajectories]),
-    )
+    return RecordedDataset(header, trajectories, _scans(folder, header, [trajectory.id for trajectory in trajectories]))
 
 
 def save_dataset(
@@ -128,7 +119,7 @@ def save_dataset(
         tables["poses"] = pl.concat(placed)
     if measured:
         tables[TABLE] = reference_frame(measured)
-    contents: dict[Path, FileContent] = {folder / "dataset.yaml": to_yaml(header_of(dataset)).encode()}
+    contents: dict[Path, FileContent] = {folder / "dataset.yaml": header_of(dataset).text.encode()}
     for name, frame in tables.items():
         # A column that only some trajectories have is left out of the sample tables, which may have no gaps.
         allowed = len(frame) - 1 if name in ("trajectories", TABLE) else 0
@@ -164,7 +155,7 @@ def _check_origin(folder: Path, dataset: Dataset) -> None:
     """DataError: the folder holds another data set."""
     if not (folder / "dataset.yaml").is_file():
         return
-    old = _read_header(folder)
+    old = read_header(folder)
     if (old.name, old.simulated) != (dataset.name, dataset.simulated):
         kind = "simulated " if old.simulated else ""
         raise DataError(f"{folder}: holds the {kind}data set {old.name!r}; name another folder, or overwrite=True")
@@ -183,6 +174,7 @@ def header_of(dataset: Dataset) -> Header:
         sample_period=dataset.sample_period,
         wheels=dataset.robot.wheel_names,
         scanner=None if scans is None else scans.scanner,
+        imported=dataset.imported,
     )
 
 
@@ -212,20 +204,6 @@ class _PoseColumns:
         self.poses = np.column_stack([table.numbers(column) for column in ("x", "y", "theta")])
         upper = table.stack([f"cov_{name}" for name in _COVARIANCE])
         self.covariances = None if upper is None else upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-
-
-def _read_header(folder: Path) -> Header:
-    if not folder.is_dir():
-        raise DataError(f"{folder}: no such folder; a data set is a folder with dataset.yaml in it")
-    file = folder / "dataset.yaml"
-    try:
-        content = read_yaml(file)
-        given = content.get("format") if isinstance(content, dict) else None
-        if given != FORMAT:
-            raise DataError(f"{file}: format is {given!r}, expected {FORMAT!r}")
-        return validate(Header, content, str(file))
-    except ConfigError as error:
-        raise DataError(str(error)) from None
 
 
 def _scans(folder: Path, header: Header, trajectories: Sequence[str]) -> ScansOnDisk | None:

@@ -9,6 +9,7 @@ from typing import Any
 
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset
+from omnibench.data.header import Imported
 from omnibench.data.importer import Importer
 from omnibench.errors import DataError
 from omnibench.registry import importers
@@ -21,13 +22,16 @@ def import_dataset(name: str, source: Path | str, options: Mapping[str, Any] | N
     options: the importer's, with those of SLAM under ``slam`` where the importer reads scans. UnknownNameError,
     ConfigError or DataError in one line.
     """
-    importer: Importer = importers.create(name, options)
-    slam = validate(SlamOptions, getattr(importer.options, "slam", {}), f"importer {name!r}: slam")
-    source = Path(source)
+    given, source = dict(options or {}), Path(source)
+    entry = importers.entry(name)
     if not source.exists():
         raise DataError(f"{source}: no such file or folder")
+    given = entry.cls.completed(given, source)
+    importer: Importer = importers.create(name, given)
+    slam = validate(SlamOptions, getattr(importer.options, "slam", {}), f"importer {name!r}: slam")
     recorded = importer.read(source)
-    return recorded if recorded.referenced else _with_reference_poses(recorded, slam, source)
+    dataset = recorded if recorded.referenced else _with_reference_poses(recorded, slam, source)
+    return replace(dataset, imported=Imported.of(name, source, options or {}))
 
 
 def _with_reference_poses(recorded: Dataset, options: SlamOptions, source: Path) -> Dataset:

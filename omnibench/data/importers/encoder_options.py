@@ -20,7 +20,7 @@ from omnibench.data.importers.encoder_counts import (
     recognised_wrap,
     turns_restored,
 )
-from omnibench.data.importers.recording_options import RecordingOptions
+from omnibench.data.importers.runs.reference_options import ReferenceOptions
 from omnibench.errors import DataError, nearest
 from omnibench.robot.kinematics import Array
 from omnibench.robot.wheels.fastest import fastest_rates
@@ -62,7 +62,7 @@ Offsets = Annotated[tuple[FiniteFloat, ...], BeforeValidator(_listed)]
 Wrap = Annotated[float | Literal["auto", "never"], BeforeValidator(_as_wrap)]
 
 
-class EncoderOptions(RecordingOptions, ABC):
+class EncoderOptions(ReferenceOptions, ABC):
     """What the encoders of wheels and of steering axles count. A subclass has the signs of the wheels."""
 
     wheel_unit: WheelUnit = Field(
@@ -163,6 +163,11 @@ class EncoderOptions(RecordingOptions, ABC):
             again = f"wheel positions begin again after {wrap:.10g} {self.wheel_unit}"
             _say(f"{again} and were counted on (wraps_at={wrap:.10g} says so)", warnings)
         return on if register is None else _restored(on, times, register, place, warnings)
+
+    @property
+    def steers_otherwise(self) -> bool:
+        """True if an option says how steering angles are to be read."""
+        return any(name.startswith("steering_") for name in self.model_fields_set - {"steering_columns"})
 
     def steering_angles(self, shown: Array, place: str, wheels: slice = _ALL) -> Array:
         """Steering angles (F, n), rad, of some steered wheels whose encoders show positions (F, n) in the unit.

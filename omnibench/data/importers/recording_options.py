@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 from pydantic import Field
 
 from omnibench.config import Positive
 from omnibench.data.alignment import median_period
-from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.data.dataset import Dataset, Split, Trajectory, make_dataset
 from omnibench.data.importers.robot_option import RobotOption
 from omnibench.data.scans import Scans
-from omnibench.data.splits import Names
+from omnibench.data.splits import Names, divided, remaining
 from omnibench.registry import Options
 
 
@@ -21,11 +21,34 @@ class RecordingOptions(Options):
     robot: RobotOption = Field(description="YAML file with name and wheels, see omnibench guide data; or a mapping")
     train: Names = Field((), description="patterns of run names that train")
     validation: Names = Field((), description="patterns of run names that validate")
+    leave_out: Names = Field((), description="patterns of the names of runs that are left out")
     sample_period: Positive | None = Field(None, description="s; default: the median of the wheel samples")
     name: str = Field("recording", min_length=1, description="name of the data set")
     description: str = Field("", description="description of the data set")
     source: str = Field("", description="origin of the recording")
     licence: str = Field("", description="licence of the recording")
+
+    def divided(
+        self,
+        runs: Sequence[Trajectory],
+        *,
+        otherwise: Sequence[Split] | None = None,
+        alike: Sequence[Hashable] | None = None,
+        kind: str = "run",
+    ) -> list[Trajectory]:
+        """The runs with their splits and repetitions, without those that are left out; as for ``splits.divided``."""
+        kept = list(range(len(runs)))
+        if self.leave_out:
+            names = remaining([run.id for run in runs], self.leave_out, kind)
+            kept = [index for index, run in enumerate(runs) if run.id in names]
+        return divided(
+            [runs[index] for index in kept],
+            self.train,
+            self.validation,
+            kind,
+            otherwise=None if otherwise is None else [otherwise[index] for index in kept],
+            alike=None if alike is None else [alike[index] for index in kept],
+        )
 
     def dataset(self, runs: Sequence[Trajectory], scans: Scans | None = None) -> Dataset:
         """The data set of these runs. DataError as for ``make_dataset``."""

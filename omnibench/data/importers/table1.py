@@ -18,7 +18,7 @@ from omnibench.data.importer import Importer
 from omnibench.data.importers.recording_options import RecordingOptions
 from omnibench.data.importers.robot_option import RobotOption
 from omnibench.data.scans import Scanner, ScansInMemory, TrajectoryScans
-from omnibench.data.splits import complete, divided
+from omnibench.data.splits import complete
 from omnibench.errors import DataError
 from omnibench.registry import importers
 from omnibench.robot.kinematics import Array, Robot, Wheel
@@ -96,7 +96,7 @@ class Table1(Importer):
         train, validation = self.options.train, self.options.validation
         by_folder = None if train or validation else _splits_by_folder([run.id for run in runs])
         alike = [(run.session, run.command) for run in runs]
-        runs = divided(complete(runs), train, validation, "trajectory", otherwise=by_folder, alike=alike)
+        runs = self.options.divided(complete(runs), otherwise=by_folder, alike=alike, kind="trajectory")
         if not scans:
             return self.options.dataset(runs)
         dataset = self.options.dataset(runs, ScansInMemory(self.options.scanner, scans))

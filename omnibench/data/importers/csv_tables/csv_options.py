@@ -9,6 +9,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from omnibench.config import Positive
 from omnibench.data.importers.encoder_options import EncoderOptions, Signs
+from omnibench.data.importers.runs.reference_options import HeadingUnit
 from omnibench.data.splits import Names
 from omnibench.errors import nearest
 from omnibench.words import plural
@@ -46,8 +47,7 @@ class CsvOptions(EncoderOptions):
     pose_columns: Names = Field(("x", "y", "theta"), description="of CSV poses")
     pose_time_column: Column | None = Field(None, description="of CSV poses; default t, or the wheels' in one file")
     pose_time_unit: TimeUnit | None = Field(None, description="of CSV poses; default s, or the wheels' in one file")
-    position_unit: Literal["m", "cm", "mm"] = Field("m", description="of CSV poses; TUM has m")
-    heading_unit: Literal["rad", "deg"] = Field("rad", description="of CSV poses")
+    heading_unit: HeadingUnit = Field("rad", description="unit of the headings of CSV poses")
     separator: Annotated[str, AfterValidator(_as_separator)] = Field(
         ",", min_length=1, description="a character, or blanks: white space between fields, comments from # on"
     )

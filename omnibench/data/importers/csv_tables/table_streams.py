@@ -11,6 +11,8 @@ import numpy as np
 from omnibench.data.alignment import median_period
 from omnibench.data.delimited import ColumnError, NumberTable, read_numbers
 from omnibench.data.importers.csv_tables.csv_options import BLANKS, CsvOptions
+from omnibench.data.importers.runs.reference_options import RADIANS
+from omnibench.data.importers.runs.reference_stream import ReferenceStream
 from omnibench.data.importers.tum import read_tum
 from omnibench.data.importers.wheel_samples import WheelReadings, WheelSamples, wheel_samples
 from omnibench.errors import DataError
@@ -18,7 +20,6 @@ from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _MOST_REPEATED = 0.5  # of a table's rows; more mean that its times are too coarse
 
 
@@ -38,18 +39,17 @@ def read_wheels(file: Path, options: CsvOptions, warnings: list[str]) -> WheelSa
     return samples
 
 
-def read_poses(file: Path, wheel_file: Path, options: CsvOptions, warnings: list[str]) -> tuple[Array, Array]:
+def read_poses(file: Path, wheel_file: Path, options: CsvOptions, warnings: list[str]) -> ReferenceStream:
+    """The reference poses of a run as the options say."""
     if file.suffix == ".tum":
         track = read_tum(file)
-        return track.times, track.poses
+        return ReferenceStream(track.times, track.poses).read_as(options)
     column, unit = (options.wheel_time_column, options.wheel_time_unit) if file == wheel_file else ("t", "s")
     column, unit = options.pose_time_column or column, options.pose_time_unit or unit
     keys = ("pose_time_column", "pose_columns")
     said = warnings if file != wheel_file else []  # of the same rows it was said
     table, times = _read(file, options, column, unit, options.pose_columns, keys, said)
-    metres = _METRES[options.position_unit]
-    heading = math.pi / 180 if options.heading_unit == "deg" else 1.0
-    return times, table.columns(options.pose_columns) * (metres, metres, heading)
+    return ReferenceStream(times, table.columns(options.pose_columns)).read_as(options, RADIANS[options.heading_unit])
 
 
 def _read(

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from omnibench.data.alignment import align
 from omnibench.data.dataset import Trajectory
 from omnibench.data.importers.rosbag.bag import Bag, Topic, open_bag
-from omnibench.data.importers.rosbag.cutting import Cut, Piece, between_rests, find_rests, from_cuts, windows
+from omnibench.data.importers.rosbag.cutting import Cut, Piece, between_rests, from_cuts, windows
 from omnibench.data.importers.rosbag.joint_streams import WheelStream, read_wheels
 from omnibench.data.importers.rosbag.message_streams import PoseStream, Stamps, header_stamp, read_poses
 from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
 from omnibench.data.importers.rosbag.scan_stream import RunScans, ScanStream, read_scans
 from omnibench.data.importers.rosbag.topic_choice import TRANSFORMS, joint_topics, pose_topic, scan_topic
 from omnibench.data.importers.rosbag.transform_poses import read_transforms
+from omnibench.data.importers.runs.cut_run import cut_run
+from omnibench.data.importers.runs.reference_stream import ReferenceStream
+from omnibench.data.importers.runs.rests import find_rests
+from omnibench.data.importers.runs.run_spans import Span, breaks, from_rest, parted
 from omnibench.data.importers.wheel_samples import Losses, WheelSamples, wheel_samples
 from omnibench.errors import DataError, one_line
-from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
 _SAME_TIME = 1e-9  # s, the resolution of the stamps
@@ -36,9 +39,7 @@ class Recording:
     place: str
     origin: int
     samples: WheelSamples
-    pose_times: Array
-    poses: Array
-    covariances: Array | None
+    poses: ReferenceStream
     cuts: tuple[Cut, ...]
     scans: ScanStream | None
     reference: Topic | None
@@ -82,16 +83,21 @@ def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list
         poses = PoseStream(scans.stamps, np.zeros((len(scans.stamps), 3)), None)
     place = f"{path}: topic {topic.name}"
     period = float(np.median(np.diff(wheels.readings.times)))
+    gap = options.longest_gap or wheels.longest_gap
     samples, losses = wheel_samples(
-        wheels.readings, options, place, period, longest_gap=wheels.longest_gap, still=options.still
+        wheels.readings,
+        options,
+        place,
+        period,
+        longest_gap=gap,
+        still=options.still,
     )
     warnings.extend(f"{place}: {loss}" for loss in _losses_in_words(losses))
     origin = int(wheels.stamps[0])
     # Exact to the nanosecond, which a double of unix time is not.
-    pose_times = (poses.stamps - origin) / 1e9
-    return Recording(
-        name, place, origin, samples, pose_times, poses.poses, poses.covariances, tuple(cuts), scans, reference
-    )
+    stream = ReferenceStream((poses.stamps - origin) / 1e9, poses.poses, poses.covariances)
+    stream = stream.read_as(options) if reference else stream
+    return Recording(name, place, origin, samples, stream, tuple(cuts), scans, reference)
 
 
 def cut_into_runs(recording: Recording, options: RosbagOptions, *, alone: bool = True) -> tuple[list[Run], list[str]]:
@@ -100,11 +106,15 @@ def cut_into_runs(recording: Recording, options: RosbagOptions, *, alone: bool =
     alone: the recording is the only one; then one without any rest is warned of, too.
     """
     runs: list[Run] = []
-    pieces = short = bare = uncut = 0
+    pieces = short = bare = uncut = driving = 0
+    at = breaks(recording.samples, recording.poses, options)
     for number, part in enumerate(recording.samples.stretches(), 1):
         session = recording.name if number == 1 or recording.samples.angles is None else f"{recording.name}#{number}"
-        for piece in _pieces(recording, part, options):
+        for piece in _unbroken(_pieces(recording, part, options), recording, part, at, options):
             pieces += 1
+            if piece is None:
+                driving += 1
+                continue
             uncut += (piece.begin, piece.end) == (recording.samples.begins[part][0], recording.samples.ends[part][-1])
             if piece.moving < options.least_run:
                 short += 1
@@ -119,8 +129,12 @@ def cut_into_runs(recording: Recording, options: RosbagOptions, *, alone: bool =
         reasons.append(f"{short} shorter than {options.least_run:g} s (least_run)")
     if bare:
         reasons.append(f"{bare} with fewer than two {'reference poses' if recording.referenced else 'scans'}")
+    if driving:
+        reasons.append(f"{driving} that never rest (start_at_rest)")
     if reasons:
-        return runs, [f"{recording.place}: {short + bare} of {plural(pieces, 'drive')} left out: {', '.join(reasons)}"]
+        return runs, [
+            f"{recording.place}: {short + bare + driving} of {plural(pieces, 'drive')} left out: {', '.join(reasons)}"
+        ]
     if not runs:
         return runs, [f"{recording.place}: {_nothing(options)}"]
     if alone and options.cut == "rests" and uncut == len(runs):
@@ -140,44 +154,49 @@ def _pieces(recording: Recording, part: slice, options: RosbagOptions) -> list[P
     span = (float(times[0]), float(times[-1]))
     if options.cut == "rests":
         rests = find_rests(times, angles, options.least_rest, options.still)
-        return between_rests(span, rests, recording.pose_times)
+        return between_rests(span, rests, recording.poses.times)
     if options.cut == "topic":
-        return from_cuts(times, angles, recording.cuts, recording.pose_times, options.still)
+        return from_cuts(times, angles, recording.cuts, recording.poses.times, options.still)
     return windows(span, options.window or span[1] - span[0])
 
 
+def _unbroken(
+    pieces: Sequence[Piece], recording: Recording, part: slice, at: Sequence[Span], options: RosbagOptions
+) -> Iterator[Piece | None]:
+    """The pieces without gaps and jumps, from rest on if wanted; None for those that never rest."""
+    for piece in pieces:
+        spans = list(parted((piece.begin, piece.end), at))
+        for span in spans:
+            begun: Span | None = span
+            if options.start_at_rest:
+                begun = from_rest(recording.samples, part, span, recording.poses.times)
+            moving, command = min(piece.moving, span[1] - span[0]), piece.command if len(spans) == 1 else None
+            yield None if begun is None else Piece(*begun, moving, command)
+
+
 def _run(recording: Recording, part: slice, piece: Piece, number: str, session: str) -> Run | None:
-    samples, times = recording.samples, recording.pose_times
+    samples, reference = recording.samples, recording.poses
     within = (samples.begins[part] < piece.end - _SAME_TIME) & (samples.ends[part] > piece.begin + _SAME_TIME)
-    chosen = part.start + np.flatnonzero(within)
     # From reference pose to reference pose: one interpolated within a drive would be wrong by the path's bend.
-    seen = (times >= piece.begin - _SAME_TIME) & (times <= piece.end + _SAME_TIME)
-    if seen.sum() < 2:
-        return None
-    aligned = align(float(samples.begins[chosen[0]]), samples.ends[chosen], times[seen], recording.poses[seen])
-    if aligned is None:
-        return None
-    kept = chosen[aligned.kept]
-    ends = samples.ends[kept] - aligned.zero
-    shown = np.searchsorted(times, aligned.pose_times + (aligned.zero - _SAME_TIME / 2))
-    scans = recording.scans
-    trajectory = Trajectory(
+    seen = (reference.times >= piece.begin - _SAME_TIME) & (reference.times <= piece.end + _SAME_TIME)
+    whole = Trajectory(
         id=number if piece.command is None else f"{number}-{piece.command}",
         split="train",
-        times=ends,
-        rates=samples.rates[kept],
-        pose_times=aligned.pose_times,
-        poses=aligned.poses,
+        times=samples.ends,
+        rates=samples.rates,
+        pose_times=reference.times,
+        poses=reference.poses,
         command=piece.command,
         session=session,
-        started_at=aligned.zero - float(samples.begins[0 if samples.angles is None else part.start]),
-        duration=float(ends[-1]),
-        angles=None if samples.angles is None else samples.angles[kept],
-        steering=None if samples.steering is None else samples.steering[kept],
-        pose_covariances=None if recording.covariances is None else recording.covariances[shown],
     )
-    seen_by = None if scans is None else scans.between(aligned.zero, aligned.zero + float(ends[-1]), recording.origin)
-    return Run(trajectory, seen_by)
+    cut = cut_run(whole, samples, part.start + np.flatnonzero(within), reference, seen)
+    if cut is None:
+        return None
+    started = cut.zero - float(samples.begins[0 if samples.angles is None else part.start])
+    run = replace(cut.trajectory, started_at=started)
+    scans = recording.scans
+    end = cut.zero + float(run.times[-1])
+    return Run(run, None if scans is None else scans.between(cut.zero, end, recording.origin))
 
 
 def _read_cuts(bag: Bag, topic: Topic, wheels: WheelStream) -> list[Cut]:

@@ -8,10 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from omnibench.data.importers.runs.rests import departure
 from omnibench.robot.kinematics import Array
 from omnibench.robot.planar import interpolated
-
-_KEPT_REST = 0.5  # s of rest that are kept before and after a run (chosen)
 
 
 @dataclass(frozen=True)
@@ -32,32 +31,6 @@ class Cut:
     command: str | None
 
 
-def find_rests(times: Array, angles: Array, least: float, turned: float) -> list[tuple[float, float]]:
-    """Rests as (begin, end), s: no wheel's angle leaves a range of ``turned`` rad for at least ``least`` s.
-
-    times (F + 1,): s. angles (F + 1, N): rad, at these times. The range is used and not the rate from sample to sample,
-    because one encoder tick within a short sample is a high rate.
-    """
-    # (first, last) indices of the shortest spans of that length from each time on, and up to each time.
-    every, enough = np.arange(len(times)), least * (1 - 1e-9)
-    on = np.column_stack([every, np.searchsorted(times, times + enough)])
-    back = np.column_stack([np.searchsorted(times, times - enough, side="right") - 1, every])
-    spans = np.vstack([on[on[:, 1] < len(times)], back[back[:, 0] >= 0]])
-    if not len(spans):
-        return []
-    # reduceat takes pairs (first, behind the last); every second result is that between two pairs.
-    pairs = (spans + np.array([0, 1])).ravel()
-    padded = np.vstack([angles, angles[-1:]])
-    ranges = np.maximum.reduceat(padded, pairs)[::2] - np.minimum.reduceat(padded, pairs)[::2]
-    quiet = spans[(ranges <= turned).all(axis=1)]
-    balance = np.zeros(len(times) + 1, dtype=int)
-    np.add.at(balance, quiet[:, 0], 1)
-    np.add.at(balance, quiet[:, 1], -1)
-    resting = np.cumsum(balance)[:-1] > 0  # (T,): the sample that begins at each time is at rest
-    steps = np.flatnonzero(np.diff(resting.astype(int), prepend=0, append=0))
-    return [(float(times[begin]), float(times[end])) for begin, end in zip(steps[::2], steps[1::2], strict=True)]
-
-
 def between_rests(span: tuple[float, float], rests: Sequence[tuple[float, float]], stamps: Array) -> list[Piece]:
     """The drives between rests, each with a little rest at both ends, from a reference pose to another.
 
@@ -70,7 +43,7 @@ def between_rests(span: tuple[float, float], rests: Sequence[tuple[float, float]
         edges = edges[:-1]
     pieces = []
     for before, after in pairwise(edges):
-        begin = _departure(before, before[0] > span[0], stamps)
+        begin = departure(before, before[0] > span[0], stamps)
         end = _arrival(after, after[1] < span[1], stamps)
         pieces.append(Piece(begin, end, after[0] - before[1]))
     return pieces
@@ -101,21 +74,10 @@ def from_cuts(times: Array, angles: Array, cuts: Sequence[Cut], stamps: Array, t
     return pieces
 
 
-def _departure(rest: tuple[float, float], shared: bool, stamps: Array) -> float:
-    """Begin of the run after a rest, s: at a reference pose of the rest, if it has one."""
-    begin, end = rest
-    target = max(end - _KEPT_REST, (begin + end) / 2 if shared else begin)
-    inside = stamps[(stamps >= begin) & (stamps <= end)]
-    if not len(inside):
-        return target
-    late = inside[inside >= target]
-    return float(late[0] if len(late) else inside[-1])
-
-
 def _arrival(rest: tuple[float, float], shared: bool, stamps: Array) -> float:
     """End of the run before a rest, s: at a reference pose of the rest, if it has one."""
     begin, end = rest
-    return -_departure((-end, -begin), shared, -stamps[::-1])
+    return -departure((-end, -begin), shared, -stamps[::-1])
 
 
 def _stood(times: Array, angles: Array, begin: float, end: float, turned: float) -> bool:

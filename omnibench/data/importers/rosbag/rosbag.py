@@ -14,7 +14,8 @@ from omnibench.data.importers.rosbag.bag_recording import cut_into_runs, read_re
 from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
 from omnibench.data.importers.rosbag.scan_stream import RunScans, gather_scans
 from omnibench.data.importers.rosbag.topic_choice import ODOMETRY, TRANSFORMS
-from omnibench.data.splits import complete, divided
+from omnibench.data.importers.runs.recorded_streams import RecordedStreams, by_one_clock
+from omnibench.data.splits import complete
 from omnibench.errors import DataError
 from omnibench.registry import importers
 from omnibench.robot.model import OdometryModel
@@ -69,8 +70,12 @@ class Rosbag(Importer):
         scans: dict[str, RunScans] = {}
         unreferenced: list[Path] = []
         doubtful: set[str] = set()
-        for name, path in bags.items():
-            recording = read_recording(path, name, self.options, warnings)
+        recordings = [read_recording(path, name, self.options, warnings) for name, path in bags.items()]
+        if all(recording.referenced for recording in recordings):
+            streams = [RecordedStreams(each.name, each.place, each.samples, each.poses) for each in recordings]
+            matched = by_one_clock(streams, self.options, warnings)
+            recordings = [replace(each, poses=one.reference) for each, one in zip(recordings, matched, strict=True)]
+        for (name, path), recording in zip(bags.items(), recordings, strict=True):
             if not recording.referenced:
                 unreferenced.append(path)
             elif recording.reference is not None and recording.reference.type in (ODOMETRY, TRANSFORMS):
@@ -91,7 +96,7 @@ class Rosbag(Importer):
             )
         if unreferenced:
             runs = self._with_placeholders(runs)
-        chosen = divided(complete(runs), self.options.train, self.options.validation)
+        chosen = self.options.divided(complete(runs))
         dataset = self.options.dataset(
             chosen, gather_scans({run.id: scans[run.id] for run in chosen if run.id in scans})
         )

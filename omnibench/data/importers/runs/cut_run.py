@@ -1,0 +1,58 @@
+"""A run cut from the streams of a recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.data.alignment import align
+from omnibench.data.dataset import Trajectory
+from omnibench.data.importers.runs.reference_stream import ReferenceStream
+from omnibench.data.importers.wheel_samples import WheelSamples
+
+_SAME_TIME = 1e-9  # s, the resolution of stamps
+
+
+@dataclass(frozen=True, eq=False)
+class CutRun:
+    """A run from t = 0 on, and the time of the recording that became its t = 0, s. kept: its samples' indices."""
+
+    trajectory: Trajectory
+    zero: float
+    kept: NDArray[np.intp]
+
+
+def cut_run(
+    whole: Trajectory,
+    samples: WheelSamples,
+    chosen: NDArray[np.intp],
+    reference: ReferenceStream,
+    seen: NDArray[np.bool_] | slice,
+) -> CutRun | None:
+    """The run of the chosen samples and the poses that were seen then; None if it has not two poses.
+
+    whole: the recording as a run, whose id, split and command are taken over; its arrays are replaced.
+    """
+    times, poses = reference.times[seen], reference.poses[seen]
+    if len(times) < 2:
+        return None
+    aligned = align(float(samples.begins[chosen[0]]), samples.ends[chosen], times, poses)
+    if aligned is None:
+        return None
+    kept = chosen[aligned.kept]
+    ends = samples.ends[kept] - aligned.zero
+    shown = np.searchsorted(reference.times, aligned.pose_times + (aligned.zero - _SAME_TIME / 2))
+    trajectory = replace(
+        whole,
+        times=ends,
+        rates=samples.rates[kept],
+        pose_times=aligned.pose_times,
+        poses=aligned.poses,
+        duration=float(ends[-1]),
+        angles=None if samples.angles is None else samples.angles[kept],
+        steering=None if samples.steering is None else samples.steering[kept],
+        pose_covariances=None if reference.covariances is None else reference.covariances[shown],
+    )
+    return CutRun(trajectory, aligned.zero, kept)
