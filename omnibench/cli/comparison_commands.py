@@ -5,7 +5,13 @@ from typing import Annotated
 
 import typer
 
-from omnibench.cli.options import Force, output_option
+from omnibench.cli.options import (
+    Figures,
+    Force,
+    output_option,
+    refuse_figures_without_browser,
+    write_asked_figures,
+)
 from omnibench.cli.terminal.console import make_console, print_ending, print_verdict, warn
 from omnibench.errors import ConfigError
 
@@ -25,6 +31,7 @@ def compare(
             "--data", metavar="[NAME=]PATH", help="Where the recordings of the config's data set NAME are on this disk."
         ),
     ] = None,
+    figures: Figures = None,
     force: Force = False,
     plugins: Annotated[
         list[Path] | None,
@@ -39,13 +46,19 @@ def compare(
     from omnibench.cli.terminal.comparison_tables import print_comparison_ending, print_result
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.compare.read_config import read_compare_config
+    from omnibench.compare.report.comparison_report import comparison_document
     from omnibench.compare.run import run_comparison
+    from omnibench.progress import Progress
 
+    refuse_figures_without_browser(figures)
     comparison = read_compare_config(config, _named_paths(data))
     folders = [*comparison.plugins, *(folder.resolve() for folder in plugins or [])]
     comparison = comparison.model_copy(update={"plugins": tuple(dict.fromkeys(folders))})
     with ProgressDisplay() as watch:
         result = run_comparison(comparison, output, watch, force=force)
+        if figures is not None:
+            watch(Progress("drawing the figures"))
+            write_asked_figures(comparison_document(result), figures)
     warn(result.warnings)
     print_result(make_console(), result)
     for name, entry in result.held_out.items():

@@ -7,7 +7,17 @@ from typing import Annotated
 
 import typer
 
-from omnibench.cli.options import DatasetFolder, Force, Json, Plugins, load_given_plugins, output_option
+from omnibench.cli.options import (
+    DatasetFolder,
+    Figures,
+    Force,
+    Json,
+    Plugins,
+    load_given_plugins,
+    output_option,
+    refuse_figures_without_browser,
+    write_asked_figures,
+)
 from omnibench.cli.terminal.console import make_console, print_json, warn
 
 discovery_app = typer.Typer()
@@ -29,6 +39,7 @@ def discover(
         typer.Option("--unknown-term", help="If no known effect fits, close the gap with a smooth function instead."),
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,
+    figures: Figures = None,
     force: Force = False,
     plugins: Plugins = None,
     as_json: Json = False,
@@ -40,14 +51,17 @@ def discover(
     """
     from omnibench.cli.terminal.discovery_summary import print_discovery
     from omnibench.cli.terminal.progress_display import ProgressDisplay
+    from omnibench.config import to_yaml
     from omnibench.data.storage import load_dataset
     from omnibench.discover.discover import discover_effects
     from omnibench.discover.output import DiscoverOptions, check_output, write_discovery
+    from omnibench.discover.report.discovery_report import discovery_report
     from omnibench.discover.result import discovery_document
     from omnibench.progress import Progress
     from omnibench.registry import effects
     from omnibench.robot.calibration import read_calibration
 
+    refuse_figures_without_browser(figures)
     load_given_plugins(plugins)
     for name in without or ():
         effects.entry(name, "--without")
@@ -73,6 +87,8 @@ def discover(
         )
         watch(Progress("writing the report"))
         folder = write_discovery(discovery, options, output, force=force)
+        if figures is not None:
+            write_asked_figures(discovery_report(discovery, to_yaml(options)), figures)
     warn(recordings.warnings)
     if as_json:
         return print_json(discovery_document(discovery, folder))

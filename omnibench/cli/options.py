@@ -14,6 +14,7 @@ from omnibench.cli.terminal.console import warn
 
 if TYPE_CHECKING:
     from omnibench.registry import PluginFailure
+    from omnibench.report.blocks import Document
 
 
 def output_option(text: str, **settings: Any) -> Any:
@@ -26,6 +27,14 @@ CalibrationFile = Annotated[Path, typer.Argument(help="Calibration file.")]
 WhichDataset = Annotated[str | None, typer.Option(help="Name of the data set, if the config has several.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output, and nothing else.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there already.")]
+Figures = Annotated[
+    Path | None,
+    typer.Option(
+        "--figures",
+        metavar="DIR",
+        help="Also write each figure of the report, as SVG and PNG (by Chromium or Chrome).",
+    ),
+]
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Set an option, its value in YAML; may be repeated."),
@@ -40,6 +49,23 @@ Plugins = Annotated[
         help="Folder of plug-ins; may be repeated. Default: ./plugins, if any; none: load none.",
     ),
 ]
+
+
+def refuse_figures_without_browser(folder: Path | None) -> None:
+    """DataError, before the work begins: figures are asked for, and nothing here can draw them."""
+    if folder is not None:
+        from omnibench.report.figure_files import browser
+
+        browser()
+
+
+def write_asked_figures(document: Document, folder: Path | None) -> None:
+    """Write the figures of a report to the folder of ``--figures``, if it was given, and say how many there are."""
+    if folder is not None:
+        from omnibench.report.figure_files import write_figures
+
+        names = write_figures(document, folder)
+        typer.echo(f"figures: {folder} ({len(names)}, each as SVG and PNG; the first: {names[0]}.svg)", err=True)
 
 
 def plugin_folders(given: Sequence[Path] | None) -> list[Path]:

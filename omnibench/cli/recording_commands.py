@@ -7,6 +7,7 @@ import typer
 
 from omnibench.cli.options import (
     DatasetFolder,
+    Figures,
     Force,
     Json,
     Plugins,
@@ -15,6 +16,8 @@ from omnibench.cli.options import (
     WhichDataset,
     load_given_plugins,
     output_option,
+    refuse_figures_without_browser,
+    write_asked_figures,
 )
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, warn
 from omnibench.errors import ConfigError
@@ -127,6 +130,7 @@ def design(
     output: Annotated[
         Path | None, output_option("Folder for report.html and design.json. Default: nothing is written.")
     ] = None,
+    figures: Figures = None,
     force: Force = False,
     plugins: Plugins = None,
     as_json: Json = False,
@@ -144,6 +148,7 @@ def design(
     from omnibench.files import refuse_existing, write_text
     from omnibench.report.render import write_document
 
+    refuse_figures_without_browser(figures)
     if output is not None:
         refuse_existing(output / "design.json", output / "report.html", force=force)
     load_given_plugins(plugins)
@@ -160,6 +165,7 @@ def design(
     if output is not None:
         write_text(output / "design.json", to_json(chosen) + "\n")
         write_document(design_document(chosen), output / "report.html")
+    write_asked_figures(design_document(chosen), figures)
     if as_json:
         return print_json(chosen)
     print_design(make_console(), chosen)
@@ -192,6 +198,7 @@ def slam(
     report: Annotated[
         Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of scans, paths and wheels.")
     ] = None,
+    figures: Figures = None,
     settings: Settings = None,
     table_format: TableFormat = "parquet",
     force: Force = False,
@@ -219,14 +226,17 @@ def slam(
         dataset, output, validate(SlamOptions, parse_settings(settings) | given, "slam --set"), model, truth, force
     )
     refuse_existing(report, force=force)
-    if output is None and report is None and not as_json:
+    refuse_figures_without_browser(figures)
+    if output is None and report is None and figures is None and not as_json:
         raise ConfigError("say where the poses go: -o DATASET; or ask for figures alone: --json, --report FILE.html")
     with ProgressDisplay() as watch:
         result = request.run(watch, table_format)
-        if report is not None:
+        if report is not None or figures is not None:
             watch(Progress("writing the report"))
             document = recording_document(result.dataset, truth=result.truth, accuracy=result.accuracy)
-            write_document(document, report)
+            write_asked_figures(document, figures)
+            if report is not None:
+                write_document(document, report)
     warn(result.summary.warnings)
     if as_json:
         return print_json(result.summary)
@@ -268,6 +278,7 @@ def simulate(
     report: Annotated[
         Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of the recording and the truth.")
     ] = None,
+    figures: Figures = None,
     force: Force = False,
     plugins: Plugins = None,
 ) -> None:
@@ -286,14 +297,18 @@ def simulate(
     hidden = tuple(effects or ())
     request = SimulationRequest(output, config, truth, dataset, hidden, like, model, noise, seed, force)
     refuse_existing(report, force=force)
+    refuse_figures_without_browser(figures)
     load_given_plugins([*(plugins or []), *request.plugins] or None)
     with ProgressDisplay() as watch:
         made = request.write(table_format, watch)
-        if report is not None:
+        if report is not None or figures is not None:
             watch(Progress("writing the report"))
             shown = made.simulation
             known: dict[str, Any] = {"truth": shown.paths, "plan": shown.plan, "starts": shown.starts} if shown else {}
-            write_document(recording_document(made.dataset, accuracy=made.accuracy, **known), report)
+            document = recording_document(made.dataset, accuracy=made.accuracy, **known)
+            write_asked_figures(document, figures)
+            if report is not None:
+                write_document(document, report)
     warn(made.dataset.warnings)
     if made.accuracy is not None:
         print_slam_accuracy(make_console(), made.accuracy)

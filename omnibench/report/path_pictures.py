@@ -1,4 +1,4 @@
-"""The picture that a report begins with: paths of a few runs by two models, beside the reference."""
+"""The picture that a report begins with: paths by two models beside the reference, and the ends of all runs."""
 
 from __future__ import annotations
 
@@ -7,78 +7,138 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
+import plotly.graph_objects as go
 
 from omnibench.data.dataset import Trajectory
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
-from omnibench.report.numbers import listing
+from omnibench.report.numbers import fixed, listing
 from omnibench.report.recording.drawing import REFERENCE_ITEM
+from omnibench.report.recording.runs import ON_THE_SPOT, kinds_of, motion_titles, spread
 from omnibench.report.recording.scan_points import evenly
-from omnibench.report.style import plan
+from omnibench.report.style import INK, THEORETICAL, plan, text
 from omnibench.report.traces import START, marks, path
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.planar import relative
 from omnibench.words import plural
 
-MOST_PICTURES = 3  # runs: as many as stand side by side
+DESIGN_ITEM = LegendItem("design", "design values", THEORETICAL, "dash")
 CALIBRATED = "#0072b2"
+Models = Sequence[tuple[LegendItem, OdometryModel]]
+_PATHS = 2  # runs whose paths are drawn: with the ends of all, as many pictures as stand side by side
+_WIDTHS = (3.2, 1.8)  # px: before is seen behind after
 _POINTS = 160  # points that a path is drawn with (chosen)
+_ENDS = 500  # ends that are drawn of each model (chosen: more cannot be told apart)
 _HEIGHT = 330  # px
 _LEAST_WINDOW = 0.1  # m: a smaller picture would magnify the reference's noise
+_TARGET = LegendItem("", "reference's end", INK, symbol="cross-thin-open")
 
 
-def paths_before_after(
-    runs: Mapping[str, Trajectory], models: Sequence[tuple[LegendItem, OdometryModel]], which: str
-) -> FigureGrid | None:
-    """Reference and odometry of at most three runs, side by side, on one scale in m; None without a run.
+def paths_before_after(runs: Sequence[Trajectory], models: Models, which: str) -> FigureGrid | None:
+    """Paths of two typical runs by the reference and two models, and the ends of all runs; None without a run.
 
-    runs: by titles. models: in the order in which they are drawn. which: the choice of the runs, a sentence.
+    models: before and after. which: the runs in words, such as ``held-out``.
     """
-    shown = dict(list(runs.items())[:MOST_PICTURES])
-    if not shown:
+    if not runs:
         return None
-    figures = tuple(_run(title, run, models) for title, run in shown.items())
+    ends = [_final_errors(model, runs) for _, model in models]
+    shown, choice = _typical(runs, ends)
+    figures = [_paths(title, run, models) for title, run in shown.items()]
+    figures.append(_all_ends(runs, ends, models, which))
     names = listing([item.label for item, _ in models])
-    caption = f"{which} Circle: start; dots: ends of reference and odometry. In the titles: distance of the end from "
-    caption += f"the reference's, by {names}." if len(models) == 1 else f"the reference's, by {names}, in this order."
-    items = (REFERENCE_ITEM, *(item for item, _ in models))
+    caption = f"{choice} Circle: start; dots: ends. In the titles: mean distance of the end from the reference's, and "
+    caption += f"turn between them, by {names}, in this order."
     columns: Literal[1, 2, 3] = 3 if len(figures) == 3 else 2 if len(figures) == 2 else 1
-    return FigureGrid(figures, items, columns, caption, "paths-before-after" if len(models) > 1 else "paths")
+    items = (REFERENCE_ITEM, *(item for item, _ in models))
+    return FigureGrid(tuple(figures), items, columns, caption, "paths-before-after")
 
 
-def choice_in_words(runs: Mapping[str, Trajectory]) -> str:
-    """How :func:`runs_with_paths` chose these runs."""
-    if not {"Straight", "Turning left", "Turning right"} & set(runs):
-        return f"{plural(len(runs), 'run')} of different motions"
-    return "Of each kind of motion the run that the design values miss by the median"
+def _final_errors(model: OdometryModel, runs: Sequence[Trajectory]) -> Array:
+    """Ends (Z, 3) by the odometry as seen from the reference's ends, m, m, rad."""
+    reported = model.reported([run.final_log for run in runs])
+    errors = np.array([_seen_from_end(run, poses[-1]) for run, poses in zip(runs, reported, strict=True)])
+    return errors.reshape(-1, 3)
 
 
-def _run(title: str, run: Trajectory, models: Sequence[tuple[LegendItem, OdometryModel]]) -> Figure:
+def _seen_from_end(run: Trajectory, pose: Array) -> Array:
+    """An end relative to the reference's, x and y along the axes of the run's start."""
+    error: Array = relative(run.start, pose) - relative(run.start, run.final_pose)
+    error[2] = pose[2] - run.final_pose[2]
+    return error
+
+
+def _typical(runs: Sequence[Trajectory], ends: Sequence[Array]) -> tuple[dict[str, Trajectory], str]:
+    """Two runs to draw by their titles, one of a kind of motion where kinds are known, and how they were chosen.
+
+    Of a kind it is the run whose error, m and rad as one length, falls by the median of its kind.
+    """
+    gains = np.linalg.norm(ends[0], axis=1) - np.linalg.norm(ends[-1], axis=1)
+    gain_of = {run.id: float(gain) for run, gain in zip(runs, gains, strict=True)}
+    drawn = [run for run in runs if len(run.poses) > 1]
+    kinds = {kind: like for kind, like in kinds_of(drawn).items() if kind != ON_THE_SPOT}
+    if len(kinds) < _PATHS:
+        chosen = spread(drawn, _PATHS) if drawn else []
+        return motion_titles(chosen), f"{plural(len(chosen), 'run')} of different motions." if chosen else ""
+    medians = {kind: _median(like, gain_of) for kind, like in kinds.items()}
+    largest = sorted(medians, key=lambda kind: gain_of[medians[kind].id], reverse=True)[:_PATHS]
+    words = "Of each kind of motion the run whose error falls by the median of its kind."
+    return {f"{kind[0].upper()}{kind[1:]}": run for kind, run in medians.items() if kind in largest}, words
+
+
+def _median(runs: Sequence[Trajectory], value: Mapping[str, float]) -> Trajectory:
+    return sorted(runs, key=lambda run: value[run.id])[(len(runs) - 1) // 2]
+
+
+def _paths(title: str, run: Trajectory, models: Models) -> Figure:
     reference = run.poses[evenly(len(run.poses), 2 * _POINTS)]
-    stamps = np.linspace(0.0, max(run.pose_times[-1], run.times[-1]), _POINTS)
+    stamps = np.linspace(0.0, run.pose_times[-1], _POINTS)
     traces = [path(REFERENCE_ITEM, reference, 3.5), marks(REFERENCE_ITEM, 8, *reference[-1:, :2].T)]
-    drawn, ends = [reference[:, :2]], []
-    for item, model in models:
-        (poses,) = model.poses([run.log(stamps)])
-        traces += [path(item, poses, 2.2), marks(item, 8, *poses[-1:, :2].T)]
+    drawn, words = [reference[:, :2]], []
+    for (item, model), width in zip(models, _WIDTHS, strict=False):
+        (poses,) = model.reported([run.log(stamps)])
+        traces += [path(item, poses, width), marks(item, 8, *poses[-1:, :2].T)]
         drawn.append(poses[:, :2])
-        (end,) = model.poses([run.final_log])
-        ends.append(math.hypot(*(end[-1, :2] - run.final_pose[:2])))
+        words.append(_error_in_words(_seen_from_end(run, poses[-1])[None]))
     traces.append(marks(START, 9, *run.start[None, :2].T, hover="start"))
-    words = " → ".join(_length(end) for end in ends)
-    window = _window(np.vstack(drawn))
-    figure = plan(*traces, window=window)
+    points = np.vstack(drawn)
+    middle = (np.nanmin(points, axis=0) + np.nanmax(points, axis=0)) / 2
+    figure = plan(*traces, window=_window(points, middle))
+    return _compact(f"{title}: {' → '.join(words)}", figure, "Paths of a run: reference and odometry, x and y in m")
+
+
+def _all_ends(runs: Sequence[Trajectory], ends: Sequence[Array], models: Models, which: str) -> Figure:
+    """The ends of all runs by both models about the reference's."""
+    picks = evenly(len(runs), _ENDS)
+    names = [runs[index].id for index in picks]
+    traces = []
+    for (item, _), errors in zip(models, ends, strict=True):
+        at = 1e3 * errors[picks, :2]
+        hover = f"%{{text}}, {text(item.label)}<br>%{{x:.0f}} mm, %{{y:.0f}} mm"
+        traces.append(marks(item, 6, *at.T, hover=hover, words=names, marker_opacity=0.65))
+    traces.append(marks(_TARGET, 14, [0.0], [0.0], hover="the reference's end", marker_line_width=2.5))
+    axes = {"x_title": "ahead of the reference (mm)", "y_title": "left of it (mm)"}
+    drawn = np.vstack([np.zeros((1, 2)), *(1e3 * errors[picks, :2] for errors in ends)])
+    figure = plan(*traces, window=_window(drawn, np.zeros(2)), **axes)
+    words = " → ".join(map(_error_in_words, ends))
+    title = f"Ends of {f'all {len(runs)}' if len(runs) > 1 else 'the'} {which} {'runs' if len(runs) > 1 else 'run'}"
+    return _compact(f"{title}: {words}", figure, "Ends of the runs by both models about the reference's, in mm")
+
+
+def _compact(title: str, figure: go.Figure, description: str) -> Figure:
     figure.update_layout(margin={"l": 48, "r": 10, "t": 8, "b": 44})
-    description = f"Paths of a run ({title}): reference and odometry, x and y in m; at the end {words} from it"
-    return Figure(f"{title}: {words}", figure, description, _HEIGHT)
+    return Figure(title, figure, f"{title}. {description}", _HEIGHT)
 
 
-def _window(points: Array) -> Array:
-    """A square window (2, 2) about the points, m, with a margin."""
-    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    half = 0.56 * max(float((high - low).max()), _LEAST_WINDOW)
-    window: Array = ((low + high) / 2)[:, None] + half * np.array([[-1.0, 1.0]] * 2)
+def _window(points: Array, middle: Array) -> Array:
+    """A square window (2, 2) about a middle that holds the points, with a margin."""
+    reach = np.nanmax(np.abs(points - middle), initial=_LEAST_WINDOW / 2)
+    window: Array = middle[:, None] + 1.12 * float(reach) * np.array([[-1.0, 1.0]] * 2)
     return window
 
 
-def _length(metres: float) -> str:
-    return f"{1e3 * metres:.0f} mm" if metres < 1 else f"{metres:.2f} m"
+def _error_in_words(errors: Array) -> str:
+    """The mean of final errors (n, 3), such as ``84 mm, 5.1°``."""
+    distance = float(np.hypot(errors[:, 0], errors[:, 1]).mean())
+    turned = math.degrees(float(np.abs(errors[:, 2]).mean()))
+    words = f"{1e3 * distance:.0f} mm" if distance < 1 else f"{distance:.2f} m"
+    return f"{words}, {fixed(turned, 1)}°".replace(" ", "\N{NO-BREAK SPACE}")

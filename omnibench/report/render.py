@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,11 @@ def render(document: Document) -> str:
     template = _environment(Glossary()).get_template("report.html.j2")
     footer = f"omnibench {package_versions().get('omnibench', '')}, written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
     return template.render(document=document, plot_options=_json(_PLOT_OPTIONS), footer=footer)
+
+
+def figures_page(grids: Sequence[Mapping[str, Any]]) -> str:
+    """A page whose scripts draw grids of figures as pictures; figures.js says what it reads of each."""
+    return _environment(Glossary()).get_template("figures.html.j2").render(grids=grids)
 
 
 def _environment(glossary: Glossary) -> Environment:

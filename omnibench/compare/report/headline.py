@@ -21,8 +21,7 @@ from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.report.blocks import Block, Callout, Fact, FigureGrid, LegendItem, Paragraph, Section, answer_section
 from omnibench.report.numbers import fixed, listing, percent, span
-from omnibench.report.path_pictures import CALIBRATED, choice_in_words, paths_before_after
-from omnibench.report.recording.runs import runs_with_paths
+from omnibench.report.path_pictures import CALIBRATED, paths_before_after
 from omnibench.words import plural
 
 _ARRIVED = 0.01  # relative: a search whose training cost is further above the lowest one missed the minimum (chosen)
@@ -46,14 +45,13 @@ def answer_of(view: DatasetView) -> Section:
 
 def path_picture(view: DatasetView) -> FigureGrid | None:
     """Paths of a few runs of the scored split: reference, design values and the best calibration."""
-    runs = runs_with_paths(view.dataset.split(view.scored), view.dataset.robot)
     models = [(THEORETICAL_STYLE, view.model(view.design_matrix))]
     best = view.best
     if best is not None and best.calibrator != THEORETICAL_NAME and best.typical is not None:
         matrix = best.typical.matrix
         if matrix is not None:
             models.append((LegendItem("calibrated", f"calibrated by {best.label}", CALIBRATED), view.model(matrix)))
-    return paths_before_after(runs, models, f"{choice_in_words(runs)}, from the {SPLIT_NAMES[view.scored]} runs.")
+    return paths_before_after(view.dataset.split(view.scored), models, SPLIT_NAMES[view.scored])
 
 
 def _held_out(view: DatasetView) -> tuple[Block, ...]:

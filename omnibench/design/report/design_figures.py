@@ -29,6 +29,7 @@ _BASELINE = LegendItem("", "baseline", QUIET, symbol="diamond")
 # seems to turn by 0.1 to 2.7 degrees in six straight runs: five are drawn as straight, three with half of it and six
 # with twice (tests/benchmarks/constants_fit.py).
 _STRAIGHT_BELOW = math.radians(2)
+_HEIGHT = 380  # px: the paths end within the first 900 of the page
 _ROW_DASHES: tuple[Dash, ...] = ("solid", "dash", "dot")
 
 
@@ -42,7 +43,7 @@ def path_figures(design: Design) -> FigureGrid:
             + ", ".join(
                 f"{command_in_words(design.candidate(chosen.command))} {chosen.runs}x" for chosen in of_set.chosen
             ),
-            560,
+            _HEIGHT,
         )
         for of_set in design.sets
     )
@@ -52,6 +53,7 @@ def path_figures(design: Design) -> FigureGrid:
         2 if len(figures) > 1 else 1,
         "All paths start at the origin, heading along x, and end at the dot. The more often a command is driven, the "
         "wider its line (and its number stands at its end). Turns on the spot are arcs about the origin.",
+        "what-to-drive",
     )
 
 

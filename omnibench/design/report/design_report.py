@@ -26,6 +26,7 @@ from omnibench.report.blocks import (
     Facts,
     Paragraph,
     Section,
+    answer_section,
     simulated_badge,
 )
 from omnibench.report.numbers import listing, percent, significant
@@ -38,11 +39,29 @@ def design_document(design: Design) -> Document:
         title=f"Which commands are worth driving: {design.name}",
         subtitle=design.description,
         sections=(
-            Section("result", "Result", _result(design)),
+            _answer(design),
             Section("commands", "Chosen commands", _commands(design)),
-            Section("precision", "Precision against runs", (precision_figures(design), promise_table(design))),
-            Section("efficiency", "Efficiency against the bound", (efficiency_figure(design),)),
-            Section("basis", "What this rests on", _basis(design)),
+            Section(
+                "precision",
+                "Precision against runs",
+                (precision_figures(design), promise_table(design), equal_table(design)),
+                about="How well the matrix is known after so many runs, beside the baseline.",
+                folded=True,
+            ),
+            Section(
+                "efficiency",
+                "Efficiency against the bound",
+                (efficiency_figure(design),),
+                about="How near the chosen runs are to the best that any choice could reach.",
+                folded=True,
+            ),
+            Section(
+                "basis",
+                "What this rests on",
+                _basis(design),
+                about="Candidates, noise and source.",
+                folded=True,
+            ),
         ),
         badges=_badges(design),
     )
@@ -54,7 +73,8 @@ def _badges(design: Design) -> tuple[Badge, ...]:
     return simulated_badge(design.simulated)
 
 
-def _result(design: Design) -> tuple[Block, ...]:
+def _answer(design: Design) -> Section:
+    """The section with the answer: what to drive, in words and as a picture of the paths."""
     tiles = []
     for of_set in design.sets:
         equal = next(equal for equal in of_set.equivalents if equal.use == design.use)
@@ -71,16 +91,12 @@ def _result(design: Design) -> tuple[Block, ...]:
                 "" if effort is None else f"{duration_in_words(effort.seconds)} of driving",
             ),
         ]
-    return (
-        Paragraph(headline(design), "lead"),
-        Facts(tuple(tiles), "tiles"),
-        equal_table(design),
-        Callout("Before you read on", design.notes),
-    )
+    notes = Callout("Before you rely on it", design.notes)
+    return answer_section(headline(design), tiles, path_figures(design), notes)
 
 
 def _commands(design: Design) -> tuple[Block, ...]:
-    blocks: list[Block] = [path_figures(design)]
+    blocks: list[Block] = []
     for of_set in design.sets:
         blocks += [
             Paragraph(f"{of_set.name}: {choice_in_words(design, of_set)}"),

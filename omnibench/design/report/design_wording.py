@@ -109,7 +109,8 @@ def headline(design: Design) -> str:
 
 def _verdict(design: Design, of_set: SetDesign) -> str:
     equal = next(equal for equal in of_set.equivalents if equal.use == design.use)
-    words = f"{of_set.name}: {plural(of_set.step.effort.runs, 'run')} of {plural(len(of_set.chosen), 'command')} give "
+    runs, chosen = plural(of_set.step.effort.runs, "run"), plural(len(of_set.chosen), "command")
+    words = f"{of_set.name}: drive {runs} of {chosen}; together they give "
     if of_set.reached:
         commands = f"{len(of_set.commands)} {noun_for(len(of_set.commands), 'command')}"
         words += f"as much information per {design.per} as the best design from {commands}, within 1 %"

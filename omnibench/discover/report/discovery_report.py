@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
+from omnibench.discover.report.before_after import ALONE, EXTENDED, PLAIN
 from omnibench.discover.report.evidence_figures import CANDIDATES, GAPS, drawn, hidden_grid
 from omnibench.discover.report.tables import (
     absorbed_table,
@@ -20,6 +22,7 @@ from omnibench.discover.report.tables import (
 from omnibench.discover.report.where_section import where_section
 from omnibench.discover.report.wording import (
     STAGES,
+    answer_in_words,
     closed_in_words,
     decisive,
     effect_in_words,
@@ -29,7 +32,6 @@ from omnibench.discover.report.wording import (
     gap_in_words,
     held_out_in_words,
     noise_in_words,
-    parameter_in_words,
     verdict_at_length,
     verdict_in_words,
     weight_in_words,
@@ -44,11 +46,16 @@ from omnibench.report.blocks import (
     Document,
     Fact,
     Facts,
+    FigureGrid,
+    LegendItem,
     Paragraph,
     Section,
+    answer_section,
     simulated_badge,
 )
 from omnibench.report.numbers import count, fixed, listing
+from omnibench.report.path_pictures import DESIGN_ITEM, paths_before_after
+from omnibench.robot.model import OdometryModel
 from omnibench.words import plural
 
 
@@ -59,50 +66,71 @@ def discovery_report(discovery: Discovery, options: str) -> Document:
         title=f"What the odometry model lacks: {dataset.name}",
         subtitle=dataset.description,
         sections=(
-            Section("answer", "Answer", tuple(_answer(discovery))),
-            where_section(discovery),
-            Section("what", "What", tuple(what_blocks(discovery))),
-            Section("sure", "How sure", tuple(sure_blocks(discovery))),
-            Section("better", better, tuple(_how_much_better(discovery))),
-            Section("basis", "What this rests on", tuple(_basis(discovery, options))),
+            _answer(discovery),
+            Section("what", "What", tuple(what_blocks(discovery)), about="What is missing, with its parameters."),
+            _folded("better", better, "Errors before and after, on held-out runs.", _how_much_better(discovery)),
+            replace(where_section(discovery), about="What the errors of the plain matrix depend on.", folded=True),
+            _folded("sure", "How sure", "Rivals of the name, and what could still hide.", sure_blocks(discovery)),
+            _folded("basis", "What this rests on", "Data, noise, options and files.", _basis(discovery, options)),
         ),
         badges=simulated_badge(dataset.simulated),
     )
 
 
-def _answer(discovery: Discovery) -> Iterator[Block]:
-    """The answer in words and figures, and its warnings."""
-    yield Paragraph(discovery.headline, "lead")
-    yield Facts(tuple(_tiles(discovery)), "tiles")
-    yield Callout(
-        "Motions that the training runs never had", extrapolations_in_words(discovery.extrapolations), "warning"
+def _folded(key: str, title: str, about: str, blocks: Iterator[Block]) -> Section:
+    return Section(key, title, tuple(blocks), about=about, folded=True)
+
+
+def _answer(discovery: Discovery) -> Section:
+    """The section with the answer: what was gained and the cause, paths before and after, and the warnings."""
+    new_motions = extrapolations_in_words(discovery.extrapolations)
+    return answer_section(
+        answer_in_words(discovery),
+        tuple(_tiles(discovery)),
+        _picture(discovery),
+        Paragraph(discovery.headline),
+        Callout("Motions that the training runs never had", new_motions, "warning"),
+        Callout("Before you rely on it", discovery.notes),
     )
-    yield Callout("Before you read on", discovery.notes)
+
+
+def _picture(discovery: Discovery) -> FigureGrid | None:
+    """Paths of a few held-out runs, or of training runs where none are held out, by both models."""
+    dataset, training = discovery.dataset, set(discovery.trajectories)
+    held_out = [run for run in dataset.trajectories if run.id not in training]
+    plain = discovery.plain.model
+    models: list[tuple[LegendItem, OdometryModel]] = [(PLAIN, plain), (EXTENDED, discovery.extended.model)]
+    if not discovery.extends:
+        models = [(DESIGN_ITEM, OdometryModel.of_design(dataset.robot, plain.integration)), (ALONE, plain)]
+    return paths_before_after(held_out or dataset.trajectories, models, "held-out" if held_out else "training")
 
 
 def _tiles(discovery: Discovery) -> Iterator[Fact]:
+    held = decisive(discovery)
+    if held is not None:
+        position, heading = final_errors_in_words(discovery, held)
+        where = f"{held_out_in_words(discovery, held)}, {plural(held.runs, 'run')}"
+        yield Fact("Final position error, mean", position, where)
+        yield Fact("Final heading error, mean", heading, where)
+        yield _gap_fact(discovery, held.eq6, where)
+    else:
+        yield _gap_fact(discovery, discovery.gap, f"training runs, {gap_in_words(discovery.gap)}")
+    yield Fact("Cause" if discovery.effects else "Verdict", *_cause(discovery))
+
+
+def _cause(discovery: Discovery) -> tuple[str, str]:
+    """The name of what is missing, and the verdict with the weight of the name."""
     sessions = ", sessions not compared" if discovery.sessions.doubts else ""
     sessions = ", sessions differ" if discovery.sessions.differences else sessions
-    yield Fact("Verdict", f"{discovery.verdict}{sessions}", verdict_in_words(discovery))
-    for effect in discovery.effects:
-        values = "; ".join(parameter_in_words(each) for each in effect.parameters[:2])
-        more = f" and {len(effect.parameters) - 2} more" if len(effect.parameters) > 2 else ""
-        others = [name.replace("_", " ") for name in effect.confusable_with if name != effect.name]
-        alike = f"or as well: {listing(others)}; " if len(others) > 1 else ""
-        yield Fact(
-            f"{effect.stage}, weight {weight_in_words(effect.weight)}",
-            f"{effect.name.replace('_', ' ')} or {len(others)} others" if alike else _spaced(effect),
-            alike + values + more,
-        )
-    held = decisive(discovery)
-    if held is None:
-        yield _gap_fact(discovery, discovery.gap, f"training runs, {gap_in_words(discovery.gap)}")
-        return
-    position, heading = final_errors_in_words(discovery, held)
-    where = f"{held_out_in_words(discovery, held)}, {plural(held.runs, 'run')}"
-    yield Fact("Final position error, mean", position, where)
-    yield Fact("Final heading error, mean", heading, where)
-    yield _gap_fact(discovery, held.eq6, where)
+    verdict = f"{verdict_in_words(discovery)}{sessions}"
+    if not discovery.effects:
+        return discovery.verdict, verdict
+    first, *more = discovery.effects
+    others = [name for name in first.confusable_with if name != first.name]
+    name = first.name.replace("_", " ")
+    name += f" or {len(others)} others" if len(others) > 1 else f" or {others[0].replace('_', ' ')}" if others else ""
+    name += f", and {len(more)} more" if more else ""
+    return name, f"{verdict}; weight of the name {weight_in_words(first.weight)}"
 
 
 def _spaced(effect: NamedEffect) -> str:

@@ -18,7 +18,8 @@ from omnibench.discover.result import (
     Step,
     Verdict,
 )
-from omnibench.report.numbers import NOTHING, decimals_for, fixed, percent, significant, span
+from omnibench.registry import effects
+from omnibench.report.numbers import NOTHING, decimals_for, fixed, listing, percent, significant, span
 from omnibench.robot.calibration import Noise
 from omnibench.robot.effects.effect import Stage
 from omnibench.words import plural
@@ -146,6 +147,30 @@ def verdict_at_length(discovery: Discovery) -> str:
 def added(step: Step) -> str:
     """The name of the effect that a step added."""
     return step.name.removeprefix("+ ")
+
+
+def answer_in_words(discovery: Discovery) -> str:
+    """The cause in plain words and what was gained on held-out runs; without a cause, the headline."""
+    if not discovery.effects or not discovery.extends:
+        return discovery.headline
+    causes = " Also: ".join(f"{_cause_in_words(effect)}." for effect in discovery.effects)
+    held = decisive(discovery)
+    if held is None:
+        return f"{causes} No run was held out to show what that gains."
+    before, after = (
+        f"{1e3 * position:.0f} mm and {math.degrees(heading):.1f}°"
+        for position, heading in zip(held.position_m, held.heading_rad, strict=True)
+    )
+    return f"{causes} With it in the model, the held-out error goes from {before} to {after}."
+
+
+def _cause_in_words(effect: NamedEffect) -> str:
+    """What an effect does to the robot, its name, and the names that the data cannot tell from it."""
+    entry = effects.entry(effect.name)
+    what = entry.summary.partition(":")[0].rstrip(".") if entry.cls.in_catalogue else "Something that has no name"
+    others = [name.replace("_", " ") for name in effect.confusable_with if name != effect.name]
+    alike = f"; it may as well be {listing(others, 3)}" if others else ""
+    return f"{what} ({effect.name.replace('_', ' ')}{alike})"
 
 
 def weight_in_words(weight: float) -> str:

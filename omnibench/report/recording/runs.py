@@ -10,7 +10,6 @@ import numpy as np
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.report.motions import motion_in_words
 from omnibench.report.numbers import fixed
-from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
 
 _SHOWN = 4  # runs, where kinds of motion are not known
@@ -38,30 +37,18 @@ def representative_runs(dataset: Dataset) -> dict[str, Trajectory]:
     if dataset.scans is not None:
         scanned = set(dataset.scans.trajectories)
         runs = [run for run in runs if run.id in scanned]
-    by_kind = typical_runs(runs, dataset.robot)
+    design = OdometryModel.of_design(dataset.robot, "arc")
+    by_kind = {kind: _of_median_error(like, design) for kind, like in kinds_of(runs).items()}
     if len(by_kind) > 1:
         return {f"{kind}: {describe(run)}": run for kind, run in by_kind.items()}
     return {describe(run): run for run in spread(runs)}
 
 
-def runs_with_paths(runs: Sequence[Trajectory], robot: Robot) -> dict[str, Trajectory]:
-    """A few runs whose paths can be drawn, by what they drive: one of each kind of motion, or a spread of all."""
-    drawn = [run for run in runs if len(run.poses) > 1]
-    by_kind = {kind: run for kind, run in typical_runs(drawn, robot).items() if kind != ON_THE_SPOT}
-    if len(by_kind) > 1:
-        return {f"{kind[0].upper()}{kind[1:]}": run for kind, run in by_kind.items()}
-    first = {run.command or run.session or run.id: run for run in reversed(drawn)}
-    several = list(first.values())[::-1] if len(first) > 2 else drawn
-    chosen = spread(several, 3) if several else []
-    words = [motion_in_words(run.id, run.v, run.alpha, run.omega) for run in chosen]
+def motion_titles(runs: Sequence[Trajectory]) -> dict[str, Trajectory]:
+    """Runs by their motions in words, with their names where motions are not known or alike."""
+    words = [motion_in_words(run.id, run.v, run.alpha, run.omega) for run in runs]
     unique = len(set(words)) == len(words)
-    return {name if unique else f"{name}, {run.id}": run for name, run in zip(words, chosen, strict=True)}
-
-
-def typical_runs(runs: Sequence[Trajectory], robot: Robot) -> dict[str, Trajectory]:
-    """The run of each kind of commanded motion whose final position error by the design odometry is the median."""
-    design = OdometryModel.of_design(robot, "arc")
-    return {kind: _of_median_error(like, design) for kind, like in _kinds(runs).items()}
+    return {name if unique else f"{name}, {run.id}": run for name, run in zip(words, runs, strict=True)}
 
 
 def spread(runs: Sequence[Trajectory], number: int = _SHOWN) -> list[Trajectory]:
@@ -70,7 +57,7 @@ def spread(runs: Sequence[Trajectory], number: int = _SHOWN) -> list[Trajectory]
     return [runs[index] for index in picks]
 
 
-def _kinds(runs: Sequence[Trajectory]) -> dict[str, list[Trajectory]]:
+def kinds_of(runs: Sequence[Trajectory]) -> dict[str, list[Trajectory]]:
     """The runs of each kind of commanded motion; of turning ones only those at the highest rate."""
     kinds: dict[str, list[Trajectory]] = {"straight": [], "turning left": [], "turning right": [], ON_THE_SPOT: []}
     for run in runs:

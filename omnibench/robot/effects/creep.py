@@ -20,7 +20,7 @@ def _smooth_sign(rates: Array) -> Array:
 
 @effects.register("wheel_dead_zone")
 class WheelDeadZone(MotionEffect):
-    """A constant rate is lost or gained in the direction of rotation: omega + c sign(omega)."""
+    """Every wheel that turns loses or gains a constant rate: omega + c sign(omega)."""
 
     stage = "wheel"
     physics = "Play in the drive and dry friction of the rollers take a constant rate off every wheel that turns."
@@ -34,7 +34,7 @@ class WheelDeadZone(MotionEffect):
 
 @effects.register("coulomb_creep")
 class CoulombCreep(MotionEffect):
-    """A rate in proportion to the robot's speed, against each wheel's rotation: omega + c sign(omega) abs(v) / r."""
+    """Every wheel that turns loses a rate in proportion to the robot's speed: omega + c sign(omega) abs(v) / r."""
 
     stage = "wheel"
     physics = "Rollers drag with a friction that does not depend on their speed, and the wheels creep against it."

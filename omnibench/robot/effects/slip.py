@@ -77,7 +77,7 @@ class LoadTransfer(MotionEffect):
 
 @effects.register("rotation_translation_coupling")
 class RotationTranslationCoupling(MotionEffect):
-    """The rate of turn depends on the velocity meanwhile: w (1 + k.v)."""
+    """The robot turns faster or slower the faster it drives: w (1 + k.v)."""
 
     stage = "body"
     physics = "Rollers that already slide along their axles give way more easily when the robot turns."
