@@ -15,6 +15,7 @@ _PUBLIC = {
     "References": "data.references.run_references",
     "Robot": "robot.kinematics",
     "Trajectory": "data.dataset",
+    "Wheel": "robot.wheels.wheel",
     "calibrate": "fit.calibrate",
     "certify_optimum": "fit.certify",
     "design_experiment": "design.design",
@@ -25,29 +26,36 @@ _PUBLIC = {
     "inspect_dataset": "fit.inspect",
     "load_dataset": "data.storage",
     "load_plugins": "registry",
-    "make_dataset": "data.dataset",
+    "make_dataset": "data.tables.dataset_tables",
+    "odometry": "robot.dead_reckoning",
     "read_calibration": "robot.calibration",
     "read_compare_config": "compare.read_config",
     "read_live_config": "live.config",
     "read_simulation": "simulate.source",
+    "read_tum": "data.importers.tum",
     "run_comparison": "compare.run",
     "save_dataset": "data.storage",
     "simulate_dataset": "simulate.simulate",
     "subscribe": "live.wire.subscriber",
     "write_calibration": "robot.calibration",
+    "write_tum": "data.importers.tum",
 }
 __all__ = list(_PUBLIC)
+
+__version__: str  # of the installed package, "unknown" in a folder of source files that is not installed
 
 if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py holds them equal to the list
     from omnibench.compare.read_config import read_compare_config as read_compare_config
     from omnibench.compare.run import run_comparison as run_comparison
     from omnibench.data.dataset import Dataset as Dataset
     from omnibench.data.dataset import Trajectory as Trajectory
-    from omnibench.data.dataset import make_dataset as make_dataset
+    from omnibench.data.importers.tum import read_tum as read_tum
+    from omnibench.data.importers.tum import write_tum as write_tum
     from omnibench.data.references.run_references import Reference as Reference
     from omnibench.data.references.run_references import References as References
     from omnibench.data.storage import load_dataset as load_dataset
     from omnibench.data.storage import save_dataset as save_dataset
+    from omnibench.data.tables.dataset_tables import make_dataset as make_dataset
     from omnibench.design.design import design_experiment as design_experiment
     from omnibench.discover.discover import discover_effects as discover_effects
     from omnibench.errors import OmnibenchError as OmnibenchError
@@ -63,18 +71,27 @@ if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py hol
     from omnibench.robot.calibration import Calibration as Calibration
     from omnibench.robot.calibration import read_calibration as read_calibration
     from omnibench.robot.calibration import write_calibration as write_calibration
+    from omnibench.robot.dead_reckoning import odometry as odometry
     from omnibench.robot.export.formats import export_calibration as export_calibration
     from omnibench.robot.kinematics import Robot as Robot
+    from omnibench.robot.wheels.wheel import Wheel as Wheel
     from omnibench.simulate.simulate import simulate_dataset as simulate_dataset
     from omnibench.simulate.source import read_simulation as read_simulation
     from omnibench.slam.import_dataset import import_dataset as import_dataset
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":  # looked up when it is asked for, since that takes as long as all else here
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            return version("omnibench")
+        except PackageNotFoundError:
+            return "unknown"
     if name not in _PUBLIC:
         raise AttributeError(f"module 'omnibench' has no attribute {name!r}")
     return getattr(import_module(f"omnibench.{_PUBLIC[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return [*__all__, "__version__"]

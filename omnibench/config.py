@@ -14,6 +14,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import ErrorDetails, to_jsonable_python
 
 from omnibench.errors import ConfigError, nearest
+from omnibench.views import brief
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -36,6 +37,12 @@ class Model(BaseModel):
     """Base of every document that omnibench reads: unknown keys are refused, instances are immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    def __repr__(self) -> str:
+        return brief(type(self).__name__, self.__repr_args__())
+
+    def __str__(self) -> str:
+        return repr(self)
 
 
 def folder_of(info: ValidationInfo) -> Path | None:

@@ -45,12 +45,10 @@ class CommandsByFamily(TyperGroup):
 def _print_version(asked: bool) -> None:
     if not asked:
         return
-    from importlib.metadata import PackageNotFoundError, version
+    from omnibench import __version__
 
-    try:
-        typer.echo(f"omnibench {version('omnibench')}")
-    except PackageNotFoundError:  # run from a folder of source files
-        typer.echo("omnibench, version unknown: it is not installed")
+    installed = __version__ != "unknown"
+    typer.echo(f"omnibench {__version__}" if installed else "omnibench, version unknown: it is not installed")
     raise typer.Exit
 
 

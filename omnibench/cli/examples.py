@@ -1,12 +1,14 @@
 """Files that ``omnibench example`` writes: configs and plug-ins to begin with, and a small simulated recording.
 
 An example is laid out as the repository is, ``configs`` beside ``plugins``, so that the paths in a config hold.
+Notebooks are the handbook's.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from omnibench.cli.handbook_topics import HANDBOOK
 from omnibench.config import Model, read_model
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.files import refuse_existing, write_files
@@ -75,9 +77,13 @@ def bundled_folder() -> Path:
 
 def _contents(example: Example) -> list[tuple[str, bytes]]:
     """The example's files by their path in the folder that it is written to."""
-    bundled = bundled_folder()
-    files = [file for pattern in example.files for file in sorted(bundled.glob(pattern)) if file.is_file()]
-    return [(file.relative_to(bundled).as_posix(), file.read_bytes()) for file in files]
+    return [
+        (file.relative_to(folder).as_posix(), file.read_bytes())
+        for pattern in example.files
+        for folder in (bundled_folder(), HANDBOOK)
+        for file in sorted(folder.glob(pattern))
+        if file.is_file()
+    ]
 
 
 def _simulate(config: Path, output: Path, force: bool) -> None:

@@ -220,6 +220,11 @@ _COLUMN_OF: dict[Any, Any] = {
 _INTERVAL_COLUMNS = {name: _COLUMN_OF[Interval | None] for split in SPLITS for name in (split, f"{split}_improvement")}
 
 
+def result_table(result: ComparisonResult, name: str) -> pl.DataFrame:
+    """One of the tables that are written beside the report: statistics, runs, errors or history."""
+    return _tables(result)[name]
+
+
 def _tables(result: ComparisonResult) -> dict[str, pl.DataFrame]:
     statistics = [_statistics_row(entry) for entry in result.statistics]
     return {

@@ -23,6 +23,7 @@ from omnibench.fit.uncertainty.uncertainty import Uncertainty
 from omnibench.registry import calibrators
 from omnibench.robot.calibration import HeldOutVerdict, Row
 from omnibench.robot.kinematics import Array
+from omnibench.views import Shown
 
 THEORETICAL_NAME = "theoretical"  # the calibrator that leaves the design values
 
@@ -174,8 +175,8 @@ class EntryVerdict:
     verdict: HeldOutVerdict
 
 
-@dataclass(frozen=True, eq=False)
-class ComparisonResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class ComparisonResult(Shown):
     """Everything that the report shows.
 
     design_costs: mean cost of the design values, by data set and split. uncertainties: of the entries' typical runs, by

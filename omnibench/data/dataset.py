@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from omnibench.errors import DataError, nearest
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.wheels.drive import Drive, in_the_middle
+from omnibench.views import Shown
 from omnibench.words import plural
 
 Split = Literal["train", "validation"]
@@ -35,8 +36,8 @@ _MOVED, _TURNED, _HARDLY = 0.05, 0.1, 0.01
 _ARRAYS = ("times", "rates", "pose_times", "poses", "angles", "targets", "pose_covariances", "steering")
 
 
-@dataclass(frozen=True, eq=False)
-class Trajectory:
+@dataclass(frozen=True, eq=False, repr=False)
+class Trajectory(Shown):
     """One recorded run.
 
     times (F,): end of each wheel sample, s, > 0. rates (F, N): mean wheel rates over each sample, rad/s.
@@ -66,6 +67,17 @@ class Trajectory:
     steering: Array | None = None  # steering angles at ``times`` (F, S), rad
     drive: Drive | None = None  # the robot's drive signals where it steers; ``make_dataset`` sets it
     references: References | None = None  # distances, turns and the like that were measured in the place of poses
+
+    def with_arrays(self) -> Trajectory:
+        """The run with its numbers as arrays, whatever sequences they were given as. DataError: they are no numbers."""
+        arrays: dict[str, Any] = {}
+        for name in _ARRAYS:
+            if (value := getattr(self, name)) is not None:
+                try:
+                    arrays[name] = np.asarray(value, dtype=float)
+                except (TypeError, ValueError):
+                    raise DataError(f"trajectory {self.id}: {name} are no numbers in rows of one length") from None
+        return replace(self, **arrays)
 
     @cached_property
     def signals(self) -> Array:
@@ -136,8 +148,8 @@ class Trajectory:
         return self.log(self.pose_times[1:])
 
 
-@dataclass(frozen=True, eq=False)
-class Dataset:
+@dataclass(frozen=True, eq=False, repr=False)
+class Dataset(Shown):
     """Recordings of one robot. Make it with :func:`make_dataset`, which unwraps headings and looks for wrong units.
 
     scans: scans of its laser scanner, if it has one and they were recorded. referenced: the poses are reference poses;

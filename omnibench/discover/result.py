@@ -19,6 +19,7 @@ from omnibench.fit.sessions.session_differences import SessionComparison
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.effects.effect import Stage
 from omnibench.robot.kinematics import Array
+from omnibench.views import Shown
 from omnibench.words import plural
 
 Verdict = Literal["none", "named", "class", "incomplete", "unknown"]
@@ -229,8 +230,8 @@ def experiment_file(number: int) -> str:
     return f"experiment-{number}.yaml"
 
 
-@dataclass(frozen=True, eq=False, config=ConfigDict(arbitrary_types_allowed=True))
-class Discovery:
+@dataclass(frozen=True, eq=False, repr=False, config=ConfigDict(arbitrary_types_allowed=True))
+class Discovery(Shown):
     """The result of a discovery.
 
     where, left: what the residuals depend on before and after the effects that were found. absorbed: names of effects

@@ -41,11 +41,12 @@ from omnibench.robot.calibration import (
 from omnibench.robot.effects.term import Term
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
+from omnibench.views import Shown
 from omnibench.words import plural
 
 
-@dataclass(frozen=True, eq=False)
-class CalibrationRun:
+@dataclass(frozen=True, eq=False, repr=False)
+class CalibrationRun(Shown):
     """A calibration, the calibrator's result and, where asked for, resampled 95 % intervals of the elements.
 
     parameters: radius, distance and angle of each wheel, if these were searched. uncertainty: covariance of the

@@ -17,6 +17,7 @@ from omnibench.jobs.memory import memory_limit
 from omnibench.registry import AnyOptions, Options, PluginFailure, calibrators
 from omnibench.robot.calibration import Noise, matrix_flaw
 from omnibench.robot.kinematics import Array, JsonArray
+from omnibench.views import Brief
 
 
 class Outcome(StrEnum):
@@ -86,8 +87,8 @@ class Shrinkage:
     source: str
 
 
-@dataclass(frozen=True, eq=False)
-class RunResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class RunResult(Brief):
     """Result of one calibrator on one problem. ``vector``, ``matrix`` and ``cost`` are None if there is no answer.
 
     at_bounds, held: names of elements on a bound of the box, and of those kept at their start values.

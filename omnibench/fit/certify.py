@@ -29,6 +29,7 @@ from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
+from omnibench.views import Brief
 
 _TIMED = 3  # parts whose mean time stands for that of all: the whole box and its first two parts
 # Parts of proofs to a gap of 0.1 %: the median and the fewest of twelve of simulated data (61 to 379), and the 901 of
@@ -37,8 +38,8 @@ _PARTS, _FEW_PARTS, _MANY_PARTS = 150, 60, 900
 _PARTS_GAP = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class Proof:
+@dataclass(frozen=True, eq=False, repr=False)
+class Proof(Brief):
     """State of the branch and bound: no matrix of the box costs less than ``lower_bound``.
 
     best_cost, best_vector (n,): the best matrix that is known. boxes: number of parts bounded so far. finished: False
@@ -69,8 +70,8 @@ class Certificate(Model):
     shrinking: float | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class CertifiedCalibration:
+@dataclass(frozen=True, eq=False, repr=False)
+class CertifiedCalibration(Brief):
     """A certificate with its proof. inside: True if the calibration lies in the box. held: names of fixed elements."""
 
     certificate: Certificate

@@ -17,6 +17,7 @@ from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
+from omnibench.views import Shown
 
 
 class SplitErrors(Model):
@@ -30,7 +31,7 @@ class SplitErrors(Model):
     heading_max_rad: float
 
 
-class Evaluation(Model):
+class Evaluation(Shown, Model):
     """Errors of a calibration and of the design values, by split; the split ``all`` is every trajectory.
 
     loss: the robust loss that the calibration was fitted with; costs and errors are without it.

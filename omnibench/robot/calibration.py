@@ -24,6 +24,7 @@ from omnibench.robot.effects.term import make_term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
+from omnibench.views import Shown
 from omnibench.words import plural
 
 FORMAT: Final = "omnibench-calibration/1"
@@ -118,7 +119,7 @@ def _signal_names(content: dict[str, Any]) -> tuple[str, ...] | None:
     return None if robot is None or robot.drive.direct else robot.drive.names
 
 
-class Calibration(Model):
+class Calibration(Shown, Model):
     """The content of a calibration file."""
 
     format: Literal["omnibench-calibration/1"] = FORMAT

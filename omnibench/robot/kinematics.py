@@ -40,6 +40,7 @@ from omnibench.robot.arrays import JsonArray as JsonArray
 from omnibench.robot.wheels.drive import CarDrive, Drive, drive_of
 from omnibench.robot.wheels.wheel import Wheel as Wheel
 from omnibench.robot.wheels.wheel import in_degrees_too, in_radians, looks_like_radians
+from omnibench.views import Shown
 
 # Of the largest singular value: directions below it are rounding of design values, which have some digits.
 _RANK = 1e-6
@@ -74,7 +75,7 @@ class Mount(Model):
         return axes @ np.array([[1.0, 0.0, -self.y], [0.0, 1.0, self.x], [0.0, 0.0, 1.0]])
 
 
-class Robot(Model):
+class Robot(Shown, Model):
     """A wheeled robot as designed.
 
     mount: the tracked point, where it is not the robot's centre. skid: True where fixed wheels have to slide in turns.

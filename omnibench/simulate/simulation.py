@@ -10,10 +10,11 @@ from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.chain.floor_plan import FloorPlan
 from omnibench.simulate.truth import TruthRecord
+from omnibench.views import Brief
 
 
-@dataclass(frozen=True)
-class Simulation:
+@dataclass(frozen=True, repr=False)
+class Simulation(Brief):
     """A simulated data set and, apart from it, the truth behind it.
 
     The robot simulator also gives paths: the true path of each run. plan: the room. starts: the true start pose (3,) in

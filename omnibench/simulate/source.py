@@ -20,6 +20,7 @@ from omnibench.simulate.config import FlowerConfig, Truth
 from omnibench.simulate.dataset_source import DatasetSource
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.simulation import Simulation
+from omnibench.views import Brief
 
 
 class SimulationConfig(Model):
@@ -40,8 +41,8 @@ class ComparedData(SimulationConfig):
     integration: Integration = "arc"
 
 
-@dataclass(frozen=True)
-class SimulationSource:
+@dataclass(frozen=True, repr=False)
+class SimulationSource(Brief):
     """A simulated data set of a config. plugins: folders of plug-ins that its effects may come from."""
 
     name: str

@@ -1,7 +1,8 @@
-"""How long ``omnibench --help`` takes beside a Python that only imports Typer and Rich.
+"""How long ``omnibench --help`` takes beside a Python that only imports Typer and Rich, and ``import omnibench`` beside
+``import numpy``.
 
-``python tests/benchmarks/start_up.py [--runs 20]`` runs the two in turn, each in a process of its own, and prints the
-medians of the wall time and of the processor time (user and system), in ms, and their ratios.
+``python tests/benchmarks/start_up.py [--runs 20]`` runs each pair in turn, each in a process of its own, and prints the
+ratios of the medians of the wall time and of the processor time (user and system).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from statistics import median
 # What the installed script does; ``python -m`` would import more of Python's own modules.
 HELP = (sys.executable, "-c", "from omnibench.__main__ import main; main()", "--help")
 BARE = (sys.executable, "-c", "import typer, rich")
+PACKAGE, NUMPY = ((sys.executable, "-c", f"import {name}") for name in ("omnibench", "numpy"))
 
 
 def times(command: tuple[str, ...]) -> tuple[float, float]:
@@ -26,17 +28,26 @@ def times(command: tuple[str, ...]) -> tuple[float, float]:
     return 1000 * wall, 1000 * (after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
 
 
+def ratio(ours: tuple[str, ...], other: tuple[str, ...], runs: int) -> tuple[float, float]:
+    """Ratio of the medians of the wall time and of the processor time of two commands that run in turn."""
+    for command in (ours, other):  # once each, so that the files are in the disk's cache
+        times(command)
+    pairs = [(times(ours), times(other)) for _ in range(runs)]
+    medians = [[median(pair[which][index] for pair in pairs) for which in (0, 1)] for index in (0, 1)]
+    return medians[0][0] / medians[0][1], medians[1][0] / medians[1][1]
+
+
 def main() -> None:
-    """Print the medians and their ratios."""
+    """Print the ratios."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=20, help="Of each of the two.")
     runs = parser.parse_args().runs
-    for command in (HELP, BARE):  # once each, so that the files are in the disk's cache
-        times(command)
-    pairs = [(times(HELP), times(BARE)) for _ in range(runs)]
-    for index, kind in enumerate(("wall time", "processor time")):
-        ours, bare = (median(pair[which][index] for pair in pairs) for which in (0, 1))
-        print(f"{kind}: omnibench --help {ours:.0f} ms, import typer, rich {bare:.0f} ms, ratio {ours / bare:.2f}")
+    for words, pair in {
+        "omnibench --help : import typer, rich": (HELP, BARE),
+        "import omnibench : import numpy": (PACKAGE, NUMPY),
+    }.items():
+        wall, processor = ratio(*pair, runs)
+        print(f"{words}: {wall:.2f} of the wall time, {processor:.2f} of the processor time")
 
 
 if __name__ == "__main__":

@@ -26,9 +26,10 @@ BELOW = {
     "discover": {"robot", "data", "simulate", "fit", "report"},
     "live": {"robot", "data", "simulate"},
     "testing": {"robot", "data", "fit"},
+    "notebook": {"robot", "data", "slam", "simulate", "fit", "report", "design", "compare", "discover"},
     "cli": {"robot", "data", "slam", "simulate", "fit", "report", "design", "compare", "discover", "live", "testing"},
 }
-GROUND = {"config", "registry", "errors", "files", "processes", "jobs", "environment", "words", "progress"}
+GROUND = {"config", "registry", "errors", "files", "processes", "jobs", "environment", "words", "progress", "views"}
 CONVENTIONAL = {"__init__", "config", "output", "result", "tables", "wording"}  # one in a room, the same in each
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import doctest
 import subprocess
 import sys
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from start_up import NUMPY, PACKAGE, ratio
 from timing import PATIENCE
 
 import omnibench
@@ -83,3 +85,24 @@ def test_importing_the_package_loads_no_heavy_library() -> None:
     program = "import sys, omnibench; print(sorted({'numpy', 'polars', 'plotly', 'cvxpy'} & set(sys.modules)))"
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=True)
     assert run.stdout == "[]\n"
+
+
+def test_importing_the_package_takes_at_most_twice_as_long_as_importing_numpy() -> None:
+    _, processor = ratio(PACKAGE, NUMPY, runs=3)
+    assert processor <= 2
+
+
+def test_the_version_is_that_of_the_installed_package() -> None:
+    shown = subprocess.run(
+        [sys.executable, "-m", "omnibench", "--version"], capture_output=True, text=True, timeout=PATIENCE, check=True
+    )
+    assert omnibench.__version__ in shown.stdout
+
+
+@pytest.mark.parametrize("name", omnibench.__all__)
+def test_the_examples_of_a_public_name_give_what_they_show(name: str) -> None:
+    found = getattr(omnibench, name)
+    names = vars(sys.modules[found.__module__]) | {each: getattr(omnibench, each) for each in omnibench.__all__}
+    examples = doctest.DocTestFinder(recurse=False).find(found, name, globs=names)
+    runner = doctest.DocTestRunner()
+    assert sum(runner.run(example).failed for example in examples) == 0

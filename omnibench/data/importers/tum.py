@@ -1,4 +1,4 @@
-"""Reference poses in TUM format: ``timestamp tx ty tz qx qy qz qw``, separated by spaces, ``#`` begins a comment."""
+"""Poses in TUM format, read and written: ``timestamp tx ty tz qx qy qz qw`` by spaces, ``#`` begins a comment."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from omnibench.data.delimited import read_numbers
 from omnibench.data.importers.orientation import planar_headings
+from omnibench.errors import DataError
+from omnibench.files import write_text
 from omnibench.robot.kinematics import Array
 
 FIELDS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
@@ -22,16 +25,35 @@ class PoseTrack:
     poses: Array
 
 
-def read_tum(file: Path) -> PoseTrack:
+def read_tum(file: Path | str) -> PoseTrack:
     """The planar poses of a TUM file: x, y and the yaw of the quaternion; z, roll and pitch are left out.
 
     DataError names file and row when a row is malformed, the time does not increase, a quaternion has no length 1
     (to 1 %), or the pose is tilted by more than 20 degrees: then it is another frame than the robot's body (z up), for
     example a camera's. Source: the file format of the TUM RGB-D benchmark, as evo and others write it.
     """
-    table = read_numbers(file, FIELDS, separator=None, header_lines=0)
+    table = read_numbers(Path(file), FIELDS, separator=None, header_lines=0)
     times = table.increasing("timestamp")
     orientations = planar_headings(table.columns(FIELDS[4:]))
     for row in np.flatnonzero(orientations.flawed)[:1]:
         raise table.fail(int(row), orientations.flaw(int(row)))
     return PoseTrack(times, np.column_stack([table.columns(("tx", "ty")), orientations.headings]))
+
+
+def write_tum(file: Path | str, times: ArrayLike, poses: ArrayLike) -> None:
+    """Write planar poses as a TUM file, which evo reads (``evo_ape tum REFERENCE ODOMETRY``).
+
+    times (K,): s. poses (K, 3): x, y (m) and heading (rad); z is 0. DataError: shapes do not agree, a value is not
+    finite, times do not increase, or the disk refuses.
+    """
+    stamps, planar = np.asarray(times, dtype=float), np.asarray(poses, dtype=float)
+    if stamps.ndim != 1 or planar.shape != (*stamps.shape, 3):
+        raise DataError(f"{file}: times have shape {stamps.shape}, poses {planar.shape}; expected (K,) and (K, 3)")
+    flawed = ~np.isfinite(np.column_stack([stamps, planar])).all(axis=1) | (np.diff(stamps, prepend=-np.inf) <= 0)
+    for row in np.flatnonzero(flawed)[:1]:
+        raise DataError(f"{file}: row {row + 1} of the poses: times must increase, and all values be finite")
+    half = planar[:, 2] / 2
+    zero = np.zeros_like(half)
+    columns = (stamps, planar[:, 0], planar[:, 1], zero, zero, zero, np.sin(half), np.cos(half))
+    lines = (" ".join(f"{value:.9f}" for value in row) for row in zip(*columns, strict=True))
+    write_text(Path(file), "\n".join([f"# {' '.join(FIELDS)}", *lines]) + "\n")

@@ -7,7 +7,6 @@ Columns: trajectory, kind, value and sigma of kinds of one number, value_x, valu
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,24 +14,24 @@ import polars as pl
 
 from omnibench.data.references.reference_flaws import reference_flaw
 from omnibench.data.references.run_references import AT_ONE_TIME, PLANAR, References
-from omnibench.data.table import Table, read_table, table_file
+from omnibench.data.tables.table import Table
 from omnibench.robot.kinematics import Array
 
 TABLE = "references"
+REFERENCE_COLUMNS = ("trajectory", "kind")  # those that every such table has
 _NUMBERS = ("t0", "t1", "value", "value_x", "value_y", "sigma", "sigma_x", "sigma_y")
 
 
 def read_references(
-    folder: Path, wheel_times: Mapping[str, Array], started: Collection[str], runs_file: str
+    table: Table | None, wheel_times: Mapping[str, Array], started: Collection[str], runs_file: str
 ) -> dict[str, References]:
     """The references of each run that has some; none where there is no such table.
 
     wheel_times: ends of the wheel samples (F,) of each run, s. started: ids of the runs whose start pose is known.
     runs_file: the table that names the runs. DataError in one line names the file, the row and what is wrong.
     """
-    if table_file(folder, TABLE) is None:
+    if table is None:
         return {}
-    table = read_table(folder, TABLE, ("trajectory", "kind"))
     owners, kinds = table.frame["trajectory"], table.frame["kind"]
     table.refuse(~owners.is_in(list(wheel_times)), lambda row: f"trajectory {owners[row]} is not in {runs_file}")
     numbers = {name: _column(table, name) for name in _NUMBERS}

@@ -28,6 +28,7 @@ from omnibench.fit.uncertainty.robust_scores import robust_scores
 from omnibench.fit.uncertainty.sandwich import Sandwich, Scores, sandwich, scores_of_runs
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
+from omnibench.views import Brief
 
 # The check that an answer is a minimum says the same with half of _MOST_STEPS and _NO_GAIN and with twice
 # (tests/benchmarks/constants_fit.py).
@@ -47,8 +48,8 @@ class NoCovarianceError(DataError):
     """A calibration has no covariance; the message says why, in one line."""
 
 
-@dataclass(frozen=True, eq=False)
-class Uncertainty:
+@dataclass(frozen=True, eq=False, repr=False)
+class Uncertainty(Brief):
     """Uncertainty of a calibration, given that the values it kept are right.
 
     covariance (3N, 3N): the elements' covariance, row by row, m and rad per rad of wheel. Rows and columns of elements

@@ -12,10 +12,11 @@ from omnibench.robot.calibration import Calibration
 from omnibench.robot.export.c_header import c_header
 from omnibench.robot.export.robot_localization import robot_localization
 from omnibench.robot.export.ros2_controllers import ros2_controllers
+from omnibench.views import Brief
 
 
-@dataclass(frozen=True)
-class Export:
+@dataclass(frozen=True, repr=False)
+class Export(Brief):
     """The text of an exported file, a warning for everything left out, and a name for the file."""
 
     text: str

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from omnibench.data.importers.tum import read_tum
+from omnibench.data.importers.tum import read_tum, write_tum
 from omnibench.errors import DataError
 
 
@@ -80,3 +80,19 @@ def test_a_file_without_poses_is_refused(tmp_path: Path) -> None:
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"none\.tum: no such file"):
         read_tum(tmp_path / "none.tum")
+
+
+def test_poses_that_were_written_are_read_again(tmp_path: Path) -> None:
+    times, poses = np.array([0.0, 0.1, 0.25]), np.array([[0, 0, 0], [0.1, -0.2, 3.1], [1.5, 2, -3.0]])
+    write_tum(tmp_path / "run.tum", times, poses)
+    track = read_tum(tmp_path / "run.tum")
+    np.testing.assert_allclose(track.times, times, atol=1e-9)
+    np.testing.assert_allclose(track.poses, poses, atol=1e-8)
+
+
+def test_poses_that_no_tum_file_can_hold_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"times have shape \(2,\), poses \(3, 3\)"):
+        write_tum(tmp_path / "run.tum", [0, 1], np.zeros((3, 3)))
+    with pytest.raises(DataError, match="row 2 of the poses: times must increase"):
+        write_tum(tmp_path / "run.tum", [0, 0], np.zeros((2, 3)))
+    assert not list(tmp_path.iterdir())

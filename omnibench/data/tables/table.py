@@ -91,6 +91,14 @@ def read_table(folder: Path, name: str, required: Sequence[str]) -> Table:
     twice = [column for column in frame.columns if "_duplicated_" in column and file.suffix == ".csv"]
     if twice:  # polars' name for the second of two
         raise DataError(f"{file}: column {twice[0].partition('_duplicated_')[0]!r} is there twice; remove one")
+    return checked_table(file, frame, required)
+
+
+def checked_table(file: Path, frame: pl.DataFrame, required: Sequence[str]) -> Table:
+    """A frame as a table. DataError when it has no rows, or a required column or a trajectory's name is missing.
+
+    file: where it is from; of a frame in memory its name in messages.
+    """
     for column in required:
         if column not in frame.columns:
             raise missing_column(file, column, frame.columns)

@@ -1,0 +1,345 @@
+"""A data set as tables: made from data frames, from dicts of arrays or from what was read, and written as such."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import polars as pl
+
+from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
+from omnibench.data.dataset import make_dataset as of_trajectories
+from omnibench.data.references.reference_table import REFERENCE_COLUMNS, TABLE, read_references, reference_frame
+from omnibench.data.references.run_references import References
+from omnibench.data.run_checks import Flaw, pose_times_flaw, stored_pose_times_flaw, wheel_times_flaw
+from omnibench.data.scans import Scans
+from omnibench.data.splits import every_second
+from omnibench.data.tables.table import Table, checked_table
+from omnibench.errors import DataError, nearest, require_type
+from omnibench.robot.kinematics import Array, Robot
+
+POSE_COLUMNS = ("trajectory", "t", "x", "y", "theta")
+_RUN_NUMBERS = ("started_at", "v", "alpha", "omega", "duration", "distance")
+_Rows = np.ndarray[Any, np.dtype[np.intp]]  # indices of rows of a table
+_COVARIANCE = ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
+_ONLY_RUN = "run"  # id of the run of tables without a column "trajectory"
+_PERIOD_DECIMALS = 9  # of a sample period in s that is taken from stamps: ns
+
+
+def make_dataset(
+    name: str,
+    robot: Robot,
+    sample_period: float | None = None,
+    trajectories: Iterable[Trajectory] | Any = None,
+    *,
+    wheels: Any = None,
+    poses: Any = None,
+    references: Any = None,
+    description: str = "",
+    source: str = "",
+    licence: str = "",
+    simulated: bool = False,
+    scans: Scans | None = None,
+) -> Dataset:
+    """A data set from arrays or data frames, checked as files are checked.
+
+    sample_period: s, that of the wheel samples; default: the median of their stamps. Either
+
+    - ``trajectories``: :class:`Trajectory` objects, one a run, with arrays; or
+    - tables: Polars or pandas data frames, or dicts of columns, with the columns of a data set's files.
+      wheels: trajectory, t (s), omega_<wheel> (rad/s) of every wheel, steer_<wheel> (rad) of steered ones; poses:
+      trajectory, t, x, y (m), theta (rad), the first of a run at t = 0; references: in their place or beside them.
+      trajectories: trajectory, split (train or validation), command ...; default: every run of ``wheels``. Without
+      ``split`` every second run of a command validates. Tables of one run need no column ``trajectory``.
+
+    DataError names the table, its row (1 is the first) and column, and what is wrong: a missing column or value, times
+    that do not increase, a run without a pose at t = 0, two runs of the same name, values that no robot reaches. Units
+    and signs that look wrong are the data set's ``warnings``.
+
+    >>> import numpy as np
+    >>> robot = Robot(name="cart", wheels=[
+    ...     Wheel(name="left", type="fixed", radius=0.05, x=0, y=0.15),
+    ...     Wheel(name="right", type="fixed", radius=0.05, x=0, y=-0.15)])
+    >>> t = np.arange(1, 51) * 0.02
+    >>> wheels = {"t": t, "omega_left": np.full(50, 4.0), "omega_right": np.full(50, 4.0)}
+    >>> poses = {"t": [0.0, 1.0], "x": [0.0, 0.2], "y": [0.0, 0.0], "theta": [0.0, 0.0]}
+    >>> make_dataset("day1", robot, wheels=wheels, poses=poses)
+    Dataset 'day1': 1 run (1 train, 0 validation) of robot cart (wheels left, right)
+      recorded, 50 wheel samples every 20 ms, 2 reference poses
+    """
+    require_type(robot, Robot, "Robot(name=..., wheels=[...])")
+    texts: dict[str, Any] = {"description": description, "source": source, "licence": licence, "simulated": simulated}
+    if wheels is None:
+        runs = _runs(name, trajectories, poses is not None or references is not None)
+    else:
+        runs = _tables(robot, trajectories, wheels, poses, references).trajectories(robot)
+    period = _sample_period(runs) if sample_period is None else sample_period
+    return of_trajectories(name, robot, period, runs, scans=scans, **texts)
+
+
+def _runs(name: str, trajectories: Any, others: bool) -> list[Trajectory]:
+    """Trajectory objects whose fields may be lists. DataError: there are none, or tables without that of the wheels."""
+    if others or trajectories is None:
+        raise DataError(f"data set {name}: wheels is missing: a table with the columns t and omega_<wheel>")
+    runs = list(trajectories)
+    for run in runs:
+        if not isinstance(run, Trajectory):
+            given = type(run).__name__
+            raise DataError(f"data set {name}: a trajectory is of type {given}; of tables give wheels= and poses=, too")
+    return [run.with_arrays() for run in runs]
+
+
+def _sample_period(runs: Sequence[Trajectory]) -> float:
+    """The median time between wheel samples, s."""
+    if not runs:
+        return 1.0  # that there is no run is said next
+    periods = np.concatenate([np.diff(run.times, prepend=0.0) for run in runs])
+    return round(float(np.median(periods)), _PERIOD_DECIMALS)
+
+
+def _tables(robot: Robot, trajectories: Any, wheels: Any, poses: Any, references: Any) -> DatasetTables:
+    """The tables that a user gave, with a table of runs."""
+    frames = {"wheels": _frame("wheels", wheels)}
+    if poses is not None:
+        frames["poses"] = _frame("poses", poses)
+    if references is not None:
+        frames[TABLE] = _frame(TABLE, references)
+    if all("trajectory" not in frame.columns for frame in frames.values()):
+        frames = {name: frame.with_columns(pl.lit(_ONLY_RUN).alias("trajectory")) for name, frame in frames.items()}
+    rates = [f"omega_{wheel}" for wheel in robot.wheel_names]
+    required = {"wheels": ("trajectory", "t", *rates), "poses": POSE_COLUMNS, TABLE: REFERENCE_COLUMNS}
+    checked = {name: checked_table(Path(name), frame, required[name]) for name, frame in frames.items()}
+    named = checked["wheels"].frame["trajectory"].unique(maintain_order=True)
+    runs = pl.DataFrame({"trajectory": named}) if trajectories is None else _frame("trajectories", trajectories)
+    if "split" not in runs.columns:
+        commands = runs["command"].to_list() if "command" in runs.columns else [None] * len(runs)
+        runs = runs.with_columns(pl.Series("split", every_second(commands), dtype=pl.String))
+    of_runs = checked_table(Path("trajectories"), runs, ("trajectory", "split"))
+    return DatasetTables(of_runs, checked["wheels"], checked.get("poses"), checked.get(TABLE))
+
+
+def _frame(name: str, content: Any) -> pl.DataFrame:
+    """A data frame or a dict of columns as a Polars frame. DataError names the table and the column that is unfit."""
+    if isinstance(content, pl.DataFrame):
+        return content
+    if isinstance(content, Mapping):
+        columns = {str(column): content[column] for column in content}
+    elif hasattr(content, "columns") and hasattr(content, "__getitem__"):  # pandas, and others like it
+        columns = {str(column): content[column] for column in content.columns}
+    else:
+        raise DataError(f"{name}: expected a data frame or a dict of arrays, found {type(content).__name__}")
+    arrays = {column: np.atleast_1d(np.asarray(values)) for column, values in columns.items()}
+    if not arrays:
+        raise DataError(f"{name}: it has no columns")
+    first, rows = next((column, len(array)) for column, array in arrays.items())
+    for column, array in arrays.items():
+        if array.ndim != 1:
+            raise DataError(f"{name}: column {column!r} has shape {array.shape}; give a column for each wheel or axis")
+        if len(array) != rows:
+            raise DataError(f"{name}: column {column!r} has {len(array)} rows, {first!r} has {rows}")
+    return pl.DataFrame(
+        {column: array.tolist() if array.dtype == object else array for column, array in arrays.items()}, strict=False
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class DatasetTables:
+    """The tables of a data set, whose required columns are there. poses: None where all runs have references."""
+
+    runs: Table
+    wheels: Table
+    poses: Table | None
+    references: Table | None
+
+    def trajectories(self, robot: Robot) -> list[Trajectory]:
+        """The runs of the tables. DataError names the table, the row and what is wrong."""
+        runs, wheels, poses = self.runs, self.wheels, self.poses
+        _check_steering(wheels, robot)
+        _check_runs(runs)
+        wheel_rows = _rows_by_trajectory(runs, wheels)
+        _check_times(wheels, wheel_rows, wheel_times_flaw)
+        samples = _WheelColumns(wheels, robot)
+        ids = runs.frame["trajectory"].to_list()
+        ends = {run: samples.times[rows] for run, rows in zip(ids, wheel_rows, strict=True)}
+        started = set() if poses is None else set(poses.frame["trajectory"])
+        references = read_references(self.references, ends, started, runs.file.name)
+        pose_rows = _pose_rows(runs, poses, references)
+        reference = None if poses is None else _PoseColumns(poses)
+        return [
+            _trajectory(row, samples, wheel_rows[index], reference, pose_rows[index], references.get(row["trajectory"]))
+            for index, row in enumerate(runs.frame.iter_rows(named=True))
+        ]
+
+
+def tables_of(dataset: Dataset) -> dict[str, pl.DataFrame]:
+    """The tables of a data set by name: trajectories, wheels, and poses and references where there are some."""
+    tables = {
+        "trajectories": pl.DataFrame([_run_row(run) for run in dataset.trajectories], infer_schema_length=None),
+        "wheels": pl.concat([_wheel_frame(run, dataset.robot) for run in dataset.trajectories]),
+    }
+    if placed := [_pose_frame(run) for run in dataset.trajectories if run.start_known]:
+        tables["poses"] = pl.concat(placed)
+    if measured := [(run.id, run.references) for run in dataset.trajectories if run.references is not None]:
+        tables[TABLE] = reference_frame(measured)
+    return tables
+
+
+class _WheelColumns:
+    def __init__(self, table: Table, robot: Robot) -> None:
+        wheels, steered = robot.wheel_names, robot.drive.steered
+        self.times = table.numbers("t")
+        rates = table.stack([f"omega_{wheel}" for wheel in wheels])
+        assert rates is not None  # their presence was checked on reading
+        self.rates = rates
+        self.steering = table.stack([f"steer_{wheel}" for wheel in steered]) if steered else None
+        self.angles = table.stack([f"phi_{wheel}" for wheel in wheels])
+        self.targets = table.stack([f"target_{wheel}" for wheel in wheels])
+
+
+class _PoseColumns:
+    def __init__(self, table: Table) -> None:
+        self.times = table.numbers("t")
+        self.poses = np.column_stack([table.numbers(column) for column in ("x", "y", "theta")])
+        upper = table.stack([f"cov_{name}" for name in _COVARIANCE])
+        self.covariances = None if upper is None else upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+
+
+def _check_steering(wheels: Table, robot: Robot) -> None:
+    """DataError: there is no column with the steering angles of a wheel."""
+    columns = wheels.frame.columns
+    for wheel in robot.drive.steered:
+        if (column := f"steer_{wheel}") not in columns:
+            hint = nearest(column, [name for name in columns if not name.startswith("omega_")])
+            raise DataError(
+                f"{wheels.file}: column {column!r}, the steering angle of wheel {wheel} (rad, counter-clockwise, at "
+                f"the sample's end), is missing; {hint}found: {', '.join(columns)}"
+            )
+
+
+def _check_runs(runs: Table) -> None:
+    for column in (*_RUN_NUMBERS, "repetition"):
+        if column in runs.frame.columns:
+            series = runs.floats(column)
+            _refuse_infinite(runs, series)
+            runs.frame = runs.frame.with_columns(series.alias(column))
+    if "repetition" in runs.frame.columns:
+        numbers = runs.frame["repetition"]
+        runs.refuse(numbers % 1 != 0, lambda row: f"repetition is {numbers[row]}, not a whole number")
+    ids = runs.frame["trajectory"]
+    runs.refuse(~ids.is_first_distinct(), lambda row: f"trajectory {ids[row]} is there twice; give each its own id")
+    for row, split in enumerate(runs.frame["split"]):
+        if split not in SPLITS:
+            raise runs.fail(row, f"split is {split!r}; {nearest(str(split), SPLITS)}it must be train or validation")
+
+
+def _refuse_infinite(runs: Table, values: pl.Series) -> None:
+    infinite = ~values.is_finite() & values.is_not_null()
+    runs.refuse(infinite, lambda row: f"{values.name} is {values[row]}; leave it empty if it is not known")
+
+
+def _pose_rows(runs: Table, poses: Table | None, referenced: Collection[str]) -> list[_Rows]:
+    """The rows of poses of each run; runs that have references may have none, or the start alone."""
+    ids = runs.frame["trajectory"].to_list()
+    if poses is None:
+        for index, run in enumerate(ids):
+            if run not in referenced:
+                raise runs.fail(index, f"trajectory {run} has neither references nor, without poses.parquet, poses")
+        return [np.zeros(0, dtype=np.intp) for _ in ids]
+    rows = _rows_by_trajectory(runs, poses, referenced)
+    given = [(run in referenced, of_run) for run, of_run in zip(ids, rows, strict=True) if len(of_run)]
+    _check_times(poses, [of_run for has_references, of_run in given if not has_references], stored_pose_times_flaw)
+    _check_times(poses, [of_run for has_references, of_run in given if has_references], pose_times_flaw)
+    return rows
+
+
+def _rows_by_trajectory(runs: Table, table: Table, others: Collection[str] = ()) -> list[_Rows]:
+    """The rows of ``table`` that belong to each run, in the file's order; a run among the others may have none."""
+    ids = runs.frame["trajectory"].to_list()
+    number = {identity: index for index, identity in enumerate(ids)}
+    named = table.frame["trajectory"]
+    codes = np.array([number.get(identity, -1) for identity in named])
+    table.refuse(codes < 0, lambda row: f"trajectory {named[row]} is not in {runs.file.name}")
+    order = np.argsort(codes, kind="stable")
+    counts = np.bincount(codes, minlength=len(ids))
+    for index, count in enumerate(counts):
+        if count == 0 and ids[index] not in others:
+            what = "wheel samples" if table.file.stem == "wheels" else "reference poses"
+            raise DataError(f"{table.file}: trajectory {ids[index]} ({runs.file.name}, row {index + 1}) has no {what}")
+    return np.split(order, np.cumsum(counts)[:-1])
+
+
+def _check_times(table: Table, groups: Sequence[_Rows], find_flaw: Callable[[Array, str], Flaw | None]) -> None:
+    """DataError for the first run whose times in ``table`` have a flaw. groups: the rows of each run."""
+    times = table.numbers("t")
+    for rows in groups:
+        if (flaw := find_flaw(times[rows], table.frame["trajectory"][int(rows[0])])) is not None:
+            raise table.fail(int(rows[flaw[0]]), flaw[1])
+
+
+def _trajectory(
+    run: dict[str, Any],
+    wheels: _WheelColumns,
+    wheel_rows: _Rows,
+    reference: _PoseColumns | None,
+    pose_rows: _Rows,
+    references: References | None,
+) -> Trajectory:
+    pose_times: Array = np.zeros(1)
+    poses: Array = np.zeros((1, 3))
+    covariances: Array | None = None
+    if reference is not None and len(pose_rows):
+        pose_times, poses = reference.times[pose_rows], reference.poses[pose_rows]
+        covariances = None if reference.covariances is None else reference.covariances[pose_rows]
+    return Trajectory(
+        id=run["trajectory"],
+        split=cast(Split, run["split"]),
+        times=wheels.times[wheel_rows],
+        rates=wheels.rates[wheel_rows],
+        pose_times=pose_times,
+        poses=poses,
+        command=None if run.get("command") is None else str(run["command"]),
+        repetition=None if run.get("repetition") is None else round(run["repetition"]),
+        session=None if run.get("session") is None else str(run["session"]),
+        angles=None if wheels.angles is None else wheels.angles[wheel_rows],
+        targets=None if wheels.targets is None else wheels.targets[wheel_rows],
+        steering=None if wheels.steering is None else wheels.steering[wheel_rows],
+        pose_covariances=covariances,
+        references=references,
+        **_run_numbers(run),
+    )
+
+
+def _run_numbers(run: dict[str, Any]) -> dict[str, Any]:
+    return {name: float(run[name]) for name in _RUN_NUMBERS if run.get(name) is not None}
+
+
+def _run_row(trajectory: Trajectory) -> dict[str, Any]:
+    names = ("command", "repetition", "split", "session", *_RUN_NUMBERS)
+    return {"trajectory": trajectory.id} | {name: getattr(trajectory, name) for name in names}
+
+
+def _wheel_frame(trajectory: Trajectory, robot: Robot) -> pl.DataFrame:
+    columns: dict[str, Any] = {"trajectory": [trajectory.id] * len(trajectory.times), "t": trajectory.times}
+    for prefix, wheels, values in (
+        ("omega", robot.wheel_names, trajectory.rates),
+        ("steer", robot.drive.steered, trajectory.steering),
+        ("phi", robot.wheel_names, trajectory.angles),
+        ("target", robot.wheel_names, trajectory.targets),
+    ):
+        for index, wheel in enumerate(wheels):
+            columns[f"{prefix}_{wheel}"] = [None] * len(trajectory.times) if values is None else values[:, index]
+    return pl.DataFrame(columns, schema_overrides={name: pl.Float64 for name in columns if name != "trajectory"})
+
+
+def _pose_frame(trajectory: Trajectory) -> pl.DataFrame:
+    count = len(trajectory.pose_times)
+    columns: dict[str, Any] = {"trajectory": [trajectory.id] * count, "t": trajectory.pose_times}
+    columns |= {name: trajectory.poses[:, index] for index, name in enumerate(("x", "y", "theta"))}
+    covariances = trajectory.pose_covariances
+    for index, name in enumerate(_COVARIANCE):
+        row, column = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))[index]
+        columns[f"cov_{name}"] = [None] * count if covariances is None else covariances[:, row, column]
+    return pl.DataFrame(columns, schema_overrides={name: pl.Float64 for name in columns if name != "trajectory"})

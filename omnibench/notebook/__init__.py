@@ -1,0 +1,1 @@
+"""What public objects show in a notebook: texts, data frames and figures."""

@@ -1,0 +1,186 @@
+"""A calibration, a run of ``calibrate`` and an evaluation in a notebook."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict
+
+import numpy as np
+import plotly.graph_objects as go
+import polars as pl
+
+from omnibench.data.dataset import Dataset
+from omnibench.errors import DataError, require_type
+from omnibench.fit.calibrate import CalibrationRun
+from omnibench.fit.evaluate import Evaluation
+from omnibench.notebook.single_figure import drawn
+from omnibench.report.blocks import LegendItem
+from omnibench.report.path_pictures import CALIBRATED, DESIGN_ITEM, paths_before_after
+from omnibench.report.style import PALETTE, plot, text
+from omnibench.robot.calibration import Calibration
+from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
+from omnibench.views import View
+
+_ROWS = (("x", "m/rad"), ("y", "m/rad"), ("heading", "rad/rad"))
+_CALIBRATED = LegendItem("calibrated", "calibration", CALIBRATED)
+_STANDARD = 1.96  # standard deviations of a normal distribution to either side that hold 95 %
+_SIGNALS = 4  # columns of a matrix that a text shows
+_WARNINGS = 4  # shown of a run
+
+
+class CalibrationView(View):
+    """A calibration: its matrix, the deviation from the design, paths before and after."""
+
+    shown: Calibration
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration that is shown."""
+        return self.shown
+
+    def lines(self) -> Iterator[str]:
+        calibration = self.calibration
+        drive, origin = calibration.robot.drive, calibration.provenance
+        fitted = "" if origin is None else f", fitted to {origin.dataset} by {origin.calibrator}"
+        yield f"{type(self.shown).__name__} {calibration.name!r} of robot {calibration.robot.name}{fitted}"
+        more = " ..." if len(drive.names) > _SIGNALS else ""
+        yield f"  {'':17}{''.join(f'{name:>13}' for name in drive.names[:_SIGNALS])}{more}"
+        for (name, unit), row in zip(_ROWS, calibration.matrix, strict=True):
+            yield f"  {f'{name} ({unit})':17}{''.join(f'{value:+13.7f}' for value in row[:_SIGNALS])}{more}"
+        if calibration.effects:
+            yield f"  effects: {calibration.effects_in_words}"
+        if origin is not None and origin.held_out is not None:
+            yield f"  {origin.held_out.sentence}"
+
+    def intervals(self) -> tuple[Array, Array] | None:
+        """Ends (3, M) of the elements' 95 % intervals."""
+        if self.calibration.covariance is None:
+            return None
+        matrix = self.calibration.matrix_array
+        variances = np.diag(np.array(self.calibration.covariance))[: matrix.size].reshape(matrix.shape)
+        half = _STANDARD * np.sqrt(variances)
+        return matrix - half, matrix + half
+
+    def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
+        return {"matrix": self._matrix}
+
+    def _matrix(self) -> pl.DataFrame:
+        calibration, design = self.calibration, self.calibration.robot.inverse_kinematic_matrix
+        ends = self.intervals()
+        rows = []
+        for (name, unit), row in zip(_ROWS, range(3), strict=True):
+            for column, signal in enumerate(calibration.robot.drive.names):
+                low, high = (math.nan, math.nan) if ends is None else (float(end[row, column]) for end in ends)
+                value, first = calibration.matrix[row][column], float(design[row, column])
+                rows.append((name, signal, unit, value, first, low, high))
+        names = ("row", "signal", "unit", "value", "design", "low", "high")
+        return pl.DataFrame(rows, names, orient="row")
+
+    def figure(self, dataset: Dataset | None = None) -> go.Figure:
+        return self._deviations() if dataset is None else self._paths(dataset)
+
+    def _deviations(self) -> go.Figure:
+        """Each element's deviation from the design, in % of its row's largest element, with its 95 % interval."""
+        frame = self._matrix().with_columns(pl.col("design").abs().max().over("row").alias("scale"))
+        scaled = {name: 100 * (frame[name] - frame["design"]) / frame["scale"] for name in ("value", "low", "high")}
+        names = [text(f"{row}: {signal}") for row, signal in zip(frame["row"], frame["signal"], strict=True)]
+        error = {
+            "type": "data",
+            "array": (scaled["high"] - scaled["value"]).to_list(),
+            "arrayminus": (scaled["value"] - scaled["low"]).to_list(),
+        }
+        marker = {"color": PALETTE[0], "size": 9}
+        dots = go.Scatter(x=scaled["value"].to_list(), y=names, mode="markers", marker=marker, error_x=error)
+        figure = plot(dots, x_title="deviation from the design, % of the row's largest element")
+        figure.add_vline(x=0.0, line={"width": 1, "dash": "dot"})
+        figure.update_yaxes(autorange="reversed")
+        title = f"{text(self.calibration.name)}: elements of the matrix with 95 % intervals"
+        figure.update_layout(title_text=title, title_x=0.02, height=160 + 28 * len(names), margin={"l": 110, "t": 60})
+        return figure
+
+    def _paths(self, dataset: Dataset) -> go.Figure:
+        """Paths of a few runs, held out where some are, by the design and by the calibration."""
+        require_type(dataset, Dataset, "load_dataset")
+        self.calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
+        held_out = dataset.split("validation")
+        runs = [run for run in held_out or dataset.trajectories if len(run.poses) > 1]
+        design = OdometryModel.of_design(dataset.robot, self.calibration.integration)
+        models = [(DESIGN_ITEM, design), (_CALIBRATED, self.calibration.model)]
+        grid = paths_before_after(runs, models, "held-out" if held_out else "")
+        if grid is None:
+            raise DataError(f"data set {dataset.name}: no run has a path of poses to draw")
+        return drawn(grid)
+
+
+class CalibrationRunView(CalibrationView):
+    """A run of ``calibrate``: the calibration, how the search ended and what the data leave open."""
+
+    shown: CalibrationRun  # type: ignore[assignment]
+
+    @property
+    def calibration(self) -> Calibration:
+        return self.shown.calibration
+
+    def lines(self) -> Iterator[str]:
+        yield from super().lines()
+        yield f"  {self.shown.result.outcome}: {self.shown.result.reason}"
+        yield from (f"  warning: {warning}" for warning in self.shown.warnings[:_WARNINGS])
+
+    def intervals(self) -> tuple[Array, Array] | None:
+        if self.shown.uncertainty is None:
+            return None
+        return self.shown.uncertainty.intervals.low, self.shown.uncertainty.intervals.high
+
+    def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
+        known = self.shown.uncertainty is not None and self.shown.uncertainty.parameters
+        return {**super().tables(), **({"parameters": self._parameters} if known else {})}
+
+    def _parameters(self) -> pl.DataFrame:
+        assert self.shown.uncertainty is not None  # else there is no such table
+        return pl.DataFrame(
+            [asdict(each) for each in self.shown.uncertainty.parameters or ()], infer_schema_length=None
+        )
+
+
+class EvaluationView(View):
+    """An evaluation: errors on every split, beside those of the design."""
+
+    shown: Evaluation
+
+    def lines(self) -> Iterator[str]:
+        evaluation = self.shown
+        yield f"Evaluation on {evaluation.dataset!r}, {evaluation.trajectories} runs"
+        for split, errors in evaluation.splits.items():
+            design = evaluation.design[split]
+            yield (
+                f"  {split}: mean position error {design.position_mean_m:.4f} -> {errors.position_mean_m:.4f} m, "
+                f"heading {design.heading_mean_rad:.4f} -> {errors.heading_mean_rad:.4f} rad"
+            )
+        yield f"  {evaluation.held_out.sentence}"
+
+    def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
+        return {"splits": self._splits}
+
+    def _splits(self) -> pl.DataFrame:
+        models = {"calibration": self.shown.splits, "design": self.shown.design}
+        return pl.DataFrame(
+            [
+                {"split": split, "model": model, **vars(errors)}
+                for model, splits in models.items()
+                for split, errors in splits.items()
+            ]
+        )
+
+    def figure(self) -> go.Figure:
+        """Mean position errors on every split, before and after."""
+        frame = self._splits()
+        bars = []
+        for model, colour in (("design", DESIGN_ITEM.colour), ("calibration", CALIBRATED)):
+            rows = frame.filter(pl.col("model") == model)
+            values = (1000 * rows["position_mean_m"]).to_list()
+            bars.append(go.Bar(x=rows["split"].to_list(), y=values, name=model, marker_color=colour))
+        figure = go.Figure(bars, layout=plot(y_title="mean position error at the end (mm)").layout)
+        figure.update_layout(title_text=text(f"{self.shown.dataset}: before and after"), showlegend=True)
+        return figure

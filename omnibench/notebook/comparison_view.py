@@ -1,0 +1,51 @@
+"""A comparison of calibrators in a notebook."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+
+import plotly.graph_objects as go
+import polars as pl
+
+from omnibench.compare.output import result_table
+from omnibench.compare.report.entry_chart import entry_chart
+from omnibench.compare.report.view import views
+from omnibench.compare.result import ComparisonResult
+from omnibench.errors import DataError, UnknownNameError
+from omnibench.notebook.single_figure import drawn
+from omnibench.views import View
+from omnibench.words import plural
+
+_ENTRIES = 14  # shown in a text
+
+
+class ComparisonView(View):
+    """A comparison: the best entry of each data set, the costs of all."""
+
+    shown: ComparisonResult
+
+    def lines(self) -> Iterator[str]:
+        result = self.shown
+        runs, sets = plural(len(result.runs), "run"), ", ".join(result.datasets)
+        yield f"Comparison {result.config.name!r}: {runs} on {sets}, in {result.output}"
+        for name, best in result.held_out.items():
+            yield f"  {name}, {best.label}: {best.verdict.sentence}"
+        for entry in result.statistics[:_ENTRIES]:
+            cost = next((entry.cost(split) for split in ("validation", "train") if entry.cost(split)), None)
+            shown = "no answer" if cost is None else f"{cost.value:.6f}"
+            yield f"  {entry.dataset} {entry.label}: cost {shown}{', the best' if entry.is_best else ''}"
+
+    def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
+        return {name: partial(result_table, self.shown, name) for name in ("statistics", "runs", "errors", "history")}
+
+    def figure(self, dataset: str | None = None) -> go.Figure:
+        """The cost of every entry with its 95 % interval. dataset: the name of one, if there are several."""
+        of_sets = {view.name: view for view in views(self.shown)}
+        name = next(iter(of_sets)) if dataset is None else dataset
+        if name not in of_sets:
+            raise UnknownNameError("data set", name, of_sets)
+        grid = entry_chart(of_sets[name])
+        if grid is None:
+            raise DataError(f"{name}: no entry was calibrated, so that there is nothing to draw")
+        return drawn(grid)

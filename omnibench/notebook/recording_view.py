@@ -1,0 +1,95 @@
+"""A data set and one of its runs in a notebook."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+
+import plotly.graph_objects as go
+import polars as pl
+
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.tables.dataset_tables import tables_of
+from omnibench.notebook.single_figure import drawn
+from omnibench.report.blocks import Figure, FigureGrid
+from omnibench.report.recording.drawing import REFERENCE_ITEM
+from omnibench.report.recording.room_figures import all_runs
+from omnibench.report.style import plan
+from omnibench.report.traces import START, marks, path
+from omnibench.views import View
+from omnibench.words import plural
+
+_WARNINGS = 5  # shown of a data set
+
+
+class DatasetView(View):
+    """A data set: its runs, its tables, the paths of all runs from one start."""
+
+    shown: Dataset
+
+    def lines(self) -> Iterator[str]:
+        dataset = self.shown
+        runs = dataset.trajectories
+        splits = ", ".join(f"{sum(run.split == split for run in runs)} {split}" for split in ("train", "validation"))
+        robot = f"robot {dataset.robot.name} (wheels {', '.join(dataset.robot.wheel_names)})"
+        yield f"Dataset {dataset.name!r}: {plural(len(runs), 'run')} ({splits}) of {robot}"
+        samples, poses = sum(len(run.times) for run in runs), sum(len(run.pose_times) for run in runs)
+        yield (
+            f"  {'simulated' if dataset.simulated else 'recorded'}, {plural(samples, 'wheel sample')} every "
+            f"{1000 * dataset.sample_period:g} ms, {plural(poses, 'reference pose')}"
+        )
+        yield from (f"  warning: {warning}" for warning in dataset.warnings[:_WARNINGS])
+
+    def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
+        run = self.shown.trajectories[0]
+        names = ["trajectories", "wheels"]
+        names += ["poses"] if any(each.start_known for each in self.shown.trajectories) else []
+        names += ["references"] if run.references is not None else []
+        return {name: partial(_table, self.shown, name) for name in names}
+
+    def figure(self) -> go.Figure:
+        grid = all_runs(self.shown, self.shown.trajectories[0], ())
+        return drawn(replace(grid, figures=grid.figures[:1], legend=grid.legend[:1]))
+
+
+def _table(dataset: Dataset, name: str) -> pl.DataFrame:
+    """A table without columns that are empty for all runs."""
+    frame = tables_of(dataset)[name]
+    return frame.select(column for column in frame.iter_columns() if column.null_count() < len(frame))
+
+
+class TrajectoryView(View):
+    """A run: how long, how far, and its reference path."""
+
+    shown: Trajectory
+
+    def lines(self) -> Iterator[str]:
+        run = self.shown
+        command = "" if run.command is None else f", command {run.command}"
+        yield f"Trajectory {run.id!r} ({run.split}{command}): {run.times[-1]:.2f} s"
+        end = ", ".join(f"{value:.3f}" for value in run.final_pose - run.start)
+        yield (
+            f"  {plural(len(run.times), 'wheel sample')} of {plural(run.rates.shape[1], 'wheel')}, "
+            f"{plural(len(run.pose_times), 'reference pose')}; end - start: {end} (m, m, rad)"
+        )
+
+    def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
+        return {"wheels": self._wheels, "poses": self._poses}
+
+    def _wheels(self) -> pl.DataFrame:
+        run = self.shown
+        columns = {"t": run.times} | {f"omega_{index + 1}": rates for index, rates in enumerate(run.rates.T)}
+        steering = () if run.steering is None else run.steering.T
+        return pl.DataFrame(columns | {f"steer_{index + 1}": angles for index, angles in enumerate(steering)})
+
+    def _poses(self) -> pl.DataFrame:
+        x, y, theta = self.shown.poses.T
+        return pl.DataFrame({"t": self.shown.pose_times, "x": x, "y": y, "theta": theta})
+
+    def figure(self) -> go.Figure:
+        run = self.shown
+        start = marks(START, 9, *run.start[None, :2].T, hover="start")
+        figure = plan(path(REFERENCE_ITEM, run.poses, 2.5), start)
+        title = f"Reference path of {run.id}"
+        return drawn(FigureGrid((Figure(title, figure, title),), (REFERENCE_ITEM,), 1))

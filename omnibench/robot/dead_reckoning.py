@@ -1,0 +1,114 @@
+"""Odometry of arrays: wheel rates in, poses out, for whoever has no data set."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from omnibench.errors import ConfigError, DataError
+from omnibench.robot.calibration import Calibration
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Wheel as Wheel
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import Integration, WheelLog
+
+
+def odometry(
+    robot: Robot | Calibration,
+    times: ArrayLike,
+    rates: ArrayLike,
+    *,
+    steering: ArrayLike | None = None,
+    start: ArrayLike = (0.0, 0.0, 0.0),
+    stamps: ArrayLike | None = None,
+    integration: Integration | None = None,
+    angles: ArrayLike | None = None,
+) -> Array:
+    """Poses (K, 3) of a robot's odometry: x, y in m and the heading in rad, not wrapped.
+
+    robot: its design, or a calibration, effects included. times (F,): end of each wheel sample, s, > 0. rates (F, N):
+    mean rate of every measured wheel over the sample, rad/s. steering (F, S): of the steered wheels at the samples'
+    ends, rad. start (3,): pose at t = 0. stamps (K,): when poses are wanted, s; default: ``times``. integration: path
+    within a sample; default: ``arc``, or the calibration's. angles (F, N): of the wheels, rad, for effects that need
+    them. Source: Eq. (1) and (2) of Palacin et al. 2023.
+
+    DataError: a shape, a time or a value is wrong, or an effect needs data that are not given. ConfigError: ``robot``
+    is neither.
+
+    >>> import numpy as np
+    >>> cart = Robot(name="cart", wheels=[
+    ...     Wheel(name="left", type="fixed", radius=0.05, x=0, y=0.15),
+    ...     Wheel(name="right", type="fixed", radius=0.05, x=0, y=-0.15)])
+    >>> times = np.arange(1, 101) * 0.02
+    >>> poses = odometry(cart, times, np.full((100, 2), 4.0))  # 2 s at 0.05 m x 4 rad/s
+    >>> poses.shape, bool(np.allclose(poses[-1], [0.4, 0, 0]))
+    ((100, 3), True)
+    """
+    log = WheelLog(
+        times=_numbers("times", times, 1),
+        rates=_numbers("rates", rates, 2),
+        start=_numbers("start", start, 1),
+        stamps=_numbers("stamps", times if stamps is None else stamps, 1),
+        wheel_angles=None if angles is None else _numbers("angles", angles, 2),
+        steering=None if steering is None else _numbers("steering", steering, 2),
+    )
+    model = _model(robot, integration)
+    _check(model.robot, log)
+    if not model.robot.drive.direct:
+        log = WheelLog(**(vars(log) | {"drive": model.robot.drive}))
+    return model.poses([log])[0]
+
+
+def _model(robot: Any, integration: Integration | None) -> OdometryModel:
+    if isinstance(robot, Robot):
+        return OdometryModel.of_design(robot, integration or "arc")
+    if isinstance(robot, Calibration):
+        model = robot.model
+        chosen = integration or model.integration
+        return OdometryModel(model.robot, model.matrix, chosen, model.terms, model.sample_period)
+    given = type(robot).__name__
+    raise ConfigError(f"expected a Robot or a Calibration, found {given}; read one with omnibench.read_calibration")
+
+
+def _numbers(name: str, values: ArrayLike, dimensions: int) -> Array:
+    """An array of finite numbers. DataError names it, and the row (1 is the first) of what is wrong."""
+    try:
+        array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise DataError(f"{name}: no numbers in rows of one length") from None
+    if array.ndim != dimensions or not array.size:
+        axes = "(rows,)" if dimensions == 1 else "(rows, columns)"
+        raise DataError(f"{name} has shape {array.shape}, expected {axes}")
+    for row in np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))[:1]:
+        raise DataError(f"{name}, row {row + 1}: it holds a value that is missing or infinite")
+    return array
+
+
+def _check(robot: Robot, log: WheelLog) -> None:
+    """DataError: shapes do not agree with each other and the robot, or times do not increase."""
+    steered = robot.drive.steered
+    if steered and log.steering is None:
+        raise DataError(f"steering is missing: angles (F, {len(steered)}) of the wheels {', '.join(steered)}, rad")
+    wheels = (len(log.times), len(robot.wheel_names))
+    for name, array, shape in (
+        ("rates", log.rates, wheels),
+        ("angles", log.wheel_angles, wheels),
+        ("steering", log.steering, (len(log.times), len(steered))),
+        ("start", log.start, (3,)),
+    ):
+        if array is not None and array.shape != shape:
+            raise DataError(f"{name} has shape {array.shape}, expected {shape}: {_axes(name, robot)}")
+    for name, values, least in (("times", log.times, np.nextafter(0.0, 1.0)), ("stamps", log.stamps, 0.0)):
+        steps = np.diff(values, prepend=values[0] - 1.0)
+        for row in np.flatnonzero((steps <= 0) | (values < least))[:1]:
+            rule = "> 0" if name == "times" else ">= 0"
+            raise DataError(f"{name}, row {row + 1}: it is {values[row]:g}; times increase and are {rule}")
+
+
+def _axes(name: str, robot: Robot) -> str:
+    if name == "start":
+        return "x, y in m and heading in rad"
+    names = robot.drive.steered if name == "steering" else robot.wheel_names
+    return f"a row for each of the times, a column for each of the wheels {', '.join(names)}"

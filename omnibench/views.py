@@ -1,0 +1,150 @@
+"""Short texts, data frames and figures of public objects, for a Python prompt and for notebooks.
+
+What an object shows is said in the room ``notebook``, which stands above all others: here the object's class names the
+view, which is imported when it is first asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields
+from html import escape
+from importlib import import_module
+from inspect import signature
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+    import polars as pl
+
+# Module and class of the room ``notebook``, by the class that is shown.
+_VIEWS = {
+    "Calibration": ("calibration_view", "CalibrationView"),
+    "CalibrationRun": ("calibration_view", "CalibrationRunView"),
+    "ComparisonResult": ("comparison_view", "ComparisonView"),
+    "Dataset": ("recording_view", "DatasetView"),
+    "Discovery": ("discovery_view", "DiscoveryView"),
+    "Evaluation": ("calibration_view", "EvaluationView"),
+    "Robot": ("robot_view", "RobotView"),
+    "Trajectory": ("recording_view", "TrajectoryView"),
+}
+_LINES = 20  # of a text, at most: a screenful with what was typed
+_WIDTH = 120  # characters of a line of such a text
+_VALUE = 60  # characters of a field's value in it
+_ROWS = 8  # rows of the table that a notebook shows below the text
+
+
+class View:
+    """An object as it is shown. Subclasses say its text, its tables and its figure."""
+
+    def __init__(self, shown: Any) -> None:
+        self.shown = shown
+
+    def lines(self) -> Iterable[str]:
+        """The text: a first line that says what it is, and lines below."""
+        raise NotImplementedError
+
+    def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
+        """Data frames by name; the first is the one that is shown where none is named."""
+        raise NotImplementedError
+
+    def figure(self, *arguments: Any, **options: Any) -> go.Figure:
+        """The figure."""
+        raise NotImplementedError
+
+
+class Brief:
+    """A mixin for dataclasses: their repr names the fields and shortens their values, arrays to their shapes."""
+
+    def __repr__(self) -> str:
+        named = ((field.name, getattr(self, field.name)) for field in fields(self) if field.repr)  # type: ignore[arg-type]
+        return brief(type(self).__name__, named)
+
+
+class Shown:
+    """A mixin for results: a short text, tables as Polars data frames and a Plotly figure."""
+
+    def __repr__(self) -> str:
+        return "\n".join(self._lines())
+
+    def __str__(self) -> str:
+        return repr(self)
+
+    def _repr_html_(self) -> str:
+        """The text and the head of the first table, for notebooks."""
+        first, *others = map(escape, self._lines())
+        below = "".join(f"<br>{line}" for line in others)
+        table = next(iter(_view(self).tables().values()))()
+        return f"<div><b>{first}</b>{below}</div>{table.head(_ROWS)._repr_html_()}"
+
+    def to_frame(self, table: str | None = None) -> pl.DataFrame:
+        """One of the object's tables as a Polars data frame, in SI units; default: the first.
+
+        Of a data set: trajectories, wheels, poses, references. A trajectory: wheels, poses. A robot: wheels. A
+        calibration: matrix; a run of ``calibrate`` also parameters. An evaluation: splits. A comparison: statistics,
+        runs, errors, history. A discovery: effects, residuals. UnknownNameError lists those that there are.
+        """
+        tables = _view(self).tables()
+        name = next(iter(tables)) if table is None else table
+        if name not in tables:
+            from omnibench.errors import UnknownNameError
+
+            raise UnknownNameError("table", name, tables)
+        return tables[name]()
+
+    def plot(self, **options: Any) -> go.Figure:
+        """The object as a Plotly figure.
+
+        A data set: the reference paths of its runs from one start. A trajectory: its path. A robot: its wheels from
+        above. A calibration: each element's deviation from the design with its 95 % interval, or with ``dataset=`` the
+        paths of a few runs before and after. A comparison: the cost of every entry (``dataset=`` names one of several).
+        A discovery: the errors before and after.
+        """
+        view = _view(self)
+        if unknown := options.keys() - signature(view.figure).parameters.keys():
+            from omnibench.errors import UnknownNameError
+
+            raise UnknownNameError("option of plot", min(unknown), signature(view.figure).parameters)
+        return view.figure(**options)
+
+    def _lines(self) -> list[str]:
+        return _screenful(_view(self).lines())
+
+
+def brief(name: str, values: Iterable[tuple[str | None, Any]]) -> str:
+    """An object in at most twenty lines: its class and its fields, with what is long shortened."""
+    shown = [f"{field}={_shortened(value)}" if field else _shortened(value) for field, value in values]
+    line = f"{name}({', '.join(shown)})"
+    if len(line) <= _WIDTH:
+        return line
+    return "\n".join(_screenful([f"{name}(", *(f"  {each}," for each in shown)], ")"))
+
+
+def _screenful(lines: Iterable[str], end: str = "") -> list[str]:
+    """At most twenty lines of at most 120 characters."""
+    kept = [line if len(line) <= _WIDTH else f"{line[: _WIDTH - 4]} ..." for line in lines]
+    last = [end] if end else []
+    if len(kept) + len(last) > _LINES:
+        room = _LINES - 1 - len(last)
+        kept = [*kept[:room], f"  ... {len(kept) - room} more lines"]
+    return [*kept, *last]
+
+
+def _shortened(value: Any) -> str:
+    """A value in a few words: an array by its shape, a collection by its length where it is long."""
+    shape = getattr(value, "shape", None)
+    if isinstance(shape, tuple) and shape:
+        return f"<array {shape}>"
+    if isinstance(value, str | bytes) and len(value) > _VALUE:
+        return f"{value[: _VALUE - 4]!r}..."
+    if isinstance(value, Mapping | tuple | list) and len(value) > 3:
+        return f"<{len(value)} items>"
+    words = " ".join(repr(value).split())
+    return words if len(words) <= _VALUE else f"<{type(value).__name__}>"
+
+
+def _view(shown: Shown) -> View:
+    """The view of an object, by its class."""
+    module, name = next(_VIEWS[kind.__name__] for kind in type(shown).__mro__ if kind.__name__ in _VIEWS)
+    view: View = getattr(import_module(f"omnibench.notebook.{module}"), name)(shown)
+    return view
