@@ -65,13 +65,34 @@ def import_(
 
 
 @recording_app.command()
-def inspect(dataset: DatasetFolder, as_json: Json = False) -> None:
+def inspect(
+    dataset: DatasetFolder,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Write a page: paths, motions driven, wheel rates, runs step by step."),
+    ] = None,
+    figures: Figures = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
     """Show what a data set holds, and what can be identified from it."""
-    from omnibench.cli.terminal.inspection_tables import print_inspection
+    from omnibench.cli.terminal.inspection_summary import print_inspection
     from omnibench.data.storage import load_dataset
+    from omnibench.files import refuse_existing
     from omnibench.fit.inspect import inspect_dataset
+    from omnibench.report.recording.inspection_report import inspection_document
+    from omnibench.report.render import write_document
 
-    inspection = inspect_dataset(load_dataset(dataset))
+    refuse_existing(report, force=force)
+    refuse_figures_without_browser(figures)
+    recordings = load_dataset(dataset)
+    inspection = inspect_dataset(recordings)
+    if report is not None or figures is not None:
+        document = inspection_document(recordings, inspection)
+        write_asked_figures(document, figures)
+        if report is not None:
+            write_document(document, report)
+            typer.echo(f"report: {report}", err=True)
     if as_json:
         return print_json(inspection)
     print_inspection(make_console(), inspection)

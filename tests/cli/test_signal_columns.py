@@ -9,7 +9,7 @@ from export_samples import TRICYCLE
 from rich.console import Console
 
 from omnibench.cli.terminal.calibration_tables import print_calibration
-from omnibench.cli.terminal.inspection_tables import print_inspection
+from omnibench.cli.terminal.inspection_summary import print_inspection
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.inspect import inspect_dataset

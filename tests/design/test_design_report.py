@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from browser import first_picture
 from report_page import Page
 from report_samples import APR02, flower
 from rich.console import Console
@@ -186,3 +187,10 @@ def test_the_terminal_needs_100_columns_and_cuts_nothing(design: Design) -> None
     told = printed(design)
     assert max(map(len, told.splitlines())) <= 100
     assert "…" not in told
+
+
+def test_what_to_drive_stands_as_a_picture_in_the_first_900_pixels(design: Design, tmp_path: Path) -> None:
+    page(design, tmp_path)
+    bottom, width = first_picture(tmp_path / "report.html")
+    assert bottom <= 900
+    assert width <= 1280

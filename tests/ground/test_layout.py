@@ -20,7 +20,7 @@ BELOW = {
     "slam": {"robot", "data"},
     "simulate": {"robot", "data", "slam"},
     "fit": {"robot", "data"},
-    "report": {"robot", "data", "slam"},
+    "report": {"robot", "data", "slam", "fit"},
     "design": {"robot", "data", "slam", "simulate", "fit", "report"},
     "compare": {"robot", "data", "slam", "simulate", "fit", "report"},
     "discover": {"robot", "data", "simulate", "fit", "report"},

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import opened
+from browser import first_picture, opened
 from recording_samples import COMMANDS, PERIOD, TICK, Sample, sample
 from report_page import Page
 
@@ -218,7 +218,8 @@ def test_more_than_wheels_and_poses_makes_a_section_for_other_reports(made: Samp
     assert not has_recording(bare(made.dataset))
     section = recording_section(made.dataset)
     assert section.key == "recording"
-    assert [part.key for part in section.sections] == [f"recording-{part}" for part in ("room", "wheels", "player")]
+    parts = ("paths", "player", "wheels", "room")
+    assert [part.key for part in section.sections] == [f"recording-{part}" for part in parts]
 
 
 def hostile(run: Trajectory) -> Trajectory:
@@ -281,3 +282,17 @@ def test_singular_covariances_of_a_foreign_recording_are_left_out_of_the_nees(ma
     others = made.dataset.trajectories[1:]
     some = replace(made.dataset, trajectories=(none[0], *others))
     assert "NEES of all poses: mean" in page(some, tmp_path, truth=made.truth).text
+
+
+def test_the_paths_of_a_recording_stand_in_the_first_900_pixels(made: Sample, tmp_path: Path) -> None:
+    page(made.dataset, tmp_path, truth=made.truth, plan=made.plan, starts=made.starts)
+    bottom, width = first_picture(tmp_path / "report.html")
+    assert bottom <= 900
+    assert width <= 1280
+
+
+def test_a_run_with_a_start_pose_alone_is_drawn_all_the_same(made: Sample, tmp_path: Path) -> None:
+    short = {"pose_times": np.zeros(1), "pose_covariances": None}
+    runs = tuple(replace(run, poses=run.poses[:1], **short) for run in made.dataset.trajectories)
+    told = page(replace(made.dataset, trajectories=runs, scans=None), tmp_path)
+    assert {len(run["times"]) > 2 for run in played(told).values()} == {True}

@@ -20,6 +20,7 @@ from omnibench.report.recording.drawing import (
     SCANS_ITEM,
     TRUTH_ITEM,
 )
+from omnibench.report.recording.runs import end_of
 from omnibench.report.recording.scan_points import evenly, scan_points, thinned
 from omnibench.report.style import plan
 from omnibench.report.traces import START, joined, line, marks, path
@@ -47,21 +48,21 @@ def all_runs(dataset: Dataset, shown: Trajectory, outlines: Sequence[Array]) -> 
     flower = joined([seen_from(run.start, _thin(run.poses)) for run in runs])
     paths = [line(REFERENCE_ITEM, 1.0, *flower.T, opacity=0.75), _start(np.zeros(2))]
     number = plural(len(dataset.trajectories), "run")
-    close = Figure(f"{number} from one start", _map(paths), "Reference paths of all runs from one start, close up", 500)
+    close = Figure(f"{number} from one start", _map(paths), "Reference paths of all runs from one start, close up", 380)
     words = "Each run is moved to begin at the origin along x."
     if len(runs) < len(dataset.trajectories):
         words += f" {count(len(runs))} of them are drawn."
     items = [REFERENCE_ITEM, *_room_items(dataset, outlines)]
     if dataset.scans is None:
-        return FigureGrid((close,), tuple(items), 1, words)
+        return FigureGrid((close,), tuple(items), 1, words, "paths")
     points = seen_from(shown.start, thinned(run_points(dataset, shown), _POINTS))
     room = Figure(
         f"The runs in the room that {shown.id} saw",
         _map([*_plan(outlines), marks(SCANS_ITEM, 2.5, *points.T, opacity=0.6), *paths]),
         "Reference paths of all runs with the points that the scans of one have seen, x and y in metres",
-        500,
+        380,
     )
-    return FigureGrid((close, room), tuple(items), 2, words)
+    return FigureGrid((close, room), tuple(items), 2, words, "paths")
 
 
 def one_run(
@@ -71,7 +72,7 @@ def one_run(
 
     outlines: the walls of the floor plan in the frame of the run's reference poses, closed (n, 2) each, m.
     """
-    end = trajectory.pose_times[-1]
+    end = end_of(trajectory)
     (driven,) = odometry.poses([trajectory.log(np.linspace(0.0, end, _PATH))])
     lines = [
         path(REFERENCE_ITEM, _thin(trajectory.poses), 2.6),

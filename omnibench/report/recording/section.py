@@ -10,19 +10,31 @@ import numpy as np
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
-from omnibench.report.blocks import Block, Callout, Choice, Document, Fact, Facts, Section, simulated_badge
-from omnibench.report.numbers import fixed
+from omnibench.report.blocks import (
+    Block,
+    Callout,
+    Choice,
+    Document,
+    Fact,
+    Facts,
+    FigureGrid,
+    Section,
+    answer_section,
+    simulated_badge,
+)
+from omnibench.report.numbers import count, fixed, significant
 from omnibench.report.recording.contents import contents_table
 from omnibench.report.recording.player import player
 from omnibench.report.recording.room_figures import all_runs, one_run
-from omnibench.report.recording.runs import representative_runs
+from omnibench.report.recording.runs import end_of, representative_runs
 from omnibench.report.recording.slam_figures import error_figures
-from omnibench.report.recording.slam_tables import accuracy_blocks
+from omnibench.report.recording.slam_tables import accuracy_tiles, bias_table, error_table, errors_in_words
 from omnibench.report.recording.wheel_figures import wheel_rates
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.planar import placed, seen_from
 from omnibench.slam.accuracy import SlamAccuracy, slam_accuracy
+from omnibench.words import plural
 
 
 class RoomPlan(Protocol):
@@ -62,19 +74,60 @@ def recording_document(
             raise DataError(
                 f"data set {dataset.name}: run {run.id} is not in the truth; name the truth of this data set"
             )
-    sections = [Section("recorded", "What was recorded", (*_about(dataset, notes), contents_table(dataset)))]
     if known and accuracy is None:
         accuracy = slam_accuracy(dataset, known)
+    sections = [_answer(dataset, notes, accuracy, path_overview(dataset, plan, starts))]
     if accuracy is not None:
         errors = error_figures(dataset, known) if known else ()
-        sections.append(Section("slam", "SLAM against the truth", (*accuracy_blocks(accuracy), *errors)))
-    sections += _pictures(dataset, "", known, plan, starts or {})
+        about = "Errors of the reference poses, over time and distance, and whether their covariances are right."
+        tables = (error_table(accuracy), bias_table(accuracy))
+        sections.append(Section("slam", "SLAM against the truth", (*tables, *errors), about=about, folded=True))
+    sections += pictures(dataset, truth=known, plan=plan, starts=starts)
+    contents = (contents_table(dataset), about_table(dataset))
+    about = "Quantities, numbers and intervals, from motion command to reference pose."
+    sections.append(Section("recorded", "What was recorded", contents, about=about, folded=True))
     return Document(
         title=f"Recording: {dataset.name}",
         subtitle=dataset.description,
         sections=tuple(sections),
         badges=simulated_badge(dataset.simulated),
     )
+
+
+def _answer(dataset: Dataset, notes: Sequence[str], accuracy: SlamAccuracy | None, picture: FigureGrid) -> Section:
+    """What is in a recording or, where the truth is known, how accurate its reference poses are; and its paths."""
+    runs = dataset.trajectories
+    seconds = sum(end_of(run) for run in runs)
+    metres = sum(float(np.hypot(*np.diff(run.poses[:, :2], axis=0).T).sum()) for run in runs)
+    sentence = f"{plural(len(runs), 'run')} of {dataset.robot.name}, {significant(metres, 3)} m in {_minutes(seconds)}"
+    tiles: tuple[Fact, ...] = (
+        Fact("Runs", count(len(runs))),
+        Fact("Driven", f"{significant(metres, 3)} m", f"in {_minutes(seconds)}"),
+        Fact("Wheel samples", f"every {significant(1e3 * dataset.sample_period, 3)} ms"),
+        Fact("Reference poses", count(sum(len(run.poses) for run in runs))),
+    )
+    if accuracy is not None:
+        sentence += f". Their reference poses end {errors_in_words(accuracy)} from the truth on average"
+        tiles = accuracy_tiles(accuracy)
+    return answer_section(
+        f"{sentence}.",
+        tiles,
+        picture,
+        Callout("Before you rely on it", tuple(notes)),
+        Callout("Warnings on reading the data", dataset.warnings, "warning"),
+    )
+
+
+def path_overview(
+    dataset: Dataset, plan: RoomPlan | None = None, starts: Mapping[str, Array] | None = None
+) -> FigureGrid:
+    """The paths of all runs from one start, and the room where there are scans."""
+    first = next(iter(representative_runs(dataset).values()))
+    return all_runs(dataset, first, _outlines(plan, (starts or {}).get(first.id)))
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{fixed(seconds / 60, 1)} min"
 
 
 def has_recording(dataset: Dataset) -> bool:
@@ -84,58 +137,56 @@ def has_recording(dataset: Dataset) -> bool:
 
 def recording_section(dataset: Dataset) -> Section:
     """The section on a recording for another report. DataError in one line: broken scans."""
-    parts = _pictures(dataset, "recording-", {}, None, {})
+    paths = Section("recording-paths", "Paths of all runs", (path_overview(dataset),))
+    parts = (paths, *pictures(dataset, prefix="recording-"))
     about = "What was recorded, all paths, wheel rates, and runs step by step."
-    return Section("recording", "Recording", (contents_table(dataset),), tuple(parts), about=about, folded=True)
+    return Section("recording", "Recording", (contents_table(dataset),), parts, about=about, folded=True)
 
 
-def _about(dataset: Dataset, notes: Sequence[str]) -> tuple[Block, ...]:
-    durations = np.array([run.pose_times[-1] for run in dataset.trajectories])
+def about_table(dataset: Dataset) -> Facts:
+    """Name, source, licence and robot of a data set."""
     facts = [
         Fact("Data set", dataset.name, "simulated" if dataset.simulated else ""),
+        Fact("Description", dataset.description),
         Fact("Source", dataset.source),
         Fact("Licence", dataset.licence),
         Fact("Robot", dataset.robot.name),
-        Fact("Runs", str(len(dataset.trajectories)), f"{fixed(float(durations.sum()) / 60, 1)} min in all"),
     ]
-    return (
-        Callout("Before you read on", tuple(notes)),
-        Callout("Warnings on reading the data", dataset.warnings, "warning"),
-        Facts(tuple(fact for fact in facts if fact.value)),
-    )
+    return Facts(tuple(fact for fact in facts if fact.value))
 
 
-def _pictures(
+def pictures(
     dataset: Dataset,
-    prefix: str,
-    truth: Mapping[str, TruePath],
-    plan: RoomPlan | None,
-    starts: Mapping[str, Array],
+    *,
+    prefix: str = "",
+    truth: Mapping[str, TruePath] | None = None,
+    plan: RoomPlan | None = None,
+    starts: Mapping[str, Array] | None = None,
 ) -> list[Section]:
-    """The sections on the room, the wheels and the step-by-step player."""
+    """The sections on single runs: in their room, wheel rates, and the step-by-step player."""
+    known, begun = truth or {}, starts or {}
     runs = representative_runs(dataset)
     odometry = OdometryModel.of_design(dataset.robot, "arc")
-    from_start = {run.id: _outlines(plan, starts.get(run.id)) for run in runs.values()}
+    from_start = {run.id: _outlines(plan, begun.get(run.id)) for run in runs.values()}
     walls = {run.id: [placed(run.start, outline) for outline in from_start[run.id]] for run in runs.values()}
-    first = next(iter(runs.values()))
     rooms: dict[str, tuple[Block, ...]] = {
-        name: (one_run(dataset, run, odometry, truth.get(run.id), walls[run.id]),) for name, run in runs.items()
+        name: (one_run(dataset, run, odometry, known.get(run.id), walls[run.id]),) for name, run in runs.items()
     }
     wheels: dict[str, tuple[Block, ...]] = {name: (wheel_rates(run, dataset.robot),) for name, run in runs.items()}
     exactness: tuple[str, ...] = ()
-    if plan is not None and not _all_known(runs, starts):
+    if plan is not None and not _all_known(runs, begun):
         exactness = (
             f"The floor plan ({plan.name}) is drawn from the robot's mark; for a run that began beside the mark it is "
             "shifted by that distance.",
         )
     return [
+        Section(f"{prefix}player", "Step by step", (player(dataset, runs, odometry, known, walls),)),
+        Section(f"{prefix}wheels", "Wheel rates", (Choice("Run", wheels),)),
         Section(
             f"{prefix}room",
-            "The room" if dataset.scans is not None else "Paths",
-            (Callout("Floor plan", exactness), all_runs(dataset, first, from_start[first.id]), Choice("Run", rooms)),
+            "Runs in their room" if dataset.scans is not None else "Single runs",
+            (Callout("Floor plan", exactness), Choice("Run", rooms)),
         ),
-        Section(f"{prefix}wheels", "Wheels", (Choice("Run", wheels),)),
-        Section(f"{prefix}player", "Step by step", (player(dataset, runs, odometry, truth, walls),)),
     ]
 
 

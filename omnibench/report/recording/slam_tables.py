@@ -5,30 +5,29 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from omnibench.report.blocks import Block, Cell, Column, Fact, Facts, Row, Table
+from omnibench.report.blocks import Cell, Column, Fact, Row, Table
 from omnibench.report.numbers import NOTHING, significant
 from omnibench.slam.accuracy import ErrorSummary, SlamAccuracy
 from omnibench.slam.summary import SlamSummary
 from omnibench.words import plural
 
 
-def accuracy_blocks(accuracy: SlamAccuracy) -> tuple[Block, ...]:
-    """The errors of reference poses against the truth, as tiles and as tables."""
-    return (_tiles(accuracy), error_table(accuracy), bias_table(accuracy))
+def errors_in_words(accuracy: SlamAccuracy) -> str:
+    """The mean errors of the last poses, such as ``1.2 mm and 0.05°``."""
+    final = accuracy.final
+    return f"{_mm(final.position_mean_m)} mm and {_degrees(final.heading_mean_rad)}°"
 
 
-def _tiles(accuracy: SlamAccuracy) -> Facts:
+def accuracy_tiles(accuracy: SlamAccuracy) -> tuple[Fact, ...]:
+    """The errors of reference poses against the truth as a few figures."""
     final = accuracy.final
     position, heading = _mm(final.position_mean_m), _degrees(final.heading_mean_rad)
     drift, turn = _mm(accuracy.drift_position), _degrees(accuracy.drift_heading)
-    return Facts(
-        (
-            Fact("Final position error, mean", f"{position} mm", f"95 % below {_mm(final.position_p95_m)} mm"),
-            Fact("Final heading error, mean", f"{heading}°", f"95 % below {_degrees(final.heading_p95_rad)}°"),
-            Fact("Drift", f"{drift} mm per metre", f"heading {turn}° per metre"),
-            Fact("NEES, mean of all poses", _nees(accuracy.every), "3 where covariances are right"),
-        ),
-        "tiles",
+    return (
+        Fact("Final position error, mean", f"{position} mm", f"95 % below {_mm(final.position_p95_m)} mm"),
+        Fact("Final heading error, mean", f"{heading}°", f"95 % below {_degrees(final.heading_p95_rad)}°"),
+        Fact("Drift", f"{drift} mm per metre", f"heading {turn}° per metre"),
+        Fact("NEES, mean of all poses", _nees(accuracy.every), "3 where covariances are right"),
     )
 
 

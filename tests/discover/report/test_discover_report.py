@@ -7,10 +7,12 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from browser import first_picture
 from discovery_samples import (
     COUPLING,
     EXPERIMENT,
@@ -32,6 +34,7 @@ from omnibench.discover.report.command_figures import command_blocks
 from omnibench.discover.report.discovery_report import discovery_report, sure_blocks, what_blocks
 from omnibench.discover.report.motion_figures import grid
 from omnibench.discover.report.residuals import Residuals
+from omnibench.discover.report.wording import decisive
 from omnibench.discover.result import Absorbed, Discovery, EstimatedParameter
 from omnibench.report.blocks import Document, FigureGrid, Section
 from omnibench.report.render import render
@@ -249,3 +252,19 @@ def test_recorded_data_wear_no_badge_and_hostile_names_stay_words() -> None:
 
 def test_the_options_are_there_to_reproduce_it(report: Page) -> None:
     assert "seed: 0" in report.text
+
+
+def test_the_answer_is_the_cause_in_plain_words_and_what_it_gains(report: Page) -> None:
+    held = decisive(named())
+    before, after = (f"{1e3 * metres:.0f} mm" for metres in held.position_m)
+    assert "The robot turns faster or slower the faster it drives (rotation translation coupling)" in report.text
+    assert f"the held-out error goes from {before} and" in report.text
+    assert f"to {after} and" in report.text
+
+
+@pytest.mark.parametrize("make", [named, nothing, nameless])
+def test_the_paths_stand_in_the_first_900_pixels(make: Callable[[], Discovery], tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text(render(discovery_report(make(), "seed: 0\n")), encoding="utf-8")
+    bottom, width = first_picture(tmp_path / "report.html")
+    assert bottom <= 900
+    assert width <= 1280

@@ -1,0 +1,163 @@
+"""Motions of a recording: speeds, directions and rates of turn, how long each was driven, and which are missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.data.dataset import Trajectory
+from omnibench.report.blocks import Cell, Column, Figure, FigureGrid, LegendItem, Row, Table
+from omnibench.report.numbers import NOTHING, fixed, percent, significant
+from omnibench.report.recording.scan_points import evenly
+from omnibench.report.style import INK, PALETTE, plot
+from omnibench.report.traces import marks
+from omnibench.robot.kinematics import Array, Robot
+
+_BLOCK = 0.5  # s: motions are means over so long, which smooths encoder ticks (chosen)
+_RESTS = 0.05  # share of the fastest motion below which the robot stands (chosen)
+_STRAIGHT = 0.03  # the wheels' way by turning, as a share of the way ahead, below which a motion is straight (chosen)
+_ON_THE_SPOT = 0.1  # the way ahead, as a share of the wheels' way by turning, below which it is on the spot (chosen)
+_HARDLY = 0.01  # share of the time in motion: a motion driven for less was not driven on purpose (chosen)
+_SECTOR = 30.0  # deg about an axis that count as along it (chosen)
+_DRAWN = 2500  # dots of a figure
+_LEFT = LegendItem("left", "turning left", PALETTE[0])
+_STRAIGHT_ON = LegendItem("straight", "straight", "#5b6772")
+_RIGHT = LegendItem("right", "turning right", PALETTE[1])
+
+
+@dataclass(frozen=True, eq=False)
+class DrivenMotion:
+    """One kind of motion: its share of the time in motion, and its twists (n, 3) in m/s, m/s, rad/s."""
+
+    name: str
+    share: float
+    twists: Array
+
+    @property
+    def driven(self) -> bool:
+        """True if it was driven for longer than by chance."""
+        return self.share >= _HARDLY
+
+
+def driven_motions(runs: Sequence[Trajectory], robot: Robot) -> list[DrivenMotion]:
+    """Every kind of motion that the robot can drive, by the design values, with what was driven of it."""
+    twists, seconds = _twists(runs, robot)
+    total = float(seconds.sum()) or 1.0
+    return [
+        DrivenMotion(name, float(seconds[chosen].sum()) / total, twists[chosen])
+        for name, chosen in _kinds(twists, robot).items()
+    ]
+
+
+def missing_in_words(motions: Sequence[DrivenMotion]) -> str:
+    """The motions that were not driven, in words; empty where none is missing."""
+    names = ", ".join(motion.name for motion in motions if not motion.driven)
+    for both in ("on the spot to the left, on the spot to the right", "sideways to the left, sideways to the right"):
+        names = names.replace(both, both.split(" to")[0])
+    return names.replace("curves to", "in curves to")
+
+
+def _twists(runs: Sequence[Trajectory], robot: Robot) -> tuple[Array, Array]:
+    """Mean twists (n, 3) of blocks in motion, by the design values, and the blocks' durations (n,), s."""
+    means, durations = [np.empty((0, 3))], [np.empty(0)]
+    for run in runs:
+        steps = np.diff(run.times, prepend=0.0)
+        starts = np.flatnonzero(np.diff(run.times // _BLOCK, prepend=-1.0))
+        lengths = np.add.reduceat(steps, starts)
+        moved = np.add.reduceat(run.signals @ robot.inverse_kinematic_matrix.T * steps[:, None], starts)
+        means.append(moved / lengths[:, None])
+        durations.append(lengths)
+    twists, seconds = np.concatenate(means), np.concatenate(durations)
+    size = np.hypot(twists[:, 0], twists[:, 1]) + robot.reach * np.abs(twists[:, 2])
+    moving = size > _RESTS * float(size.max(initial=0.0))
+    return twists[moving], seconds[moving]
+
+
+def _kinds(twists: Array, robot: Robot) -> dict[str, NDArray[np.bool_]]:
+    """Masks (n,) of twists, by the name of the motion; those that the robot cannot drive are left out."""
+    speed, turn = np.hypot(twists[:, 0], twists[:, 1]), robot.reach * twists[:, 2]
+    spot = speed < _ON_THE_SPOT * np.abs(turn)
+    straight = ~spot & (np.abs(turn) < _STRAIGHT * speed)
+    angle = np.degrees(np.arctan2(twists[:, 1], twists[:, 0]))
+    kinds = {
+        "straight": straight,
+        "curves to the left": ~spot & ~straight & (turn > 0),
+        "curves to the right": ~spot & ~straight & (turn < 0),
+    }
+    if robot.drive.direct:  # a tricycle or a car may not be able to turn on the spot
+        kinds |= {"on the spot to the left": spot & (turn > 0), "on the spot to the right": spot & (turn < 0)}
+    kinds |= {"forward": ~spot & (np.abs(angle) <= _SECTOR), "backward": ~spot & (np.abs(angle) >= 180 - _SECTOR)}
+    if len(robot.motions) == 3:
+        kinds |= {
+            "sideways to the left": ~spot & (np.abs(angle - 90) <= _SECTOR),
+            "sideways to the right": ~spot & (np.abs(angle + 90) <= _SECTOR),
+        }
+    return kinds
+
+
+def motion_table(motions: Sequence[DrivenMotion]) -> Table:
+    """How long each motion was driven, at which speeds and rates of turn."""
+    rows = []
+    for motion in motions:
+        if not motion.driven:
+            rows.append(Row.of(motion.name, Cell("not driven"), NOTHING, NOTHING, role="failed"))
+            continue
+        speeds = np.hypot(motion.twists[:, 0], motion.twists[:, 1])
+        rates = np.degrees(np.abs(motion.twists[:, 2]))
+        rows.append(Row.of(motion.name, percent(motion.share, 0), _range(speeds, 2), _range(rates, 0)))
+    return Table(
+        "Motions driven",
+        (
+            Column("Motion", numeric=False),
+            Column("Share of the time in motion"),
+            Column("Speed", "m/s"),
+            Column("Rate of turn", "°/s"),
+        ),
+        tuple(rows),
+        "By the design values, as means over 0.5 s; ranges hold nine tenths. A motion counts as straight or curved and "
+        "as forward, backward or sideways (within 30°), so that shares add up to more than 100 %.",
+    )
+
+
+def _range(values: Array, decimals: int) -> str:
+    low, high = np.quantile(values, [0.05, 0.95])
+    shown = [fixed(value, decimals) if value > 10.0**-decimals else significant(value, 1) for value in (low, high)]
+    return shown[0] if shown[0] == shown[1] else f"{shown[0]} to {shown[1]}"
+
+
+def motion_figures(runs: Sequence[Trajectory], robot: Robot) -> FigureGrid:
+    """Velocities seen from above, and speeds against rates of turn, a dot for every half second."""
+    twists, _ = _twists(runs, robot)
+    twists = twists[evenly(len(twists), _DRAWN)] if len(twists) else twists
+    turn = robot.reach * twists[:, 2]
+    straight = np.abs(turn) < _STRAIGHT * np.hypot(twists[:, 0], twists[:, 1])
+    groups = ((_LEFT, ~straight & (turn > 0)), (_STRAIGHT_ON, straight), (_RIGHT, ~straight & (turn < 0)))
+    above, turning = [], []
+    for item, chosen in groups:
+        ahead, aside, rate = twists[chosen].T
+        words = f"{item.label}<br>%{{y:.2f}} m/s ahead, %{{x:.2f}} m/s to the left"
+        above.append(marks(item, 5, aside, ahead, hover=words, marker_opacity=0.6))
+        speeds, degrees = np.hypot(ahead, aside), np.degrees(rate)
+        turning.append(marks(item, 5, degrees, speeds, hover="%{x:.0f}°/s, %{y:.2f} m/s", marker_opacity=0.6))
+    middle = marks(LegendItem("", "", INK, symbol="cross-thin-open"), 10, [0.0], [0.0])
+    velocity = plot(*above, middle, x_title="to the left (m/s)", y_title="ahead (m/s)")
+    reach = 1.1 * max(float(np.abs(twists[:, :2]).max(initial=0.0)), 0.01)
+    velocity.update_layout(
+        xaxis={"range": [reach, -reach], "scaleanchor": "y"}, yaxis={"range": [-reach, reach], "scaleratio": 1}
+    )
+    rates = plot(*turning, x_title="rate of turn, to the left (°/s)", y_title="speed (m/s)")
+    rates.update_xaxes(autorange="reversed")
+    rates.update_yaxes(rangemode="tozero")
+    return FigureGrid(
+        (
+            Figure("Velocities, seen from above", velocity, "Velocity ahead against velocity to the left, m/s", 360),
+            Figure("Speeds and rates of turn", rates, "Speed in m/s against the rate of turn in degrees a second", 360),
+        ),
+        tuple(item for item, _ in groups),
+        2,
+        "A dot is half a second, by the design values.",
+        "motions-driven",
+    )
