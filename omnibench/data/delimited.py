@@ -100,6 +100,10 @@ class CellTable:
         """The names that no column has, by name or by its number, from 1."""
         return [name for name in names if name not in self.names and not _is_number(name, self.names)]
 
+    def fail(self, row: int, what: str) -> DataError:
+        """The error of one row (0 is the first)."""
+        return row_error(self.file, row, int(self.lines[row]), what)
+
     def texts(self, name: str) -> list[str]:
         """One column as texts; whole numbers without a decimal point."""
         column = self.columns[self._index(name)]
@@ -137,7 +141,7 @@ class CellTable:
         except ValueError:
             hint = "; of decimal commas say --set decimal=comma" if _DECIMAL_COMMA.fullmatch(text) else ""
             what = f"{name} is {text!r}, expected a number{hint}"
-            raise row_error(self.file, row, int(self.lines[row]), what) from None
+            raise self.fail(row, what) from None
 
     def _index(self, name: str) -> int:
         return _place(self.file, name, self.names)

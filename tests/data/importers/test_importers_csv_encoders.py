@@ -210,9 +210,12 @@ def test_the_robot_s_own_odometry_in_a_table_is_warned_of(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, r"column 'omega_front' is missing; .*; set wheel_time_column, wheel_columns, steering_columns, separator"),
-        ({"header_lines": 0}, r"row 1: it has 6 fields, expected 3: t omega_front steer_front; set wheel_time_column"),
-        ({"header_lines": 0, "wheel_time_column": 1}, r"column 'omega_front' is missing; found: 1, 2, 3, 4, 5, 6; set"),
+        ({}, r"'omega_front' and 'steer_front' are missing; .* --set \"columns={omega_front: NAME, steer_front: NAME}"),
+        ({"header_lines": 0}, r"it has no header and 6 columns; say by numbers, .* t, omega_front, steer_front, x, y"),
+        (
+            {"header_lines": 0, "wheel_time_column": 1},
+            r"which of them are omega_front, steer_front, x, y, theta:",
+        ),
         ({"wheel_columns": "angle", "steering_columns": 9}, r"column '9' is missing; found: t, angle, phi"),
     ],
 )

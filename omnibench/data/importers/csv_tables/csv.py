@@ -1,8 +1,9 @@
-"""Importer of general CSV recordings: wheel rates, angles or ticks, and poses as CSV or in TUM format."""
+"""Importer of general CSV recordings: wheel rates, angles or ticks, and poses, in one table, two or three."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,23 +11,34 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importer import Importer
 from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.importers.csv_tables.csv_options import CsvOptions
-from omnibench.data.importers.csv_tables.run_files import find_runs
-from omnibench.data.importers.csv_tables.table_streams import read_poses, read_wheels
+from omnibench.data.importers.csv_tables.run_attributes import RunAttributes, check_names, read_run_attributes
+from omnibench.data.importers.csv_tables.table_files import find_tables
+from omnibench.data.importers.csv_tables.table_recordings import read_recordings
 from omnibench.data.importers.runs.recorded_streams import RecordedStreams, by_one_clock
 from omnibench.data.importers.runs.recording_runs import recording_runs
 from omnibench.errors import DataError
 from omnibench.registry import importers
 
+_FAR = 100.0  # times; wheels' and poses' times that last so differently are in other units; chosen
+
 
 @importers.register("csv")
 class Csv(Importer):
-    """CSV files of any robot: for each run ``<run>_wheels.csv`` and ``<run>_poses.csv`` or ``<run>_poses.tum``.
+    """CSV tables of any robot, with wheel rates, angles or ticks, and reference poses.
 
-    The source is a folder, searched with its subfolders, or one file; ``robot`` (a YAML file or a mapping) is the only
-    option that must be given. Defaults: columns t (s), omega_<wheel> (rad/s), steer_<wheel> (rad) in wheels, t (s),
-    x, y (m), theta (rad) in poses; TUM files have ``timestamp tx ty tz qx qy qz qw``. CSV columns are named in a
-    header, in any order and among others, or counted from 1. A source that is one file, or files of equal
-    ``wheel_suffix`` and ``pose_suffix``, hold wheels and poses in the same rows.
+    The source is a folder, searched with its subfolders, or one file. Its tables are told by their names and headers:
+
+        a pair a run   <run>_wheels.csv and <run>_poses.csv (or _poses.tum); or a folder a run, wheels.csv and poses.csv
+        a table a run  any tables whose header holds columns of wheels and of poses
+        one table      the same with a column run, which names the run of each row
+        three tables   wheels.csv and poses.csv, both with a column run, and runs.csv with run, command, repetition,
+                       split, session (each optional; runs.csv may stand beside any other tables, too)
+
+    ``robot`` (a YAML file or a mapping; robot.yaml in the source is found) is the only option that must be given; with
+    ``omnibench import csv --template DIR`` come tables and a robot to fill in. Columns are named in a header, in any
+    order and among others, or counted from 1. Defaults: t (s), omega_<wheel> (rad/s), steer_<wheel> (rad), x, y (m),
+    theta (rad); ``columns`` takes any other names, ``..._unit`` other units. Commas, semicolons or tabs separate
+    them, Parquet files hold the same. Where wheels and poses stand in the same rows, cells without a sample are blank.
 
     wheels: with rates a row holds the mean rates since the row before (its first one: since a sample period before).
     With positions or increments the first row only gives the start of counting. Counters that begin again are counted
@@ -34,14 +46,14 @@ class Csv(Importer):
     encoders at the motor. A run ends where positions begin anew. The sense of a positive rate is in ``omnibench guide
     conventions``; ``wheel_signs: [-1, 1, 1]`` turns a wheel round. Steering angles are those at the rows' times.
 
-    times: both files of a run by one clock, in any epoch (unix time, say). t = 0 becomes the first pose, or, where
-    poses begin before the wheels, the begin of the wheels with the pose interpolated. Poses after the last wheel sample
-    are left out, and so are rows that repeat a time.
+    times: in any epoch (unix time, say), wheels and poses by one clock, or ``clocks=match`` finds what is between them.
+    t = 0 becomes the first pose, or, where poses begin before the wheels, the begin of the wheels with the pose
+    interpolated. Poses after the last wheel sample are left out, and so are rows that repeat a time.
 
     Splits: ``train`` and ``validation`` are patterns of run names (``day2/*``); with one of them all other runs go to
-    the other side, with both the runs in neither are left out, with none every second run of a command validates. Runs
-    share a command by ``command_pattern``; without it nothing is known of repetitions. The runs that ``window`` cuts a
-    recording into are called ``<run>#1``, ``<run>#2`` ...
+    the other side, with both the runs in neither are left out, with none the table of runs says it, or every second run
+    of a command validates. Runs share a command by the table of runs or by ``command_pattern``; without them nothing is
+    known of repetitions. The runs that a recording is cut into are called ``<run>#1``, ``<run>#2`` ...
     """
 
     Options = CsvOptions
@@ -49,33 +61,59 @@ class Csv(Importer):
 
     def read(self, source: Path) -> Dataset:
         """All runs under ``source``; DataError names the file and the row of what is wrong."""
-        warnings: list[str] = []
-        files = find_runs(source, self.options)
-        recordings = [self._read(name, *tables, warnings) for name, tables in files.items()]
-        recordings = by_one_clock(recordings, self.options, warnings)
-        runs = [run for recording in recordings for run in self._runs(recording, warnings)]
-        dataset = self.options.dataset(self.options.divided(runs))
+        options, warnings = self.options, list[str]()
+        recordings = read_recordings(find_tables(source, options, warnings), options, warnings)
+        attributes = read_run_attributes(source, options)
+        check_names(attributes, [recording.name for recording in recordings], warnings)
+        recordings = by_one_clock(recordings, options, warnings)
+        runs = [run for recording in recordings for run in self._runs(recording, attributes, warnings)]
+        splits = [run.split for run in runs] if any(each.split for each in attributes.values()) else None
+        numbers = {run.id: run.repetition for run in runs if run.repetition is not None}
+        divided = [
+            replace(run, repetition=numbers.get(run.id, run.repetition))
+            for run in options.divided(runs, otherwise=splits)
+        ]
+        dataset = options.dataset(divided)
         if (residual := follows_the_wheels(dataset.trajectories)) is not None:
             warnings.append(
                 "the reference is the robot's odometry, or simulated without noise: some matrix makes its headings of "
-                f"the wheels to {residual:.1g} rad a second; if it is odometry, name the columns of an independent one"
+                f"the wheels to {residual:.1g} rad a second; if it is odometry, name the columns of an independent one "
+                '(--set "columns={x: NAME, y: NAME, theta: NAME}")'
             )
         return replace(dataset, warnings=(*warnings, *dataset.warnings))
 
-    def _read(self, name: str, wheel_file: Path, pose_file: Path, warnings: list[str]) -> RecordedStreams:
-        samples = read_wheels(wheel_file, self.options, warnings)
-        return RecordedStreams(name, str(pose_file), samples, read_poses(pose_file, wheel_file, self.options, warnings))
-
-    def _runs(self, recording: RecordedStreams, warnings: list[str]) -> list[Trajectory]:
+    def _runs(
+        self, recording: RecordedStreams, attributes: Mapping[str, RunAttributes], warnings: list[str]
+    ) -> list[Trajectory]:
         name, options, samples, reference = recording.name, self.options, recording.samples, recording.reference
         match = re.search(options.command_pattern, name) if options.command_pattern else None
-        command = match and match.group(1)
-        whole = Trajectory(name, "train", samples.ends, samples.rates, reference.times, reference.poses, command)
+        said = attributes.get(name, RunAttributes())
+        whole = Trajectory(
+            id=name,
+            split=said.split or "train",
+            times=samples.ends,
+            rates=samples.rates,
+            pose_times=reference.times,
+            poses=reference.poses,
+            command=match.group(1) if match else said.command,
+            repetition=said.repetition,
+            session=said.session,
+            started_at=said.started_at,
+        )
         runs = recording_runs(whole, samples, reference, options, warnings, recording.place, options.window)
         if not runs:
-            raise DataError(
-                f"{recording.place}: no two poses while the wheels were recorded (poses {reference.times[0]:.10g} to "
-                f"{reference.times[-1]:.10g} s, wheels {samples.begins[0]:.10g} to {samples.ends[-1]:.10g} s); check "
-                "time units"
-            )
+            raise _apart(recording)
         return [run.trajectory for run in runs]
+
+
+def _apart(recording: RecordedStreams) -> DataError:
+    """The error of wheels and poses that share no time."""
+    samples, times = recording.samples, recording.reference.times
+    spans = f"poses {times[0]:.10g} to {times[-1]:.10g} s, wheels {samples.begins[0]:.10g} to {samples.ends[-1]:.10g} s"
+    share = (times[-1] - times[0]) / (samples.ends[-1] - samples.begins[0])
+    way = "check time units (--set wheel_time_unit=ms, pose_time_unit=ms), or --set clocks=match for clocks apart"
+    if share > _FAR:
+        way = "the poses' times look like ms: --set pose_time_unit=ms (or us, ns)"
+    elif share < 1 / _FAR:
+        way = "the wheels' times look like ms: --set wheel_time_unit=ms (or us, ns)"
+    return DataError(f"{recording.place}: no two poses while the wheels were recorded ({spans}); {way}")

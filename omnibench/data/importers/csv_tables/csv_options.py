@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
@@ -15,15 +16,22 @@ from omnibench.errors import nearest
 from omnibench.words import plural
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
-POSE_SUFFIXES = ("_poses.csv", "_poses.tum")
+WHEEL_SUFFIXES = ("_wheels.csv", "_wheels.parquet")
+POSE_SUFFIXES = ("_poses.csv", "_poses.tum", "_poses.parquet")
 BLANKS = "blanks"
+_SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t"}
+TIMES = ("t", "time", "stamp", "timestamp")
+HEADINGS = ("theta", "heading", "yaw")
+RUNS = ("run", "trajectory")
 
 
 def _as_separator(value: str) -> str:
-    if value.isspace():
+    value = _SEPARATORS.get(value, value)
+    if value.isspace() and value != "\t":
         return BLANKS
     if len(value) != 1 and value != BLANKS:
-        raise ValueError(f"{nearest(value, [BLANKS])}expected one character, or blanks (given: {value!r})")
+        words = [BLANKS, *_SEPARATORS]
+        raise ValueError(f"{nearest(value, words)}expected one character, or {', '.join(words)} (given: {value!r})")
     return value
 
 
@@ -31,31 +39,45 @@ def _as_name(value: object) -> object:
     return str(value) if isinstance(value, int) else value
 
 
+def _as_names(value: Any) -> Any:
+    return {key: _as_name(name) for key, name in value.items()} if isinstance(value, dict) else value
+
+
 Column = Annotated[str, BeforeValidator(_as_name)]
 """An option that takes the name of a column, or its number."""
 
 
 class CsvOptions(EncoderOptions):
-    """Names of files and columns, units, the robot, and which runs train and validate."""
+    """Names of files and columns, units, and how the text is written."""
+
+    group: ClassVar[str] = "Tables, columns and units"
 
     name: str = Field("csv", min_length=1, description="name of the data set")
+    columns: Annotated[dict[str, Column], BeforeValidator(_as_names)] = Field(
+        {}, description="names of columns, as {t: time, omega_left: rpm_l, x: px}; also pose_t, run"
+    )
     wheel_columns: Names = Field((), description="in the robot's order; default omega_, phi_ or ticks_ <wheel>")
-    wheel_signs: Signs = Field((), description="-1 for wheels that count the other way round")
-    wheel_time_column: Column = "t"
-    wheel_time_unit: TimeUnit = "s"
+    wheel_signs: Signs = Field((), description="-1 for wheels that count the other way round, as [-1,1]")
+    wheel_time_column: Column | None = Field(None, description=f"default: {', '.join(TIMES)}")
+    wheel_time_unit: TimeUnit = Field("s", description="unit of the wheels' times")
     steering_columns: Names = Field((), description="in the order of the wheels that steer; default steer_<wheel>")
-    pose_columns: Names = Field(("x", "y", "theta"), description="of CSV poses")
-    pose_time_column: Column | None = Field(None, description="of CSV poses; default t, or the wheels' in one file")
-    pose_time_unit: TimeUnit | None = Field(None, description="of CSV poses; default s, or the wheels' in one file")
+    pose_columns: Names = Field((), description="of x, y and heading; default: x, y, and theta, heading or yaw")
+    pose_time_column: Column | None = Field(None, description="default: as for wheels")
+    pose_time_unit: TimeUnit | None = Field(None, description="default: s, or the wheels' in one table")
     heading_unit: HeadingUnit = Field("rad", description="unit of the headings of CSV poses")
-    separator: Annotated[str, AfterValidator(_as_separator)] = Field(
-        ",", min_length=1, description="a character, or blanks: white space between fields, comments from # on"
+    run_column: Column | None = Field(None, description="it names the run of a row; default: run or trajectory, if any")
+    runs_table: Path | None = Field(
+        None, description="table of run, command, repetition, split, session; default: runs.csv, if any"
     )
+    separator: Annotated[str, AfterValidator(_as_separator)] | None = Field(
+        None, min_length=1, description="comma, semicolon, tab, blanks or a character; default: recognised"
+    )
+    decimal: Literal["point", "comma"] = Field("point", description="what decimals are written with")
     header_lines: int = Field(
-        1, ge=0, description="lines above the rows, the last with the columns' names; 0: columns by number, from 1"
+        1, ge=0, description="lines above the rows, the last with the names; 0: columns by number, from 1"
     )
-    wheel_suffix: str = Field("_wheels.csv", min_length=1, description="what follows a run's name")
-    pose_suffix: str | None = Field(None, min_length=1, description=f"default: {' or '.join(POSE_SUFFIXES)}")
+    wheel_suffix: str | None = Field(None, min_length=1, description="of the wheels' files; default _wheels.csv")
+    pose_suffix: str | None = Field(None, min_length=1, description="of the poses' files; default _poses.csv or .tum")
     window: Positive | None = Field(None, description="s; cuts each recording into runs this long")
     command_pattern: str | None = Field(
         None, description="regular expression: its group 1 in a run's name is the command"
@@ -64,8 +86,12 @@ class CsvOptions(EncoderOptions):
     @model_validator(mode="after")
     def _fits_together(self) -> CsvOptions:
         self.require_one_each("wheel_columns", "wheel_signs", "steering_columns")
-        if len(self.pose_columns) != 3:
-            raise ValueError(f"pose_columns has {plural(len(self.pose_columns), 'value')}, expected 3")
+        if len(self.pose_columns) not in (0, 3):
+            raise ValueError(f"pose_columns has {plural(len(self.pose_columns), 'value')}, expected 3: x, y, heading")
+        known = self.column_keys
+        for key in self.columns:
+            if key not in known:
+                raise ValueError(f"columns: unknown column {key!r}; {nearest(key, known)}known: {', '.join(known)}")
         if self.command_pattern is not None:
             try:
                 groups = re.compile(self.command_pattern).groups
@@ -80,12 +106,13 @@ class CsvOptions(EncoderOptions):
         return self.wheel_signs
 
     @property
-    def columns(self) -> tuple[str, ...]:
-        """The columns of the wheels."""
-        prefix = "omega_" if self.quantity == "rates" else "ticks_" if "ticks" in self.wheel_unit else "phi_"
-        return self.wheel_columns or tuple(prefix + wheel for wheel in self.robot.wheel_names)
+    def prefix(self) -> str:
+        """What the columns of the wheels begin with, by their unit."""
+        return "omega_" if self.quantity == "rates" else "ticks_" if "ticks" in self.wheel_unit else "phi_"
 
     @property
-    def angle_columns(self) -> tuple[str, ...]:
-        """The columns of the steering angles."""
-        return self.steering_columns or tuple(f"steer_{wheel}" for wheel in self.robot.drive.steered)
+    def column_keys(self) -> tuple[str, ...]:
+        """The keys of ``columns``."""
+        wheels = [f"{self.prefix}{wheel}" for wheel in self.robot.wheel_names]
+        steering = [f"steer_{wheel}" for wheel in self.robot.drive.steered]
+        return ("t", *wheels, *self.robot.wheel_names, *steering, "pose_t", "x", "y", "theta", "run")

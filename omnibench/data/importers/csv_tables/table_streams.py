@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omnibench.data.alignment import median_period
-from omnibench.data.delimited import ColumnError, NumberTable, read_numbers
-from omnibench.data.importers.csv_tables.csv_options import BLANKS, CsvOptions
+from omnibench.data.delimited import CellTable, NumberTable
+from omnibench.data.importers.csv_tables.csv_options import CsvOptions
+from omnibench.data.importers.csv_tables.wanted_columns import WantedColumns
 from omnibench.data.importers.runs.reference_options import RADIANS
 from omnibench.data.importers.runs.reference_stream import ReferenceStream
-from omnibench.data.importers.tum import read_tum
 from omnibench.data.importers.wheel_samples import WheelReadings, WheelSamples, wheel_samples
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
@@ -23,54 +23,61 @@ _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _MOST_REPEATED = 0.5  # of a table's rows; more mean that its times are too coarse
 
 
-def read_wheels(file: Path, options: CsvOptions, warnings: list[str]) -> WheelSamples:
-    columns = (*options.columns, *options.angle_columns)
-    keys = ("wheel_time_column", "wheel_columns", *(["steering_columns"] if options.angle_columns else []))
-    table, times = _read(file, options, options.wheel_time_column, options.wheel_time_unit, columns, keys, warnings)
-    shown, counted = table.columns(options.columns), options.quantity != "rates"
+def read_wheels(
+    table: CellTable, wanted: WantedColumns, options: CsvOptions, warnings: list[str], *, shared: bool
+) -> WheelSamples:
+    """The wheel samples of the rows of a run. shared: poses stand in the same rows.
+
+    DataError names the row of what is wrong.
+    """
+    file, count = table.file, len(options.robot.wheel_names)
+    numbers, times, names = _stream(table, wanted, options.wheel_time_unit, warnings, shared)
+    shown, counted = numbers.columns(names[:count]), options.quantity != "rates"
     if counted and len(times) < 2:
         raise DataError(f"{file}: positions and increments need two rows or more")
     values = options.wheel_angles(shown, times, str(file), warnings) if counted else shown * options.wheel_radians
-    angles = options.steering_angles(table.columns(options.angle_columns), str(file)) if options.angle_columns else None
+    angles = options.steering_angles(numbers.columns(names[count:]), str(file)) if len(names) > count else None
     readings = WheelReadings(times, values, counted, options.quantity == "positions", angles)
     period = options.sample_period or (median_period([times]) if len(times) > 1 else float(times[0]))
-    samples, losses = wheel_samples(readings, options, str(file), period)
+    samples, losses = wheel_samples(readings, options, str(file), period, longest_gap=options.longest_gap or np.inf)
     warnings.extend(f"{file}: {loss}" for loss in losses.in_words("row"))
     return samples
 
 
-def read_poses(file: Path, wheel_file: Path, options: CsvOptions, warnings: list[str]) -> ReferenceStream:
-    """The reference poses of a run as the options say."""
-    if file.suffix == ".tum":
-        track = read_tum(file)
-        return ReferenceStream(track.times, track.poses).read_as(options)
-    column, unit = (options.wheel_time_column, options.wheel_time_unit) if file == wheel_file else ("t", "s")
-    column, unit = options.pose_time_column or column, options.pose_time_unit or unit
-    keys = ("pose_time_column", "pose_columns")
-    said = warnings if file != wheel_file else []  # of the same rows it was said
-    table, times = _read(file, options, column, unit, options.pose_columns, keys, said)
-    return ReferenceStream(times, table.columns(options.pose_columns)).read_as(options, RADIANS[options.heading_unit])
+def read_poses(
+    table: CellTable, wanted: WantedColumns, options: CsvOptions, warnings: list[str], *, shared: bool
+) -> ReferenceStream:
+    """The reference poses of the rows of a run as the options say. shared: wheels stand in the same rows."""
+    unit = options.pose_time_unit or (options.wheel_time_unit if shared else "s")
+    said: list[str] = []
+    numbers, times, names = _stream(table, wanted, unit, said, shared)
+    warnings.extend(() if shared else said)  # of the same rows it was said
+    return ReferenceStream(times, numbers.columns(names)).read_as(options, RADIANS[options.heading_unit])
 
 
-def _read(
-    file: Path,
-    options: CsvOptions,
-    time_column: str,
-    unit: str,
-    columns: Sequence[str],
-    keys: Sequence[str],
-    warnings: list[str],
-) -> tuple[NumberTable, Array]:
-    """The columns of a file and its times (rows,), s, without rows that repeat a time."""
-    separator = None if options.separator == BLANKS else options.separator
-    try:
-        table = read_numbers(file, (time_column, *columns), separator=separator, header_lines=options.header_lines)
-    except ColumnError as error:
-        ways = ", ".join([*keys, "separator (blanks, ;)", "header_lines (0: columns by number, from 1)"])
-        raise DataError(f"{error}; set {ways}") from None
-    fresh = np.diff(table.column(time_column), prepend=-math.inf) != 0
+def _stream(
+    table: CellTable, wanted: WantedColumns, unit: str, warnings: list[str], shared: bool
+) -> tuple[NumberTable, Array, list[str]]:
+    """The rows of a table that hold a stream, their times (rows,), s, and the names of its values.
+
+    Rows without any value of the stream are left out, and so are rows that repeat a time.
+    """
+    time, names = wanted.names(table)
+    filled = _filled(table, names)
+    if not len(filled):
+        raise DataError(f"{table.file}: no row has values of the {wanted.what} ({', '.join(names)})")
+    numbers = (table if len(filled) == len(table) else table.only(filled)).finite([time, *names])
+    blank = len(table) - len(filled)
+    if blank and not shared:
+        warnings.append(f"{table.file}: {plural(blank, 'row')} without values of the {wanted.what} left out")
+    fresh = np.diff(numbers.column(time), prepend=-math.inf) != 0
     repeated = int((~fresh).sum())
     if 0 < repeated < _MOST_REPEATED * len(fresh):
-        table = table.only(fresh)
-        warnings.append(f"{file}: {plural(repeated, 'row')} that repeat the {time_column} of the one before left out")
-    return table, table.increasing(time_column) * _SECONDS[unit]
+        numbers = numbers.only(fresh)
+        warnings.append(f"{table.file}: {plural(repeated, 'row')} that repeat the {time} of the one before left out")
+    return numbers, numbers.increasing(time) * _SECONDS[unit], names
+
+
+def _filled(table: CellTable, names: Sequence[str]) -> NDArray[np.intp]:
+    """The rows that hold any of the values."""
+    return np.flatnonzero(~np.isnan(table.numbers(names)).all(axis=1))

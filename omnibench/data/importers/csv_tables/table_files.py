@@ -1,0 +1,148 @@
+"""The tables of every recording under a source: a pair of files each, or tables that hold wheels and poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from omnibench.data.delimited import AUTO, CellTable, NoRowsError, read_cells
+from omnibench.data.importers.csv_tables.csv_options import BLANKS, POSE_SUFFIXES, WHEEL_SUFFIXES, CsvOptions
+from omnibench.data.importers.csv_tables.missing_columns import missing_error
+from omnibench.data.importers.csv_tables.wanted_columns import Wanted, pose_columns, wheel_columns
+from omnibench.errors import DataError
+from omnibench.words import some
+
+RUN_TABLES = ("runs.csv", "runs.parquet", "trajectories.csv", "trajectories.parquet")
+_TABLES = (".csv", ".tsv", ".txt", ".log", ".dat", ".parquet")
+_TEMPLATE = "omnibench import csv --template DIR writes tables to fill in"
+
+
+@dataclass(frozen=True)
+class TablePair:
+    """The files of wheels and of poses of a recording; one file where they stand in the same rows."""
+
+    name: str
+    wheels: Path
+    poses: Path
+
+
+def find_tables(source: Path, options: CsvOptions, warnings: list[str]) -> list[TablePair]:
+    """The tables under a folder, or those of a file, by the names of files, else by what their headers hold."""
+    if source.is_file():
+        return [_of_file(source, options)]
+    wheels, poses = _by_suffix(source, _wheel_suffixes(options)), _by_suffix(source, _pose_suffixes(options))
+    if wheels or (poses and options.wheel_suffix):
+        return _pairs(wheels, poses, options)
+    if options.wheel_suffix:
+        raise DataError(f"{source}: no *{options.wheel_suffix} below it; --set wheel_suffix=ENDING for other names")
+    return _by_headers(source, options, warnings)
+
+
+def load(file: Path, options: CsvOptions) -> CellTable:
+    """The cells of a file as the options say they are written."""
+    separator = None if options.separator == BLANKS else options.separator or AUTO
+    comma = options.decimal == "comma"
+    table = read_cells(file, separator=separator, header_lines=options.header_lines, decimal_comma=comma)
+    if options.header_lines or file.suffix == ".parquet":
+        return table
+    return _as_expected(table, options)
+
+
+def _as_expected(table: CellTable, options: CsvOptions) -> CellTable:
+    """A table without a header that has exactly the columns that are wanted of one of its streams, with their names."""
+    for wanted in (wheel_columns(options), pose_columns(options, shared=False)):
+        names = [each.names[0] for each in wanted.all]
+        if len(names) == len(table.names) and not any(name.isdecimal() for name in names):
+            return table.named(names)
+    return table
+
+
+def _wheel_suffixes(options: CsvOptions) -> tuple[str, ...]:
+    return (options.wheel_suffix,) if options.wheel_suffix else WHEEL_SUFFIXES
+
+
+def _pose_suffixes(options: CsvOptions) -> tuple[str, ...]:
+    return (options.pose_suffix,) if options.pose_suffix else POSE_SUFFIXES
+
+
+def _of_file(source: Path, options: CsvOptions) -> TablePair:
+    for ending in _wheel_suffixes(options):
+        name = source.name.removesuffix(ending)
+        bare = source.name == ending.lstrip("_-.")
+        if name == source.name and not bare:
+            continue
+        for suffix in _pose_suffixes(options):
+            beside = source.with_name(suffix.lstrip("_-.") if bare else name + suffix)
+            if beside.is_file() and beside != source:
+                return TablePair(source.resolve().parent.name if bare else name, source, beside)
+    return TablePair(source.stem, source, source)
+
+
+def _by_suffix(source: Path, suffixes: Sequence[str]) -> dict[str, Path]:
+    """The files that end in one of the suffixes, or are called like one, by the name of their recording."""
+    found = {}
+    for suffix in suffixes:
+        bare = suffix.lstrip("_-.")
+        for file in sorted(source.rglob(f"*{bare}")):
+            place = file.relative_to(source)
+            if file.name == bare and file.name != suffix:
+                found[place.parent.as_posix() if place.parent.name else source.resolve().name] = file
+            elif file.name.endswith(suffix):
+                found[place.as_posix().removesuffix(suffix)] = file
+    return found
+
+
+def _pairs(wheels: dict[str, Path], poses: dict[str, Path], options: CsvOptions) -> list[TablePair]:
+    for name in sorted(wheels):
+        if name not in poses:
+            missing = " or ".join(name + suffix for suffix in _pose_suffixes(options))
+            raise DataError(
+                f"{wheels[name]}: run {name!r} has no {missing}; --set pose_suffix=ENDING for other names, or name "
+                "this file as the source if it holds the poses, too"
+            )
+    for name in sorted(poses):
+        if name not in wheels:
+            missing = name + _wheel_suffixes(options)[0]
+            raise DataError(f"{poses[name]}: run {name!r} has no {missing}; --set wheel_suffix=ENDING for other names")
+    return [TablePair(name, wheels[name], poses[name]) for name in sorted(wheels)]
+
+
+def _by_headers(source: Path, options: CsvOptions, warnings: list[str]) -> list[TablePair]:
+    """The tables under a folder whose headers hold columns of wheels and of poses."""
+    files = [file for file in _tables(source) if file.name not in RUN_TABLES]
+    if not files:
+        raise DataError(
+            f"{source}: no tables below it; a recording is a pair <run>_wheels.csv and <run>_poses.csv, or one table "
+            f"of both ({_TEMPLATE})"
+        )
+    lacking: dict[Path, tuple[CellTable, list[Wanted]]] = {}
+    fitting = []
+    for file in files:
+        try:
+            table = load(file, options)
+        except NoRowsError:
+            warnings.append(f"{file}: left out, as it has no rows")
+            continue
+        missing = [*wheel_columns(options).missing(table), *pose_columns(options, shared=True).missing(table)]
+        if missing:
+            lacking[file] = table, list(dict.fromkeys(missing))
+        else:
+            fitting.append(file)
+    if not fitting:
+        if not lacking:
+            raise DataError(f"{source}: none of its tables has rows ({_TEMPLATE})")
+        table, missing = min(lacking.values(), key=lambda pair: len(pair[1]))
+        raise missing_error(table, missing, options)
+    if lacking:
+        others = some([file.relative_to(source).as_posix() for file in lacking])
+        warnings.append(f"tables without columns of wheels and poses were left out: {others}")
+    return [TablePair(_stem(file, source), file, file) for file in fitting]
+
+
+def _tables(source: Path) -> Iterable[Path]:
+    return sorted(file for file in source.rglob("*") if file.suffix.lower() in _TABLES and file.is_file())
+
+
+def _stem(file: Path, source: Path) -> str:
+    return file.relative_to(source).with_suffix("").as_posix()

@@ -1,0 +1,202 @@
+"""The csv importer's layouts: a pair a run, a table a run, one table, three; blank cells, names and units."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from drive_samples import DIFF, PERIOD, drive, odometry_error
+
+from omnibench.data.dataset import Dataset
+from omnibench.errors import DataError
+from omnibench.robot.kinematics import Array
+from omnibench.slam.import_dataset import import_dataset
+
+FITS = 0.03  # m: noise of the start's heading over the way of a drive
+
+
+def read(source: Path, **options: Any) -> Dataset:
+    return import_dataset("csv", source, {"robot": DIFF} | options)
+
+
+def wheels(seed: int, **names: str) -> pl.DataFrame:
+    """Wheel rates of a drive, at 50 Hz."""
+    of = drive(seed)
+    frame = pl.DataFrame({"t": of.times, "omega_left": of.rates[:, 0], "omega_right": of.rates[:, 1]})
+    return frame.rename(names)
+
+
+def poses(seed: int, **names: str) -> pl.DataFrame:
+    """Poses of a drive, at 10 Hz."""
+    of = drive(seed)
+    x, y, theta = of.poses.T
+    return pl.DataFrame({"t": of.pose_times, "x": x, "y": y, "theta": theta}).rename(names)
+
+
+def both(seed: int) -> pl.DataFrame:
+    """Wheels and poses in one table, blank where a stream has no sample."""
+    joined = pl.concat([_stamped(wheels(seed)), _stamped(poses(seed))], how="diagonal")
+    columns = [pl.col(name).drop_nulls().first() for name in joined.columns if name != "t"]
+    return joined.group_by("t", maintain_order=True).agg(columns).sort("t")
+
+
+def _stamped(frame: pl.DataFrame) -> pl.DataFrame:
+    return frame.with_columns(pl.col("t").round(6))
+
+
+def quarter_ticks(seed: int, turn: int = 1000) -> Array:
+    """Counts of both wheels at the ends of the samples."""
+    of = drive(seed)
+    return np.floor(np.cumsum(of.rates * PERIOD, axis=0) / (2 * np.pi) * turn)
+
+
+def ids(data: Dataset) -> list[str]:
+    return [run.id for run in data.trajectories]
+
+
+def test_a_table_a_run_is_told_by_its_header(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        both(seed).write_csv(tmp_path / f"drive{seed}.csv")
+    pl.DataFrame({"t": [0.0], "voltage": [12.0]}).write_csv(tmp_path / "battery.csv")
+    data = read(tmp_path)
+    assert ids(data) == ["drive1", "drive2"]
+    assert odometry_error(data) < FITS
+    assert data.warnings[0] == "tables without columns of wheels and poses were left out: battery.csv"
+
+
+def test_one_table_names_the_run_of_each_row(tmp_path: Path) -> None:
+    frames = [both(seed).with_columns(run=pl.lit(f"r{seed}")) for seed in (1, 2)]
+    pl.concat(frames).write_csv(tmp_path / "all.csv")
+    for source in (tmp_path / "all.csv", tmp_path):
+        data = read(source)
+        assert ids(data) == ["r1", "r2"]
+        assert odometry_error(data) < FITS
+
+
+def test_three_tables_hold_wheels_poses_and_runs(tmp_path: Path) -> None:
+    for make, name in ((wheels, "wheels"), (poses, "poses")):
+        pl.concat([make(seed).with_columns(run=pl.lit(seed)) for seed in (1, 2, 3)]).write_csv(tmp_path / f"{name}.csv")
+    (tmp_path / "runs.csv").write_text(
+        "run,command,repetition,split,session\n1,curve,2,train,day1\n2,curve,1,validation,day1\n3,line,1,train,\n"
+    )
+    data = read(tmp_path)
+    assert [(run.id, run.command, run.repetition, run.split, run.session) for run in data.trajectories] == [
+        ("1", "curve", 2, "train", "day1"),
+        ("2", "curve", 1, "validation", "day1"),
+        ("3", "line", 1, "train", None),
+    ]
+    assert odometry_error(data) < FITS
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_a_folder_a_run_holds_wheels_and_poses(tmp_path: Path, ending: str) -> None:
+    for seed in (1, 2):
+        (tmp_path / f"run{seed}").mkdir()
+        for make, name in ((wheels, "wheels"), (poses, "poses")):
+            file = tmp_path / f"run{seed}" / f"{name}.{ending}"
+            make(seed).write_csv(file) if ending == "csv" else make(seed).write_parquet(file)
+    if ending == "csv":
+        assert ids(read(tmp_path)) == ["run1", "run2"]
+    else:
+        data = read(tmp_path, wheel_suffix="wheels.parquet", pose_suffix="poses.parquet")
+        assert odometry_error(data) < FITS
+
+
+def test_a_table_of_runs_must_list_every_run(tmp_path: Path) -> None:
+    both(1).write_csv(tmp_path / "drive1.csv")
+    (tmp_path / "runs.csv").write_text("run,command\ndrive2,curve\n")
+    with pytest.raises(DataError, match="does not list run 'drive1'; did you mean 'drive2'"):
+        read(tmp_path)
+
+
+def test_any_column_is_named_by_a_mapping(tmp_path: Path) -> None:
+    made = both(1).rename({"t": "clock", "omega_left": "l", "omega_right": "r", "x": "px", "y": "py", "theta": "h"})
+    made.write_csv(tmp_path / "log.csv")
+    columns = {"t": "clock", "omega_left": "l", "right": "r", "x": "px", "y": "py", "theta": "h"}
+    assert odometry_error(read(tmp_path / "log.csv", columns=columns)) < FITS
+
+
+def test_ticks_millimetres_degrees_and_milliseconds_are_units(tmp_path: Path) -> None:
+    counts = quarter_ticks(1)
+    frame = wheels(1).with_columns(ticks_left=counts[:, 0], ticks_right=counts[:, 1], t=pl.col("t") * 1e3 + 1.7e12)
+    frame.write_csv(tmp_path / "a_wheels.csv")
+    poses(1).select(
+        t=pl.col("t") * 1e6 + 1.7e15, x=pl.col("x") * 1e3, y=pl.col("y") * 1e3, yaw=pl.col("theta").degrees()
+    ).write_csv(tmp_path / "a_poses.csv")
+    units = {"wheel_unit": "ticks", "ticks_per_turn": 1000, "wheel_time_unit": "ms", "pose_time_unit": "us"}
+    assert odometry_error(read(tmp_path, position_unit="mm", heading_unit="deg", **units)) < FITS
+
+
+def test_semicolons_decimal_commas_marks_and_line_ends_of_spreadsheets_are_read(tmp_path: Path) -> None:
+    text = both(1).write_csv(separator=";").replace(".", ",").replace("\n", "\r\n")
+    (tmp_path / "log.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
+    with pytest.raises(DataError, match=r"expected a number; of decimal commas say --set decimal=comma"):
+        read(tmp_path)
+    assert odometry_error(read(tmp_path, decimal="comma")) < FITS
+
+
+def test_all_missing_columns_are_named_with_what_to_type(tmp_path: Path) -> None:
+    names = {"t": "time_ms", "omega_left": "rpm_l", "omega_right": "rpm_r", "x": "px_mm", "theta": "yaw_deg"}
+    both(1).rename(names).write_csv(tmp_path / "log.csv")
+    with pytest.raises(DataError) as caught:
+        read(tmp_path)
+    assert "'t', 'omega_left', 'omega_right', 'x' and 'theta' are missing; found: time_ms, " in str(caught.value)
+    for part in ("t: time_ms", "omega_left: rpm_l", "omega_right: rpm_r", "theta: yaw_deg", "x: px_mm"):
+        assert part in str(caught.value)
+    units = "--set wheel_time_unit=ms --set wheel_unit=rpm --set position_unit=mm --set heading_unit=deg?"
+    assert str(caught.value).endswith(units)
+
+
+def test_missing_columns_of_both_files_are_named_at_once(tmp_path: Path) -> None:
+    wheels(1, omega_left="speed_l").write_csv(tmp_path / "a_wheels.csv")
+    poses(1, x="east").write_csv(tmp_path / "a_poses.csv")
+    with pytest.raises(DataError, match=r"a_wheels\.csv: column 'omega_left' .*; and .*a_poses\.csv: column 'x' is"):
+        read(tmp_path)
+
+
+def test_a_row_with_some_blank_cells_of_a_stream_is_named(tmp_path: Path) -> None:
+    made = both(1).with_columns(theta=pl.when(pl.col("t") == 1.0).then(None).otherwise(pl.col("theta")))
+    made.write_csv(tmp_path / "log.csv")
+    with pytest.raises(DataError, match=r"log\.csv, .*line \d+.*: theta is missing"):
+        read(tmp_path)
+
+
+def test_poses_without_values_are_left_out_and_said(tmp_path: Path) -> None:
+    wheels(1).write_csv(tmp_path / "a_wheels.csv")
+    lost = pl.col("t").is_between(5.0, 5.55)
+    made = poses(1).with_columns(
+        [pl.when(lost).then(float("nan")).otherwise(pl.col(name)).alias(name) for name in ("x", "y", "theta")]
+    )
+    made.write_csv(tmp_path / "a_poses.csv")
+    data = read(tmp_path)
+    assert data.warnings[0].endswith("a_poses.csv: 6 rows without values of the poses left out")
+    assert odometry_error(data) < FITS
+
+
+def test_clocks_of_other_epochs_are_matched(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        wheels(seed).with_columns(t=pl.col("t") + 1.7e9).write_csv(tmp_path / f"r{seed}_wheels.csv")
+        poses(seed).with_columns(t=pl.col("t") + 0.3).write_csv(tmp_path / f"r{seed}_poses.csv")
+    with pytest.raises(DataError, match="or --set clocks=match for clocks apart"):
+        read(tmp_path)
+    assert odometry_error(read(tmp_path, clocks="match")) < FITS
+
+
+def test_times_in_milliseconds_are_told(tmp_path: Path) -> None:
+    wheels(1).with_columns(t=pl.col("t") + 1.7e9).write_csv(tmp_path / "r_wheels.csv")
+    poses(1).with_columns(t=(pl.col("t") + 1.7e9) * 1e3).write_csv(tmp_path / "r_poses.csv")
+    with pytest.raises(DataError, match="the poses' times look like ms: --set pose_time_unit=ms"):
+        read(tmp_path)
+
+
+def test_robot_yaml_in_the_source_is_the_robot(tmp_path: Path) -> None:
+    both(1).write_csv(tmp_path / "drive1.csv")
+    robot = "name: r\nwheels:\n" + "".join(
+        f"  - {{name: {side}, type: fixed, radius: 0.05, x: 0, y: {y}}}\n"
+        for side, y in (("left", 0.15), ("right", -0.15))
+    )
+    (tmp_path / "robot.yaml").write_text(robot)
+    assert odometry_error(import_dataset("csv", tmp_path)) < FITS
