@@ -20,7 +20,10 @@ comparison_app = typer.Typer()
 
 @comparison_app.command()
 def compare(
-    config: Annotated[Path, typer.Argument(help="Comparison config (YAML).")],
+    config: Annotated[
+        Path,
+        typer.Argument(metavar="CONFIG|DATASET", help="Comparison config (YAML), or a data set folder: a quick one."),
+    ],
     output: Annotated[
         Path | None,
         output_option("Folder for the results; finished runs in it are kept. Default: results/NAME/TIME."),
@@ -40,18 +43,25 @@ def compare(
 ) -> None:
     """Run calibrators on equal terms, score them, write a report.
 
-    All calibrators of the config get the same data and the same budget. Run again with the same -o, it goes on
-    where it was stopped.
+    All calibrators of the config, or all that suit the data set, get the same data and the same budget. Run again
+    with the same -o, it goes on where it was stopped.
     """
     from omnibench.cli.terminal.comparison_tables import print_comparison_ending, print_result
     from omnibench.cli.terminal.progress_display import ProgressDisplay
     from omnibench.compare.read_config import read_compare_config
+    from omnibench.compare.recording_config import config_in_words, recording_config
     from omnibench.compare.report.comparison_report import comparison_document
     from omnibench.compare.run import run_comparison
     from omnibench.progress import Progress
 
     refuse_figures_without_browser(figures)
-    comparison = read_compare_config(config, _named_paths(data))
+    if config.is_dir():
+        if data:
+            raise ConfigError(f"--data is for a config, and {config} is a data set; leave it out")
+        comparison = recording_config(config, plugins or ())
+        make_console(error=True).print(config_in_words(comparison), soft_wrap=True)
+    else:
+        comparison = read_compare_config(config, _named_paths(data))
     folders = [*comparison.plugins, *(folder.resolve() for folder in plugins or [])]
     comparison = comparison.model_copy(update={"plugins": tuple(dict.fromkeys(folders))})
     with ProgressDisplay() as watch:

@@ -95,26 +95,31 @@ def _layout(table: Table, width: int) -> _Layout:
     """The most comfortable layout that fits: notes beside, notes below, narrow gaps, and at last fewer columns."""
     beside = [_extent(table, index, "beside").natural for index in range(len(table.columns))]
     below = {index: _extent(table, index, "below") for index in range(len(table.columns))}
-    needed = _needed(table, below)
+    needed = _width(_floors(table, below), 1)
     if sum(beside) + 2 * (len(beside) - 1) <= width:
         return _Layout(dict(enumerate(beside)), 2, "beside", needed)
-    while len(below) > 1 and _needed(table, below) > width:
+    while len(below) > 1 and _width(_floors(table, below), 1) > width:
         del below[max(list(below)[1:], key=lambda index: (table.columns[index].priority, index))]
-    gap = 2 if sum(extent.least for extent in below.values()) + 2 * (len(below) - 1) <= width else 1
+    floors = _floors(table, below)
+    gap = 2 if _width(floors, 2) <= width else 1
     widths = {index: extent.natural for index, extent in below.items()}
     for _ in range(sum(widths.values()) + gap * (len(widths) - 1) - width):
         wide = [index for index in widths if widths[index] > below[index].cells]  # headings wrap first
-        wide = wide or [index for index in widths if widths[index] > below[index].least]
+        wide = wide or [index for index in widths if widths[index] > floors[index]]
         if wide:  # else one column is left, with a word that is longer than the terminal is wide
             widths[max(wide, key=lambda index: widths[index])] -= 1
     return _Layout(widths, gap, "below", needed)
 
 
-def _needed(table: Table, extents: Mapping[int, _Extent]) -> int:
-    """Width in which columns can stand: text stays readable as long as there are lesser columns to leave out."""
+def _floors(table: Table, extents: Mapping[int, _Extent]) -> Mapping[int, int]:
+    """Least widths of columns: text stays readable as long as there are lesser columns to leave out."""
     lesser = any(table.columns[index].priority for index in extents)
-    widths = (extent.readable if lesser else extent.least for extent in extents.values())
-    return sum(widths) + len(extents) - 1
+    return {index: extent.readable if lesser else extent.least for index, extent in extents.items()}
+
+
+def _width(columns: Mapping[int, int], gap: int) -> int:
+    """The width of columns side by side."""
+    return sum(columns.values()) + gap * (len(columns) - 1)
 
 
 def _extent(table: Table, index: int, notes: Place) -> _Extent:
