@@ -76,7 +76,7 @@ def run_comparison(
             held_out=held_out_verdicts(statistics, datasets, config.bootstrap),
             sessions=sessions_that_differ(datasets, config.integration),
             environment=environment(),
-            warnings=tuple(_warnings(failures, datasets, plan, runs)),
+            warnings=tuple(_warnings(config, failures, datasets, plan, runs)),
         )
         write_results(result)
         write_document(comparison_document(result), folder / "report.html")
@@ -110,6 +110,7 @@ def _resumable(plan: Sequence[PlannedRun], store: ResultStore[RunResult], folder
 
 
 def _warnings(
+    config: CompareConfig,
     failures: Iterable[PluginFailure],
     datasets: Mapping[str, Dataset],
     plan: Sequence[PlannedRun],
@@ -125,6 +126,10 @@ def _warnings(
             dataset.robot, dataset.split("train"), parameterisation, fitted[0].config.unidentified
         )
         yield from (f"data set {name}, fit of the {parameterisation}: {warning}" for warning in undetermined)
+    if config.loss != "squares":
+        first = {run.dataset_name: run for run in reversed(plan)}
+        for name, run in first.items():
+            yield from (f"data set {name}: {sentence}" for sentence in run.task.problem().moved_ends)
     if not all(is_mean(run) for run in runs):
         yield "the cost is no mean over trajectories: intervals and differences are of the mean of their own costs"
 

@@ -22,9 +22,10 @@ from omnibench.fit.parameterisation import (
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
 from omnibench.fit.shrinkage.prior import MountChoice, default_cost, default_mount, default_unidentified
 from omnibench.fit.shrinkage.shrinkage import shrunk
-from omnibench.fit.span import Unidentified, WheelDirection
+from omnibench.fit.span import Unidentified, WheelDirection, driven_span, unidentified_directions
 from omnibench.fit.steering_fit import SteeringChoice, SteeringFit, corrected_runs, on_bounds, words_of
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals, bootstrap_intervals
+from omnibench.fit.uncertainty.physical import inseparable_in_words
 from omnibench.fit.uncertainty.ratio_intervals import FEWEST, Units, units_of
 from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 from omnibench.fit.uncertainty.unidentified import kept_motions, warnings_of_calibration
@@ -39,10 +40,10 @@ from omnibench.robot.calibration import (
     matrix_rows,
 )
 from omnibench.robot.effects.term import Term
+from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 from omnibench.views import Shown
-from omnibench.words import plural
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -103,25 +104,12 @@ def calibrate(
     """
     require_type(dataset, Dataset, "load_dataset")
     chosen: Calibrator = calibrators.create(calibrator, options)
-    if intervals and not chosen.exact:
-        raise ConfigError("intervals are drawn about a minimum to rounding: use the calibrator closed_form")
     training = training_split(dataset)
     cost = cost or default_cost(dataset.robot, len(training))
     plain: Cost = costs.create(cost)
     objective = with_loss(plain, loss)
-    if intervals and loss != "squares":
-        raise ConfigError(
-            f"resampled intervals are drawn about the minimum of a sum of norms: leave out the loss {loss}, or the "
-            "resampling, since a calibration has other intervals, too"
-        )
     unidentified = unidentified or default_unidentified(dataset.robot)
-    if tolerance is not None and unidentified != "shrink":
-        raise ConfigError(f"tolerance is of the design, for unidentified: shrink, and unidentified is {unidentified}")
-    if intervals and unidentified == "shrink":
-        raise ConfigError(
-            "resampled intervals are drawn about a minimum, which a shrunk answer is not: set unidentified to keep; a "
-            "shrunk answer has intervals of its own"
-        )
+    _check_choices(chosen, loss, unidentified, tolerance, intervals)
     terms: tuple[Term, ...] = ()
     driven = training
     if steering == "fit":
@@ -152,76 +140,150 @@ def calibrate(
     result = shrunk(problem, run_calibrator(chosen, problem), fitted=chosen.bounded)
     if result.matrix is None or result.vector is None:
         raise ConfigError(f"calibrator {calibrator!r} gave no answer ({result.outcome}): {result.reason}")
-    validation = dataset.split("validation")
-    model = OdometryModel(dataset.robot, result.matrix, integration, terms, dataset.sample_period)
-    uncertainty, doubts = _uncertainty(problem, result, chosen)
-    warnings = warnings_of_calibration(dataset.robot, driven, searched.name, unidentified)
-    if terms:
-        doubts += (
-            f"the steering was fitted first ({words_of(terms)}); the matrix's intervals take "
-            "these numbers for exact, and the file has no covariance",
+    uncertainty, untold = _uncertainty(problem, result, chosen)
+    fit = _Fit(dataset, calibrator, chosen, problem, result, terms, uncertainty)
+    calibration = fit.calibration(
+        cost=cost,
+        plain=plain,
+        loss=loss,
+        unidentified=unidentified,
+        tolerance=tolerance,
+        mount=mount,
+    )
+    units = units_of(training)
+    drawn = None
+    if intervals and units.count >= FEWEST and uncertainty:
+        drawn = bootstrap_intervals(problem, result.vector, units=units, rng=problem.rng)
+    return CalibrationRun(
+        calibration=calibration,
+        result=result,
+        intervals=drawn,
+        parameters=fitted_parameters(searched, result.vector) if isinstance(searched, WheelGeometry) else None,
+        uncertainty=uncertainty,
+        warnings=(
+            *warnings_of_calibration(dataset.robot, driven, searched.name, unidentified),
+            *_inseparable(problem, chosen),
+            *problem.moved_ends,
+            *untold,
+            *_doubts_of_steering(dataset.robot, terms),
+            *_too_few_units(intervals, units),
+        ),
+        kept=kept_motions(dataset.robot, driven, searched.name, unidentified),
+        units=units,
+    )
+
+
+def _check_choices(
+    chosen: Calibrator, loss: LossName, unidentified: Unidentified, tolerance: float | None, intervals: bool
+) -> None:
+    """ConfigError: two choices contradict each other."""
+    if intervals and not chosen.exact:
+        raise ConfigError("intervals are drawn about a minimum to rounding: use the calibrator closed_form")
+    if intervals and loss != "squares":
+        raise ConfigError(
+            f"resampled intervals are drawn about the minimum of a sum of norms: leave out the loss {loss}, or the "
+            "resampling, since a calibration has other intervals, too"
         )
-        doubts += tuple(
+    if tolerance is not None and unidentified != "shrink":
+        raise ConfigError(f"tolerance is of the design, for unidentified: shrink, and unidentified is {unidentified}")
+    if intervals and unidentified == "shrink":
+        raise ConfigError(
+            "resampled intervals are drawn about a minimum, which a shrunk answer is not: set unidentified to keep; a "
+            "shrunk answer has intervals of its own"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A fit that gave an answer, before it is a calibration file."""
+
+    dataset: Dataset
+    calibrator: str
+    chosen: Calibrator
+    problem: CalibrationProblem
+    result: RunResult
+    terms: tuple[Term, ...]
+    uncertainty: Uncertainty | None
+
+    def calibration(
+        self,
+        *,
+        cost: str,
+        plain: Cost,
+        loss: LossName,
+        unidentified: Unidentified,
+        tolerance: float | None,
+        mount: MountChoice | None,
+    ) -> Calibration:
+        """The calibration, with how it came about. plain: the cost without its loss, which costs in the file are of."""
+        dataset, problem, result, uncertainty = self.dataset, self.problem, self.result, self.uncertainty
+        assert result.matrix is not None  # there is an answer
+        robot, validation = dataset.robot, dataset.split("validation")
+        model = OdometryModel(robot, result.matrix, problem.integration, self.terms, dataset.sample_period)
+        squares = loss == "squares"
+        return fitted_calibration(
+            name=f"{dataset.name} {self.calibrator}",
+            robot=robot,
+            sample_period=dataset.sample_period,
+            matrix=matrix_rows(result.matrix),
+            integration=problem.integration,
+            effects=tuple(EffectTerm(name=term.name, parameters=dict(term.values)) for term in self.terms),
+            noise=uncertainty.noise if uncertainty else None,
+            covariance=covariance_rows(uncertainty.covariance) if uncertainty and not self.terms else None,
+            provenance=Provenance(
+                dataset=dataset.name,
+                dataset_hash=dataset.hash,
+                fitted=dataset.fingerprints("train"),
+                simulated=dataset.simulated,
+                calibrator=self.calibrator,
+                options=self.chosen.options.model_dump(mode="json"),
+                seed=problem.seed,
+                cost=cost,
+                loss=None if loss == "squares" else loss,
+                box=problem.box,
+                unidentified=unidentified,
+                tolerance=tolerance,
+                mount=None if robot.slides else mount or default_mount(robot),
+                unshrunk_cost=result.shrinkage.unshrunk_cost if result.shrinkage and squares else None,
+                on_bounds=result.at_bounds,
+                versions=package_versions(),
+                training_cost=result.cost if squares else plain.of_model(model, training_split(dataset)),
+                validation_cost=plain.of_model(model, validation) if validation else None,
+                outcome=result.outcome,
+                reason=result.reason,
+                held_out=verdict_on(model, validation),
+            ),
+        )
+
+
+def _inseparable(problem: CalibrationProblem, calibrator: Calibrator) -> tuple[str, ...]:
+    """Sentences on numbers of a fitted geometry that the data cannot tell apart; none of a matrix."""
+    if not isinstance(problem.parameterisation, WheelGeometry) or not calibrator.bounded:
+        return ()
+    kept = unidentified_directions(problem.robot, driven_span(problem.trajectories))
+    return inseparable_in_words(problem.parameterisation, kept)
+
+
+def _doubts_of_steering(robot: Robot, terms: tuple[Term, ...]) -> tuple[str, ...]:
+    """Sentences on a steering that was fitted first; none where it was not."""
+    if not terms:
+        return ()
+    return (
+        f"the steering was fitted first ({words_of(terms)}); the matrix's intervals take these numbers for exact, and "
+        "the file has no covariance",
+        *(
             f"{number} lies on the bound of what is searched, so that these runs hardly tell it, or it stands for "
             "something else; take the fit only for drives that steer as these do"
-            for number in on_bounds(dataset.robot, terms)
-        )
-    calibration = fitted_calibration(
-        name=f"{dataset.name} {calibrator}",
-        robot=dataset.robot,
-        sample_period=dataset.sample_period,
-        matrix=matrix_rows(result.matrix),
-        integration=integration,
-        effects=tuple(EffectTerm(name=term.name, parameters=dict(term.values)) for term in terms),
-        noise=uncertainty.noise if uncertainty else None,
-        covariance=covariance_rows(uncertainty.covariance) if uncertainty and not terms else None,
-        provenance=Provenance(
-            dataset=dataset.name,
-            dataset_hash=dataset.hash,
-            fitted=dataset.fingerprints("train"),
-            simulated=dataset.simulated,
-            calibrator=calibrator,
-            options=chosen.options.model_dump(mode="json"),
-            seed=seed,
-            cost=cost,
-            loss=None if loss == "squares" else loss,
-            box=problem.box,
-            unidentified=unidentified,
-            tolerance=tolerance,
-            mount=None if dataset.robot.slides else mount or default_mount(dataset.robot),
-            unshrunk_cost=result.shrinkage.unshrunk_cost if result.shrinkage and loss == "squares" else None,
-            on_bounds=result.at_bounds,
-            versions=package_versions(),
-            training_cost=result.cost if loss == "squares" else plain.of_model(model, training),
-            validation_cost=plain.of_model(model, validation) if validation else None,
-            outcome=result.outcome,
-            reason=result.reason,
-            held_out=verdict_on(model, validation),
+            for number in on_bounds(robot, terms)
         ),
     )
-    units, drawn = units_of(training), None
-    if intervals and units.count < FEWEST:
-        doubts += (f"no resampled intervals: {units.words}; {FEWEST} are needed",)
-    elif intervals and uncertainty:
-        drawn = bootstrap_intervals(problem, result.vector, units=units, rng=problem.rng)
-    geometry = problem.parameterisation
-    parameters = fitted_parameters(geometry, result.vector) if isinstance(geometry, WheelGeometry) else None
-    kept = kept_motions(dataset.robot, driven, searched.name, unidentified)
-    warnings = (*warnings, *_ends_in_words(problem), *doubts)
-    return CalibrationRun(calibration, result, drawn, parameters, uncertainty, warnings, kept, units)
 
 
-def _ends_in_words(problem: CalibrationProblem) -> tuple[str, ...]:
-    """A sentence on the runs whose start or end has jumped; none where none has."""
-    moved = problem.ends_moved
-    if not moved:
+def _too_few_units(intervals: bool, units: Units) -> tuple[str, ...]:
+    """A sentence where resampled intervals were asked for and there are too few units; none else."""
+    if not intervals or units.count >= FEWEST:
         return ()
-    which = "start or end" if problem.objective.stamps == "final" else "start"
-    named = f"{', '.join(moved[:5])}{' ...' if len(moved) > 5 else ''}"
-    return (
-        f"{plural(len(moved), 'run')} of {len(problem.trajectories)} ({named}): the reference pose at the {which} is "
-        "far from what the poses beside it say, which are used in its place",
-    )
+    return (f"no resampled intervals: {units.words}; {FEWEST} are needed",)
 
 
 def _uncertainty(

@@ -19,7 +19,7 @@ from omnibench.fit.evaluator.driven_frame import DrivenFrame
 from omnibench.fit.evaluator.element_box import ElementBox
 from omnibench.fit.evaluator.evaluator import PoseEvaluator, make_evaluator
 from omnibench.fit.geometry import GeometryLimits, WheelGeometry
-from omnibench.fit.loss.end_poses import with_ends_from_others
+from omnibench.fit.loss.end_poses import moved_ends_in_words, with_ends_from_others
 from omnibench.fit.loss.robust_cost import RobustCost, norms_of
 from omnibench.fit.parameterisation import (
     Box,
@@ -139,6 +139,12 @@ class CalibrationProblem:
     def size(self) -> int:
         """The length n of the vector."""
         return len(self.start)
+
+    @property
+    def moved_ends(self) -> tuple[str, ...]:
+        """A sentence on the runs whose start or end has jumped; none where none has."""
+        last = self.objective.stamps == "final"
+        return moved_ends_in_words(self.ends_moved, len(self.trajectories), last=last)
 
     @property
     def remaining(self) -> int:

@@ -19,8 +19,10 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 from omnibench.robot.planar import compose, relative
+from omnibench.words import plural
 
 _BESIDE = 3  # poses beside an end that tell where it was: the fewest of which one may be off, too
+_NAMED = 5  # runs that a sentence names
 _FEWEST_RUNS = 5  # fewer ends do not tell how far an end usually is from what the poses beside it say
 
 
@@ -48,6 +50,18 @@ def with_ends_from_others(
             moved[index] = replace(moved[index], poses=poses)
             names.add(runs[index].id)
     return tuple(moved), tuple(run.id for run in runs if run.id in names)
+
+
+def moved_ends_in_words(names: Sequence[str], runs: int, *, last: bool) -> tuple[str, ...]:
+    """A sentence on the runs (``names``) of all (their number) whose start or end has jumped; none where none has."""
+    if not names:
+        return ()
+    which = "start or end" if last else "start"
+    named = f"{', '.join(names[:_NAMED])}{' ...' if len(names) > _NAMED else ''}"
+    return (
+        f"{plural(len(names), 'run')} of {runs} ({named}): the reference pose at the {which} is far from what the "
+        "poses beside it say, which are used in its place",
+    )
 
 
 def _told(design: OdometryModel, run: Trajectory, end: int) -> Array:

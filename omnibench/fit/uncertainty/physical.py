@@ -74,8 +74,53 @@ def identified_parameters(geometry: WheelGeometry, kept: Array) -> tuple[bool, .
     Linearised about the design: a parameter is identified if every change of the geometry that moves it changes the
     known part of the matrix.
     """
+    return tuple(bool(share < _UNIDENTIFIED) for share in np.diag(_unseen_changes(geometry, kept)))
+
+
+def inseparable_parameters(geometry: WheelGeometry, kept: Array) -> tuple[tuple[str, ...], ...]:
+    """Groups of numbers that cannot be told apart: a change of one is made up for by the others of its group.
+
+    kept as for ``identified_parameters``; the numbers that are not identified are those of all groups. A group of one
+    is a number of which nothing is known. The changes that are not seen form a space; its projection is zero between
+    numbers of different groups.
+    """
+    projection = _unseen_changes(geometry, kept)
+    left = [index for index, share in enumerate(np.diag(projection)) if share >= _UNIDENTIFIED]
+    groups = []
+    while left:
+        group, reached = [], [left[0]]
+        while reached:
+            number = reached.pop()
+            group.append(number)
+            left.remove(number)
+            tied = [other for other in left if abs(projection[number, other]) > _UNIDENTIFIED]
+            reached += [other for other in tied if other not in reached]
+        groups.append(tuple(geometry.names[index] for index in sorted(group)))
+    return tuple(groups)
+
+
+def inseparable_in_words(geometry: WheelGeometry, kept: Array) -> tuple[str, ...]:
+    """A sentence for each group of a geometry's numbers that cannot be told apart."""
+    return tuple(map(_group_in_words, inseparable_parameters(geometry, kept)))
+
+
+def _group_in_words(group: tuple[str, ...]) -> str:
+    if len(group) == 1:
+        return f"these data say nothing of {group[0]}: it stays where the search left it"
+    return (
+        f"these data cannot tell {', '.join(group[:-1])} and {group[-1]} apart: a change of one is made up for by the "
+        "others, so that no such number is known by itself, only what they do together in the motions that were driven"
+    )
+
+
+def _unseen_changes(geometry: WheelGeometry, kept: Array) -> Array:
+    """The projection (n, n) onto changes of a geometry, in units of its scale, that leave the known matrix as it is.
+
+    Linearised about the design.
+    """
     rows = np.repeat(geometry.robot.row_scales, len(geometry.robot.drive.names))
     slopes = known_slopes(geometry, kept) / rows[:, None]
     _, strengths, directions = np.linalg.svd(np.vstack([slopes, np.zeros((slopes.shape[1], slopes.shape[1]))]))
     unidentified = directions[strengths <= _NO_CHANGE * strengths[0]]
-    return tuple(bool(share < _UNIDENTIFIED) for share in np.square(unidentified).sum(axis=0))
+    projection: Array = unidentified.T @ unidentified
+    return projection
