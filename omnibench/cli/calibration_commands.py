@@ -28,7 +28,12 @@ def calibrate(
     output: Annotated[
         Path | None, output_option("Calibration file to write. Default: it is only shown.", metavar="FILE.yaml")
     ] = None,
-    calibrator: Annotated[str, typer.Option(help="How to search; omnibench list names all.")] = "closed_form",
+    calibrator: Annotated[
+        str | None,
+        typer.Option(
+            help="How to search; omnibench list names all. Default: closed_form; trajectory_ml, of runs without poses."
+        ),
+    ] = None,
     cost: Annotated[
         str | None,
         typer.Option(help="What to minimise (see omnibench list). Default: final_pose; trajectory, of few runs."),
@@ -96,7 +101,8 @@ def calibrate(
     from omnibench.robot.calibration import write_calibration
 
     load_given_plugins(plugins)
-    calibrators.entry(calibrator, "--calibrator")
+    if calibrator is not None:
+        calibrators.entry(calibrator, "--calibrator")
     if cost is not None:
         costs.entry(cost, "--cost")
     refuse_existing(output, force=force)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from omnibench.data.dataset import Dataset
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError, require_type
 from omnibench.fit.calibrator import Calibrator, RunResult, run_calibrator
@@ -15,6 +15,7 @@ from omnibench.fit.evaluate import verdict_on
 from omnibench.fit.geometry import FittedParameter, GeometryLimits, WheelGeometry, fitted_parameters
 from omnibench.fit.loss.losses import LossName
 from omnibench.fit.loss.robust_cost import with_loss
+from omnibench.fit.observations.open_in_words import open_sentences
 from omnibench.fit.parameterisation import (
     Box,
     ParameterisationName,
@@ -68,7 +69,7 @@ class CalibrationRun(Shown):
 
 def calibrate(
     dataset: Dataset,
-    calibrator: str = "closed_form",
+    calibrator: str | None = None,
     *,
     options: Mapping[str, Any] | None = None,
     cost: str | None = None,
@@ -88,6 +89,8 @@ def calibrate(
 ) -> CalibrationRun:
     """Fit the odometry model of a data set's training split.
 
+    calibrator: default closed_form, or trajectory_ml where training runs have references other than poses, each of
+    which it weighs by its own uncertainty.
     intervals: also draw resampled intervals about the optimum (closed_form only), unless there are fewer than three
     commands (runs, where none is repeated) or too few for a covariance, of which a warning tells.
     loss: of the cost's pose errors when they are fitted. squares: as the calibrator takes them; huber, student_t: poses
@@ -103,8 +106,9 @@ def calibrate(
     when the calibrator gives no answer.
     """
     require_type(dataset, Dataset, "load_dataset")
-    chosen: Calibrator = calibrators.create(calibrator, options)
     training = training_split(dataset)
+    calibrator = calibrator or default_calibrator(training)
+    chosen: Calibrator = calibrators.create(calibrator, options)
     cost = cost or default_cost(dataset.robot, len(training))
     plain: Cost = costs.create(cost)
     objective = with_loss(plain, loss)
@@ -162,6 +166,7 @@ def calibrate(
         uncertainty=uncertainty,
         warnings=(
             *warnings_of_calibration(dataset.robot, driven, searched.name, unidentified),
+            *open_sentences(dataset.robot, driven, unidentified),
             *_inseparable(problem, chosen),
             *problem.moved_ends,
             *untold,
@@ -171,6 +176,11 @@ def calibrate(
         kept=kept_motions(dataset.robot, driven, searched.name, unidentified),
         units=units,
     )
+
+
+def default_calibrator(training: Sequence[Trajectory]) -> str:
+    """The calibrator where none is given: the one that weighs references by their uncertainty, if there are some."""
+    return "closed_form" if all(run.references is None for run in training) else "trajectory_ml"
 
 
 def _check_choices(
@@ -228,7 +238,7 @@ class _Fit:
             matrix=matrix_rows(result.matrix),
             integration=problem.integration,
             effects=tuple(EffectTerm(name=term.name, parameters=dict(term.values)) for term in self.terms),
-            noise=uncertainty.noise if uncertainty else None,
+            noise=uncertainty.noise if uncertainty and any(run.has_poses for run in problem.trajectories) else None,
             covariance=covariance_rows(uncertainty.covariance) if uncertainty and not self.terms else None,
             provenance=Provenance(
                 dataset=dataset.name,

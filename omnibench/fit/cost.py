@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
+from omnibench.fit.observations.reference_batch import ReferenceBatch, predicted_by
+from omnibench.fit.observations.reference_rows import ReferenceRows, reference_rows
 from omnibench.registry import Options, costs
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
@@ -23,7 +25,8 @@ class Cost(ABC):
     """One number for the pose errors of a set of trajectories.
 
     stamps: where along a trajectory poses are compared, ``final`` (last reference pose) or ``reference`` (all after the
-    start). rounding: in the cost's unit; one that is not above it is rounding, of which no share means anything.
+    start). Of a run with references other than poses all of these count, too, each with the coordinates that it has.
+    rounding: in the cost's unit; one that is not above it is rounding, of which no share means anything.
     """
 
     Options: ClassVar[type[Options]] = Options
@@ -45,9 +48,30 @@ class Cost(ABC):
 
     def of_model(self, model: OdometryModel, trajectories: Sequence[Trajectory]) -> float:
         """The cost of a model on some trajectories. DataError: these lack what an effect of the model needs."""
+        errors, owner = self.errors_of(model, trajectories)
+        return float(self.combine(errors[None], owner)[0])
+
+    def errors_of(self, model: OdometryModel, trajectories: Sequence[Trajectory]) -> tuple[Array, NDArray[np.intp]]:
+        """Errors (S, 3) of a model at this cost's stamps, and the trajectory (S,) of each. DataError: see above."""
+        if (rows := self.rows(trajectories)) is not None:
+            return predicted_by(model, rows) - rows.observed, rows.trajectory
         poses = model.reported(self.logs(trajectories))
         owner = np.repeat(np.arange(len(poses)), [len(of_run) for of_run in poses])
-        return float(self.combine((np.concatenate(poses) - self.reference(trajectories))[None], owner)[0])
+        return np.concatenate(poses) - self.reference(trajectories), owner
+
+    def rows(self, trajectories: Sequence[Trajectory]) -> ReferenceRows | None:
+        """The rows that this cost compares, where a trajectory has references other than poses; else None.
+
+        DataError: a trajectory has nothing that this cost compares.
+        """
+        if all(run.references is None for run in trajectories):
+            return None
+        return reference_rows(trajectories, self.stamps, self.coordinates, self.name)
+
+    @property
+    def coordinates(self) -> tuple[float, float, float]:
+        """Factors of the errors of x, y and heading; 0 of those that do not count."""
+        return (1.0, 1.0, 1.0)
 
     def logs(self, trajectories: Sequence[Trajectory]) -> list[WheelLog]:
         """The wheel logs of the trajectories with this cost's stamps. DataError: one has no pose after its start."""
@@ -56,12 +80,16 @@ class Cost(ABC):
                 raise DataError(f"trajectory {run.id} has no reference pose after its start, which {self.name} needs")
         return [t.final_log if self.stamps == "final" else t.reference_log for t in trajectories]
 
-    def batch(self, trajectories: Sequence[Trajectory], integration: Integration) -> OdometryBatch:
-        """The odometry of the trajectories at this cost's stamps."""
+    def batch(self, trajectories: Sequence[Trajectory], integration: Integration) -> OdometryBatch | ReferenceBatch:
+        """The odometry of the trajectories at this cost's stamps, or what it says of their references."""
+        if (rows := self.rows(trajectories)) is not None:
+            return ReferenceBatch(rows, integration)
         return OdometryBatch(self.logs(trajectories), integration)
 
     def reference(self, trajectories: Sequence[Trajectory]) -> Array:
-        """The reference poses (S, 3) at this cost's stamps."""
+        """The reference poses (S, 3) at this cost's stamps, or what was observed in their place."""
+        if (rows := self.rows(trajectories)) is not None:
+            return rows.observed
         return np.concatenate([t.poses[-1:] if self.stamps == "final" else t.poses[1:] for t in trajectories])
 
 
@@ -76,6 +104,11 @@ class SumOfNorms(Cost):
 
     weights: ClassVar[tuple[float, float, float]] = (1.0, 1.0, 1.0)
     rounding = NO_ERROR
+
+    @property
+    def coordinates(self) -> tuple[float, float, float]:
+        """The weights."""
+        return self.weights
 
     def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
         """Costs (P,): the norms, weighted by the stamps' shares."""

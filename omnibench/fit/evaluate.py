@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -10,8 +11,10 @@ from pydantic import Field
 from omnibench.config import Model
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory
 from omnibench.data.domain_check import extrapolation_warning
+from omnibench.data.references.run_references import UNITS, ReferenceKind
 from omnibench.errors import require_type
 from omnibench.fit.held_out import judge, nothing_held_out, unfitted_runs
+from omnibench.fit.observations.reference_errors import errors_by_kind, mean_errors, measured_parts
 from omnibench.fit.sessions.session_differences import compare_sessions
 from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
@@ -20,15 +23,34 @@ from omnibench.robot.model import OdometryModel
 from omnibench.views import Shown
 
 
+class ReferenceErrors(Model):
+    """Errors of a model at the references of one kind: their mean and largest magnitude, m or rad as ``unit`` says.
+
+    in_sigmas: root mean square of the errors in standard deviations of the references; 1 for a model that is right.
+    """
+
+    kind: ReferenceKind
+    references: int
+    unit: Literal["m", "rad"]
+    mean: float
+    max: float
+    in_sigmas: float
+
+
 class SplitErrors(Model):
-    """Cost (Eq. 6) and errors of the final pose, on one split."""
+    """Cost (Eq. 6) and errors of the final pose, on one split.
+
+    Of runs that have references in the place of poses they are means over these; None where no run has any of a
+    position or length, or of an angle. references: errors at these by their kind; left out where there are none.
+    """
 
     trajectories: int = Field(exclude=True)
     cost: float
-    position_mean_m: float
-    position_max_m: float
-    heading_mean_rad: float
-    heading_max_rad: float
+    position_mean_m: float | None
+    position_max_m: float | None
+    heading_mean_rad: float | None
+    heading_max_rad: float | None
+    references: tuple[ReferenceErrors, ...] = Field((), exclude_if=lambda references: not references)
 
 
 class Evaluation(Shown, Model):
@@ -120,9 +142,17 @@ def verdict_on(model: OdometryModel, held_out: Sequence[Trajectory]) -> HeldOutV
 
 
 def final_errors(model: OdometryModel, trajectories: Sequence[Trajectory]) -> Array:
-    """Final pose errors (Z, 3): reported by the model minus reference, at each trajectory's last pose, m, m, rad."""
+    """Final pose errors (Z, 3): reported by the model minus reference, at each trajectory's last pose, m, m, rad.
+
+    In their place, of a run that has references and no poses: the mean error of its lengths and places, 0, and that of
+    its angles; 0 where it has none of these.
+    """
     ends = np.concatenate(model.reported([trajectory.final_log for trajectory in trajectories]))
-    return ends - np.array([trajectory.final_pose for trajectory in trajectories])
+    errors = ends - np.array([trajectory.final_pose for trajectory in trajectories])
+    for index, run in enumerate(trajectories):
+        if not run.has_poses and run.references is not None:
+            errors[index] = mean_errors(model, run)
+    return errors
 
 
 def positions_and_headings(errors: Array) -> tuple[Array, Array]:
@@ -134,12 +164,23 @@ def split_errors(model: OdometryModel, trajectories: Sequence[Trajectory]) -> Sp
     """Errors of a model on some trajectories."""
     errors = final_errors(model, trajectories)
     positions, headings = positions_and_headings(errors)
-    cost = costs.create("final_pose").combine(errors[None], np.arange(len(errors)))
+    placed, turned = measured_parts(trajectories)
     return SplitErrors(
         trajectories=len(trajectories),
-        cost=float(cost[0]),
-        position_mean_m=float(positions.mean()),
-        position_max_m=float(positions.max()),
-        heading_mean_rad=float(headings.mean()),
-        heading_max_rad=float(headings.max()),
+        cost=costs.create("final_pose").of_model(model, trajectories),
+        position_mean_m=float(positions[placed].mean()) if placed.any() else None,
+        position_max_m=float(positions[placed].max()) if placed.any() else None,
+        heading_mean_rad=float(headings[turned].mean()) if turned.any() else None,
+        heading_max_rad=float(headings[turned].max()) if turned.any() else None,
+        references=tuple(
+            ReferenceErrors(
+                kind=kind,
+                references=len(of_kind),
+                unit=UNITS[kind],
+                mean=float(np.mean(of_kind[:, 0])),
+                max=float(np.max(of_kind[:, 0])),
+                in_sigmas=float(np.sqrt(np.mean(np.square(of_kind[:, 1])))),
+            )
+            for kind, of_kind in errors_by_kind(model, trajectories).items()
+        ),
     )

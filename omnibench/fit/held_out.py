@@ -10,6 +10,7 @@ import numpy as np
 
 from omnibench.data.dataset import WHEEL_DIGITS, Dataset, Trajectory
 from omnibench.fit.cost import NO_ERROR
+from omnibench.fit.observations.reference_errors import measured_parts
 from omnibench.fit.uncertainty.ratio_intervals import FEWEST, Bootstrap, Interval, RatioIntervals, Units, units_of
 from omnibench.robot.calibration import HeldOutVerdict
 from omnibench.robot.kinematics import Array
@@ -44,7 +45,10 @@ def unfitted_runs(dataset: Dataset, fitted: Collection[str]) -> tuple[Trajectory
 def judge(
     design: Array, calibrated: Array, runs: Sequence[Trajectory], bootstrap: Bootstrap | None = None
 ) -> HeldOutVerdict:
-    """The verdict by the final pose errors (Z, 3), m, m, rad, of the design values and of the calibration."""
+    """The verdict by the final pose errors (Z, 3), m, m, rad, of the design values and of the calibration.
+
+    Of runs without poses they are what ``final_errors`` of evaluate.py says.
+    """
     if not runs:
         return nothing_held_out()
     bootstrap = bootstrap or Bootstrap()
@@ -55,25 +59,29 @@ def judge(
     verdict: Literal["better", "worse", "undecided"] = "undecided"
     if low is not None and high is not None and not (low <= 0 <= high):
         verdict = "better" if low > 0 else "worse"
-    positions = [float(np.hypot(errors[:, 0], errors[:, 1]).mean()) for errors in (design, calibrated)]
-    headings = [float(np.abs(errors[:, 2]).mean()) for errors in (design, calibrated)]
+    placed, turned = measured_parts(runs)
+    positions = [
+        float(np.hypot(errors[:, 0], errors[:, 1])[placed].mean()) for errors in (design, calibrated) if placed.any()
+    ]
+    headings = [float(np.abs(errors[:, 2])[turned].mean()) for errors in (design, calibrated) if turned.any()]
+    changes = [*([_lengths(*positions)] if positions else []), *([_angles(*headings)] if headings else [])]
     meaning = (
         _MEANINGS[verdict] if verdict != "undecided" else _undecided(gain, units, same=bool((costs == before).all()))
     )
     return HeldOutVerdict(
         verdict=verdict,
         runs=tuple(run.id for run in runs),
-        design_position_m=positions[0],
-        position_m=positions[1],
-        design_heading_rad=headings[0],
-        heading_rad=headings[1],
+        design_position_m=positions[0] if positions else None,
+        position_m=positions[1] if positions else None,
+        design_heading_rad=headings[0] if headings else None,
+        heading_rad=headings[1] if headings else None,
         improvement=None if gain is None else gain.value,
         low=low,
         high=high,
         unit=units.name,
         units=units.count,
         method=units.method,
-        sentence=f"held out ({plural(len(runs), 'run')}): {_lengths(*positions)}, {_angles(*headings)}, {meaning}",
+        sentence=f"held out ({plural(len(runs), 'run')}): {', '.join([*changes, meaning])}",
         detail=f"{_gain_in_words(gain, units)}{noun_for(len(runs), 'run')}: {_named(runs)}",
     )
 

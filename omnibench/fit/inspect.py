@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from omnibench.config import Model
-from omnibench.data.dataset import SPLITS, Dataset, Split
+from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
+from omnibench.data.references.run_references import KINDS, ReferenceKind
 from omnibench.data.scans import Scans
 from omnibench.errors import require_type
 from omnibench.fit.span import direction_in_words, driven_span
 from omnibench.fit.uncertainty.identifiability import Identifiability, identifiability
+from omnibench.robot.model import OdometryModel
 from omnibench.words import plural
 
 
@@ -39,7 +43,8 @@ class ScansContent(Model):
 
 
 class Inspection(Model):
-    """A data set in numbers. driven_shares: RMS along each direction of wheel rates, relative to the strongest.
+    """A data set in numbers. references: how many there are other than poses, by kind. driven_shares: RMS along each
+    direction of wheel rates, relative to the strongest.
 
     identifiability: how well the training runs (all runs, if none is marked train) determine the robot's parameters.
     """
@@ -54,9 +59,10 @@ class Inspection(Model):
     trajectories: int
     sample_period_s: float
     sample_period_range_s: tuple[float, float]
-    pose_period_s: float
+    pose_period_s: float | None
     wheel_samples: int
     reference_poses: int
+    references: dict[ReferenceKind, int]
     has_angles: bool
     has_targets: bool
     scans: ScansContent | None
@@ -93,9 +99,10 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
         trajectories=len(trajectories),
         sample_period_s=dataset.sample_period,
         sample_period_range_s=(float(periods.min()), float(periods.max())),
-        pose_period_s=float(np.median(pose_periods)),
+        pose_period_s=float(np.median(pose_periods)) if len(pose_periods) else None,
         wheel_samples=len(periods),
-        reference_poses=len(pose_periods) + len(trajectories),
+        reference_poses=len(pose_periods) + sum(run.start_known for run in trajectories),
+        references=_references(trajectories),
         has_angles=all(t.angles is not None for t in trajectories),
         has_targets=all(t.targets is not None for t in trajectories),
         scans=None if dataset.scans is None else _scans(dataset.scans),
@@ -112,6 +119,8 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
 def _content(dataset: Dataset, split: Split) -> SplitContent:
     group = dataset.split(split)
     commands = [t.command for t in group if t.command is not None]
+    design = OdometryModel.of_design(dataset.robot, "arc")  # which drives the runs that have no poses
+    paths = [t.poses if t.has_poses else design.poses([t.log(t.times)])[0] for t in group]
     counts = [commands.count(command) for command in sorted(set(commands))] or [1]
     return SplitContent(
         trajectories=len(group),
@@ -120,9 +129,15 @@ def _content(dataset: Dataset, split: Split) -> SplitContent:
         repetitions_max=max(counts),
         sessions=len({t.session for t in group if t.session is not None}),
         duration_s=float(sum(t.times[-1] for t in group)),
-        distance_m=float(sum(np.linalg.norm(np.diff(t.poses[:, :2], axis=0), axis=1).sum() for t in group)),
-        turned_rad=float(sum(np.abs(t.poses[-1, 2] - t.poses[0, 2]) for t in group)),
+        distance_m=float(sum(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum() for path in paths)),
+        turned_rad=float(sum(np.abs(path[-1, 2] - path[0, 2]) for path in paths)),
     )
+
+
+def _references(runs: Sequence[Trajectory]) -> dict[ReferenceKind, int]:
+    """Numbers of references other than poses, by their kind."""
+    kinds = [kind for run in runs if run.references is not None for kind in run.references.kinds.tolist()]
+    return {kind: kinds.count(kind) for kind in KINDS if kind in kinds}
 
 
 def _scans(scans: Scans) -> ScansContent:

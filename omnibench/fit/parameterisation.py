@@ -78,7 +78,9 @@ class MatrixElements:
 
     null (q, M): orthonormal directions of drive signals that the data do not identify; along them the matrix keeps its
     start values. known_mount: the matrix gives a robot that cannot slide only twists in which its fixed wheels do not,
-    the tracked point being where the robot says; False: it may be elsewhere. tolerance: see prior.py.
+    the tracked point being where the robot says; False: it may be elsewhere. tolerance: see prior.py. open (q, 3M):
+    orthonormal combinations of elements, in units of their rows' largest, that references other than poses leave open;
+    along them the matrix keeps its start values, too.
     """
 
     robot: Robot
@@ -86,6 +88,7 @@ class MatrixElements:
     null: Array
     known_mount: bool = True
     tolerance: float | None = None
+    open: Array | None = None
     name: ParameterisationName = field(default="matrix", init=False)
 
     @property
@@ -109,6 +112,9 @@ class MatrixElements:
         if not (self.rows == np.eye(3)).all():
             design = self.robot.inverse_kinematic_matrix
             matrices = design + self.rows @ (matrices - design)
+        if self.open is not None and len(self.open):
+            deviations = (matrices.reshape(len(matrices), -1) - self.start) / self.units
+            matrices = matrices - (deviations @ self.open.T @ self.open * self.units).reshape(matrices.shape)
         return matrices
 
     def slopes(self, vector: Array) -> Array:  # noqa: ARG002 (the matrix is linear in the vector)
@@ -118,7 +124,15 @@ class MatrixElements:
     @property
     def projection(self) -> Array:
         projection: Array = np.kron(self.rows, np.eye(len(self.robot.drive.names)) - self.null.T @ self.null)
+        if self.open is not None and len(self.open):
+            kept = self.units[:, None] * self.open.T @ self.open / self.units
+            projection = projection - kept @ projection
         return projection
+
+    @property
+    def units(self) -> Array:
+        """The largest element (3M,) of each element's row, m and rad per rad."""
+        return np.repeat(self.robot.row_scales, len(self.robot.drive.names))
 
     @property
     def prior_root(self) -> Array:

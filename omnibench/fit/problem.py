@@ -21,6 +21,8 @@ from omnibench.fit.evaluator.evaluator import PoseEvaluator, make_evaluator
 from omnibench.fit.geometry import GeometryLimits, WheelGeometry
 from omnibench.fit.loss.end_poses import moved_ends_in_words, with_ends_from_others
 from omnibench.fit.loss.robust_cost import RobustCost, norms_of
+from omnibench.fit.observations.open_combinations import with_open_combinations
+from omnibench.fit.observations.reference_batch import ReferenceBatch
 from omnibench.fit.parameterisation import (
     Box,
     MatrixElements,
@@ -184,10 +186,11 @@ class CalibrationProblem:
     def build_evaluator(self) -> PoseEvaluator | None:
         """The fast evaluator, which ``cost`` uses from now on; None where direct integration is faster.
 
+        There is none for references other than poses either.
+
         ``cost`` builds it by itself when a search asks for many candidates. Both ways give the same costs to 1e-11.
         """
-        if not self._evaluator_tried:
-            self._evaluator_tried = True
+        if not self._evaluator_tried and isinstance(self.odometry, OdometryBatch):
             logs, odometry, searched = self.objective.logs(self.trajectories), self.odometry, self.parameterisation
             if isinstance(searched, MatrixElements) and len(searched.null):
                 self._frame = DrivenFrame.of(searched)
@@ -195,6 +198,7 @@ class CalibrationProblem:
                 odometry = OdometryBatch(logs, self.integration)
             box = ElementBox.of(self._frame or searched, self.lower, self.upper)
             self._evaluator = make_evaluator(odometry, logs, self.integration, box)
+        self._evaluator_tried = True
         return self._evaluator
 
     def to_unit(self, vectors: Array) -> Array:
@@ -267,15 +271,18 @@ class CalibrationProblem:
         return self.objective.combine(poses, self.odometry.trajectory)
 
     def _relevant(self) -> NDArray[np.bool_]:
-        """True (n,) for elements that the cost depends on: for a cost of headings alone, those of row 3."""
+        """True (n,) for elements that the cost depends on: for headings alone those of row 3."""
         cost = norms_of(self.objective)
         if not isinstance(self.parameterisation, MatrixElements):
             return np.ones(len(self.start), dtype=bool)
         used = np.repeat(self.parameterisation.rows.any(axis=0), len(self.robot.drive.names))
-        if cost is None or 0.0 not in cost.weights:
+        if (cost is None or 0.0 not in cost.weights) and not isinstance(self.odometry, ReferenceBatch):
             return used
         slopes: Array = np.abs(self.odometry.jacobian(self.matrix(self.start))).max(axis=0)  # (3, 3, N)
-        return np.asarray(used & ((np.abs(cost.weights) @ slopes.reshape(3, -1)) > 0))
+        weights = (1.0, 1.0, 1.0) if cost is None else cost.weights
+        if isinstance(self.odometry, ReferenceBatch):  # rows that no wheel can move are not searched anyway
+            slopes[:, ~self.parameterisation.rows.any(axis=1)] = 1.0
+        return np.asarray(used & ((np.abs(weights) @ slopes.reshape(3, -1)) > 0))
 
     def _check_budget(self) -> None:
         """Raise BudgetSpent if no evaluations or no seconds are left."""
@@ -336,7 +343,8 @@ def make_parameterisation(
     if name == "geometry":
         return WheelGeometry(robot, limits, mount == "fit", tolerance)
     null = directions_kept(robot, driven_span(trajectories), unidentified)
-    return MatrixElements(robot, box, null, mount == "known", tolerance)
+    searched = MatrixElements(robot, box, null, mount == "known", tolerance)
+    return searched if unidentified == "shrink" else with_open_combinations(searched, trajectories)
 
 
 def _frozen(array: NDArray[Any]) -> NDArray[Any]:

@@ -30,6 +30,8 @@ _NULL_SHARE = 1e-2
 # Robotino's would count as driven.
 WEAK_SHARE = 0.1
 
+_EVERY = 1.0  # s between the moments at which wheel angles are compared where there are no poses; chosen
+
 # The following decide on names of directions alone; half of each and twice give the same names
 # (tests/benchmarks/constants_fit.py).
 _SAME_DIRECTION = 0.99  # cosine from which on a direction is called by one of the robot's motions: 8 degrees
@@ -218,8 +220,9 @@ def _signed(directions: Array) -> Array:
 
 
 def _angles_at_poses(trajectory: Trajectory) -> Array:
-    """Wheel angles (K, N) driven up to each reference pose, rad."""
+    """Wheel angles (K, N) driven up to each reference pose, rad; without poses once a second."""
     driven = np.cumsum(trajectory.signals * np.diff(trajectory.times, prepend=0.0)[:, None], axis=0)
     times = np.concatenate([[0.0], trajectory.times])
     angles = np.vstack([np.zeros(driven.shape[1]), driven])
-    return interpolated(trajectory.pose_times, times, angles)
+    stamps = trajectory.pose_times if trajectory.has_poses else np.arange(0.0, times[-1] + _EVERY, _EVERY)
+    return interpolated(stamps, times, angles)

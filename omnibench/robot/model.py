@@ -59,6 +59,8 @@ class OdometryModel:
         """
         if self.motion_terms:
             return [self._path(log).poses(log.stamps) for log in logs]
+        if not logs:
+            return []
         batch = OdometryBatch(logs, self.integration)
         poses = batch.poses(self.matrix[None])[0]
         return [poses[batch.trajectory == index] for index in range(len(logs))]

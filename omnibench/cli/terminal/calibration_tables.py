@@ -73,7 +73,8 @@ def print_calibration(console: Console, run: CalibrationRun) -> None:
         console.print(f"95 % intervals: {run.uncertainty.source}", soft_wrap=True)
         if run.intervals is not None:
             console.print(f"95 % intervals, resampled: {run.units.words}", soft_wrap=True)
-        console.print(f"noise of the reference: {'; '.join(noise_in_words(run.uncertainty.noise))}", soft_wrap=True)
+        if calibration.noise is not None:
+            console.print(f"noise of the reference: {'; '.join(noise_in_words(calibration.noise))}", soft_wrap=True)
     console.print(
         f"{result.outcome}: {result.reason}; {plural(result.evaluations, 'evaluation')}, {result.seconds:.2f} s",
         soft_wrap=True,
@@ -170,10 +171,11 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
         for label, errors in (("calibration", evaluation.splits[split]), ("design", evaluation.design[split])):
             figures = (
                 f"{errors.cost:.4f}",
-                f"{errors.position_mean_m:.4f}",
-                f"{errors.position_max_m:.4f}",
-                f"{math.degrees(errors.heading_mean_rad):.2f}",
-                f"{math.degrees(errors.heading_max_rad):.2f}",
+                *("" if each is None else f"{each:.4f}" for each in (errors.position_mean_m, errors.position_max_m)),
+                *(
+                    "" if each is None else f"{math.degrees(each):.2f}"
+                    for each in (errors.heading_mean_rad, errors.heading_max_rad)
+                ),
             )
             rows.append(Row.of(label, *figures))
     columns = (
@@ -185,6 +187,41 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     kind = " (simulated data)" if evaluation.simulated else ""
     note = f"fitted with the loss {evaluation.loss}; cost and errors are without it" if evaluation.loss else ""
     print_table(console, Table(f"{evaluation.dataset}{kind}", columns, tuple(rows), note))
+    _print_references(console, evaluation)
+
+
+def _print_references(console: Console, evaluation: Evaluation) -> None:
+    """Print the errors at references other than poses, by kind, of the calibration and of the design values."""
+    rows = []
+    for split, errors in evaluation.splits.items():
+        if not errors.references:
+            continue
+        rows.append(Row.of(split, role="group"))
+        for fitted, before in zip(errors.references, evaluation.design[split].references, strict=True):
+            figures = (
+                _size(each, of_model.unit) for of_model in (fitted, before) for each in (of_model.mean, of_model.max)
+            )
+            ratios = (f"{fitted.in_sigmas:.1f}", f"{before.in_sigmas:.1f}")
+            rows.append(Row.of(fitted.kind, str(fitted.references), *figures, *ratios))
+    columns = (
+        Column("reference", numeric=False),
+        Column("number"),
+        Column("mean"),
+        Column("largest", priority=1),
+        Column("design: mean"),
+        Column("largest", priority=1),
+        Column("in sigmas"),
+        Column("design: in sigmas", priority=1),
+    )
+    if rows:
+        note = (
+            "in sigmas: root mean square of errors in the references' own standard deviations, 1 if the model is right"
+        )
+        print_table(console, Table("errors by kind of reference", columns, tuple(rows), note))
+
+
+def _size(value: float, unit: str) -> str:
+    return f"{math.degrees(value):.2f} deg" if unit == "rad" else f"{1000 * value:.1f} mm"
 
 
 def print_verdict_ending(verdict: HeldOutVerdict, calibration: Calibration, file: Path, dataset: Path) -> None:

@@ -64,7 +64,7 @@ from omnibench.fit.evaluator.element_box import ElementBox
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.robot.kinematics import Array
-from omnibench.robot.odometry import Complex
+from omnibench.robot.odometry import Complex, OdometryBatch
 
 # m or rad per rad: slope of phi that is assumed beside Eq. (B8), so that a part whose width does no harm to first order
 # is cut all the same. It decides only where nothing else does: a proof has the same parts with half of it and with
@@ -99,18 +99,24 @@ class LowerBounds:
             )
         if not isinstance(objective, SumOfNorms):
             raise ConfigError(f"a lower bound needs a cost that is a sum of norms, which {objective.name} is not")
+        odometry = problem.odometry
+        if not isinstance(odometry, OdometryBatch):
+            raise ConfigError(
+                "a lower bound is proven for reference poses alone; of runs with distances, turns and other references "
+                "no bound is known, and their calibration cannot be certified"
+            )
         self._design = problem.start.reshape(3, -1)
         self._fitted = _complement(parameterisation.null, self._design.shape[1])
         self._box = self._deviations_of_box(problem)
-        owner = problem.odometry.trajectory
+        owner = odometry.trajectory
         self._shares = objective.shares(owner)
         self._weights = np.array(objective.weights)
         elements = ElementBox.of(parameterisation, problem.lower, problem.upper)
         self._stamps = StampSums(problem, self._fitted, elements)
         start = np.array([run.start for run in problem.trajectories])[owner]
         self._offset = start[:, 0] - problem.reference[:, 0] + 1j * (start[:, 1] - problem.reference[:, 1])
-        self._turned = problem.odometry.driven @ self._fitted.T
-        self._heading = start[:, 2] + problem.odometry.driven @ self._design[2] - problem.reference[:, 2]
+        self._turned = odometry.driven @ self._fitted.T
+        self._heading = start[:, 2] + odometry.driven @ self._design[2] - problem.reference[:, 2]
         self._size = float(np.abs(problem.reference).max()) + float(np.abs(start).max())
 
     def root(self, vector: Array) -> Node:

@@ -22,12 +22,13 @@ from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.least_squares.reweighted import reweighted_minimum
 from omnibench.fit.linear_fit import linear_fit
-from omnibench.fit.loss.losses import Huber
-from omnibench.fit.loss.robust_cost import RobustCost
+from omnibench.fit.loss.losses import Huber, Squares
+from omnibench.fit.loss.robust_cost import RobustCost, norms_of
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import OdometryBatch
 
 if TYPE_CHECKING:
     from omnibench.fit.loss.sum_of_norms import SumOfNormsProgram
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 # (tests/benchmarks/constants_fit.py).
 _MOST_HALVINGS = 30  # lengths of one step that are tried, each half the one before: down to a billionth
 _FLAT = 1e-6  # share of the matrix's range: a smaller step that does not lower the cost is rounding of the solver
+_STILL = 1e-9  # m or rad per rad: a smaller last step ends the least squares that references are begun with
 _NO_STEP = 1e-12  # m or rad per rad of wheel: a shorter step is rounding of the solver
 
 
@@ -118,7 +120,11 @@ def _stopped(problem: CalibrationProblem, objective: SumOfNorms, cost: float, er
 
 
 def linear_start(problem: CalibrationProblem) -> Array:
-    """Vector (n,) in the box by linear least squares."""
+    """Vector (n,) in the box by linear least squares; by Gauss-Newton steps where references are no poses."""
+    if not isinstance(problem.odometry, OdometryBatch):
+        base = norms_of(problem.objective)
+        assert base is not None  # closed_form has refused other costs
+        return reweighted_minimum(problem, RobustCost(base, Squares(3)), problem.start, _STILL)[0]
     design, identity = problem.matrix(problem.start), np.eye(len(problem.robot.drive.names))
     matrix = linear_fit(problem.odometry, problem.trajectories, problem.reference, design, identity)
     return problem.settled(matrix.ravel())

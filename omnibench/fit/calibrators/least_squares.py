@@ -26,16 +26,19 @@ from numpy.typing import NDArray
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.least_squares.gauss_newton import bounded_step
+from omnibench.fit.least_squares.reweighted import reweighted_minimum
 from omnibench.fit.linear_fit import linear_system
-from omnibench.fit.loss.losses import Huber, Loss
+from omnibench.fit.loss.losses import Huber, Loss, Squares
 from omnibench.fit.loss.robust_cost import RobustCost, norms_of
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import OdometryBatch
 
 _MOST_FITS = 200  # reweighted fits of one loss; Huber's take about 20
 _STILL = 1e-7  # share of the box: a smaller change of every number ends them
+_SMALL = 1e-9  # m or rad per rad: a smaller last Gauss-Newton step ends the fit to references that are no poses
 _MOST_ROUNDS = 5  # choices of the headings that are used; two or three settle
 
 
@@ -55,6 +58,8 @@ class LeastSquares(Calibrator):
             raise ConfigError("least_squares works on the matrix parameterisation; search the geometry with another")
         if norms_of(problem.objective) is None:
             raise ConfigError(f"least_squares squares the norms of a sum, which {problem.objective.name} is not")
+        if not isinstance(problem.odometry, OdometryBatch):
+            return _minimum_of_references(problem)
         if isinstance(problem.objective, RobustCost):
             vector, reason, settled = _robust_minimum(problem, problem.objective)
         else:
@@ -62,6 +67,21 @@ class LeastSquares(Calibrator):
         vector = problem.settled(vector)
         problem.cost(vector[None])
         return Solution(vector, reason, settled)
+
+
+def _minimum_of_references(problem: CalibrationProblem) -> Solution:
+    """The minimum where references are no poses, whose headings Eq. (1) would need: by Gauss-Newton steps."""
+    base = norms_of(problem.objective)
+    assert base is not None  # the calibrator has checked
+    costs = [RobustCost(base, Squares(3))]
+    if isinstance(problem.objective, RobustCost):
+        costs.append(RobustCost(base, Huber(problem.objective.loss.coordinates)))
+        costs += [problem.objective] * (problem.objective.loss.name != "huber")
+    vector, steps, settled = problem.start, 0, True
+    for cost in costs:
+        vector, count, settled = reweighted_minimum(problem, cost, vector, _SMALL)
+        steps += count
+    return Solution(vector, f"{'' if settled else 'not '}settled after {steps} Gauss-Newton steps", settled)
 
 
 class _LinearErrors:
@@ -74,17 +94,19 @@ class _LinearErrors:
         self._problem = problem
         objective = norms_of(problem.objective)
         assert objective is not None  # the calibrator has checked
-        moved, columns = linear_system(problem.odometry, problem.trajectories, problem.reference, used)
+        odometry = problem.odometry
+        assert isinstance(odometry, OdometryBatch)  # the calibrator has checked
+        moved, columns = linear_system(odometry, problem.trajectories, problem.reference, used)
         none = np.zeros(columns.shape)
         rows = np.stack(  # (S, 3, 3N): Eq. (1), real and imaginary part of the position, then the heading
             [
                 np.hstack([columns.real, -columns.imag, none]),
                 np.hstack([columns.imag, columns.real, none]),
-                np.hstack([none, none, problem.odometry.driven]),
+                np.hstack([none, none, odometry.driven]),
             ],
             axis=1,
         )
-        self.shares = objective.shares(problem.odometry.trajectory)
+        self.shares = objective.shares(odometry.trajectory)
         self._rows, self._weights = rows, np.array(objective.weights)
         self._missing = moved - rows @ problem.matrix(problem.start).ravel()
         # In units of the box the program is well scaled.

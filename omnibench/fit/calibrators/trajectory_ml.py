@@ -29,6 +29,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from omnibench.config import Positive
+from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.least_squares.gauss_newton import BoxedFit, Descent, descend, first_fit
 from omnibench.fit.least_squares.noise import FIRST_NOISE, NoiseEstimate, is_near, whiteners
@@ -39,6 +40,7 @@ from omnibench.fit.least_squares.trajectory_covariance import FitCovariance
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
 from omnibench.fit.loss.cost_weights import cost_weightings, mean_curvature
 from omnibench.fit.loss.robust_cost import RobustCost, loss_of
+from omnibench.fit.observations.reference_fit import ReferenceFit
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.uncertainty.intervals import EstimatedCovariance
 from omnibench.registry import Options, calibrators
@@ -50,6 +52,7 @@ from omnibench.robot.kinematics import Array
 _MOST_ROUNDS = 10
 _FIRST_WEIGHTS = 5  # fits with Huber's weights before the noise is estimated from poses that are not off
 _MOST_REWEIGHTED = 50  # fits by the weights of a robust cost
+_WALKS = 2  # times that the walk of the odometry beside references is estimated, and the fit done again
 _NEAR = 0.01  # share of the largest component of the noise by which components of the same noise differ
 _STILL = 0.1  # standard errors: a smaller change of the vector ends the rounds
 
@@ -124,6 +127,10 @@ class TrajectoryML(Calibrator):
     def estimate(self, problem: CalibrationProblem) -> TrajectoryEstimate:
         """Fit and noise estimated in turn until neither changes, then weights and covariance chosen."""
         fit = first_fit(problem)
+        if fit.references is not None:
+            self._check_references(problem)
+        if not fit.trajectories.runs and fit.references is not None:
+            return self._by_references(fit, fit.references)
         stamps = fit.trajectories.stamps
         now = descend(self._with_deviations(fit, 0.0), whiteners(FIRST_NOISE, stamps), _STILL)
         loss = loss_of(problem.objective)
@@ -137,7 +144,7 @@ class TrajectoryML(Calibrator):
             before, earlier = now.fit, noise
             usual = before.trajectories if heavy is None else heavy.without_jumps(before.trajectories)
             noise = self._noise(usual, earlier)
-            fit = self._with_deviations(before, noise.deviations[TURN])
+            fit = self._with_deviations(before, noise.deviations[TURN]).with_walk()
             weightings: Sequence[Weighting] = whiteners(noise.estimate.noise, stamps)
             if heavy is not None:
                 heavy = robust_noise(noise.estimate.noise, fit.trajectories, loss, heavy)
@@ -152,6 +159,26 @@ class TrajectoryML(Calibrator):
         assert noise is not None  # there is at least one round
         return self._conclude(now, noise.estimate, rounds, settled, 1.0 if heavy is None else heavy.curvature)
 
+    def _by_references(self, fit: BoxedFit, references: ReferenceFit) -> TrajectoryEstimate:
+        """The estimate where no run has poses: references say how exact they are, their errors how odometry wanders."""
+        now = descend(fit, [], self.options.tolerance)
+        for _ in range(_WALKS):
+            now = descend(now.fit.with_walk(), [], self.options.tolerance)
+        references = now.fit.references or references
+        return self._conclude(now, references.noise, 1 + _WALKS, now.settled, 1.0)
+
+    def _check_references(self, problem: CalibrationProblem) -> None:
+        """ConfigError: an option is asked for that is of poses, and references of other kinds are fitted, too."""
+        if loss_of(problem.objective) != "squares":
+            raise ConfigError(
+                f"trajectory_ml weighs references that are no poses by their own sigma, without the loss "
+                f"{loss_of(problem.objective)}: leave the loss out, or take the calibrator closed_form"
+            )
+        if self.options.weights == "cost":
+            raise ConfigError(
+                "weights: cost is of poses; references that are no poses have their own sigma: leave weights out"
+            )
+
     def _conclude(
         self, now: Descent, noise: NoiseEstimate, rounds: int, settled: bool, curvature: float
     ) -> TrajectoryEstimate:
@@ -160,7 +187,7 @@ class TrajectoryML(Calibrator):
         covariance = self._covariance(now, noise, curvature)
         misfit = covariance.scatter.words if covariance.scatter and covariance.scatter.lack_of_fit else ""
         by_cost = options.weights == "cost" or (
-            options.weights == "auto" and bool(misfit) and options.covariance != "model"
+            options.weights == "auto" and bool(misfit) and options.covariance != "model" and now.fit.references is None
         )
         if by_cost:
             held = now.fit.with_nuisances(fit.nuisances.held())
@@ -183,7 +210,7 @@ class TrajectoryML(Calibrator):
         """The covariances of a descent's vector, held elements with none."""
         problem = now.fit.problem
         unit = np.where(problem.free, problem.upper - problem.lower, 0.0)
-        return FitCovariance(now.data, now.fit.trajectories.runs, noise, unit, curvature)
+        return FitCovariance(now.data, now.fit.runs, noise, unit, curvature, now.fit.freedom_of_walk)
 
     def _with_deviations(self, fit: BoxedFit, start_heading: float) -> BoxedFit:
         """The fit with the nuisances' standard deviations; those that are not estimated are 0."""

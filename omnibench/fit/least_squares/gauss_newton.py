@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
+from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.least_squares.nuisances import Nuisances, Weighting
 from omnibench.fit.least_squares.roots import roots_of
 from omnibench.fit.least_squares.trajectory_fit import TrajectoryFit
 from omnibench.fit.least_squares.whitened import Whitened
+from omnibench.fit.observations.reference_fit import ReferenceFit, with_references
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
@@ -32,19 +34,30 @@ _ROOM = 1e-9  # share of the box: lsq_linear needs an interior, and the vector i
 
 @dataclass(frozen=True, eq=False)
 class BoxedFit:
-    """The fit of one vector (n,) of a calibration problem to the problem's runs."""
+    """The fit of one vector (n,) of a calibration problem to the problem's runs.
+
+    trajectories: at the poses of the runs that have some. references: at the references other than poses, if any.
+    """
 
     problem: CalibrationProblem
     vector: Array
     trajectories: TrajectoryFit
+    references: ReferenceFit | None = None
+
+    @property
+    def runs(self) -> tuple[Trajectory, ...]:
+        """The runs that are fitted."""
+        if self.references is None:
+            return self.trajectories.runs
+        fitted = {run.id for run in (*self.trajectories.runs, *self.references.runs)}
+        return tuple(run for run in self.problem.trajectories if run.id in fitted)
 
     def moved(self, vector: Array, values: Array) -> BoxedFit:
         """The fit of another vector, with other values (Z, 3) of the nuisances."""
         fit = self.trajectories
         model = replace(fit.model, matrix=self.problem.matrix(vector))
-        return BoxedFit(
-            self.problem, vector, replace(fit, model=model, nuisances=replace(fit.nuisances, values=values))
-        )
+        moved = replace(fit, model=model, nuisances=replace(fit.nuisances, values=values))
+        return replace(self, vector=vector, trajectories=moved)
 
     def with_nuisances(self, nuisances: Nuisances) -> BoxedFit:
         """The fit with other nuisances."""
@@ -53,23 +66,55 @@ class BoxedFit:
     @property
     def columns(self) -> list[Array]:
         """Derivatives (K, 3, n) of every run's poses by the vector."""
+        if not self.trajectories.runs:
+            return []
         slopes = self.problem.parameterisation.slopes(self.vector)
         return [of_run @ slopes for of_run in self.trajectories.matrix_jacobian()]
 
     def linearised(self, weightings: Sequence[Weighting]) -> Whitened:
         """The fit's columns and residuals, weighted, the nuisances eliminated."""
-        return self.trajectories.linearised(self.columns, weightings)
+        return self.joined(self.trajectories.linearised(self.columns, weightings) if self.trajectories.runs else None)
+
+    def joined(self, by_poses: Whitened | None) -> Whitened:
+        """The whitened poses with the references, whitened by their own uncertainty."""
+        if self.references is None:
+            assert by_poses is not None  # there are poses or references
+            return by_poses
+        matrix = self.problem.matrix(self.vector)
+        white = self.references.whitened(matrix, self.problem.parameterisation.slopes(self.vector))
+        return with_references(self.runs, self.trajectories.runs, by_poses, self.references.runs, white)
+
+    def with_walk(self) -> BoxedFit:
+        """The fit with the likeliest walk of the odometry beside its references other than poses, if there are any."""
+        if self.references is None:
+            return self
+        slopes = self.problem.parameterisation.slopes(self.vector)
+        return replace(self, references=self.references.with_walk(self.problem.matrix(self.vector), slopes))
+
+    @property
+    def freedom_of_walk(self) -> Callable[[Array], Array] | None:
+        """Degrees of freedom (n,) of a covariance (n, n) that the walk of the odometry leaves; None without one."""
+        references = self.references
+        if references is None:
+            return None
+        matrix, slopes = self.problem.matrix(self.vector), self.problem.parameterisation.slopes(self.vector)
+        return lambda covariance: references.freedom(matrix, slopes, covariance)
+
+    @property
+    def chi_square_of_references(self) -> float:
+        """Sum of squares of the references' residuals in their standard deviations; 0 where there are none."""
+        return 0.0 if self.references is None else self.references.chi_square(self.problem.matrix(self.vector))
 
 
 def first_fit(problem: CalibrationProblem) -> BoxedFit:
-    """The problem's start at the runs that have reference poses after theirs, nuisances 0. DataError without any."""
-    runs = tuple(run for run in problem.trajectories if len(run.pose_times) > 1)
-    if not runs:
+    """The problem's start at the runs that have a reference after theirs, nuisances 0. DataError without any."""
+    runs = tuple(run for run in problem.trajectories if run.has_poses)
+    references = ReferenceFit.of(problem.trajectories, problem.integration)
+    if not runs and references is None:
         raise DataError("no trajectory has a reference pose after its start; nothing can be fitted")
     model = OdometryModel(problem.robot, problem.matrix(problem.start), problem.integration)
-    return BoxedFit(
-        problem, problem.start, TrajectoryFit(model, runs, Nuisances(np.zeros((len(runs), 3)), np.zeros(3)))
-    )
+    nuisances = Nuisances(np.zeros((len(runs), 3)), np.zeros(3))
+    return BoxedFit(problem, problem.start, TrajectoryFit(model, runs, nuisances), references)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,12 +170,12 @@ def _step(fit: BoxedFit, weightings: Sequence[Weighting]) -> tuple[BoxedFit | No
     """The fit after one step, None if no part of it lowers chi2, and the step's size in standard errors."""
     problem, runs = fit.problem, fit.trajectories
     columns = fit.columns
-    data = runs.linearised(columns, weightings)
+    data = fit.joined(runs.linearised(columns, weightings) if runs.runs else None)
     whole = bounded_step(problem, fit.vector, data.information, -data.scores.sum(axis=0))
     size = math.sqrt(max(float(whole @ data.information @ whole), 0.0))
-    limit = float(runs.chi_square(weightings).sum()) * (1 + _ROUNDING)
+    limit = (float(runs.chi_square(weightings).sum()) + fit.chi_square_of_references) * (1 + _ROUNDING)
     shares = _SHARES if runs.nuisances.estimated.any() else (0.0,)
-    free = runs.nuisance_free_residuals
+    free = runs.nuisance_free_residuals if runs.runs else []
     for halvings in range(_MOST_HALVINGS):
         step = 0.5**halvings * whole
         vector = np.clip(fit.vector + step, problem.lower, problem.upper)
@@ -141,7 +186,7 @@ def _step(fit: BoxedFit, weightings: Sequence[Weighting]) -> tuple[BoxedFit | No
         trials = [fit.moved(vector, runs.nuisances.values + share * change) for share in shares]
         values = np.array([trial.trajectories.chi_square(weightings) for trial in trials])
         best = values.argmin(axis=0)
-        if values.min(axis=0).sum() <= limit:
+        if values.min(axis=0).sum() + trials[0].chi_square_of_references <= limit:
             nuisances = np.array([trial.trajectories.nuisances.values for trial in trials])
             return fit.moved(vector, nuisances[best, np.arange(len(best))]), size
     return None, size

@@ -200,13 +200,17 @@ def _differences(residuals: Array) -> Array:
 class NoiseEstimate:
     """A noise model and its source.
 
-    degrees_of_freedom: number of independent differences between runs, or of runs if no command is repeated.
+    degrees_of_freedom: number of independent differences between runs, or of runs if no command is repeated. source
+    ``given``: there are no poses, and references of other kinds say how exact they are.
     """
 
     noise: Noise
-    source: Literal["repetitions", "within runs"]
+    source: Literal["repetitions", "within runs", "given"]
     degrees_of_freedom: int
     description: str
+
+
+GIVEN = NoiseEstimate(Noise(), "given", 1_000_000, "the standard deviations that the references have")
 
 
 def estimate_noise(differences: Differences, near: Noise | None = None) -> NoiseEstimate:

@@ -29,7 +29,7 @@ truth in 87 %, those of the scatter in 96 %.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -56,20 +56,29 @@ class FitCovariance:
     by_model: inverse of the information, zero along undetermined directions. scatter: the sandwich of
     uncertainty/sandwich.py, None if there are too few runs. Both are zero in rows and columns whose ``unit`` (n,) is 0;
     others are the units of the numbers in which directions are judged as undetermined. curvature: of a robust loss, as
-    a share of the information of its weights.
+    a share of the information of its weights. freedom_of: degrees of freedom (n,) of a covariance (n, n) at most.
     """
 
     scatter: Sandwich | None = None
 
     def __init__(
-        self, data: Whitened, runs: Sequence[Trajectory], noise: NoiseEstimate, unit: Array, curvature: float = 1.0
+        self,
+        data: Whitened,
+        runs: Sequence[Trajectory],
+        noise: NoiseEstimate,
+        unit: Array,
+        curvature: float = 1.0,
+        freedom_of: Callable[[Array], Array] | None = None,
     ) -> None:
         scores, information = data.scores * unit, data.information_of_runs * np.outer(unit, unit)
         roots = roots_of(information.sum(axis=0))
         self._noise, self._roots = noise, unit[:, None] * roots
-        taken = 0 if noise.source == "repetitions" else roots.shape[1]
-        freedom = max(2 * noise.degrees_of_freedom - 2 * taken / 3, 1)  # Eq. (2), (3)
-        self.by_model = EstimatedCovariance(self._roots @ self._roots.T, freedom)
+        taken = roots.shape[1] if noise.source == "within runs" else 0
+        freedom: Array | float = max(2 * noise.degrees_of_freedom - 2 * taken / 3, 1)  # Eq. (2), (3)
+        covariance = self._roots @ self._roots.T
+        if freedom_of is not None:
+            freedom = np.minimum(freedom, freedom_of(covariance))
+        self.by_model = EstimatedCovariance(covariance, freedom)
         if not roots.size:
             return
         with suppress(DataError):

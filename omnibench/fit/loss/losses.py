@@ -68,6 +68,36 @@ class Loss(ABC):
     def __init__(self, coordinates: int) -> None:
         self.coordinates = coordinates
 
+    @abstractmethod
+    def scales(self, norms: Array, shares: Array) -> Array:
+        """Scales (P,) of P sets of norms (P, S) with shares (S,)."""
+
+    @abstractmethod
+    def costs(self, norms: Array, shares: Array) -> Array:
+        """Costs (P,), in the unit of the norms (P, S), at the scales that minimise them; NaN of norms that are NaN."""
+
+    @abstractmethod
+    def weights(self, ratios: Array) -> Array:
+        """Weights w (...), Eq. (5), of ratios x (...) of norms to their scale."""
+
+    def is_near(self, norms: Array, shares: Array) -> NDArray[np.bool_]:
+        """True (S,) for the norms (S,) that are not far off the others, by their weights."""
+        ratios = norms / self.scales(norms[None], shares)[0]
+        return np.asarray(self.weights(ratios) >= OFF * self.weights(np.zeros(1)))
+
+    def mean_curvature(self, ratios: Array, shares: Array) -> float:
+        """Mean second derivative of the loss over the d directions of errors at ratios (S,), over the mean weight."""
+        weights = self.weights(ratios)
+        return max(1 + float(self.slopes(ratios) @ shares) / (self.coordinates * float(weights @ shares)), OFF)
+
+    @abstractmethod
+    def slopes(self, ratios: Array) -> Array:
+        """Derivatives x w'(x) (...) of the weights by the logarithm of the ratios x (...)."""
+
+
+class ScaledLoss(Loss):
+    """A loss whose scale is estimated with the norms."""
+
     def scales(self, norms: Array, shares: Array) -> Array:
         """Scales (P,) of P sets of norms (P, S) with shares (S,): the roots of Eq. (2) or (4)."""
         squares = np.square(norms)
@@ -98,24 +128,6 @@ class Loss(ABC):
         """Costs (P,), in the unit of the norms (P, S), at the scales that minimise them; NaN of norms that are NaN."""
         return self._costs(norms, self.scales(norms, shares), shares)
 
-    @abstractmethod
-    def weights(self, ratios: Array) -> Array:
-        """Weights w (...), Eq. (5), of ratios x (...) of norms to their scale."""
-
-    def is_near(self, norms: Array, shares: Array) -> NDArray[np.bool_]:
-        """True (S,) for the norms (S,) that are not far off the others, by their weights."""
-        ratios = norms / self.scales(norms[None], shares)[0]
-        return np.asarray(self.weights(ratios) >= OFF * self.weights(np.zeros(1)))
-
-    def mean_curvature(self, ratios: Array, shares: Array) -> float:
-        """Mean second derivative of the loss over the d directions of errors at ratios (S,), over the mean weight."""
-        weights = self.weights(ratios)
-        return max(1 + float(self.slopes(ratios) @ shares) / (self.coordinates * float(weights @ shares)), OFF)
-
-    @abstractmethod
-    def slopes(self, ratios: Array) -> Array:
-        """Derivatives x w'(x) (...) of the weights by the logarithm of the ratios x (...)."""
-
     @property
     @abstractmethod
     def _target(self) -> float:
@@ -130,7 +142,7 @@ class Loss(ABC):
         """Eq. (1) or the exponential of Eq. (3)."""
 
 
-class Huber(Loss):
+class Huber(ScaledLoss):
     """Squares of small errors and magnitudes of large ones, Eq. (1)."""
 
     name: LossName = "huber"
@@ -164,7 +176,7 @@ class Huber(Loss):
         return total
 
 
-class StudentT(Loss):
+class StudentT(ScaledLoss):
     """Minus the log-likelihood of Student's t with four degrees of freedom, Eq. (3)."""
 
     name: LossName = "student_t"
@@ -192,6 +204,28 @@ class StudentT(Loss):
         power = (DEGREES_OF_FREEDOM + self.coordinates) / (2 * self.coordinates)
         total: Array = scales * np.exp(power * logarithms)
         return total
+
+
+class Squares(Loss):
+    """Squares, whatever their size: the cost is their root mean square, which has no scale."""
+
+    name: LossName = "squares"
+
+    def costs(self, norms: Array, shares: Array) -> Array:
+        """Root mean squares (P,) of norms (P, S)."""
+        return np.asarray(np.sqrt(np.square(norms) @ shares))
+
+    def scales(self, norms: Array, shares: Array) -> Array:  # noqa: ARG002 (none is needed)
+        """1 for every set of norms (P, S)."""
+        return np.ones(len(norms))
+
+    def weights(self, ratios: Array) -> Array:
+        """1 for every ratio."""
+        return np.ones(ratios.shape)
+
+    def slopes(self, ratios: Array) -> Array:
+        """0 for every ratio."""
+        return np.zeros(ratios.shape)
 
 
 def make_loss(name: LossName, coordinates: int) -> Loss | None:

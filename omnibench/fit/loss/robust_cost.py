@@ -24,6 +24,11 @@ class RobustCost(Cost):
         self.name, self.stamps, self.rounding = base.name, base.stamps, base.rounding
 
     @property
+    def coordinates(self) -> tuple[float, float, float]:
+        """The weights of the cost."""
+        return self.base.weights
+
+    @property
     def of_poses(self) -> Loss:
         """The same loss of whole poses, m, m, rad."""
         return type(self.loss)(3)

@@ -18,7 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omnibench.fit.calibrator import RunResult, Shrinkage
+from omnibench.fit.least_squares.noise import GIVEN
 from omnibench.fit.loss.robust_cost import loss_of
+from omnibench.fit.observations.open_combinations import information_of_references
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.span import driven_span, unidentified_directions
@@ -97,12 +99,24 @@ def _knowledge(problem: CalibrationProblem, result: RunResult) -> _Knowledge:
             information = slopes.T @ np.linalg.pinv(told, rcond=_ROUNDING, hermitian=True) @ slopes
             freedom = np.broadcast_to(answer.of_vector.degrees_of_freedom, problem.size)
             return _Knowledge(information, np.array(freedom), answer.noise, answer.source)
-    loss = loss_of(problem.objective)
-    noise = noise_of_matrix(problem.trajectories, result.matrix, problem.integration, loss)
-    every = information_of_runs(problem.trajectories, result.matrix, problem.integration, noise.noise).sum(axis=0)
+    every, noise, words = _information(problem, result.matrix)
     columns = unit[:, None] * slopes
-    words = f"the poses' noise ({noise.description})"
-    return _Knowledge(columns.T @ every @ columns, np.full(problem.size, MANY), noise.noise, words)
+    return _Knowledge(columns.T @ every @ columns, np.full(problem.size, MANY), noise, words)
+
+
+def _information(problem: CalibrationProblem, matrix: Array) -> tuple[Array, Noise | None, str]:
+    """Information (3M, 3M) about the elements by the noise of poses and references, that noise, and both in words."""
+    posed = [run for run in problem.trajectories if run.has_poses]
+    measured = [run for run in problem.trajectories if run.references is not None]
+    total: Array = np.zeros((matrix.size, matrix.size))
+    noise, words = None, GIVEN.description
+    if posed:
+        estimate = noise_of_matrix(posed, matrix, problem.integration, loss_of(problem.objective))
+        total = information_of_runs(posed, matrix, problem.integration, estimate.noise).sum(axis=0)
+        noise, words = estimate.noise, f"the poses' noise ({estimate.description})"
+    if measured:
+        total = total + information_of_references(problem.robot, measured, problem.integration, poses=False)
+    return total, noise, words
 
 
 def _freedom(posterior: Array, known: _Knowledge) -> Array:

@@ -10,9 +10,12 @@ from omnibench.config import Model
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.fit.geometry import WheelGeometry, unit_of
-from omnibench.fit.least_squares.noise import NoiseEstimate
+from omnibench.fit.least_squares.noise import GIVEN, NoiseEstimate
 from omnibench.fit.least_squares.roots import roots_of
 from omnibench.fit.linear_fit import linear_fit
+from omnibench.fit.observations.open_combinations import information_of_references, with_open_combinations
+from omnibench.fit.observations.open_in_words import open_sentences
+from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.shrinkage.prior import default_mount
 from omnibench.fit.span import DrivenSpan, State, driven_span, unidentified_directions, wheel_directions
 from omnibench.fit.uncertainty.information import information_of_runs, noise_of_matrix
@@ -30,6 +33,7 @@ ROWS = ("x", "y", "heading")
 # calibrations change rows by a few per cent, and the box about the design is +-25 % wide. Half of it and twice say the
 # same of three recordings (tests/benchmarks/constants_fit.py).
 LARGEST_DEVIATION = 0.10
+UNTOLD = 10.0  # the same share from which on references other than poses tell nothing, as other sentences say
 _OPEN = 1e-14  # share of the largest eigenvalue of the information: less is rounding, and the direction is open
 
 
@@ -83,7 +87,10 @@ def identifiability(
     """
     span = driven_span(trajectories)
     estimate, matrix = _quick_noise(robot, trajectories, span, integration)
-    information = information_of_runs(trajectories, matrix, integration, estimate.noise).sum(axis=0)
+    posed = [run for run in trajectories if run.has_poses]
+    information = information_of_runs(posed, matrix, integration, estimate.noise).sum(axis=0)
+    if measured := [run for run in trajectories if run.references is not None]:
+        information = information + information_of_references(robot, measured, integration, poses=False)
     rows = robot.row_scales
     every = wheel_directions(robot, span)
     driven = np.array([each.rates for each in every if each.state != "undriven"])
@@ -98,7 +105,10 @@ def identifiability(
         )
         for each in every
     )
-    parameters = _parameters(robot, span, information)
+    left_open = with_open_combinations(
+        MatrixElements(robot, "row", unidentified_directions(robot, span), known_mount=False), trajectories
+    ).open
+    parameters = _parameters(robot, span, information, left_open)
     return Identifiability(
         directions=directions,
         parameters=parameters,
@@ -106,6 +116,7 @@ def identifiability(
         noise_source=estimate.description,
         sentences=(
             *open_directions(every),
+            *open_sentences(robot, trajectories),
             *_rough_rows(directions),
             *_open_parameters(robot, parameters),
         ),
@@ -120,7 +131,7 @@ def _rough_rows(directions: Sequence[DirectionIdentifiability]) -> Iterator[str]
         rough = [
             f"row {number} ({name}) to {100 * value:.0f} %"
             for number, (name, value) in enumerate(zip(ROWS, direction.deviations, strict=True), 1)
-            if value > LARGEST_DEVIATION
+            if LARGEST_DEVIATION < value < UNTOLD
         ]
         if rough:
             motion = f" ({direction.motion})" if direction.motion else ""
@@ -145,7 +156,9 @@ def _quick_noise(
     robot: Robot, trajectories: Sequence[Trajectory], span: DrivenSpan, integration: Integration
 ) -> tuple[NoiseEstimate, Array]:
     """Noise of the poses by a linear fit, and the fit's matrix (3, N). Undriven directions keep the design values."""
-    usable = [run for run in trajectories if len(run.pose_times) > 1]
+    usable = [run for run in trajectories if run.has_poses]
+    if not usable and any(run.references is not None for run in trajectories):
+        return GIVEN, robot.inverse_kinematic_matrix
     if not usable:
         raise DataError("no trajectory has a reference pose after its start; nothing can be identified")
     odometry = OdometryBatch([run.reference_log for run in usable], integration)
@@ -178,10 +191,16 @@ def _geometry(robot: Robot) -> WheelGeometry:
     return WheelGeometry(robot, fitted_mount=default_mount(robot) == "fit")
 
 
-def _parameters(robot: Robot, span: DrivenSpan, information: Array) -> tuple[ParameterIdentifiability, ...]:
-    """Identifiability of the physical parameters if the matrix is unknown along unidentified directions."""
+def _parameters(
+    robot: Robot, span: DrivenSpan, information: Array, left_open: Array | None
+) -> tuple[ParameterIdentifiability, ...]:
+    """Identifiability of the physical parameters if the matrix is unknown along unidentified directions.
+
+    left_open (q, 3M): combinations of elements that references leave open, and that are unknown, too.
+    """
     kept, geometry = unidentified_directions(robot, span), _geometry(robot)
-    identified, slopes = identified_parameters(geometry, kept), known_slopes(geometry, kept)
+    identified = identified_parameters(geometry, kept, left_open)
+    slopes = known_slopes(geometry, kept, left_open)
     deviations = geometry.scale * np.linalg.norm(roots_of(slopes.T @ information @ slopes), axis=1)
     return tuple(
         ParameterIdentifiability(

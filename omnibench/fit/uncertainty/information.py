@@ -24,8 +24,10 @@ def noise_of_matrix(
 ) -> NoiseEstimate:
     """Noise of the reference poses, estimated from the residuals that ``matrix`` (3, N) leaves in some runs.
 
-    With a robust loss poses that are far off are left out.
+    With a robust loss poses that are far off are left out. Runs without poses tell nothing of it; DataError where none
+    has any.
     """
+    runs = [run for run in runs if run.has_poses]
     logs = [run.reference_log for run in runs]
     residuals = [
         OdometryBatch([log], integration).poses(matrix[None])[0] - run.poses[1:]

@@ -58,18 +58,21 @@ def geometry_of(matrix: Array, robot: Robot) -> Array:
     return np.concatenate([radius, turn * radius, angle])
 
 
-def known_slopes(geometry: WheelGeometry, kept: Array) -> Array:
+def known_slopes(geometry: WheelGeometry, kept: Array, left_open: Array | None = None) -> Array:
     """Derivatives (3M, n) of the matrix elements by the numbers of a geometry in units of their scale, at the design.
 
     kept (q, M): directions of drive signals along which the matrix is unknown; the derivatives are 0 there.
+    left_open (r, 3M): combinations of elements that are unknown, too, as MatrixElements has them.
     """
-    known = MatrixElements(geometry.robot, "row", kept, known_mount=False).projection
+    known = MatrixElements(geometry.robot, "row", kept, known_mount=False, open=left_open).projection
     slopes: Array = known @ geometry.slopes(geometry.start) * geometry.scale
     return slopes
 
 
-def identified_parameters(geometry: WheelGeometry, kept: Array) -> tuple[bool, ...]:
+def identified_parameters(geometry: WheelGeometry, kept: Array, left_open: Array | None = None) -> tuple[bool, ...]:
     """True (n,) for the numbers that a matrix identifies which is unknown along the directions ``kept`` (q, M).
+
+    left_open (r, 3M): combinations of its elements that are unknown, too, as MatrixElements has them.
 
     Linearised about the design: a parameter is identified if every change of the geometry that moves it changes the
     known part of the matrix.
@@ -119,7 +122,7 @@ def _unseen_changes(geometry: WheelGeometry, kept: Array) -> Array:
     Linearised about the design.
     """
     rows = np.repeat(geometry.robot.row_scales, len(geometry.robot.drive.names))
-    slopes = known_slopes(geometry, kept) / rows[:, None]
+    slopes = known_slopes(geometry, kept, left_open) / rows[:, None]
     _, strengths, directions = np.linalg.svd(np.vstack([slopes, np.zeros((slopes.shape[1], slopes.shape[1]))]))
     unidentified = directions[strengths <= _NO_CHANGE * strengths[0]]
     projection: Array = unidentified.T @ unidentified

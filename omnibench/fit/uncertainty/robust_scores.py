@@ -24,6 +24,8 @@ from omnibench.data.dataset import Trajectory
 from omnibench.fit.least_squares.noise import covariance_of_sums
 from omnibench.fit.least_squares.roots import roots_of
 from omnibench.fit.loss.robust_cost import RobustCost
+from omnibench.fit.observations.reference_batch import ReferenceBatch
+from omnibench.fit.uncertainty.reference_scores import covariance_of_rows
 from omnibench.fit.uncertainty.sandwich import Scores
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
@@ -32,7 +34,7 @@ from omnibench.robot.odometry import OdometryBatch
 
 def robust_scores(
     objective: RobustCost,
-    odometry: OdometryBatch,
+    odometry: OdometryBatch | ReferenceBatch,
     errors: Array,
     jacobian: Array,
     trajectories: Sequence[Trajectory],
@@ -59,9 +61,14 @@ def robust_scores(
     runs = range(len(trajectories))
     hessians = np.array([np.einsum("ski,skj->ij", slopes[owner == run], curved[owner == run]) for run in runs])
     correction = _correction(weights + loss.slopes(ratios), shares, len(trajectories) * len(used), hessians)
-    stamps = [log.stamps for log in objective.logs(trajectories)]
     by_errors = curved * factors[used][:, None]
-    working = [covariance_of_sums(noise, stamps[run], by_errors[owner == run], used.tolist()) for run in runs]
+    if isinstance(odometry, ReferenceBatch):
+        whole = np.zeros((len(by_errors), 3, by_errors.shape[2]))
+        whole[:, used] = by_errors
+        working = [covariance_of_rows(odometry, run, whole[owner == run], noise) for run in runs]
+    else:
+        stamps = [log.stamps for log in objective.logs(trajectories)]
+        working = [covariance_of_sums(noise, stamps[run], by_errors[owner == run], used.tolist()) for run in runs]
     scores = np.array([pulls[owner == run].sum(axis=0) for run in runs])
     roots = roots_of(np.einsum("s,ski,skj->ij", shares * weights, slopes, slopes))
     step = -roots @ roots.T @ scores.sum(axis=0)

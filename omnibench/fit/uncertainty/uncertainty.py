@@ -12,7 +12,11 @@ from omnibench.errors import DataError
 from omnibench.fit.calibrator import RunResult
 from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.geometry import WheelGeometry, unit_of
+from omnibench.fit.least_squares.noise import GIVEN
 from omnibench.fit.loss.robust_cost import RobustCost, loss_of, norms_of
+from omnibench.fit.observations.open_combinations import elements_open, with_open_combinations
+from omnibench.fit.observations.reference_batch import ReferenceBatch
+from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.span import driven_span, unidentified_directions
 from omnibench.fit.uncertainty.bootstrap import ElementIntervals
@@ -24,6 +28,7 @@ from omnibench.fit.uncertainty.physical import (
     identified_parameters,
     is_invertible,
 )
+from omnibench.fit.uncertainty.reference_scores import scores_of_references
 from omnibench.fit.uncertainty.robust_scores import robust_scores
 from omnibench.fit.uncertainty.sandwich import Sandwich, Scores, sandwich, scores_of_runs
 from omnibench.robot.calibration import Noise
@@ -56,7 +61,8 @@ class Uncertainty(Brief):
     that are held at their start are zero, with scatter as the basis also of those on a bound, and so is the variance
     along directions of wheel rates that were kept at the design values. standard_deviations (3, N). intervals: 95 %, by
     Student's t; nan where an element depends on a number that the box holds or that lies on a bound of it, about which
-    the answers of other recordings do not scatter evenly. parameters: the wheels' geometry, if it was searched or
+    the answers of other recordings do not scatter evenly, or on a combination that references other than poses leave
+    open. parameters: the wheels' geometry, if it was searched or
     follows from the matrix (three omni wheels); without standard deviation where the data do not identify a parameter,
     or it depends on such a number. noise: the reference poses'. basis: likelihood (the calibrator's own covariance),
     scatter of the runs, or posterior of either and the design. source: the data behind it, in words.
@@ -89,7 +95,8 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     slopes = problem.parameterisation.slopes(result.vector)
     of_elements = of_vector.of(slopes)
     bounded = depending(slopes, problem.without_interval(result.at_bounds))
-    reach = np.where(bounded, np.nan, of_elements.reach).reshape(result.matrix.shape)
+    untold = bounded | elements_open(problem.parameterisation)
+    reach = np.where(untold, np.nan, of_elements.reach).reshape(result.matrix.shape)
     return Uncertainty(
         covariance=of_elements.matrix,
         standard_deviations=of_elements.standard_deviations.reshape(result.matrix.shape),
@@ -119,7 +126,9 @@ def covariance_of_answer(problem: CalibrationProblem, result: RunResult) -> Answ
     """The calibrator's own covariance of its answer, or else that of the scatter. NoCovarianceError says why not."""
     assert result.matrix is not None  # callers have checked
     loss = loss_of(problem.objective)
-    noise = result.noise or noise_of_matrix(problem.trajectories, result.matrix, problem.integration, loss).noise
+    posed = any(run.has_poses for run in problem.trajectories)
+    noise = result.noise if posed else GIVEN.noise
+    noise = noise or noise_of_matrix(problem.trajectories, result.matrix, problem.integration, loss).noise
     if result.covariance is None:
         scatter = _by_scatter(problem, result, noise)
         estimated = EstimatedCovariance(scatter.covariance, scatter.effective_freedom)
@@ -150,7 +159,8 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult, noise: Noise) ->
     try:
         scores = _scores(problem, result.vector, free, noise)
         numbers = len(problem.trajectories) * sum(map(bool, base.weights))
-        answer = sandwich(scores if isinstance(objective, RobustCost) else _less_curved(scores, numbers))
+        expected = isinstance(objective, RobustCost) or isinstance(problem.odometry, ReferenceBatch)
+        answer = sandwich(scores if expected else _less_curved(scores, numbers))
         _check_minimum(problem, result.vector, free, scores, noise)
     except NoCovarianceError:
         raise
@@ -173,7 +183,10 @@ def _scores(problem: CalibrationProblem, vector: Array, free: NDArray[np.bool_],
     if isinstance(objective, RobustCost):
         return robust_scores(objective, problem.odometry, errors, jacobian, problem.trajectories, noise)
     assert isinstance(objective, SumOfNorms)  # _by_scatter has checked
-    return scores_of_runs(objective, problem.odometry, errors, jacobian, problem.trajectories, noise)
+    odometry = problem.odometry
+    if isinstance(odometry, ReferenceBatch):
+        return scores_of_references(objective, odometry, errors, jacobian, problem.trajectories, noise)
+    return scores_of_runs(objective, odometry, errors, jacobian, problem.trajectories, noise)
 
 
 def _less_curved(scores: Scores, numbers: int) -> Scores:
@@ -237,9 +250,10 @@ def _parameters(
     else:
         return None
     kept = unidentified_directions(robot, driven_span(problem.trajectories))
+    known = with_open_combinations(MatrixElements(robot, "row", kept, known_mount=False), problem.trajectories)
     untold = [
         "no interval" if touching else "" if identified else "not identified by these data"
-        for identified, touching in zip(identified_parameters(geometry, kept), bounded, strict=True)
+        for identified, touching in zip(identified_parameters(geometry, kept, known.open), bounded, strict=True)
     ]
     return tuple(
         ParameterEstimate(

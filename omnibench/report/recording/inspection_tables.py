@@ -43,7 +43,7 @@ def identifiability_table(inspection: Inspection) -> Table:
     for direction in identifiability.directions:
         deviations = ["open"] * len(ROWS)
         if direction.state == "driven" and direction.deviations is not None:
-            deviations = [f"{100 * value:.2g} %" for value in direction.deviations]
+            deviations = ["open" if value > UNTOLD else f"{100 * value:.2g} %" for value in direction.deviations]
         motion = direction.motion or "slip of the wheels"
         rows.append(Row.of(direction.direction, motion, f"{100 * direction.share:.3g} %", *deviations))
     columns = (

@@ -1,0 +1,1 @@
+"""What is observed of runs: poses, and references of other kinds, as rows of three coordinates."""

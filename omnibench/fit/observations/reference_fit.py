@@ -1,0 +1,321 @@
+"""References other than poses in a maximum likelihood fit: residuals and columns in units of their uncertainty.
+
+The errors of a run's references, of the standard deviations s, are those of what measured them and of the odometry,
+which wanders as it drives. Two references of the same coordinate have the covariance
+
+    C_ij = s_i^2 1_ij + w^2 |span_i and span_j|,                                                          (1)
+
+with w = w_p of lengths and places (m per sqrt s), w_h of angles (rad per sqrt s), and spans of time from t0 to t1, of
+what is measured in a fixed frame from the run's start on. With the columns J of what is fitted, N of the run's start
+where it is not known, and P = C^-1 - C^-1 N (N'C^-1 N)^-1 N'C^-1, the walks maximise the restricted likelihood
+
+    -2 ln L = sum_z (ln |C| + ln |N'C^-1 N| + r'P r) + ln |A| - b'A^-1 b,   A = sum J'P J,   b = sum J'P r   (2)
+
+(Patterson and Thompson, Biometrika 58:545, 1971). Whitened are L^-1 r and L^-1 J, LL' = C, less what N explains. A
+variance V_i of the fit, V = A^-1, changes with w^2 by (V K V)_ii, K = sum J'P G P J, G the shared spans, and w^2 has
+the variance 1 / I, I = 1/2 sum tr (P G)^2 times the share of numbers that the fit leaves, so that V_i has
+
+    2 V_i^2 / sum_w ((V K V)_ii^2 / I)                                                                    (3)
+
+degrees of freedom (Satterthwaite 1946), and any number where no walk is found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import minimize
+
+from omnibench.data.dataset import Trajectory
+from omnibench.fit.least_squares.noise import GIVEN, NoiseEstimate
+from omnibench.fit.least_squares.repetitions import grouped
+from omnibench.fit.least_squares.roots import ROUNDING, roots_of
+from omnibench.fit.least_squares.whitened import Whitened
+from omnibench.fit.observations.reference_batch import ReferenceBatch
+from omnibench.fit.observations.reference_rows import reference_rows
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import Integration
+
+# Shares of the references' own variance at which the search for the odometry's begins: nothing, and as much again.
+_STARTS = (0.0, 1.0)
+_MANY = 1e9  # degrees of freedom that stand for any number
+_MOST = 1e6  # times the references' own variance: the most that is searched
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Random walk of the odometry beside its references: m and rad per sqrt s."""
+
+    position: float = 0.0
+    heading: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceFit:
+    """The references of some runs, and the walk of the odometry beside them."""
+
+    runs: tuple[Trajectory, ...]
+    batch: ReferenceBatch
+    walk: Walk = Walk()
+
+    @classmethod
+    def of(cls, runs: Sequence[Trajectory], integration: Integration) -> ReferenceFit | None:
+        """The references of those runs that have some; None where none has."""
+        measured = tuple(run for run in runs if run.references is not None)
+        if not measured:
+            return None
+        return cls(measured, ReferenceBatch(reference_rows(measured, "none"), integration))
+
+    def whitened(self, matrix: Array, slopes: Array | None = None) -> tuple[list[Array], list[Array]]:
+        """Whitened residuals (k,) and columns (k, n) of each run, by a matrix (3, M). slopes (3M, n): of the matrix.
+
+        Without slopes there are no columns, n = 0.
+        """
+        residuals, columns, starts = self._unweighted(matrix, slopes)
+        white = [
+            _without(solve_triangular(root, np.column_stack([values, of_run, of_start]), lower=True), of_start.shape[1])
+            for root, values, of_run, of_start in zip(self._roots, residuals, columns, starts, strict=True)
+        ]
+        return [of_run[:, 0] for of_run in white], [of_run[:, 1:] for of_run in white]
+
+    def chi_square(self, matrix: Array) -> float:
+        """Sum of the squared residuals."""
+        return float(sum(np.square(of_run).sum() for of_run in self.whitened(matrix)[0]))
+
+    def with_walk(self, matrix: Array, slopes: Array) -> ReferenceFit:
+        """The fit with the walk of largest restricted likelihood, Eq. (2), linearised at a matrix (3, M)."""
+        residuals, columns, starts = self._unweighted(matrix, slopes)
+        means = [[float(own[which].mean()) for own, which in part if which.any()] for part in self._sizes]
+        size = [float(np.mean(part)) if part else 0.0 for part in means]
+        known = [unit > 0 for unit in size]
+
+        def walk_of(shares: Array) -> Walk:
+            position, heading = (np.sqrt(max(share, 0.0) * unit) for share, unit in zip(shares, size, strict=True))
+            return Walk(float(position), float(heading))
+
+        groups = _Group.of(self._own, self._overlaps, residuals, columns, starts)
+
+        def value(shares: Array) -> float:
+            return _minus_log_likelihood(groups, walk_of(shares))
+
+        bounds = [(0.0, _MOST if each else 0.0) for each in known]
+        tries = [
+            minimize(value, np.where(known, start, 0.0), method="L-BFGS-B", bounds=bounds, options={"eps": 1e-4})
+            for start in _STARTS
+        ]
+        return replace(self, walk=walk_of(min(tries, key=lambda answer: float(answer.fun)).x))
+
+    @property
+    def noise(self) -> NoiseEstimate:
+        """The noise where no run has poses: given, and a walk that was estimated."""
+        words = [f"{1e3 * self.walk.position:.2g} mm"] * (self.walk.position > 0)
+        words += [f"{np.degrees(self.walk.heading):.2g} deg"] * (self.walk.heading > 0)
+        walk = f", and odometry that wanders by {' and '.join(words)} in a second" if words else ""
+        return replace(GIVEN, description=f"{GIVEN.description}{walk}")
+
+    def freedom(self, matrix: Array, slopes: Array, covariance: Array) -> Array:
+        """Degrees of freedom (n,) of the variances on the diagonal of a covariance (n, n), Eq. (3)."""
+        residuals, columns, starts = self._unweighted(matrix, slopes)
+        groups = _Group.of(self._own, self._overlaps, residuals, columns, starts)
+        rows, fitted = self.batch.rows, len(roots_of(covariance).T)
+        numbers = int(rows.measured.sum()) - rows.numbers_of_starts
+        left = max(numbers - fitted, 1) / max(numbers, 1)
+        reciprocals = np.zeros(len(covariance))
+        for part, walk in enumerate((self.walk.position, self.walk.heading)):
+            if walk == 0:
+                continue
+            information, change = 0.0, np.zeros_like(covariance)
+            for group in groups:
+                of_run, by_columns = group.by_walk(self.walk, part)
+                information += left * of_run / 2
+                change += by_columns
+            moved = np.diag(covariance @ change @ covariance)
+            reciprocals += np.square(moved) / max(information, 1e-300)
+        doubled = 2 * np.square(np.diag(covariance))
+        known = reciprocals * _MANY > doubled
+        return np.where(known, doubled / np.where(known, reciprocals, 1.0), _MANY)
+
+    def _unweighted(self, matrix: Array, slopes: Array | None) -> tuple[list[Array], list[Array], list[Array]]:
+        """Residuals (k,), columns (k, n) and derivatives (k, 0 or 3) by the start of each run, in m and rad."""
+        rows = self.batch.rows
+        predicted = self.batch.poses(matrix[None])[0]
+        errors = rows.observed - predicted
+        jacobian = np.zeros((*errors.shape, 0))
+        if slopes is not None:
+            jacobian = self.batch.jacobian(matrix).reshape(*errors.shape, -1) @ slopes
+        chosen = [(own, rows.measured[own]) for own in self._owned]
+        starts = [rows.start_columns(index, predicted)[which] for index, (_, which) in enumerate(chosen)]
+        return [errors[own][which] for own, which in chosen], [jacobian[own][which] for own, which in chosen], starts
+
+    @cached_property
+    def _owned(self) -> list[NDArray[np.intp]]:
+        return [np.flatnonzero(self.batch.trajectory == index) for index in range(len(self.runs))]
+
+    @cached_property
+    def _own(self) -> list[Array]:
+        """Standard deviations (k,) that the references of each run have."""
+        rows = self.batch.rows
+        return [rows.sigmas[own][rows.measured[own]] for own in self._owned]
+
+    @cached_property
+    def _overlaps(self) -> list[tuple[Array, Array]]:
+        """Times (k, k) that two references of a run share, s: of lengths and places, and of angles, Eq. (1)."""
+        rows = self.batch.rows
+        overlaps = []
+        for own in self._owned:
+            which = rows.measured[own]
+            number, coordinate = np.nonzero(which)
+            begin = np.where(rows.begins_at_start[own][number, coordinate], 0.0, rows.t0[own][number])
+            end = rows.t1[own][number]
+            shared = np.maximum(np.minimum.outer(end, end) - np.maximum.outer(begin, begin), 0.0)
+            same = np.equal.outer(coordinate, coordinate)
+            turned = coordinate == 2
+            overlaps.append((shared * same * ~turned, shared * same * turned))
+        return overlaps
+
+    @cached_property
+    def _sizes(self) -> list[list[tuple[Array, NDArray[np.bool_]]]]:
+        """Of lengths and places, and of angles: variance over time (k,) of each run, and where there is any (k,)."""
+        return [
+            [
+                (np.square(own) / np.maximum(np.diag(of_run[part]), 1e-9), np.diag(of_run[part]) > 0)
+                for own, of_run in zip(self._own, self._overlaps, strict=True)
+            ]
+            for part in range(2)
+        ]
+
+    @cached_property
+    def _roots(self) -> list[Array]:
+        """Lower triangular roots (k, k) of the covariance of each run, Eq. (1)."""
+        position, heading = self.walk.position**2, self.walk.heading**2
+        return [
+            np.linalg.cholesky(np.diag(np.square(own)) + position * lengths + heading * angles)
+            for own, (lengths, angles) in zip(self._own, self._overlaps, strict=True)
+        ]
+
+
+def _without(values: Array, count: int) -> Array:
+    """Values (..., k, n) less what their last ``count`` columns explain, and without these."""
+    if not count:
+        return values
+    left, nuisances = values[..., :-count], values[..., -count:]
+    basis, sizes, _ = np.linalg.svd(nuisances, full_matrices=False)
+    basis = basis * (sizes > ROUNDING * sizes.max(axis=-1, initial=0.0)[..., None])[..., None, :]
+    explained: Array = basis @ (basis.swapaxes(-1, -2) @ left)
+    return np.asarray(left - explained)
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """G runs with as many references each: own variances (G, k), shared times (G, k, k) and columns of Eq. (2).
+
+    values (G, k, 1 + n + count): residuals, columns of what is fitted, and the ``count`` columns of unknown starts.
+    """
+
+    variances: Array
+    lengths: Array
+    angles: Array
+    values: Array
+    count: int
+
+    @classmethod
+    def of(
+        cls,
+        own: Sequence[Array],
+        overlaps: Sequence[tuple[Array, Array]],
+        residuals: Sequence[Array],
+        columns: Sequence[Array],
+        starts: Sequence[Array],
+    ) -> list[_Group]:
+        """The groups of all runs."""
+        groups = []
+        for members in grouped(
+            [(len(values), of_start.shape[1]) for values, of_start in zip(own, starts, strict=True)]
+        ):
+            values = [np.column_stack([residuals[run], columns[run], starts[run]]) for run in members]
+            groups.append(
+                cls(
+                    np.array([np.square(own[run]) for run in members]),
+                    np.array([overlaps[run][0] for run in members]),
+                    np.array([overlaps[run][1] for run in members]),
+                    np.array(values),
+                    starts[members[0]].shape[1],
+                )
+            )
+        return groups
+
+    def by_walk(self, walk: Walk, part: int) -> tuple[float, Array]:
+        """Sum of tr (P G)^2, and J'P G P J (n, n), G being the shared times of lengths (part 0) or of angles (1)."""
+        white, _, roots = self._white(walk)
+        shared = np.linalg.solve(roots, (self.lengths, self.angles)[part])
+        shared = np.linalg.solve(roots, shared.swapaxes(1, 2))  # L^-1 G L'^-1
+        starts = white[..., white.shape[2] - self.count :]
+        basis, sizes, _ = np.linalg.svd(starts, full_matrices=False)
+        basis = basis * (sizes > ROUNDING * sizes.max(axis=1, initial=0.0)[:, None])[:, None, :]
+        free = np.eye(shared.shape[1]) - basis @ basis.swapaxes(1, 2)
+        left = free @ shared @ free
+        columns = white[..., 1 : white.shape[2] - self.count]
+        return float(np.square(left).sum()), np.einsum("gki,gkl,glj->ij", columns, left, columns)
+
+    def whitened(self, walk: Walk) -> tuple[Array, Array]:
+        """Values (G, k, ...) whitened under a walk, starts among them, and ln |C| (G,)."""
+        white, logarithms, _ = self._white(walk)
+        return white, logarithms
+
+    def _white(self, walk: Walk) -> tuple[Array, Array, Array]:
+        shared = walk.position**2 * self.lengths + walk.heading**2 * self.angles
+        roots = np.linalg.cholesky(self.variances[..., None] * np.eye(self.variances.shape[1]) + shared)
+        logarithms = 2 * np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
+        return np.linalg.solve(roots, self.values), logarithms, roots
+
+
+def _minus_log_likelihood(groups: Sequence[_Group], walk: Walk) -> float:
+    """Eq. (2), up to a constant."""
+    size = groups[0].values.shape[2] - 1 - groups[0].count
+    total, information, scores = 0.0, np.zeros((size, size)), np.zeros(size)
+    for group in groups:
+        white, logarithms = group.whitened(walk)
+        total += float(logarithms.sum())
+        if group.count:
+            sizes = np.linalg.svd(white[..., -group.count :], compute_uv=False)
+            known = sizes > ROUNDING * sizes.max(axis=1, initial=0.0)[:, None]
+            total += 2 * float(np.log(sizes[known]).sum())
+        left = _without(white, group.count)
+        total += float(np.square(left[..., 0]).sum())
+        information += np.einsum("gki,gkj->ij", left[..., 1:], left[..., 1:])
+        scores += np.einsum("gki,gk->i", left[..., 1:], left[..., 0])
+    eigenvalues, vectors = np.linalg.eigh(information)
+    told = eigenvalues > ROUNDING * eigenvalues.max(initial=0.0)
+    along = vectors[:, told].T @ scores
+    return total + float(np.log(eigenvalues[told]).sum() - np.square(along) @ (1 / eigenvalues[told]))
+
+
+def with_references(
+    runs: Sequence[Trajectory],
+    posed: Sequence[Trajectory],
+    by_poses: Whitened | None,
+    measured: Sequence[Trajectory],
+    by_references: tuple[Sequence[Array], Sequence[Array]],
+) -> Whitened:
+    """Whitened data of runs, from the poses of some and the references of others; a run may be among both.
+
+    by_poses: of the runs ``posed``. by_references: residuals (k,) and columns (k, n) of the runs ``measured``.
+    """
+    parts: dict[str, list[tuple[Array, Array]]] = {run.id: [] for run in runs}
+    if by_poses is not None:
+        for run, values, slopes in zip(posed, by_poses.residuals, by_poses.columns, strict=True):
+            parts[run.id].append((values, slopes))
+    for run, values, slopes in zip(measured, *by_references, strict=True):
+        parts[run.id].append((values, slopes))
+    whole = [
+        (np.concatenate([values for values, _ in of_run]), np.concatenate([slopes for _, slopes in of_run]))
+        for of_run in parts.values()
+    ]
+    information = np.sum([slopes.T @ slopes for _, slopes in whole], axis=0)
+    scores = np.array([slopes.T @ values for values, slopes in whole])
+    return Whitened(tuple(values for values, _ in whole), tuple(slopes for _, slopes in whole), information, scores)
