@@ -13,6 +13,7 @@ from omnibench.compare.scoring import is_comparable
 from omnibench.fit.certify import prove, proven_gap
 from omnibench.fit.cost import SumOfNorms
 from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import OdometryBatch
 
 
 def certify(
@@ -21,7 +22,7 @@ def certify(
     """The runs with their proven gaps, and one proof for each box of matrix elements in which a run gave an answer.
 
     A geometry, or an answer without a box, is compared with a box that contains its matrix. Nothing is proven where the
-    config asks for no certificate, or the cost is no sum of norms: no bound is known for others.
+    config asks for no certificate, the cost is no sum of norms, or references are no poses: no bound is known then.
     """
     proofs: list[tuple[PlannedRun, BoxCertificate]] = []
     for run, done in zip(plan, scored, strict=True):
@@ -47,7 +48,8 @@ def _proof(run: PlannedRun, answers: Sequence[Array]) -> list[BoxCertificate]:
     """The lower bound over a run's box, if its cost has one. Good answers (3N,) that are known make it faster."""
     choice = run.config.certificate
     problem = run.task.problem()
-    if choice is None or not isinstance(problem.objective, SumOfNorms):
+    posed = isinstance(problem.odometry, OdometryBatch)
+    if choice is None or not posed or not isinstance(problem.objective, SumOfNorms):
         return []
     known = np.stack([problem.start, *answers])
     inside = known[problem.inside(known)]

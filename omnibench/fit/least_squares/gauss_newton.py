@@ -109,7 +109,7 @@ class BoxedFit:
 def first_fit(problem: CalibrationProblem) -> BoxedFit:
     """The problem's start at the runs that have a reference after theirs, nuisances 0. DataError without any."""
     runs = tuple(run for run in problem.trajectories if run.has_poses)
-    references = ReferenceFit.of(problem.trajectories, problem.integration)
+    references = ReferenceFit.of(problem.trajectories, problem.matrix(problem.start), problem.integration)
     if not runs and references is None:
         raise DataError("no trajectory has a reference pose after its start; nothing can be fitted")
     model = OdometryModel(problem.robot, problem.matrix(problem.start), problem.integration)

@@ -24,6 +24,11 @@ def usable_runs(trajectories: Sequence[Trajectory], split: str = "train") -> tup
     Raises DataError where there are none, or where the wheels stand in all of them.
     """
     runs = [run for run in trajectories if _covered_poses(run) > 1]
+    if not runs and any(run.references is not None for run in trajectories):
+        raise DataError(
+            f"no trajectory of the split {split} has reference poses along its path, without which what a "
+            "matrix lacks is not found; distances, turns and other references serve calibrate, evaluate and compare"
+        )
     if not runs:
         raise DataError(
             f"no trajectory of the split {split} has a reference pose between its start and its last wheel sample"

@@ -30,6 +30,10 @@ class ReferenceBatch:
         poses = self._odometry.poses(matrices)
         return self.rows.predicted(poses, self._lengths(matrices))
 
+    def start_turns(self, matrix: Array) -> Array:
+        """Likeliest headings (Z,) of the runs' unknown starts by a matrix (3, M), 0 of those that are known, rad."""
+        return self.rows.start_turns(self._odometry.poses(matrix[None])[0])
+
     def jacobian(self, matrix: Array) -> Array:
         """Derivatives (S, 3, 3, M) of the predictions with respect to the elements of one matrix (3, M)."""
         moving = self._odometry.jacobian(matrix)

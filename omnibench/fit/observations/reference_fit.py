@@ -1,18 +1,17 @@
 """References other than poses in a maximum likelihood fit: residuals and columns in units of their uncertainty.
 
 The errors of a run's references, of the standard deviations s, are those of what measured them and of the odometry,
-which wanders as it drives. Two references of the same coordinate have the covariance
+which wanders by random walks w_p of position and w_h of heading (m and rad per sqrt s). They have the covariance
 
-    C_ij = s_i^2 1_ij + w^2 |span_i and span_j|,                                                          (1)
+    C = diag(s^2) + w_p^2 G_p + w_h^2 G_h,                                                                (1)
 
-with w = w_p of lengths and places (m per sqrt s), w_h of angles (rad per sqrt s), and spans of time from t0 to t1, of
-what is measured in a fixed frame from the run's start on. With the columns J of what is fitted, N of the run's start
+with the G of wander.py. With the columns J of what is fitted, N of the run's start
 where it is not known, and P = C^-1 - C^-1 N (N'C^-1 N)^-1 N'C^-1, the walks maximise the restricted likelihood
 
     -2 ln L = sum_z (ln |C| + ln |N'C^-1 N| + r'P r) + ln |A| - b'A^-1 b,   A = sum J'P J,   b = sum J'P r   (2)
 
 (Patterson and Thompson, Biometrika 58:545, 1971). Whitened are L^-1 r and L^-1 J, LL' = C, less what N explains. A
-variance V_i of the fit, V = A^-1, changes with w^2 by (V K V)_ii, K = sum J'P G P J, G the shared spans, and w^2 has
+variance V_i of the fit, V = A^-1, changes with w^2 by (V K V)_ii, K = sum J'P G P J, and w^2 has
 the variance 1 / I, I = 1/2 sum tr (P G)^2 times the share of numbers that the fit leaves, so that V_i has
 
     2 V_i^2 / sum_w ((V K V)_ii^2 / I)                                                                    (3)
@@ -38,6 +37,7 @@ from omnibench.fit.least_squares.roots import ROUNDING, roots_of
 from omnibench.fit.least_squares.whitened import Whitened
 from omnibench.fit.observations.reference_batch import ReferenceBatch
 from omnibench.fit.observations.reference_rows import reference_rows
+from omnibench.fit.observations.wander import wander_of
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration
 
@@ -57,19 +57,24 @@ class Walk:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceFit:
-    """The references of some runs, and the walk of the odometry beside them."""
+    """The references of some runs, and the walk of the odometry beside them.
+
+    wander: G_p and G_h (k, k) of each run, Eq. (1), on the paths of a design.
+    """
 
     runs: tuple[Trajectory, ...]
     batch: ReferenceBatch
+    wander: Sequence[tuple[Array, Array]]
     walk: Walk = Walk()
 
     @classmethod
-    def of(cls, runs: Sequence[Trajectory], integration: Integration) -> ReferenceFit | None:
+    def of(cls, runs: Sequence[Trajectory], design: Array, integration: Integration) -> ReferenceFit | None:
         """The references of those runs that have some; None where none has."""
         measured = tuple(run for run in runs if run.references is not None)
         if not measured:
             return None
-        return cls(measured, ReferenceBatch(reference_rows(measured, "none"), integration))
+        batch = ReferenceBatch(reference_rows(measured, "none"), integration)
+        return cls(measured, batch, wander_of(batch, design, integration))
 
     def whitened(self, matrix: Array, slopes: Array | None = None) -> tuple[list[Array], list[Array]]:
         """Whitened residuals (k,) and columns (k, n) of each run, by a matrix (3, M). slopes (3M, n): of the matrix.
@@ -98,7 +103,7 @@ class ReferenceFit:
             position, heading = (np.sqrt(max(share, 0.0) * unit) for share, unit in zip(shares, size, strict=True))
             return Walk(float(position), float(heading))
 
-        groups = _Group.of(self._own, self._overlaps, residuals, columns, starts)
+        groups = _Group.of(self._own, self.wander, residuals, columns, starts)
 
         def value(shares: Array) -> float:
             return _minus_log_likelihood(groups, walk_of(shares))
@@ -121,7 +126,7 @@ class ReferenceFit:
     def freedom(self, matrix: Array, slopes: Array, covariance: Array) -> Array:
         """Degrees of freedom (n,) of the variances on the diagonal of a covariance (n, n), Eq. (3)."""
         residuals, columns, starts = self._unweighted(matrix, slopes)
-        groups = _Group.of(self._own, self._overlaps, residuals, columns, starts)
+        groups = _Group.of(self._own, self.wander, residuals, columns, starts)
         rows, fitted = self.batch.rows, len(roots_of(covariance).T)
         numbers = int(rows.measured.sum()) - rows.numbers_of_starts
         left = max(numbers - fitted, 1) / max(numbers, 1)
@@ -163,28 +168,12 @@ class ReferenceFit:
         return [rows.sigmas[own][rows.measured[own]] for own in self._owned]
 
     @cached_property
-    def _overlaps(self) -> list[tuple[Array, Array]]:
-        """Times (k, k) that two references of a run share, s: of lengths and places, and of angles, Eq. (1)."""
-        rows = self.batch.rows
-        overlaps = []
-        for own in self._owned:
-            which = rows.measured[own]
-            number, coordinate = np.nonzero(which)
-            begin = np.where(rows.begins_at_start[own][number, coordinate], 0.0, rows.t0[own][number])
-            end = rows.t1[own][number]
-            shared = np.maximum(np.minimum.outer(end, end) - np.maximum.outer(begin, begin), 0.0)
-            same = np.equal.outer(coordinate, coordinate)
-            turned = coordinate == 2
-            overlaps.append((shared * same * ~turned, shared * same * turned))
-        return overlaps
-
-    @cached_property
     def _sizes(self) -> list[list[tuple[Array, NDArray[np.bool_]]]]:
-        """Of lengths and places, and of angles: variance over time (k,) of each run, and where there is any (k,)."""
+        """For G_p and G_h: own variance over G's diagonal (k,) of each run, and where that is not 0 (k,)."""
         return [
             [
-                (np.square(own) / np.maximum(np.diag(of_run[part]), 1e-9), np.diag(of_run[part]) > 0)
-                for own, of_run in zip(self._own, self._overlaps, strict=True)
+                (np.square(own) / np.maximum(np.diag(of_run[part]), 1e-9), np.diag(of_run[part]) > 1e-9)
+                for own, of_run in zip(self._own, self.wander, strict=True)
             ]
             for part in range(2)
         ]
@@ -195,7 +184,7 @@ class ReferenceFit:
         position, heading = self.walk.position**2, self.walk.heading**2
         return [
             np.linalg.cholesky(np.diag(np.square(own)) + position * lengths + heading * angles)
-            for own, (lengths, angles) in zip(self._own, self._overlaps, strict=True)
+            for own, (lengths, angles) in zip(self._own, self.wander, strict=True)
         ]
 
 
@@ -212,7 +201,7 @@ def _without(values: Array, count: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """G runs with as many references each: own variances (G, k), shared times (G, k, k) and columns of Eq. (2).
+    """G runs with as many references each: own variances (G, k), wander G_p, G_h (G, k, k) and columns of Eq. (2).
 
     values (G, k, 1 + n + count): residuals, columns of what is fitted, and the ``count`` columns of unknown starts.
     """
@@ -227,7 +216,7 @@ class _Group:
     def of(
         cls,
         own: Sequence[Array],
-        overlaps: Sequence[tuple[Array, Array]],
+        wander: Sequence[tuple[Array, Array]],
         residuals: Sequence[Array],
         columns: Sequence[Array],
         starts: Sequence[Array],
@@ -241,8 +230,8 @@ class _Group:
             groups.append(
                 cls(
                     np.array([np.square(own[run]) for run in members]),
-                    np.array([overlaps[run][0] for run in members]),
-                    np.array([overlaps[run][1] for run in members]),
+                    np.array([wander[run][0] for run in members]),
+                    np.array([wander[run][1] for run in members]),
                     np.array(values),
                     starts[members[0]].shape[1],
                 )
@@ -250,7 +239,7 @@ class _Group:
         return groups
 
     def by_walk(self, walk: Walk, part: int) -> tuple[float, Array]:
-        """Sum of tr (P G)^2, and J'P G P J (n, n), G being the shared times of lengths (part 0) or of angles (1)."""
+        """Sum of tr (P G)^2, and J'P G P J (n, n), G being G_p (part 0) or G_h (1)."""
         white, _, roots = self._white(walk)
         shared = np.linalg.solve(roots, (self.lengths, self.angles)[part])
         shared = np.linalg.solve(roots, shared.swapaxes(1, 2))  # L^-1 G L'^-1

@@ -151,6 +151,16 @@ class ReferenceRows:
             result[start.placed, :2], result[start.headed, 2] = columns
         return result
 
+    def start_turns(self, poses: Array) -> Array:
+        """Likeliest headings (Z,) of the runs' unknown starts, for poses (T, 3) at the logs' stamps; 0 of others."""
+        turns = np.zeros(len(self.runs))
+        if (start := self._unknown_starts) is not None:
+            _, end = self._stamp_of_rows
+            found = start.turns(poses[None, end[start.placed], :2], poses[None, end[start.headed], 2])[0]
+            runs = np.unique(self.trajectory[np.concatenate([start.placed, start.headed])])
+            turns[runs] = found
+        return turns
+
     @cached_property
     def _unknown_starts(self) -> StartPoses | None:
         """The start poses of the runs that have positions or headings in a frame in which their start is not known."""

@@ -50,7 +50,7 @@ class StartPoses:
 
     def fitted(self, positions: Array, headings: Array) -> tuple[Array, Array]:
         """Positions (P, I, 2) and headings (P, J) of odometry from the origin, seen from the likeliest starts."""
-        turns = self._turns(positions, headings)
+        turns = self.turns(positions, headings)
         of_positions = turns[:, self.of_placed]
         cosine, sine = np.cos(of_positions), np.sin(of_positions)
         x, y = positions[..., 0], positions[..., 1]
@@ -65,7 +65,7 @@ class StartPoses:
 
         moving (I, 2, n), turning (J, n): those of positions (I, 2) and headings (J,).
         """
-        turns = self._turns(positions[None], headings[None])[0]
+        turns = self.turns(positions[None], headings[None])[0]
         cosine, sine = np.cos(turns[self.of_placed]), np.sin(turns[self.of_placed])
         rotation = np.array([[cosine, -sine], [sine, cosine]])  # (2, 2, I)
         quarter = np.array([[-sine, -cosine], [cosine, -sine]])  # its derivative by the heading
@@ -86,7 +86,7 @@ class StartPoses:
         of_positions = direct + by_turn[..., None] * by_candidate[self.of_placed][:, None]
         return of_positions, turning + by_candidate[self.of_headed]
 
-    def _turns(self, positions: Array, headings: Array) -> Array:
+    def turns(self, positions: Array, headings: Array) -> Array:
         """Likeliest start headings (P, Z), Eq. (2)."""
         u, v = self.position_weights[:, 0], self.position_weights[:, 1]
         along = [self._about(positions[..., axis], 0) for axis in range(2)]
