@@ -17,6 +17,7 @@ from omnibench.fit.calibrator import Outcome, RunResult, describe_error
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.fit.geometry import FittedParameter, WheelGeometry, fitted_parameters
+from omnibench.fit.observations.reference_errors import with_mean_errors
 from omnibench.fit.parameterisation import make_bounds
 from omnibench.fit.uncertainty.ratio_intervals import UnitName, units_of
 from omnibench.registry import calibrators, costs
@@ -35,6 +36,7 @@ class SplitScorer:
         self._units = units_of(trajectories, unit)
         self._odometry = cost.batch(trajectories, integration)
         self._reference = cost.reference(trajectories)
+        self._trajectories, self._integration = tuple(trajectories), integration
         self._ends = OdometryBatch([trajectory.final_log for trajectory in trajectories], integration)
         self._final = np.array([trajectory.final_pose for trajectory in trajectories])
 
@@ -49,8 +51,12 @@ class SplitScorer:
         return self._checked(len(self._final), lambda: self._cost.of_each(errors, self._odometry.trajectory))
 
     def final_errors(self, matrix: Array) -> Array:
-        """Odometry minus reference (Z, 3) at the last reference pose of every trajectory, m, m, rad."""
-        return self._ends.poses(matrix[None])[0] - self._final
+        """Odometry minus reference (Z, 3) at the last reference pose of every trajectory, m, m, rad.
+
+        Of one without poses: what ``with_mean_errors`` of reference_errors.py says.
+        """
+        errors = self._ends.poses(matrix[None])[0] - self._final
+        return with_mean_errors(errors, matrix, self._trajectories, self._integration)
 
     def score(self, matrix: Array) -> SplitScore:
         """All of these of a matrix (3, N). PluginError when the cost raises or is not a finite number."""

@@ -93,6 +93,11 @@ class Trajectory(Shown):
         return len(self.pose_times) > 1
 
     @property
+    def end(self) -> float:
+        """Time of the last reference pose, of a run without any that of its last wheel sample, s."""
+        return float(self.pose_times[-1] if self.has_poses else self.times[-1])
+
+    @property
     def start_known(self) -> bool:
         """True if the start pose is one of the reference's frame; False: the origin of a frame of the run's own."""
         return self.references is None or self.has_poses or self.references.start_known

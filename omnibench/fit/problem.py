@@ -280,8 +280,6 @@ class CalibrationProblem:
             return used
         slopes: Array = np.abs(self.odometry.jacobian(self.matrix(self.start))).max(axis=0)  # (3, 3, N)
         weights = (1.0, 1.0, 1.0) if cost is None else cost.weights
-        if isinstance(self.odometry, ReferenceBatch):  # rows that no wheel can move are not searched anyway
-            slopes[:, ~self.parameterisation.rows.any(axis=1)] = 1.0
         return np.asarray(used & ((np.abs(weights) @ slopes.reshape(3, -1)) > 0))
 
     def _check_budget(self) -> None:

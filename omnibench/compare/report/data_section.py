@@ -15,7 +15,7 @@ def data_section(view: DatasetView) -> Section:
     """The section about the data: origin, amount, robot, and warnings on reading them."""
     dataset = view.dataset
     trajectories = dataset.trajectories
-    durations = np.array([trajectory.pose_times[-1] for trajectory in trajectories])
+    durations = np.array([trajectory.end for trajectory in trajectories])
     commands = {trajectory.command for trajectory in trajectories} - {None}
     sessions = {trajectory.session for trajectory in trajectories} - {None}
     split_sizes = [f"{count(len(dataset.split(split)))} for {SPLIT_NAMES[split]}" for split in SPLITS]

@@ -112,7 +112,7 @@ def _with_command(trajectories: Sequence[Trajectory], degrees: float) -> Traject
 
 def _path_figure(view: DatasetView, trajectory: Trajectory, models: Sequence[DrawnModel]) -> Figure:
     reference = trajectory.poses[evenly(len(trajectory.poses), 2 * _POINTS)]
-    stamps = np.linspace(0.0, trajectory.pose_times[-1], _POINTS)
+    stamps = np.linspace(0.0, trajectory.end, _POINTS)
     traces = [path(REFERENCE_STYLE, reference, 3.5), _end_mark(REFERENCE_STYLE, reference, 9)]
     for each in models:
         (poses,) = view.model(each.matrix).poses([trajectory.log(stamps)])
@@ -129,7 +129,7 @@ def _end_mark(style: LegendItem, poses: Array, size: int) -> go.Scatter:
 
 def _end_figure(view: DatasetView, trajectory: Trajectory, models: Sequence[DrawnModel]) -> Figure:
     final = trajectory.final_pose
-    duration = trajectory.pose_times[-1]
+    duration = trajectory.end
     stamps = np.linspace((1 - _TAIL) * duration, duration, 60)
     tails = [(each.style, view.model(each.matrix).poses([trajectory.log(stamps)])[0]) for each in models]
     calibrated = tails[1:] or tails  # the design values come first, and are far away

@@ -9,16 +9,29 @@ from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
 from omnibench.data.references.run_references import KINDS, UNITS, ReferenceKind
-from omnibench.fit.observations.reference_batch import predicted_by
-from omnibench.fit.observations.reference_rows import reference_rows
+from omnibench.fit.observations.reference_batch import ReferenceBatch, predicted_by
+from omnibench.fit.observations.reference_rows import ReferenceRows, reference_rows
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import Integration
+
+
+def with_mean_errors(errors: Array, matrix: Array, runs: Sequence[Trajectory], integration: Integration) -> Array:
+    """Final pose errors (Z, 3) of a matrix, those of runs without poses replaced by their ``mean_errors``."""
+    for index, run in enumerate(runs):
+        if not run.has_poses and run.references is not None:
+            rows = reference_rows([run], "none")
+            errors[index] = _means(rows, ReferenceBatch(rows, integration).poses(matrix[None])[0] - rows.observed)
+    return errors
 
 
 def mean_errors(model: OdometryModel, run: Trajectory) -> Array:
-    """Mean error (3,) of a model at the lengths and places of a run (m), 0, and at its angles (rad)."""
+    """Mean error (3,) of a model at the lengths and places of a run (m), 0, and at its angles (rad); 0 of none."""
     rows = reference_rows([run], "none")
-    errors = predicted_by(model, rows) - rows.observed
+    return _means(rows, predicted_by(model, rows) - rows.observed)
+
+
+def _means(rows: ReferenceRows, errors: Array) -> Array:
     placed, turned = rows.lengths != "", rows.angles != ""
     lengths = np.linalg.norm(errors[placed, :2], axis=1)
     return np.array(
