@@ -82,9 +82,7 @@ def _answer(dataset: Dataset, inspection: Inspection, motions: list[DrivenMotion
         Fact("Runs", count(inspection.trajectories), parts),
         Fact("Driven", f"{significant(metres, 3)} m", f"in {fixed(seconds / 60, 1)} min"),
         Fact("Wheel samples", f"every {1e3 * inspection.sample_period_s:.3g} ms", f"{count(inspection.wheel_samples)}"),
-        Fact(
-            "Reference poses", f"every {1e3 * inspection.pose_period_s:.3g} ms", f"{count(inspection.reference_poses)}"
-        ),
+        _reference_tile(inspection),
     )
     return answer_section(
         sentence,
@@ -93,6 +91,16 @@ def _answer(dataset: Dataset, inspection: Inspection, motions: list[DrivenMotion
         Callout("Findings", inspection.findings, "warning" if open_ones else "plain"),
         Callout("Warnings on reading the data", inspection.warnings, "warning"),
     )
+
+
+def _reference_tile(inspection: Inspection) -> Fact:
+    """The reference poses or, where there are none, how many references of which kinds there are."""
+    kinds = ", ".join(f"{number} of {kind}" for kind, number in inspection.references.items())
+    if inspection.pose_period_s is None:
+        return Fact("References", count(sum(inspection.references.values())), kinds)
+    every = f"every {1e3 * inspection.pose_period_s:.3g} ms"
+    beside = f"; beside them {kinds}" if kinds else ""
+    return Fact("Reference poses", every, f"{count(inspection.reference_poses)}{beside}")
 
 
 def _identified_in_words(inspection: Inspection) -> list[str]:

@@ -20,7 +20,6 @@ from omnibench.report.recording.drawing import (
     SCANS_ITEM,
     TRUTH_ITEM,
 )
-from omnibench.report.recording.runs import end_of
 from omnibench.report.recording.scan_points import evenly, poses_at, scan_points
 from omnibench.report.robot_figures import is_placed
 from omnibench.report.style import INK
@@ -61,7 +60,7 @@ def player(
 def _run(
     dataset: Dataset, run: Trajectory, odometry: OdometryModel, truth: TruePath | None, outlines: Sequence[Array]
 ) -> dict[str, Any]:
-    end = end_of(run)
+    end = run.end
     times = np.linspace(0.0, end, min(_FRAMES, max(2, round(end / 0.02) + 1)))
     poses = poses_at(run, times)
     (driven,) = odometry.poses([run.log(times)])

@@ -20,7 +20,6 @@ from omnibench.report.recording.drawing import (
     SCANS_ITEM,
     TRUTH_ITEM,
 )
-from omnibench.report.recording.runs import end_of
 from omnibench.report.recording.scan_points import evenly, scan_points, thinned
 from omnibench.report.style import plan
 from omnibench.report.traces import START, joined, line, marks, path
@@ -72,7 +71,7 @@ def one_run(
 
     outlines: the walls of the floor plan in the frame of the run's reference poses, closed (n, 2) each, m.
     """
-    end = end_of(trajectory)
+    end = trajectory.end
     (driven,) = odometry.poses([trajectory.log(np.linspace(0.0, end, _PATH))])
     lines = [
         path(REFERENCE_ITEM, _thin(trajectory.poses), 2.6),

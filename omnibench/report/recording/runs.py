@@ -17,11 +17,6 @@ _STRAIGHT = 1e-3  # rad/s; a slower turn counts as straight
 ON_THE_SPOT = "on the spot"
 
 
-def end_of(trajectory: Trajectory) -> float:
-    """The end of a run, s: of its reference poses or, where it has but a start pose, of its wheel samples."""
-    return float(trajectory.pose_times[-1] if len(trajectory.pose_times) > 1 else trajectory.times[-1])
-
-
 def describe(trajectory: Trajectory) -> str:
     """A trajectory's motion command as the paper writes it; without one, its name."""
     if trajectory.alpha is None or trajectory.omega is None:

@@ -26,7 +26,7 @@ from omnibench.report.numbers import count, fixed, significant
 from omnibench.report.recording.contents import contents_table
 from omnibench.report.recording.player import player
 from omnibench.report.recording.room_figures import all_runs, one_run
-from omnibench.report.recording.runs import end_of, representative_runs
+from omnibench.report.recording.runs import representative_runs
 from omnibench.report.recording.slam_figures import error_figures
 from omnibench.report.recording.slam_tables import accuracy_tiles, bias_table, error_table, errors_in_words
 from omnibench.report.recording.wheel_figures import wheel_rates
@@ -97,7 +97,7 @@ def recording_document(
 def _answer(dataset: Dataset, notes: Sequence[str], accuracy: SlamAccuracy | None, picture: FigureGrid) -> Section:
     """What is in a recording or, where the truth is known, how accurate its reference poses are; and its paths."""
     runs = dataset.trajectories
-    seconds = sum(end_of(run) for run in runs)
+    seconds = sum(run.end for run in runs)
     metres = sum(float(np.hypot(*np.diff(run.poses[:, :2], axis=0).T).sum()) for run in runs)
     sentence = f"{plural(len(runs), 'run')} of {dataset.robot.name}, {significant(metres, 3)} m in {_minutes(seconds)}"
     tiles: tuple[Fact, ...] = (
