@@ -15,9 +15,11 @@ from omnibench.fit.evaluate import verdict_on
 from omnibench.fit.geometry import FittedParameter, GeometryLimits, WheelGeometry, fitted_parameters
 from omnibench.fit.loss.losses import LossName
 from omnibench.fit.loss.robust_cost import with_loss
+from omnibench.fit.observations.open_combinations import with_open_combinations
 from omnibench.fit.observations.open_in_words import open_sentences
 from omnibench.fit.parameterisation import (
     Box,
+    MatrixElements,
     ParameterisationName,
 )
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
@@ -271,7 +273,9 @@ def _inseparable(problem: CalibrationProblem, calibrator: Calibrator) -> tuple[s
     if not isinstance(problem.parameterisation, WheelGeometry) or not calibrator.bounded:
         return ()
     kept = unidentified_directions(problem.robot, driven_span(problem.trajectories))
-    return inseparable_in_words(problem.parameterisation, kept)
+    known = MatrixElements(problem.robot, "row", kept, known_mount=False)
+    left_open = with_open_combinations(known, problem.trajectories).open
+    return inseparable_in_words(problem.parameterisation, kept, left_open)
 
 
 def _doubts_of_steering(robot: Robot, terms: tuple[Term, ...]) -> tuple[str, ...]:

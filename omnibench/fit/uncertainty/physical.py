@@ -77,17 +77,19 @@ def identified_parameters(geometry: WheelGeometry, kept: Array, left_open: Array
     Linearised about the design: a parameter is identified if every change of the geometry that moves it changes the
     known part of the matrix.
     """
-    return tuple(bool(share < _UNIDENTIFIED) for share in np.diag(_unseen_changes(geometry, kept)))
+    return tuple(bool(share < _UNIDENTIFIED) for share in np.diag(_unseen_changes(geometry, kept, left_open)))
 
 
-def inseparable_parameters(geometry: WheelGeometry, kept: Array) -> tuple[tuple[str, ...], ...]:
+def inseparable_parameters(
+    geometry: WheelGeometry, kept: Array, left_open: Array | None = None
+) -> tuple[tuple[str, ...], ...]:
     """Groups of numbers that cannot be told apart: a change of one is made up for by the others of its group.
 
-    kept as for ``identified_parameters``; the numbers that are not identified are those of all groups. A group of one
+    kept, left_open as for ``identified_parameters``; the numbers that are not identified are those of all groups. A group of one
     is a number of which nothing is known. The changes that are not seen form a space; its projection is zero between
     numbers of different groups.
     """
-    projection = _unseen_changes(geometry, kept)
+    projection = _unseen_changes(geometry, kept, left_open)
     left = [index for index, share in enumerate(np.diag(projection)) if share >= _UNIDENTIFIED]
     groups = []
     while left:
@@ -102,9 +104,9 @@ def inseparable_parameters(geometry: WheelGeometry, kept: Array) -> tuple[tuple[
     return tuple(groups)
 
 
-def inseparable_in_words(geometry: WheelGeometry, kept: Array) -> tuple[str, ...]:
+def inseparable_in_words(geometry: WheelGeometry, kept: Array, left_open: Array | None = None) -> tuple[str, ...]:
     """A sentence for each group of a geometry's numbers that cannot be told apart."""
-    return tuple(map(_group_in_words, inseparable_parameters(geometry, kept)))
+    return tuple(map(_group_in_words, inseparable_parameters(geometry, kept, left_open)))
 
 
 def _group_in_words(group: tuple[str, ...]) -> str:
@@ -116,7 +118,7 @@ def _group_in_words(group: tuple[str, ...]) -> str:
     )
 
 
-def _unseen_changes(geometry: WheelGeometry, kept: Array) -> Array:
+def _unseen_changes(geometry: WheelGeometry, kept: Array, left_open: Array | None) -> Array:
     """The projection (n, n) onto changes of a geometry, in units of its scale, that leave the known matrix as it is.
 
     Linearised about the design.
