@@ -22,6 +22,7 @@ WheelType = Literal["omni", "mecanum", "fixed", "steered"]
 
 _FORWARD = 0.0  # rad, the direction of rolling where none is given
 _FARTHEST = 1e3  # m
+_ON_AN_AXIS = 1e-9  # m2: a wheel ahead of the centre, or beside it, may have its rollers either way
 
 
 def in_radians(content: Any, *keys: str) -> Any:
@@ -39,6 +40,24 @@ def in_radians(content: Any, *keys: str) -> Any:
             raise ValueError(f"{degrees} must be a number (given: {content[degrees]!r})")
         content[key] = math.radians(content.pop(degrees))
     return content
+
+
+def _with_usual_rollers(content: Any) -> Any:
+    """A mecanum wheel by x and y with the rollers that it usually has, where none are given.
+
+    Four such wheels show an X from above: the lever arm of each is ``abs(x) + abs(y)`` where it rolls forward.
+    """
+    if not isinstance(content, dict) or content.get("type") != "mecanum" or content.get("roller_angle") is not None:
+        return content
+    place = [content.get(key) for key in ("x", "y", "angle")]
+    x, y, axle = (value if isinstance(value, int | float) else None for value in place)
+    if x is None or y is None:
+        return content
+    rolling = _FORWARD if axle is None else axle + math.pi / 2
+    ahead, left = x * math.cos(rolling) + y * math.sin(rolling), y * math.cos(rolling) - x * math.sin(rolling)
+    if abs(ahead * left) < _ON_AN_AXIS:
+        return content
+    return content | {"roller_angle": math.copysign(math.pi / 4, ahead * left)}
 
 
 def looks_like_radians(angle: float | None) -> float | None:
@@ -64,6 +83,7 @@ class Wheel(Model):
     of its driving force about the centre, and ``angle``, the direction of its axle: for an omni wheel whose axle points
     at the centre its position in polar coordinates; for a mecanum wheel at (lx, ly) with rollers at 45 degrees and its
     axle along y +pi/2 (left) or -pi/2 (right), and ``abs(lx) + abs(ly)``. Or by x, y and the axle's angle.
+    By x and y a mecanum wheel has the rollers of the usual arrangement, an X from above, unless it says others.
     A fixed wheel has x, y and, as ``angle``, the direction in which it rolls; a steered one x and y.
     driven: False for a steered wheel whose rate is not measured. measured: False for a wheel that only guides.
     """
@@ -88,7 +108,7 @@ class Wheel(Model):
     @model_validator(mode="before")
     @classmethod
     def _angles_in_radians(cls, content: Any) -> Any:
-        return in_radians(content, "angle", "roller_angle")
+        return _with_usual_rollers(in_radians(content, "angle", "roller_angle"))
 
     @field_validator("angle")
     @classmethod
