@@ -122,7 +122,8 @@ def _standing(view: DatasetView, best: EntryStatistics) -> str:
     if not others:
         return f"{best.label} is best"
     entries = "other entry is" if others == 1 else "other entries are"
-    return f"{_number(others)} {entries} level with it"
+    design = any(entry.calibrator == THEORETICAL_NAME for entry in view.level)
+    return f"{_number(others)} {entries} level with it{', the design values among them' if design else ''}"
 
 
 def _standing_at_length(view: DatasetView, best: EntryStatistics) -> str:
