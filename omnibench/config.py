@@ -164,15 +164,26 @@ def _describe(model: type[BaseModel], error: ValidationError) -> str:
     details = error.errors(include_url=False)
     # An unknown key explains a missing one, so it comes first.
     details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
+    missing = [detail for detail in details if detail["type"] == "missing"]
+    if details[0]["type"] == "missing" and len(missing) > 1:
+        keys = [repr(_place(detail)) for detail in missing]
+        others = len(details) - len(missing)
+        rest = f" (and {others} more mistake{'s' if others > 1 else ''})" if others else ""
+        return f"keys {', '.join(keys[:-1])} and {keys[-1]} are missing{rest}"
     more = len(details) - 1
     rest = f" (and {more} more mistake{'s' if more > 1 else ''})" if more else ""
     return _describe_one(model, details[0]) + rest
 
 
+def _place(detail: ErrorDetails) -> str:
+    """The key of a mistake, from the document's top."""
+    return ".".join(str(part) for part in detail["loc"] if not str(part).startswith(CHOSEN))
+
+
 def _describe_one(model: type[BaseModel], detail: ErrorDetails) -> str:
     whole = detail["loc"]
     location = tuple(part for part in whole if not str(part).startswith(CHOSEN))
-    place = ".".join(str(part) for part in location)
+    place = _place(detail)
     if detail["type"] == "extra_forbidden":
         known = _keys_at(model, whole[:-1])
         return f"unknown key {place!r}; {nearest(str(location[-1]), known)}known: {', '.join(known) or 'none'}"

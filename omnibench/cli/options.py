@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from omnibench.cli.terminal.console import warn
+from omnibench.errors import PluginError
 
 if TYPE_CHECKING:
     from omnibench.registry import PluginFailure
@@ -51,6 +52,12 @@ Plugins = Annotated[
 ]
 
 
+PluginFiles = Annotated[
+    list[Path] | None,
+    typer.Option("--plugin", metavar="FILE", help="One plug-in file to load; may be repeated."),
+]
+
+
 def refuse_figures_without_browser(folder: Path | None) -> None:
     """DataError, before the work begins: figures are asked for, and nothing here can draw them."""
     if folder is not None:
@@ -78,14 +85,19 @@ def plugin_folders(given: Sequence[Path] | None) -> list[Path]:
     return [Path("plugins")]
 
 
-def load_given_plugins(given: Sequence[Path] | None) -> list[PluginFailure]:
+def load_given_plugins(given: Sequence[Path] | None, files: Sequence[Path] | None = None) -> list[PluginFailure]:
     """Load the plug-ins of the given folders, or of the default one, and warn on standard error of those that fail.
 
-    PluginError: a folder does not exist.
+    files: single plug-in files to load, too. PluginError: a folder does not exist, or one of the files fails.
     """
-    from omnibench.registry import load_plugins
+    from omnibench.registry import load_plugin_file, load_plugins
 
     with redirect_stdout(sys.stderr):  # a plug-in that prints must not spoil our output
+        for file in files or ():
+            if not file.is_file():
+                raise PluginError(f"{file}: no such plug-in file")
+            if (failure := load_plugin_file(file)) is not None:
+                raise PluginError(f"plug-in {failure.origin} cannot be imported: {failure.error}")
         failures = load_plugins(plugin_folders(given))
     for failure in failures:
         warn([f"plug-in {failure.origin} cannot be imported: {failure.error}"])

@@ -26,44 +26,6 @@ from omnibench.words import plural
 recording_app = typer.Typer()
 
 
-@recording_app.command("import")
-def import_(
-    importer: Annotated[
-        str, typer.Argument(metavar="FORMAT", help="Format of the recordings; omnibench list names all.")
-    ],
-    source: Annotated[Path, typer.Argument(help="File or folder with the recordings.")],
-    output: Annotated[Path, output_option("Data set folder to write.")],
-    settings: Settings = None,
-    table_format: TableFormat = "parquet",
-    force: Force = False,
-    plugins: Plugins = None,
-) -> None:
-    """Convert recordings into a data set.
-
-    Recordings with laser scans but without reference poses get these by SLAM.
-    """
-    from omnibench.config import parse_settings
-    from omnibench.data.splits import division_in_words
-    from omnibench.data.storage import check_dataset_folder, save_dataset
-    from omnibench.files import refuse_existing
-    from omnibench.registry import importers
-    from omnibench.slam.import_dataset import import_dataset
-
-    load_given_plugins(plugins)
-    entry, options = importers.entry(importer, "import"), parse_settings(settings)
-    check_dataset_folder(output)
-    refuse_existing(output, force=force, folders=True)
-    folder = output.resolve().name
-    if "name" in entry.cls.Options.model_fields and folder.isprintable() and folder:
-        options.setdefault("name", folder)
-    dataset = import_dataset(importer, source, options)
-    save_dataset(dataset, output, table_format, overwrite=force)
-    warn(dataset.warnings)
-    typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {output}")
-    way = " (other: --set validation=PATTERN)" if "validation" in entry.cls.Options.model_fields else ""
-    typer.echo(f"{division_in_words(dataset.trajectories, options)}{way}", err=True)
-
-
 @recording_app.command()
 def inspect(
     dataset: DatasetFolder,

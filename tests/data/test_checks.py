@@ -90,19 +90,18 @@ IN_DEGREES_WITHIN_180 = headings(lambda values: (np.degrees(values) + 180) % 360
 IN_DEGREES_WITHIN_360 = headings(lambda values: np.degrees(values) % 360)
 IN_MM, IN_CM = positions(1000.0), positions(100.0)
 
-_HEADING = "theta looks like degrees; it must be rad (importer csv: heading_unit=deg)"
+_HEADING = "theta looks like degrees; it must be rad (import with --set heading_unit=deg)"
 MISTAKES = {
-    "rpm": (IN_RPM, "wheel rates look like rpm; omega_* must be rad/s (importers csv and rosbag: wheel_unit=rpm)"),
+    "rpm": (IN_RPM, "wheel rates look like rpm; omega_* must be rad/s (import with --set wheel_unit=rpm)"),
     "degrees per second": (
         IN_DEGREES_PER_SECOND,
-        "wheel rates look like deg/s; omega_* must be rad/s (importers csv and rosbag: wheel_unit=deg/s, or deg of "
-        "positions)",
+        "wheel rates look like deg/s; omega_* must be rad/s (import with --set wheel_unit=deg/s, or deg of positions)",
     ),
     "degrees": (IN_DEGREES, _HEADING),
     "degrees within 180": (IN_DEGREES_WITHIN_180, _HEADING),
     "degrees within 360": (IN_DEGREES_WITHIN_360, _HEADING),
-    "mm": (IN_MM, "positions look like mm; x and y must be m (importers csv and table1: position_unit=mm)"),
-    "cm": (IN_CM, "positions look like cm; x and y must be m (importer csv: position_unit=cm)"),
+    "mm": (IN_MM, "positions look like mm; x and y must be m (import with --set position_unit=mm)"),
+    "cm": (IN_CM, "positions look like cm; x and y must be m (import with --set position_unit=cm)"),
 }
 
 

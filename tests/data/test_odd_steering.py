@@ -64,7 +64,7 @@ def test_a_wheel_that_is_counted_the_wrong_way_is_named_with_its_option(robot: s
     names = recorded(robot).robot.wheel_names
     (warning,) = warnings_of(robot, rates=times(-1, wheel))
     signs = ",".join("-1" if index == wheel else "1" for index in range(len(names)))
-    assert f"(importer csv: wheel_signs, 1 by default, times [{signs}]; rosbag: joint_signs)" in warning
+    assert f"(import with --set wheel_signs=[{signs}], times the present ones; rosbag: joint_signs)" in warning
     assert warning.startswith(f"wheel {names[wheel]} looks") or f"{names[wheel]} <- -{names[wheel]}" in warning
 
 
@@ -74,13 +74,13 @@ def test_ticks_taken_for_radians_are_named_with_their_count(robot: str, count: i
     (warning,) = warnings_of(robot, rates=times(count / (2 * math.pi)))
     told = float(warning.partition("as ticks would be at about ")[2].partition(" a turn")[0].replace(",", ""))
     assert told == pytest.approx(count, rel=0.15)
-    assert "(importers csv and rosbag: wheel_unit with ticks and ticks_per_turn; or gear_ratio" in warning
-    assert "in robot.yaml or dataset.yaml: radius of the wheels" in warning
+    assert "(import with --set wheel_unit=ticks --set ticks_per_turn=N" in warning
+    assert "correct the radius of the wheels, in m, in robot.yaml" in warning
 
 
 @each_steered
 def test_a_steering_column_in_degrees_is_named(robot: str) -> None:
-    expected = "steering angles look like degrees; steer_* must be rad (importers csv and rosbag: steering_unit=deg)"
+    expected = "steering angles look like degrees; steer_* must be rad (import with --set steering_unit=deg)"
     assert warnings_of(robot, steering=times(180 / math.pi)) == (expected,)
 
 
@@ -97,7 +97,7 @@ def test_one_of_several_steering_columns_in_degrees_is_named(robot: str, wheel: 
     scales = ",".join("0.0174533" if index == wheel else "1" for index in range(len(STEERED[robot])))
     name = STEERED[robot][wheel]
     assert warning.startswith(f"the steering angle of wheel {name} looks like degrees; steer_{name} must be rad")
-    assert warning.endswith(f"(importers csv and rosbag: steering_scale, 1 by default, times [{scales}])")
+    assert warning.endswith(f"(import with --set steering_scale=[{scales}], times the present ones)")
 
 
 @each_steered
@@ -105,7 +105,7 @@ def test_one_of_several_steering_columns_in_degrees_is_named(robot: str, wheel: 
 def test_a_zero_of_all_steering_angles_10_degrees_off_is_named(robot: str, degrees: int) -> None:
     (warning,) = warnings_of(robot, steering=plus(degrees))
     assert f"looks 10 degrees too {'large' if degrees > 0 else 'small'}, its zero not straight ahead" in warning
-    assert f"add [{','.join([str(-degrees)] * len(STEERED[robot]))}] to steering_offsets_deg" in warning
+    assert f"--set steering_offsets_deg=[{','.join([str(-degrees)] * len(STEERED[robot]))}], added to" in warning
 
 
 @each_of_several
@@ -113,7 +113,7 @@ def test_the_zero_of_one_of_several_steering_angles_10_degrees_off_is_named(robo
     (warning,) = warnings_of(robot, steering=plus(10, wheel))
     offsets = ",".join("-10" if index == wheel else "0" for index in range(len(STEERED[robot])))
     assert warning.startswith(f"the steering angle of wheel {STEERED[robot][wheel]} looks 10 degrees too large")
-    assert f"add [{offsets}] to steering_offsets_deg" in warning
+    assert f"--set steering_offsets_deg=[{offsets}], added to the present ones" in warning
 
 
 def test_a_swerve_base_s_zeros_may_be_the_reference_s_yaw() -> None:
@@ -129,7 +129,7 @@ def test_steering_angles_counted_clockwise_are_named(robot: str) -> None:
     (warning,) = warnings_of(robot, steering=times(-1))
     signs = ",".join(["-1"] * len(STEERED[robot]))
     assert "looks counted clockwise; it must count counter-clockwise" in warning
-    assert f"(importers csv and rosbag: steering_signs, 1 by default, times [{signs}])" in warning
+    assert f"(import with --set steering_signs=[{signs}], times the present ones)" in warning
 
 
 @each_of_several
@@ -143,7 +143,7 @@ def test_ticks_of_the_steering_encoder_taken_for_radians_are_named_with_their_co
     (warning,) = warnings_of(robot, steering=times(8192 / (2 * math.pi)))
     told = float(warning.partition("as ticks would be at about ")[2].partition(" a turn")[0].replace(",", ""))
     assert told == pytest.approx(8192, rel=0.1)
-    assert "importers csv and rosbag: steering_unit=ticks and steering_ticks_per_turn; or steering_scale" in warning
+    assert "import with --set steering_unit=ticks --set steering_ticks_per_turn=N; or --set steering_scale" in warning
 
 
 @each_steered
@@ -154,7 +154,7 @@ def test_a_gear_of_the_steering_is_named_relative_to_the_present_scale(robot: st
     assert (
         f"times too {'large' if gear > 1 else 'small'}; is there a gear between the encoder and the wheel?" in warning
     )
-    told = float(warning.partition("steering_scale ")[2].partition(" times the present one, which is 1 by default")[0])
+    told = float(warning.partition("steering_scale=")[2].partition(", times the present one")[0])
     assert told == pytest.approx(1 / gear, rel=0.15)
 
 
@@ -164,4 +164,4 @@ def test_a_steering_angle_that_never_changes_is_named(robot: str, wheel: int | N
     names = STEERED[robot] if wheel is None else (STEERED[robot][wheel],)
     columns = ", ".join(f"steer_{name}" for name in names)
     assert warning.startswith(f"{columns} never changes, which the reference contradicts; is that steering angle")
-    assert "(importer csv: steering_columns; rosbag: steering_joints, steering_topic)" in warning
+    assert "(--set steering_columns=NAME on import; rosbag: steering_joints, steering_topic)" in warning

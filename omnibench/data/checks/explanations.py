@@ -16,23 +16,23 @@ from omnibench.robot.kinematics import Array
 # Units that a column may have been recorded in: factor to the SI unit, and warning.
 _RATES = (
     (1.0, ""),
-    (2 * math.pi / 60, "wheel rates look like rpm; omega_* must be rad/s (importers csv and rosbag: wheel_unit=rpm)"),
+    (2 * math.pi / 60, "wheel rates look like rpm; omega_* must be rad/s (import with --set wheel_unit=rpm)"),
     (
         DEGREE,
-        "wheel rates look like deg/s; omega_* must be rad/s (importers csv and rosbag: wheel_unit=deg/s, or deg of "
-        "positions)",
+        "wheel rates look like deg/s; omega_* must be rad/s (import with --set wheel_unit=deg/s, or deg of positions)",
     ),
     (
         2 * math.pi,
-        "wheel rates look like turns a second; omega_* must be rad/s (importers csv and rosbag: wheel_unit=rev/s, or "
+        "wheel rates look like turns a second; omega_* must be rad/s (import with --set wheel_unit=rev/s, or "
         "rev of positions)",
     ),
 )
-_HEADINGS = ((1.0, ""), (DEGREE, "theta looks like degrees; it must be rad (importer csv: heading_unit=deg)"))
+HEADINGS_IN_DEGREES = "theta looks like degrees; it must be rad (import with --set heading_unit=deg)"
+_HEADINGS = ((1.0, ""), (DEGREE, HEADINGS_IN_DEGREES))
 _POSITIONS = (
     (1.0, ""),
-    (1e-3, "positions look like mm; x and y must be m (importers csv and table1: position_unit=mm)"),
-    (1e-2, "positions look like cm; x and y must be m (importer csv: position_unit=cm)"),
+    (1e-3, "positions look like mm; x and y must be m (import with --set position_unit=mm)"),
+    (1e-2, "positions look like cm; x and y must be m (import with --set position_unit=cm)"),
 )
 _ARRANGED = 4  # wheels of which every order and sign is tried, at most; of more only one mistake (chosen)
 # An explanation that changes more must fit better by this share than a simpler one (chosen); wheels on one side of a
@@ -85,7 +85,8 @@ def _arrangement(recording: Recording) -> list[Explanation]:
         f"{name} <- {'-' if sign < 0 else ''}{names[column]}"
         for name, column, sign in zip(names, order, signs, strict=True)
     )
-    options = "importer csv: wheel_columns and wheel_signs set them right; rosbag: joints and joint_signs"
+    columns = ",".join(f"omega_{names[column]}" for column in order)
+    options = f"import with --set wheel_columns=[{columns}] --set wheel_signs={listed(signs)}; rosbag: joints"
     if order == tuple(range(len(names))):
         options = _signs(signs)
     warning = f"wheels look swapped or sign-flipped; the reference fits with omega of {shown} ({options})"
@@ -119,19 +120,19 @@ def _wrong_signs(wheels: Sequence[str], steered: Sequence[str]) -> Iterator[_Mis
 
 def _signs(signs: Sequence[int]) -> str:
     """The options that turn wheels round, whatever they were on import."""
-    return f"importer csv: wheel_signs, 1 by default, times {listed(signs)}; rosbag: joint_signs"
+    return f"import with --set wheel_signs={listed(signs)}, times the present ones; rosbag: joint_signs"
 
 
 def _exchanges(wheels: Sequence[str], steered: Sequence[str]) -> Iterator[_Mistake]:
     """Two wheels exchanged: their rates, their steering angles, or both."""
     for pair, swap in _swaps(wheels):
-        options = "importer csv: wheel_columns; rosbag: joints"
+        options = "exchange them in --set wheel_columns=[...]; rosbag: joints"
         yield _Mistake(f"the rates of wheels {pair} look swapped ({options})", rates=swap)
     for pair, swap in _swaps(steered):
-        options = "importer csv: steering_columns; rosbag: steering_joints"
+        options = "exchange them in --set steering_columns=[...]; rosbag: steering_joints"
         yield _Mistake(f"the steering angles of wheels {pair} look swapped ({options})", steering=swap)
     for pair, swap in _swaps(wheels) if tuple(wheels) == tuple(steered) else ():
-        options = "importer csv: wheel_columns and steering_columns; rosbag: joints and steering_joints"
+        options = "exchange them in --set wheel_columns=[...] and steering_columns; rosbag: joints and steering_joints"
         yield _Mistake(f"wheels {pair} look swapped, rates and steering angles ({options})", rates=swap, steering=swap)
 
 
@@ -168,11 +169,14 @@ def ticks(recording: Recording) -> list[Explanation]:
     misfits = recording.reread(times(rough)).misfits(factors * design)
     factor = rough * float(_FINER[misfits.argmin()])
     words, count = f"wheel rates look about {rounded(1 / factor)} times too high", 2 * math.pi / factor
-    options = "gear_ratio, where the encoder is at the motor, or ticks_per_turn, which counts edges (4 a pulse)"
+    options = (
+        f"--set gear_ratio={rounded(1 / factor)}, where the encoder is at the motor, or so many times the "
+        "ticks_per_turn, which counts edges (4 a pulse)"
+    )
     if count > _FEWEST_TICKS:
         words += f", as ticks would be at about {rounded(count)} a turn of the wheel"
-        options = f"wheel_unit with ticks and ticks_per_turn; or {options}"
+        options = f"--set wheel_unit=ticks --set ticks_per_turn=N, with /s or /sample behind ticks; or {options}"
     else:
         words += "; omega_* must be rad/s of the wheel"
-    options = f"importers csv and rosbag: {options}; in robot.yaml or dataset.yaml: radius of the wheels, in m"
-    return [Explanation((f"{words} ({options})",), float(misfits.min()))]
+    options = f"import with {options}; or correct the radius of the wheels, in m, in robot.yaml"
+    return [Explanation((f"{words} ({options})",), float(misfits.min()), unit=True)]

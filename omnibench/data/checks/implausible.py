@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from omnibench.data.checks.contradictions import contradictions
 from omnibench.data.checks.explanations import odd_units, odd_wheels, ticks
-from omnibench.data.checks.misfit import Explanation, Recording
+from omnibench.data.checks.misfit import Explanation, Recording, UnitWarning
 from omnibench.data.checks.odd_steering import frozen, odd_gears, odd_zeros
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
@@ -51,4 +51,4 @@ def _best(recording: Recording, explanations: Sequence[Explanation], fitted: Seq
         return []
     if best.misfit > _EXACT and any(each.misfit < _FAR_BETTER * best.misfit for each in fitted):
         return []
-    return list(best.warnings)
+    return [UnitWarning(warning) for warning in best.warnings] if best.unit else list(best.warnings)

@@ -42,6 +42,10 @@ def rounded(value: float) -> str:
     return f"{float(f'{value:.2g}'):,.12g}"
 
 
+class UnitWarning(str):
+    """A warning of a unit that cannot be right, by the magnitude of what was recorded."""
+
+
 @dataclass(frozen=True)
 class Explanation:
     """Warnings of what may be wrong, and the misfit that remains if they are right.

@@ -11,7 +11,7 @@ from omnibench.data.checks.misfit import EXPLAINED, Explanation, Reading, Record
 from omnibench.robot.kinematics import Array
 
 DEGREE, _TURN = math.pi / 180, 2 * math.pi
-IN_DEGREES = "steering angles look like degrees; steer_* must be rad (importers csv and rosbag: steering_unit=deg)"
+IN_DEGREES = "steering angles look like degrees; steer_* must be rad (import with --set steering_unit=deg)"
 # Factors of steering angles that are tried, 1.5 apart, then 1.1; nearer to 1 than 1.8 is what a calibration is for. The
 # smallest makes the farthest angle _LEAST_STEERED, less than which no robot steers (chosen).
 _NEAREST, _LARGEST, _APART, _LEAST_STEERED = 1.8, 20.0, 1.5, 0.1
@@ -58,14 +58,14 @@ def _gear_in_words(share: float) -> str:
     """The warning of steering angles that are to be taken times ``share``."""
     factor, size = (1 / share, "large") if share < 1 else (share, "small")
     words, count = f"steering angles look about {rounded(factor)} times too {size}", _TURN / share
-    scale = f"steering_scale {share:.2g} times the present one, which is 1 by default"
+    scale = f"--set steering_scale={share:.2g}, times the present one"
     if count > _FEWEST_TICKS:
         words += f", as ticks would be at about {rounded(count)} a turn of the wheel"
-        options = f"steering_unit=ticks and steering_ticks_per_turn; or {scale}"
+        options = f"--set steering_unit=ticks --set steering_ticks_per_turn=N; or {scale}"
     else:
         words += "; is there a gear between the encoder and the wheel?"
         options = f"{scale}; or steering_unit; or calibrate with --steering fit"
-    return f"{words} (importers csv and rosbag: {options})"
+    return f"{words} (import with {options})"
 
 
 def _single_degrees(recording: Recording) -> list[tuple[int, float]]:
@@ -79,16 +79,16 @@ def in_degrees(names: Sequence[str], wheel: int) -> str:
     """The warning of one of the steered wheels whose angle is in degrees."""
     scales = ",".join(f"{DEGREE:.7f}" if index == wheel else "1" for index in range(len(names)))
     return (
-        f"the steering angle of wheel {names[wheel]} looks like degrees; steer_{names[wheel]} must be rad (importers "
-        f"csv and rosbag: steering_scale, 1 by default, times [{scales}])"
+        f"the steering angle of wheel {names[wheel]} looks like degrees; steer_{names[wheel]} must be rad (import "
+        f"with --set steering_scale=[{scales}], times the present ones)"
     )
 
 
 def clockwise(which: str, signs: Sequence[int]) -> str:
     """The warning of steering angles of which wheels (of all: ``signs``) count the wrong way round."""
     return (
-        f"the steering angle of {which} looks counted clockwise; it must count counter-clockwise (importers csv and "
-        f"rosbag: steering_signs, 1 by default, times {listed(signs)})"
+        f"the steering angle of {which} looks counted clockwise; it must count counter-clockwise (import "
+        f"with --set steering_signs={listed(signs)}, times the present ones)"
     )
 
 
@@ -125,8 +125,8 @@ def frozen(recording: Recording) -> list[str]:
         return []
     columns = ", ".join(f"steer_{name}" for name in names)
     return [
-        f"{columns} never changes, which the reference contradicts; is that steering angle measured? (importer csv: "
-        "steering_columns; rosbag: steering_joints, steering_topic)"
+        f"{columns} never changes, which the reference contradicts; is that steering angle measured? (--set "
+        "steering_columns=NAME on import; rosbag: steering_joints, steering_topic)"
     ]
 
 
@@ -153,5 +153,5 @@ def zero_in_words(recording: Recording, group: Array, degrees: int) -> str:
     turned = f"; or the reference is turned: mount: {{yaw_deg: {-degrees}}} of the robot" if free else ""
     return (
         f"the steering angle of {which} looks {abs(degrees)} degrees too {'large' if degrees < 0 else 'small'}, its "
-        f"zero not straight ahead (importers csv and rosbag: add {values} to steering_offsets_deg{turned})"
+        f"zero not straight ahead (import with --set steering_offsets_deg={values}, added to the present ones{turned})"
     )

@@ -6,7 +6,7 @@ import math
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
@@ -64,6 +64,8 @@ Wrap = Annotated[float | Literal["auto", "never"], BeforeValidator(_as_wrap)]
 
 class EncoderOptions(ReferenceOptions, ABC):
     """What the encoders of wheels and of steering axles count. A subclass has the signs of the wheels."""
+
+    group: ClassVar[str] = "Wheels and steering"
 
     wheel_unit: WheelUnit = Field(
         "rad/s", description=f"positions {', '.join(_POSITIONS)}; rates rad/s, ..., rpm; increments rad/sample, ..."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from typing import ClassVar
 
 from pydantic import Field
 
@@ -18,7 +19,12 @@ from omnibench.registry import Options
 class RecordingOptions(Options):
     """The robot, which runs train and validate, and what the data set says of itself."""
 
-    robot: RobotOption = Field(description="YAML file with name and wheels, see omnibench guide data; or a mapping")
+    group: ClassVar[str] = "Robot and runs"
+
+    robot: RobotOption = Field(
+        description="name and wheels: --set robot=FILE.yaml, or robot.yaml in the source or beside it; "
+        "omnibench import csv --template DIR writes one"
+    )
     train: Names = Field((), description="patterns of run names that train")
     validation: Names = Field((), description="patterns of run names that validate")
     leave_out: Names = Field((), description="patterns of the names of runs that are left out")

@@ -23,9 +23,7 @@ def test_every_error_line_names_the_option_that_leads_on(command: Command, tmp_p
         said.extend(each for option in new for each in ("--set", option))
         return ["import", "rosbag", str(foreign_bag), "-o", "data", *said]
 
-    assert_refused(
-        command(*attempt()), "key 'robot' is missing (YAML file with name and wheels, see omnibench guide data"
-    )
+    assert_refused(command(*attempt()), "key 'robot' is missing (name and wheels: --set robot=FILE.yaml")
     assert_refused(command(*attempt("robot=robot.yaml")), "whole numbers: set wheel_unit=ticks and ticks_per_turn")
     assert_refused(
         command(*attempt("wheel_unit=ticks")), "needs ticks_per_turn (of the wheel, gear included; of the motor"
@@ -39,7 +37,7 @@ def test_every_error_line_names_the_option_that_leads_on(command: Command, tmp_p
     assert "front_right <- -front_right, rear_left <- rear_left, rear_right <- -rear_right" in turned.stderr
     assert "_signs" in turned.stderr
     right = command(*attempt("joint_signs=[1,-1,1,-1]", "wraps_at=2^16"), "--force")
-    assert (right.returncode, right.stderr.count("\n")) == (0, 1)
+    assert (right.returncode, "warning" in right.stderr) == (0, False)
     assert right.stdout == "20 trajectories: data\n"
 
     inspected = command("inspect", "data")

@@ -256,7 +256,7 @@ def test_the_steering_scale_of_another_laboratory_s_tricycle_is_told_relative_to
         pytest.skip(f"the recording is not at {CORELLI}")
     *_, warning = import_dataset("csv", CORELLI, CORELLI_OPTIONS).warnings
     assert warning.startswith("steering angles look about 5 times too small")
-    assert "steering_scale 5 times the present one, which is 1 by default" in warning
+    assert "--set steering_scale=5, times the present one" in warning
     *_, last = import_dataset("csv", CORELLI, CORELLI_OPTIONS | {"steering_scale": 0.5}).warnings
     assert "steering" not in last
 

@@ -47,7 +47,9 @@ class OptiodomOptions(Options):
     log: bool = Field(True, description="read commands and absolute wheel angles from each session's own log")
     name: str = Field("optiodom", min_length=1, description="name of the data set")
     robot_name: str | None = Field(None, min_length=1, description="default: inesc_tec_ and its type")
-    source: str = "public GitHub repository sousarbarb/optiodom, commit 8e025fd7"
+    source: str = Field(
+        "public GitHub repository sousarbarb/optiodom, commit 8e025fd7", description="origin of the recording"
+    )
 
 
 @importers.register("optiodom")

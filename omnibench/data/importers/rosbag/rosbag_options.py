@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -17,6 +17,8 @@ Use = Literal["auto", "positions", "velocities"]
 
 class RosbagOptions(EncoderOptions):
     """The robot, topics and joints, how the recording is cut into runs, and which of these train and validate."""
+
+    group: ClassVar[str] = "Topics, joints and cuts"
 
     name: str = Field("rosbag", min_length=1, description="name of the data set")
     wheel_unit: WheelUnit = Field(

@@ -1,0 +1,147 @@
+"""``import``: recordings into a data set, the options of every importer, and tables to fill in."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from typer.core import TyperCommand
+
+from omnibench.cli.options import (
+    Force,
+    PluginFiles,
+    Plugins,
+    Settings,
+    TableFormat,
+    load_given_plugins,
+    output_option,
+)
+from omnibench.cli.terminal.console import print_ending, warn
+from omnibench.errors import ConfigError, DataError
+from omnibench.words import plural
+
+import_app = typer.Typer()
+
+
+class HelpOfImporters(TyperCommand):
+    """The command ``import``, whose help after the name of a format is that importer's."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Print the importer's help where ``FORMAT --help`` was typed; else as any command."""
+        if "--help" in args:
+            given, _, _ = self.make_parser(ctx).parse_args(args=[each for each in args if each != "--help"])
+            if (name := given.get("importer")) is not None:
+                from omnibench.cli.terminal.importer_help import importer_help
+
+                load_given_plugins(_paths(given.get("plugins")), _paths(given.get("plugin_files")))
+                typer.echo(importer_help(str(name), ctx.command_path))
+                ctx.exit()
+        return super().parse_args(ctx, args)
+
+
+def _paths(given: Any) -> list[Path] | None:
+    return [Path(each) for each in given] if isinstance(given, list) else None
+
+
+@import_app.command("import", cls=HelpOfImporters)
+def import_(
+    importer: Annotated[
+        str,
+        typer.Argument(metavar="FORMAT", help="Format of the recordings; import FORMAT --help shows its options."),
+    ],
+    source: Annotated[Path | None, typer.Argument(help="File or folder with the recordings.")] = None,
+    output: Annotated[Path | None, output_option("Data set folder to write.")] = None,
+    settings: Settings = None,
+    accept_units: Annotated[
+        bool, typer.Option("--accept-units", help="Write the data set even if units look wrong by magnitude.")
+    ] = False,
+    template: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="csv, without SOURCE: write tables and robot.yaml to fill in."),
+    ] = None,
+    robot_type: Annotated[
+        Literal["diff", "omni3", "mecanum", "tricycle", "car", "swerve", "skid"] | None,
+        typer.Option(help="With --template: the robot's type. Default: diff."),
+    ] = None,
+    table_format: TableFormat = "parquet",
+    force: Force = False,
+    plugins: Plugins = None,
+    plugin_files: PluginFiles = None,
+) -> None:
+    """Convert recordings into a data set.
+
+    omnibench import FORMAT --help lists the options of a format, which --set takes. Formats: csv (tables of any
+    robot), rosbag, dataset (a data set again, with other options), table1, optiodom and plug-ins. Recordings with laser
+    scans but without reference poses get these by SLAM.
+    """
+    from omnibench.config import parse_settings
+    from omnibench.data.header import Imported
+    from omnibench.data.splits import division_in_words
+    from omnibench.data.storage import check_dataset_folder, save_dataset
+    from omnibench.files import refuse_existing, resolved
+    from omnibench.registry import importers
+    from omnibench.slam.import_dataset import import_dataset
+
+    load_given_plugins(plugins, plugin_files)
+    entry, given = importers.entry(importer, "import"), parse_settings(settings)
+    if template is not None:
+        return _write_template(importer, template, robot_type or "diff", force, source, output)
+    if robot_type is not None:
+        raise ConfigError("--robot-type is for --template DIR; the robot of a recording is --set robot=FILE")
+    if source is None or output is None:
+        lacking = "SOURCE, the file or folder with the recordings" if source is None else "-o DIR, the folder to write"
+        raise ConfigError(f"import {importer}: say {lacking}: omnibench import {importer} SOURCE -o DIR")
+    check_dataset_folder(output)
+    if source.exists() and resolved(output) == source.resolve():
+        raise ConfigError(f"{output} is the source; name another folder with -o")
+    refuse_existing(output, force=force, folders=True)
+    options, folder = dict(given), output.resolve().name
+    if "name" in entry.cls.Options.model_fields and folder.isprintable() and folder:
+        options.setdefault("name", folder)
+    dataset = import_dataset(importer, source, options)
+    _refuse_units(dataset.warnings, output, accept_units)
+    from dataclasses import replace
+
+    dataset = replace(dataset, imported=Imported.of(importer, source, given))
+    save_dataset(dataset, output, table_format, overwrite=force)
+    warn(dataset.warnings)
+    typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {output}")
+    way = " (other: --set validation=PATTERN)" if "validation" in entry.cls.Options.model_fields else ""
+    typer.echo(f"{division_in_words(dataset.trajectories, options)}{way}", err=True)
+    print_ending(
+        f"{output} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}",
+        "see what they tell",
+        *("omnibench", "inspect", output),
+    )
+    return None
+
+
+def _refuse_units(warnings: tuple[str, ...], output: Path, accepted: bool) -> None:
+    """DataError: the units of a recording cannot be right by their magnitude, and nobody said that they are."""
+    from omnibench.data.checks.misfit import UnitWarning
+
+    wrong = [warning for warning in warnings if isinstance(warning, UnitWarning)]
+    if wrong and not accepted:
+        raise DataError(f"{'; '.join(wrong)}; {output} is not written (--accept-units writes it as it is)")
+
+
+def _write_template(
+    importer: str, folder: Path, robot_type: str, force: bool, source: Path | None, output: Path | None
+) -> None:
+    """Write tables and robot.yaml to fill in, and say what to type then."""
+    from omnibench.data.importers.csv_tables.csv_template import write_template
+    from omnibench.files import refuse_existing
+
+    if importer != "csv":
+        raise ConfigError(f"--template is for csv, not for {importer}: omnibench import csv --template {folder}")
+    if source is not None or output is not None:
+        raise ConfigError("--template DIR writes tables to fill in; leave SOURCE and -o out")
+    refuse_existing(folder, force=force, folders=True)
+    files = write_template(folder, robot_type)
+    typer.echo(f"{plural(len(files), 'file')}: {folder}")
+    for file in files:
+        typer.echo(f"  {file.name}", err=True)
+    print_ending(
+        f"{folder} holds robot.yaml and {plural(len(files) - 1, 'table')} to fill in",
+        "put your robot and your samples into them, and import them",
+        *("omnibench", "import", "csv", folder, "-o", f"data/{folder.resolve().name}"),
+    )
