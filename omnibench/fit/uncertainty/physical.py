@@ -85,9 +85,9 @@ def inseparable_parameters(
 ) -> tuple[tuple[str, ...], ...]:
     """Groups of numbers that cannot be told apart: a change of one is made up for by the others of its group.
 
-    kept, left_open as for ``identified_parameters``; the numbers that are not identified are those of all groups. A group of one
-    is a number of which nothing is known. The changes that are not seen form a space; its projection is zero between
-    numbers of different groups.
+    kept, left_open as for ``identified_parameters``; the numbers that are not identified are those of all groups. A
+    group of one is a number of which nothing is known. The changes that are not seen form a space; its projection is
+    zero between numbers of different groups.
     """
     projection = _unseen_changes(geometry, kept, left_open)
     left = [index for index, share in enumerate(np.diag(projection)) if share >= _UNIDENTIFIED]
