@@ -117,8 +117,8 @@ def _reduced(run: Trajectory, kind: str, rng: np.random.Generator) -> Trajectory
     return replace(run, pose_times=np.zeros(1), poses=np.zeros((1, 3)), references=references)
 
 
-def simulated(robot: str, seed: int) -> tuple[Dataset, np.ndarray]:
-    """A simulated data set with exact poses, and the robot's true matrix."""
+def simulated(robot: str, seed: int, encoder: float = 0.02) -> tuple[Dataset, np.ndarray]:
+    """A simulated data set with exact poses, and the robot's true matrix. encoder: noise of each wheel rate, rad/s."""
     name, changes, length = ROBOTS[robot]
     flower = read_simulation(CONFIGS / f"{name}.yaml").config
     assert isinstance(flower, FlowerConfig)
@@ -126,8 +126,9 @@ def simulated(robot: str, seed: int) -> tuple[Dataset, np.ndarray]:
     design = flower.robot.inverse_kinematic_matrix
     off = OFF * np.random.default_rng([seed, 7]).normal(size=design.shape) * flower.robot.row_scales[:, None]
     off[1] *= bool(design[1].any())  # a robot on two fixed wheels does not slide
+    noise = flower.noise.model_copy(update={"encoder": encoder})
     truth = Truth(matrix=matrix_rows(design + off))
-    made = simulate_dataset(flower.model_copy(update={**changes, "train": train, "truth": truth}))
+    made = simulate_dataset(flower.model_copy(update={**changes, "train": train, "truth": truth, "noise": noise}))
     return made.dataset, np.array(made.truth.matrix)
 
 
