@@ -19,7 +19,7 @@ from check_exam.motion import misfit
 from check_exam.recordings import DATA, NAMES, Recording, recording
 from check_exam.sitting import UNTOUCHED, Result, chosen_runs, generator, sit, sit_untouched
 
-_QUICK = (
+QUICK = (
     ("omni3", "wheels_swapped"), ("diff", "wheel_negated"), ("omni4", "wheel_scale"), ("tricyc", "steering_zero"),
     ("robotino", "heading_unit"), ("diff", "reference_jump"),
 )  # fmt: skip
@@ -154,7 +154,7 @@ def main(description: str | None) -> int:
         parser.error(f"the recordings are not at {DATA}")
     chosen = list(cases(given.robots, given.kinds, given.seeds))
     if given.quick:
-        chosen = [Case(robot, kind, given.seeds[0]) for robot, kind in _QUICK]
+        chosen = [Case(robot, kind, given.seeds[0]) for robot, kind in QUICK]
     if given.makers:
         dry_run(chosen)
         return 0
