@@ -237,7 +237,12 @@ def reference_jump(sound: Recording, rng: Generator) -> Damage:
         step, words = np.array([0.0, 0.0, math.radians(degrees)]), f"{degrees:+.0f} deg"
 
     def change(run: Run) -> Run:
-        return replace(run, poses=run.poses + step * (run.pose_times >= chosen[run.name])[:, None])
+        after = run.pose_times >= chosen[run.name]
+        pivot = run.poses[np.argmax(after), :2]
+        cos, sin = math.cos(step[2]), math.sin(step[2])
+        moved = run.poses + step
+        moved[:, :2] = (run.poses[:, :2] - pivot) @ np.array([[cos, sin], [-sin, cos]]) + pivot + step[:2]
+        return replace(run, poses=np.where(after[:, None], moved, run.poses))
 
     detail = f"the reference jumps by {words} in {', '.join(chosen)}"
     return Damage(_some(sound, set(chosen), change), sound, detail, tuple(chosen))
