@@ -103,9 +103,10 @@ def unsound(kind: str, damage: Damage, mended: Recording) -> str:
     kept = sum(run.seconds for run in mended.runs) / sum(run.seconds for run in sound.runs)
     if kept < (_KEPT if kind in _SPOILT else _KEPT_WHOLE) or kept > 1.1:
         return f"{100 * kept:.0f} % of the seconds are there"
-    before, after = misfit(sound), misfit(mended)
-    if not after <= _WORSE * before + _MARGIN:
-        return f"misfit {after:.3f}, sound {before:.3f}"
+    for names in {(), damage.named}:  # all runs, and those that were spoilt
+        before, after = (misfit(_named(recording, names)) for recording in (sound, mended))
+        if not after <= _WORSE * before + _MARGIN and math.isfinite(before):
+            return f"misfit {after:.3f}, sound {before:.3f}"
     lengths = [
         _length(other) / _length(run)
         for run in sound.runs
@@ -119,6 +120,12 @@ def unsound(kind: str, damage: Damage, mended: Recording) -> str:
         if not 0.95 < periods[1] / periods[0] < 1.05:
             return f"sample period {periods[1]:.3g} s, sound {periods[0]:.3g} s"
     return _late(sound, mended) if kind in _CLOCKS else ""
+
+
+def _named(recording: Recording, names: Sequence[str]) -> Recording:
+    """The runs with one of the names in theirs; all where no run has one, as if it was left out."""
+    runs = [run for run in recording.runs if any(name in run.name for name in names)]
+    return recording.of(runs or list(recording.runs))
 
 
 def _length(run: Run) -> float:
