@@ -29,10 +29,10 @@ class Importer(ABC):
     def completed(cls, options: Mapping[str, Any], source: Path) -> dict[str, Any]:
         """The options with those that the source says itself: the robot by ``robot.yaml`` in it or beside it."""
         given = dict(options)
-        robot = (source if source.is_dir() else source.parent) / "robot.yaml"
+        robots = [folder / "robot.yaml" for folder in (source, source.parent) if (folder / "robot.yaml").is_file()]
         field = cls.Options.model_fields.get("robot")
-        if field is not None and field.is_required() and robot.is_file():
-            given.setdefault("robot", robot)
+        if field is not None and field.is_required() and robots:
+            given.setdefault("robot", robots[0])
         return given
 
     @abstractmethod

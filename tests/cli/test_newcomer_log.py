@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -32,10 +33,14 @@ def log_of(robot: str, folder: Path) -> Machine:
     return machine
 
 
-def columns_of(robot: str, machine: Machine) -> str:
-    names = dict(zip((wheel["name"] for wheel in _WHEELS[robot]), machine.columns, strict=True))
-    names |= {"x": "mocap_x", "y": "mocap_y", "theta": "mocap_yaw"}
-    return yaml.safe_dump(names, default_flow_style=True, width=1000).strip()
+def typed_on(line: str, machine: Machine) -> list[str]:
+    """The options of an error, with its blanks filled in: NAME of the columns, in the robot's order, N of the ticks."""
+    options = line[line.index("--set") :].rstrip("?\n")
+    for column in machine.columns:
+        options = options.replace("NAME", column, 1)
+    if "wheel_unit" not in options:
+        options += " --set wheel_unit=ticks --set ticks_per_turn=N"
+    return shlex.split(options.replace("=N", f"={machine.ticks}"))
 
 
 @pytest.mark.parametrize("robot", ["diff", "mecanum"])
@@ -47,8 +52,7 @@ def test_four_commands_lead_from_a_strange_log_to_the_true_calibration(robot: st
     assert "columns={" in refused.stderr
     assert all(column in refused.stderr for column in machine.columns)
 
-    named = [*first, "--set", f"columns={columns_of(robot, machine)}", "--set", "wheel_unit=ticks"]
-    named += ["--set", f"ticks_per_turn={machine.ticks}"]
+    named = [*first, *typed_on(refused.stderr, machine)]
     odd = omnibench(*named, cwd=tmp_path)
     assert odd.returncode == 2
     assert "heading_unit=deg" in odd.stderr

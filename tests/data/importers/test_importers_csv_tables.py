@@ -192,11 +192,23 @@ def test_times_in_milliseconds_are_told(tmp_path: Path) -> None:
         read(tmp_path)
 
 
-def test_robot_yaml_in_the_source_is_the_robot(tmp_path: Path) -> None:
-    both(1).write_csv(tmp_path / "drive1.csv")
+@pytest.mark.parametrize("names", [{}, {"columns": {"omega_left": "l", "phi_right": "r"}}])
+def test_columns_named_for_another_unit_are_taken_where_the_unit_is_said(tmp_path: Path, names: dict[str, Any]) -> None:
+    made = both(1).rename({"omega_left": "l", "omega_right": "r"} if names else {})
+    for column in made.columns[1:3]:
+        made = made.with_columns(pl.col(column) * 60 / (2 * np.pi))
+    shown = made if names else made.rename({"omega_left": "phi_left", "omega_right": "phi_right"})
+    shown.write_csv(tmp_path / "log.csv")
+    assert odometry_error(read(tmp_path, wheel_unit="rpm", **names)) < FITS
+
+
+@pytest.mark.parametrize("place", [".", ".."])
+def test_robot_yaml_in_the_source_or_beside_it_is_the_robot(tmp_path: Path, place: str) -> None:
+    (tmp_path / "log").mkdir()
+    both(1).write_csv(tmp_path / "log" / "drive1.csv")
     robot = "name: r\nwheels:\n" + "".join(
         f"  - {{name: {side}, type: fixed, radius: 0.05, x: 0, y: {y}}}\n"
         for side, y in (("left", 0.15), ("right", -0.15))
     )
-    (tmp_path / "robot.yaml").write_text(robot)
-    assert odometry_error(import_dataset("csv", tmp_path)) < FITS
+    (tmp_path / "log" / place / "robot.yaml").write_text(robot)
+    assert odometry_error(import_dataset("csv", tmp_path / "log")) < FITS

@@ -23,6 +23,8 @@ _SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t"}
 TIMES = ("t", "time", "stamp", "timestamp")
 HEADINGS = ("theta", "heading", "yaw")
 RUNS = ("run", "trajectory")
+PREFIXES = ("omega_", "ticks_", "phi_")
+"""Of the columns of wheels: rates, positions or increments in ticks, and those in other units."""
 
 
 def _as_separator(value: str) -> str:
@@ -89,8 +91,9 @@ class CsvOptions(EncoderOptions):
         if len(self.pose_columns) not in (0, 3):
             raise ValueError(f"pose_columns has {plural(len(self.pose_columns), 'value')}, expected 3: x, y, heading")
         known = self.column_keys
+        otherwise = {f"{prefix}{wheel}" for prefix in PREFIXES for wheel in self.robot.wheel_names}
         for key in self.columns:
-            if key not in known:
+            if key not in known and key not in otherwise:
                 raise ValueError(f"columns: unknown column {key!r}; {nearest(key, known)}known: {', '.join(known)}")
         if self.command_pattern is not None:
             try:
@@ -108,7 +111,8 @@ class CsvOptions(EncoderOptions):
     @property
     def prefix(self) -> str:
         """What the columns of the wheels begin with, by their unit."""
-        return "omega_" if self.quantity == "rates" else "ticks_" if "ticks" in self.wheel_unit else "phi_"
+        rates, ticks, angles = PREFIXES
+        return rates if self.quantity == "rates" else ticks if "ticks" in self.wheel_unit else angles
 
     @property
     def column_keys(self) -> tuple[str, ...]:

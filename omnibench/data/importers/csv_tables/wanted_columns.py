@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from omnibench.data.delimited import CellTable
-from omnibench.data.importers.csv_tables.csv_options import HEADINGS, RUNS, TIMES, CsvOptions
+from omnibench.data.importers.csv_tables.csv_options import HEADINGS, PREFIXES, RUNS, TIMES, CsvOptions
 
 
 @dataclass(frozen=True)
@@ -80,10 +80,14 @@ def _time(options: CsvOptions) -> Wanted:
 
 
 def _each(options: CsvOptions, prefix: str, wheels: Sequence[str], given: Sequence[str], *, bare: bool) -> list[Wanted]:
+    """The columns of some wheels. bare: wheels' names are some, too, and those of other units where one is said."""
+    others = tuple(other for other in PREFIXES if other != prefix) if bare else ()
     wanted = []
     for index, wheel in enumerate(wheels):
         key = f"{prefix}{wheel}"
-        said = options.columns.get(key) or (options.columns.get(wheel) if bare else None)
+        keys = (key, wheel, *(f"{other}{wheel}" for other in others)) if bare else (key,)
+        said = next((options.columns[each] for each in keys if each in options.columns), None)
         said = said or (given[index] if given else None)
-        wanted.append(Wanted(key, (said,) if said else (key, wheel) if bare else (key,)))
+        found = keys if "wheel_unit" in options.model_fields_set else keys[:2]
+        wanted.append(Wanted(key, (said,) if said else found))
     return wanted
