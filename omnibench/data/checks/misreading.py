@@ -1,0 +1,248 @@
+"""Mistakes by which what was recorded differs from what was meant, and what each makes of a fitted matrix."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations, permutations, product
+from typing import Any
+
+import numpy as np
+
+from omnibench.data.checks.finding import Kind
+from omnibench.data.checks.misfit import rounded
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.planar import rotation
+
+_ARRANGED = 4  # wheels of which every order and sign is tried, at most; of more only one mistake
+# Units of wheel rates by the factor from rad/s: names, and option for rates and for positions.
+_UNITS = ((60 / (2 * math.pi), "rpm"), (180 / math.pi, "deg/s"), (1 / (2 * math.pi), "rev/s"))
+_COUNTS = (4.0, 2.0, 0.5, 0.25)  # factors of counters: edges counted fourfold, twofold, or stated so and counted once
+_GEARS = 1.08 ** np.array([power for power in range(-120, 121) if abs(power) > 4])  # 1/10,000 to 10,000, not about 1
+_FEWEST_TICKS = 100  # of a turn of the wheel, from which on a factor is called ticks; chosen
+# Cost of a mistake, in units of d^2, so that the simplest explanation is taken of those that fit alike (chosen): each
+# wheel that is changed, a reference that is wrong, a factor that is fitted.
+_WHEEL, _REFERENCE, _FITTED = 4.0, 4.5, 6.0
+
+
+@dataclass(frozen=True)
+class Misreading:
+    """A mistake in words, and the options that mend it, relative to those by which the recording was read."""
+
+    kind: Kind
+    what: str
+    where: str
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Transform:
+    """Mistakes that are linear in what was recorded.
+
+    rows (3, 3): from the reference's twist as recorded to the one meant. columns (M, M): from the signals that are meant
+    to those recorded. cost: of the mistakes, in units of d^2.
+    """
+
+    rows: Array
+    columns: Array
+    cost: float
+    mistakes: tuple[Misreading, ...]
+
+    def with_reference(self, other: Transform) -> Transform:
+        """Both mistakes at once."""
+        return Transform(other.rows, self.columns, self.cost + other.cost, (*self.mistakes, *other.mistakes))
+
+
+def wheel_transforms(robot: Robot) -> Iterator[Transform]:
+    """Wheels that are swapped, negated, or scaled; the first one is none of these."""
+    count = len(robot.drive.names)
+    yield Transform(np.eye(3), np.eye(count), 0.0, ())
+    if robot.drive.direct:
+        yield from _arrangements(robot)
+    else:
+        yield from _turned_round(robot)
+    yield from _units(count)
+    yield from _scales(robot)
+
+
+def reference_transforms(flipped: bool) -> Iterator[Transform]:
+    """References that are mirrored, or whose axes are exchanged.
+
+    flipped: the fit was made with headings of the other sign; the positions then are right, or mirrored.
+    """
+
+    def pose(signs: Sequence[int], swapped: bool = False, angle: float = 0.0, mirror: bool = True) -> Transform:
+        rows = rotation(angle) @ np.diag([1.0, -1.0, -1.0] if mirror else [1.0, 1.0, 1.0])
+        changes: dict[str, Any] = {"pose_signs": list(signs)} if min(signs) < 0 else {}
+        changes |= {"pose_order": [1, 0, 2]} if swapped else {}
+        words = _mirrored_in_words(signs, swapped)
+        mistake = Misreading("reference_mirrored", words, "the reference", changes)
+        return Transform(rows, np.eye(0), _REFERENCE + 0.1 * (sum(sign < 0 for sign in signs) + swapped), (mistake,))
+
+    quarter = math.pi / 2
+    if flipped:
+        yield pose((1, 1, -1), mirror=False)
+        yield pose((1, -1, 1))
+        yield pose((-1, 1, 1), angle=2 * quarter)
+        yield pose((1, 1, 1), swapped=True, angle=quarter)
+    else:
+        yield pose((1, -1, -1))
+        yield pose((-1, 1, -1), angle=2 * quarter)
+        yield pose((1, 1, -1), swapped=True, angle=quarter)
+
+
+def position_units() -> Iterator[Transform]:
+    """Positions in other units than metres."""
+    for factor, unit in ((1e-3, "mm"), (1e-2, "cm")):
+        mistake = Misreading(
+            "position_unit", f"positions look like {unit}; x and y must be m", "the reference", {"position_unit": unit}
+        )
+        yield Transform(np.diag([factor, factor, 1.0]), np.eye(0), _REFERENCE, (mistake,))
+
+
+def turned_reference(angle: float) -> Transform:
+    """A reference whose headings are too small by an angle, rad."""
+    degrees = round(math.degrees(angle), 1)
+    mistake = Misreading(
+        "reference_turned",
+        f"the reference's heading is constantly {abs(degrees):g} degrees too {'small' if degrees > 0 else 'large'}: "
+        "the tracked point is turned on the robot",
+        "the reference",
+        {"heading_offset_deg": degrees},
+    )
+    return Transform(rotation(-angle), np.eye(0), _REFERENCE, (mistake,))
+
+
+def _mirrored_in_words(signs: Sequence[int], swapped: bool) -> str:
+    parts = ["x and y are exchanged"] if swapped else []
+    negative = [name for name, sign in zip(("x", "y", "the heading"), signs, strict=True) if sign < 0]
+    if negative:
+        parts.append(f"{' and '.join(negative)} {'has' if len(negative) == 1 else 'have'} the wrong sign")
+    return f"the reference is mirrored: {' and '.join(parts)}"
+
+
+def _arrangements(robot: Robot) -> Iterator[Transform]:
+    """Every order and sign of up to four wheels; of more, one mistake."""
+    names, count = robot.wheel_names, len(robot.wheel_names)
+    identity = tuple(range(count))
+    if count <= _ARRANGED:
+        every = list(product(permutations(range(count)), product((1, -1), repeat=count)))
+    else:
+        every = [(identity, signs) for signs in _few_signs(count)]
+        every += [(_exchanged(count, *pair), (1,) * count) for pair in combinations(range(count), 2)]
+    for order, signs in every:
+        if order == identity and min(signs) > 0:
+            continue
+        columns = np.zeros((count, count))
+        for column, (wheel, sign) in enumerate(zip(order, signs, strict=True)):
+            columns[column, wheel] = sign  # recorded column = sign x rate of wheel
+        yield Transform(np.eye(3), columns, _arrangement_cost(order, signs), (arrangement(names, order, signs),))
+
+
+def _arrangement_cost(order: Sequence[int], signs: Sequence[int]) -> float:
+    moved = sum(wheel != column for column, wheel in enumerate(order))
+    negative = sum(sign < 0 for sign in signs)
+    return _WHEEL * (moved / 2 + (1 if negative == len(signs) else negative))
+
+
+def arrangement(names: Sequence[str], order: Sequence[int], signs: Sequence[int]) -> Misreading:
+    """Recorded column i holds signs[i] times the rate of wheel order[i]."""
+    found_in = {wheel: column for column, wheel in enumerate(order)}
+    columns = [found_in[wheel] for wheel in range(len(names))]
+    wheel_signs = [signs[column] for column in columns]
+    moved = [names[wheel] for wheel, column in enumerate(columns) if wheel != column]
+    negative = [name for name, sign in zip(names, wheel_signs, strict=True) if sign < 0]
+    changes: dict[str, Any] = {"wheel_order": columns} if moved else {}
+    changes |= {"wheel_signs": wheel_signs} if negative else {}
+    if moved:
+        shown = ", ".join(
+            f"{name} <- {'-' if sign < 0 else ''}{names[column]}"
+            for name, column, sign in zip(names, columns, wheel_signs, strict=True)
+        )
+        flipped = " and sign-flipped" if negative else ""
+        words = f"wheels look swapped{flipped}; the reference fits with omega of {shown}"
+        return Misreading("wheels_swapped", words, wheels_in_words(moved), changes)
+    if len(negative) == len(names):
+        words = f"every wheel ({', '.join(names)}) looks counted the wrong way round"
+        return Misreading("wheels_negated", words, wheels_in_words(names), changes)
+    look = "looks" if len(negative) == 1 else "look"
+    words = f"{wheels_in_words(negative)} {look} counted the wrong way round"
+    return Misreading("wheel_negated", words, wheels_in_words(negative), changes)
+
+
+def _turned_round(robot: Robot) -> Iterator[Transform]:
+    """Wheels of a robot that steers, counted the wrong way round: every one alone, and all."""
+    drive, count = robot.drive, len(robot.drive.wheels)
+    for signs in _few_signs(count):
+        factors = signal_factors(robot, np.array(signs, dtype=float))
+        if factors is not None:
+            mistake = arrangement(drive.wheels, range(count), signs)
+            yield Transform(np.eye(3), np.diag(factors), _WHEEL, (mistake,))
+
+
+def signal_factors(robot: Robot, factors: Array) -> Array | None:
+    """Factors (M,) of the drive signals if those of the wheels' rates are (N,); None where they mix, as of a car."""
+    if len(set(factors.tolist())) == 1:
+        return np.full(len(robot.drive.names), factors[0])
+    if any(not wheel.has_rate for wheel in robot.wheels if wheel.has_steering):
+        return None
+    return np.repeat(factors, [1 if pair < 0 else 2 for pair in robot.drive.pairs])
+
+
+def _few_signs(count: int) -> list[tuple[int, ...]]:
+    """One of several signs negative, or all."""
+    single = [tuple(-1 if index == turned else 1 for index in range(count)) for turned in range(count)]
+    return [*single, *([(-1,) * count] if count > 1 else [])]
+
+
+def _exchanged(count: int, first: int, second: int) -> tuple[int, ...]:
+    order = list(range(count))
+    order[first], order[second] = second, first
+    return tuple(order)
+
+
+def _units(count: int) -> Iterator[Transform]:
+    for factor, unit in _UNITS:
+        yield Transform(np.eye(3), factor * np.eye(count), _WHEEL, (wrong_unit(unit),))
+
+
+def wrong_unit(unit: str) -> Misreading:
+    """Wheel rates in another unit than rad/s."""
+    name = "turns a second" if unit == "rev/s" else unit
+    words = f"wheel rates look like {name}; omega_* must be rad/s"
+    return Misreading("wheel_unit", words, "all wheels", {"wheel_unit": unit})
+
+
+def _scales(robot: Robot) -> Iterator[Transform]:
+    """Counts of one wheel or of all that are off by a factor."""
+    names = robot.wheel_names
+    groups = [np.ones(len(names))] + [row for row in np.eye(len(names)) if len(names) > 1]
+    for group in groups:
+        for factor, cost in [(each, _WHEEL) for each in _COUNTS] + [(float(each), _FITTED) for each in _GEARS]:
+            factors = signal_factors(robot, np.where(group > 0, factor, 1.0))
+            if factors is not None:
+                yield Transform(np.eye(3), np.diag(factors), cost, (scaled(names, group, factor),))
+
+
+def scaled(names: Sequence[str], group: Array, factor: float) -> Misreading:
+    """The wheels of a group (N,) of 0 and 1 whose rates are a factor too high."""
+    chosen = [name for name, member in zip(names, group, strict=True) if member]
+    where = "all wheels" if len(chosen) == len(names) else wheels_in_words(chosen)
+    size, shown = ("high", factor) if factor > 1 else ("low", 1 / factor)
+    words = f"the rates of {where} look about {rounded(shown)} times too {size}"
+    if factor in _COUNTS:
+        words += (
+            f", as where counts are {'not ' if factor < 1 else ''}multiplied by {shown:g}, or by a gear of {shown:g}"
+        )
+    elif 2 * math.pi * factor > _FEWEST_TICKS:
+        words += f", as ticks would be at about {rounded(2 * math.pi * factor)} a turn of the wheel"
+    else:
+        words += "; is there a gear between the encoder and the wheel?"
+    factors = [float(f"{factor:.3g}") if member else 1.0 for member in group]
+    return Misreading("wheel_scale", words, where, {"rate_factors": factors})
+
+
+def wheels_in_words(names: Sequence[str]) -> str:
+    """``wheel a``, or ``wheels a, b``."""
+    return f"wheel{'' if len(names) == 1 else 's'} {', '.join(names)}"
