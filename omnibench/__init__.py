@@ -17,6 +17,7 @@ _PUBLIC = {
     "Trajectory": "data.dataset",
     "Wheel": "robot.wheels.wheel",
     "calibrate": "fit.calibrate",
+    "check": "fit.check.checking",
     "certify_optimum": "fit.certify",
     "design_experiment": "design.design",
     "discover_effects": "discover.discover",
@@ -61,6 +62,7 @@ if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py hol
     from omnibench.errors import OmnibenchError as OmnibenchError
     from omnibench.fit.calibrate import calibrate as calibrate
     from omnibench.fit.certify import certify_optimum as certify_optimum
+    from omnibench.fit.check.checking import check as check
     from omnibench.fit.evaluate import evaluate as evaluate
     from omnibench.fit.inspect import inspect_dataset as inspect_dataset
     from omnibench.fit.problem import Budget as Budget

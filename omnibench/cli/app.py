@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from omnibench.cli.calibration_commands import calibration_app
+from omnibench.cli.check_command import check_app
 from omnibench.cli.comparison_commands import comparison_app
 from omnibench.cli.discovery_commands import discovery_app
 from omnibench.cli.guide_commands import guide_app
@@ -21,7 +22,7 @@ from omnibench.cli.recording_commands import recording_app
 # Headings of the help and the families under them, in the order in which a newcomer needs them.
 FAMILIES = (
     ("Calibrate and compare", (comparison_app, calibration_app, discovery_app)),
-    ("Recordings", (import_app, recording_app)),
+    ("Recordings", (import_app, check_app, recording_app)),
     ("Live", (live_app,)),
     ("Learn and extend", (guide_app, plugin_app)),
 )

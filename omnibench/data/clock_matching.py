@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.planar import interpolated
 
 _WINDOW = (
     1.0  # s between the stamps of Eq. (2): long beside the noise of a pose, short beside the drift by slip; chosen
@@ -41,7 +40,7 @@ _BLOCK = 2.0  # s: residuals that are nearer count as correlated; chosen, twice 
 _SEARCH = 2.0  # s: offsets are looked for within this on either side, unless the caller says more; chosen
 _COARSE = 0.1  # s between the offsets that are tried first, a tenth of the window
 _HUBER = 1.5  # standard deviations from which on a residual counts less
-_ROUNDS, _STEPS = 4, 4  # of h and s in turns with the clocks, and of Gauss-Newton in each
+_ROUNDS, _STEPS = 3, 4  # of h and s in turns with the clocks, and of Gauss-Newton in each
 _FEWEST = 10  # windows of a run, below which its clock is not told; chosen
 _LEAST_DRIFTING = 10.0  # s: the drift of a shorter run is not told apart from its offset; chosen
 _LARGEST_DRIFT = 0.05  # s per s: no clock goes more wrong; OptiOdom's tricycle has 0.014
@@ -180,7 +179,7 @@ class _Windows:
     def columns(self, clock: Clock, later: float = 0.0) -> Array:
         """Changes (W, C) of what the wheels count over the windows, so much ``later``, s, than by a clock."""
         taken = self.stamps + clock[0] + clock[1] * (self.stamps - self.middle) + later
-        means = _means(interpolated(taken, self.edges, self.counted), self.starts)
+        means = _means(_between(taken, self.edges, self.counted), self.starts)
         changes: Array = means[self.last] - means[self.first]
         return changes
 
@@ -217,8 +216,9 @@ class _Windows:
     def residuals(self, fitted: Sequence[Array], clock: Clock) -> tuple[Array, Array, Array]:
         """Residuals (2, W), in their standard deviations, their slopes by the middle's offset, and Huber's weights."""
         rates = (self.columns(clock, _DELTA) - self.columns(clock, -_DELTA)) / (2 * _DELTA)
-        deviations = self._deviations(fitted, clock)[:, None]
-        residuals = self._left(fitted, clock) / deviations
+        left = self._left(fitted, clock)
+        deviations = self._deviations(left, clock)[:, None]
+        residuals = left / deviations
         slopes = np.array([rates[:, channel] @ each for channel, each in zip(self.channels(), fitted, strict=True)])
         weights: Array = np.where(
             self.within(clock), np.minimum(1.0, _HUBER / np.maximum(np.abs(residuals), 1e-12)), 0.0
@@ -231,11 +231,11 @@ class _Windows:
         told = [columns[:, channel] @ each for channel, each in zip(self.channels(), fitted, strict=True)]
         return self.shown - np.array(told)
 
-    def _deviations(self, fitted: Sequence[Array], clock: Clock) -> Array:
-        """Robust standard deviations (2,) of what is left."""
-        left = np.abs(self._left(fitted, clock)[:, self.within(clock)])
+    def _deviations(self, left: Array, clock: Clock) -> Array:
+        """Robust standard deviations (2,) of what is left (2, W)."""
+        sizes = np.abs(left[:, self.within(clock)])
         least = 1e-6 + 1e-3 * np.sqrt(np.mean(self.shown**2, axis=1))
-        return least if not left.size else np.maximum(1.4826 * np.median(left, axis=1), least)
+        return least if not sizes.size else np.maximum(1.4826 * np.median(sizes, axis=1), least)
 
     def improved(self, fitted: Sequence[Array], clock: Clock) -> Clock:
         """The clock after some steps of Gauss-Newton."""
@@ -253,7 +253,7 @@ class _Windows:
     def _told(self, fitted: Sequence[Array], clock: Clock) -> bool:
         """True if other offsets fit clearly worse."""
         best, _, counted = self.residuals(fitted, clock)
-        deviations = self._deviations(fitted, clock)
+        deviations = self._deviations(self._left(fitted, clock), clock)
         for away in (-_AWAY, _AWAY):
             other = clock[0] + away, clock[1]
             both = (counted > 0).all(axis=0) & self.within(other)
@@ -320,6 +320,14 @@ def _solved(columns: Array, wanted: Array) -> Array:
         if deviation:
             solution = np.linalg.lstsq(columns * roots[:, None], wanted * roots, rcond=_RANK)[0]
     return solution
+
+
+def _between(times: Array, edges: Array, rows: Array) -> Array:
+    """Rows (K, n) at times (K,), by straight lines between the rows (F + 1, n) at the edges; held beyond."""
+    after = np.clip(np.searchsorted(edges, times), 1, len(edges) - 1)
+    share = np.clip((times - edges[after - 1]) / (edges[after] - edges[after - 1]), 0.0, 1.0)[:, None]
+    between: Array = rows[after - 1] * (1 - share) + rows[after] * share
+    return between
 
 
 def _means(values: Array, starts: NDArray[np.intp]) -> Array:

@@ -4,24 +4,22 @@ With k the elements of a fitted matrix K (3, M) and k0 the design's, the distanc
 
     d^2 = (k - k0)^T (V + S)^-1 (k - k0),                                                        (1)
 
-V being the covariance of the fit and S that of real robots about their designs: a radius and a gain of every row, the yaw
-and place of the tracked point, and small errors of all elements. Directions that are not driven have a huge V and add
-nothing, so that no mistake is claimed of what the recording does not show.
+V being the covariance of the fit and S that of real robots about their designs: a radius and a gain of every row, the
+yaw and place of the tracked point, and small errors of all elements. Directions that are not driven have a huge V and
+add nothing, so that no mistake is claimed of what the recording does not show.
 
 Over OptiOdom's four robots, a Robotino and simulated ones d^2 is at most 3.9, in whole sets and single sessions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from omnibench.data.checks.motion_fit import FreeFit
 from omnibench.robot.kinematics import Array, Robot
 
-# Standard deviations by which robots differ from their designs, as shares (chosen; OptiOdom's tricycle is 7 % off in row
-# 3, omni3's rows 1 and 2 by 10 %): radius of each wheel, gains of rows x, y and heading, each element.
+# Standard deviations by which robots differ from their designs, as shares (chosen; OptiOdom's tricycle is 7 % off in
+# row 3, omni3's rows 1 and 2 by 10 %): radius of each wheel, gains of rows x, y and heading, each element.
 _RADIUS, _GAINS, _ELEMENT = 0.06, (0.05, 0.05, 0.12), 0.02
 _LATERAL = 0.2  # the gain of row y of mecanum wheels, which slip sideways; chosen
 _SKID = 0.5  # the gain of row 3 of a skid-steered robot, which turns 20 to 50 % less than its design
@@ -81,11 +79,9 @@ def _allowed(robot: Robot, scales: Array) -> Array:
     design = robot.inverse_kinematic_matrix
     lateral = _LATERAL if any(wheel.kind == "mecanum" for wheel in robot.wheels) else _GAINS[1]
     gains = (_GAINS[0], lateral, _SKID if robot.skid else _GAINS[2])
-    changes: list[Array] = []
-    for column in range(design.shape[1]):
-        changes.append(_RADIUS * design * (np.arange(design.shape[1]) == column))
-    for row, gain in enumerate(gains):
-        changes.append(gain * design * (np.arange(3) == row)[:, None])
+    columns = range(design.shape[1])
+    changes = [_RADIUS * design * (np.arange(design.shape[1]) == column) for column in columns]
+    changes += [gain * design * (np.arange(3) == row)[:, None] for row, gain in enumerate(gains)]
     changes.append(_YAW * np.array([-design[1], design[0], 0 * design[2]]))
     zero = np.zeros_like(design[0])
     changes += [_PLACE * robot.reach * np.array(rows) for rows in ([design[2], zero, zero], [zero, design[2], zero])]
@@ -98,8 +94,8 @@ def _allowed(robot: Robot, scales: Array) -> Array:
 def transformed(fit: FreeFit, rows: Array, columns: Array) -> tuple[Array, Array]:
     """Matrices (P, 3, M) and covariances (P, 3, M, M) of a fit for other readings of what was recorded.
 
-    rows (P, 3, 3): from a twist as recorded to the one meant. columns (P, M, M): from the signals that are meant to those
-    recorded.
+    rows (P, 3, 3): from a twist as recorded to the one meant. columns (P, M, M): from the signals that are meant to
+    those recorded.
     """
     matrices = rows @ fit.matrix @ columns
     turned = np.einsum("pij,jkl->pikl", rows**2, fit.covariance)

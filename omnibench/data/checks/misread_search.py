@@ -6,8 +6,8 @@ headings of another sign or in degrees, and steering angles. Every reading has t
 
     d^2 + costs of its mistakes + n log(residual) + n log(contradiction),                           (1)
 
-d^2 being the distance from the design; the residual of the fit tells readings by which the windows contradict each other,
-and the share of the signals that no motion gives those by which the wheels do.
+d^2 being the distance from the design; the residual of the fit tells readings by which the windows contradict each
+other, and the share of the signals that no motion gives those by which the wheels do.
 """
 
 from __future__ import annotations
@@ -27,19 +27,20 @@ from omnibench.data.checks.misreading import (
     turned_reference,
     wheel_transforms,
 )
-from omnibench.data.checks.motion_fit import FreeFit, Windows
+from omnibench.data.checks.motion_fit import FreeFit, Windows, continuous
 from omnibench.data.checks.steering_readings import SteeringReading, steering_readings, steering_transforms
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 
-# d^2 from which on a recording is suspicious, share of it that may remain, and score by which an explanation must be better
-# (chosen: untouched recordings have 3.6 at most, a wheel counted 1.5 times too much adds 16 or more).
+# d^2 from which on a recording is suspicious, share of it that may remain, and score by which an explanation must be
+# better (chosen: untouched recordings have 3.6 at most, a wheel counted 1.5 times too much adds 16 or more).
 _SUSPICIOUS, _REMAINS, _BETTER = 7.0, 0.6, 4.0
-# Contradiction from which on a recording is suspicious, and what slip and designs make of it: chosen, OptiOdom's mecanum
-# base has 0.03.
+# Contradiction from which on a recording is suspicious, and what slip and designs make of it: chosen, OptiOdom's
+# mecanum base has 0.03.
 _CONTRADICTING, _USUAL = 0.1, 0.04
 _BADLY = 0.25  # share of the way that no matrix explains, from which on a recording is suspicious; untouched ones: 0.08
 _MOST_WEIGHED, _CORRELATED = 60.0, 4.0  # n of Eq. (1) at most, and windows that tell as much as one; chosen
+_SIMPLE = 4.5  # cost of wheels' mistakes that are looked for beside one of the reference
 _IN_DEGREES = 8.0  # cost of headings in degrees; less where a run begins beyond a whole turn
 _TURN = 2 * math.pi
 _LEAST_TURNED = math.radians(7.5)  # a smaller turn of the reference is what a calibration is for; chosen
@@ -59,12 +60,14 @@ class Recorded:
         """Runs from first to last that are looked at, all if they are few or short."""
         samples = sum(len(log.times) for log in self.logs)
         every = max(1, math.ceil(samples / _MOST_SAMPLES)) if len(self.logs) > 3 else 1
-        return Recorded(self.robot, self.logs[::every], self.poses[::every])
+        logs = self.logs[::every]
+        poses = [continuous(log.stamps, each) for log, each in zip(logs, self.poses[::every], strict=True)]
+        return Recorded(self.robot, logs, poses)
 
     def fit(self) -> FreeFit | None:
         """The matrix that fits freely."""
         windows = Windows.of(self.logs, self.poses)
-        return None if windows is None else windows.fit(self.robot)
+        return None if windows is None else windows.fit()
 
     def with_headings(self, factor: float) -> Recorded:
         """With headings times a factor."""
@@ -153,26 +156,26 @@ def _scores(recording: Recorded, fit: FreeFit, far: DesignDistance) -> Iterator[
             distances = far.squared(*transformed(base.fit, rows, columns))
             against = far.contradictions(base.fit.gram, columns)
             scores = cost + distances + weight * np.log(np.hypot(against, _USUAL))
-            for transform, *numbers in zip(
-                transforms, scores.tolist(), distances.tolist(), against.tolist(), strict=True
-            ):
-                yield _Scored(numbers[0] + transform.cost, *numbers[1:], (*base.mistakes, *transform.mistakes))
+            each = zip(transforms, scores.tolist(), distances.tolist(), against.tolist(), strict=True)
+            for transform, score, distance, share in each:
+                mistakes = (*base.mistakes, *transform.mistakes)
+                yield _Scored(score + transform.cost, distance, share, mistakes)
 
 
 def _combined(base: _Base, wheels: Sequence[Transform], design: Array) -> Iterator[list[Transform]]:
     """Mistakes of the wheels, and of the reference with those; never more than three at once."""
     single = wheels[0]
-    units = list(position_units())
+    units, simple = list(position_units()), [wheel for wheel in wheels if wheel.cost <= _SIMPLE]
     if not base.flipped:
         yield list(wheels)
         if base.plain:
             return
         for unit in units:
-            yield [wheel.with_reference(unit) for wheel in wheels]
-        turned = [single, *(wheel for wheel in wheels if wheel.mistakes and wheel.mistakes[0].kind != "wheels_swapped")]
+            yield [wheel.with_reference(unit) for wheel in simple]
+        turned = [single, *(wheel for wheel in simple if wheel.mistakes and wheel.mistakes[0].kind != "wheels_swapped")]
         yield list(_turned(base, turned, design)) or [single]
     for mirrored in reference_transforms(base.flipped):
-        yield [wheel.with_reference(mirrored) for wheel in wheels]
+        yield [wheel.with_reference(mirrored) for wheel in simple]
 
 
 def _turned(base: _Base, wheels: Sequence[Transform], design: Array) -> Iterator[Transform]:

@@ -19,7 +19,7 @@ _ARRANGED = 4  # wheels of which every order and sign is tried, at most; of more
 # Units of wheel rates by the factor from rad/s: names, and option for rates and for positions.
 _UNITS = ((60 / (2 * math.pi), "rpm"), (180 / math.pi, "deg/s"), (1 / (2 * math.pi), "rev/s"))
 _COUNTS = (4.0, 2.0, 0.5, 0.25)  # factors of counters: edges counted fourfold, twofold, or stated so and counted once
-_GEARS = 1.08 ** np.array([power for power in range(-120, 121) if abs(power) > 4])  # 1/10,000 to 10,000, not about 1
+_GEARS = 1.1 ** np.array([power for power in range(-97, 98) if abs(power) > 3])  # 1/10,000 to 10,000, not about 1
 _FEWEST_TICKS = 100  # of a turn of the wheel, from which on a factor is called ticks; chosen
 # Cost of a mistake, in units of d^2, so that the simplest explanation is taken of those that fit alike (chosen): each
 # wheel that is changed, a reference that is wrong, a factor that is fitted.
@@ -40,8 +40,8 @@ class Misreading:
 class Transform:
     """Mistakes that are linear in what was recorded.
 
-    rows (3, 3): from the reference's twist as recorded to the one meant. columns (M, M): from the signals that are meant
-    to those recorded. cost: of the mistakes, in units of d^2.
+    rows (3, 3): from the reference's twist as recorded to the one meant. columns (M, M): from the signals that are
+    meant to those recorded. cost: of the mistakes, in units of d^2.
     """
 
     rows: Array

@@ -1,7 +1,7 @@
 """A robot's matrix as the recording itself has it, by linear least squares, whatever its design says.
 
-Between reference poses at t_i and t_j about a second apart, with C (M) the integrals of the drive signals, p = x + iy and
-theta the reference's position and heading,
+Between reference poses at t_i and t_j about a second apart, with C (M) the integrals of the drive signals, p = x + iy
+and theta the reference's position and heading,
 
     theta_j - theta_i = k3 . (C_j - C_i),                                                           (1)
     exp(-i theta_i) (p_j - p_i) = (k1 + i k2) . sum over samples of exp(i (theta - theta_i)) dC.    (2)
@@ -17,12 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex, WheelLog
 from omnibench.robot.planar import interpolated
 
 _WINDOW = 1.0  # s between two poses: long beside their noise, short beside the drift of headings; chosen
 _LONGEST = 3.0  # s: a longer window turns too far for straight lines between its poses; chosen
+_DENSE = 0.6  # s between poses, in which no robot of this kind turns by half a turn; chosen
 _STEP = 0.1  # s: samples are taken together up to here, which windows of a second hardly show; chosen
 _HUBER = 1.5  # standard deviations from which on a residual counts less
 _REWEIGHTED = 5  # rounds of reweighted least squares; outliers are found in three
@@ -38,8 +39,9 @@ _FEWEST = 8  # windows for each column of the matrix, below which it is not told
 class FreeFit:
     """The matrix that fits a recording best.
 
-    matrix (3, M): m, m and rad per rad. covariance (3, M, M): of each row. left (2,): share of position and heading that
-    the wheels do not explain, robust. windows: their number. gram (M, M): sum of products of the driven signals, rad^2.
+    matrix (3, M): m, m and rad per rad. covariance (3, M, M): of each row. left (2,): share of position and heading
+    that the wheels do not explain, robust. windows: their number. gram (M, M): sum of products of the driven signals,
+    rad^2.
     """
 
     matrix: Array
@@ -71,7 +73,7 @@ class Windows:
             return None
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
-    def fit(self, robot: Robot) -> FreeFit | None:
+    def fit(self) -> FreeFit | None:
         """The free fit; None if there are too few windows."""
         count, columns = self.driven.shape
         if count < _FEWEST * columns:
@@ -84,7 +86,7 @@ class Windows:
                 _unexplained(self.turned, self.driven @ heading.real, heading_weights),
             ]
         )
-        slip = _slip(self.driven, robot)
+        slip = _slip(self.driven)
         rows = [
             _covariance(self.bent, self.moved - self.bent @ position, position_weights) / 2,
             _covariance(self.bent, self.moved - self.bent @ position, position_weights) / 2,
@@ -95,6 +97,16 @@ class Windows:
         scales[:2] = scales[:2].max()
         covariance = np.array([row + (scale**2) * slip for row, scale in zip(rows, scales, strict=True)])
         return FreeFit(matrix, covariance, left, count, self.driven.T @ self.driven)
+
+
+def continuous(stamps: Array, poses: Array) -> Array:
+    """Poses (K, 3) at stamps (K,) with steps of the heading of less than half a turn, where poses are near each other.
+
+    A data set has the steps that its wheels tell, which are whole turns off where these are misread.
+    """
+    if len(stamps) < 2 or float(np.median(np.diff(stamps))) > _DENSE:
+        return poses
+    return np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])])
 
 
 def _of_run(run: int, log: WheelLog, poses: Array) -> Windows | None:
@@ -121,9 +133,9 @@ def _of_run(run: int, log: WheelLog, poses: Array) -> Windows | None:
     pieces = np.diff(at, axis=1)  # (W, steps, M)
     middles = (grid[:, 1:] + grid[:, :-1]) / 2
     headings = np.interp(middles, stamps, poses[:, 2]) - poses[first, 2][:, None]
-    bent = np.einsum("ws,wsm->wm", np.exp(1j * headings), pieces)
+    bent: Complex = np.einsum("ws,wsm->wm", np.exp(1j * headings), pieces)
     path = poses[:, 0] + 1j * poses[:, 1]
-    moved = (path[last] - path[first]) * np.exp(-1j * poses[first, 2])
+    moved: Complex = (path[last] - path[first]) * np.exp(-1j * poses[first, 2])
     return Windows(
         at[:, -1] - at[:, 0],
         bent,
@@ -145,13 +157,13 @@ def _robust(columns: Complex, wanted: Complex) -> tuple[Complex, Array]:
     weights = np.ones(len(wanted))
     for _ in range(_REWEIGHTED):
         roots = np.sqrt(weights)
-        solution: Complex = np.linalg.lstsq(columns * roots[:, None], wanted * roots, rcond=_NULL)[0]
+        solution = np.linalg.lstsq(columns * roots[:, None], wanted * roots, rcond=_NULL)[0]
         sizes = np.abs(wanted - columns @ solution)
         deviation = 1.4826 * float(np.median(sizes))
         if not deviation:
             break
         weights = np.minimum(1.0, _HUBER * deviation / np.maximum(sizes, 1e-300)) ** 2  # outliers hardly count
-    return solution, weights
+    return solution.astype(np.complex128), weights
 
 
 def _unexplained(wanted: Array | Complex, fitted: Array | Complex, weights: Array) -> float:
@@ -170,7 +182,7 @@ def _covariance(columns: Complex, left: Array | Complex, weights: Array) -> Arra
     return covariance
 
 
-def _slip(driven: Array, robot: Robot) -> Array:
+def _slip(driven: Array) -> Array:
     """Covariance (M, M), as a share of a row's scale squared, of a matrix with what slip of the wheels makes of it."""
     _, strengths, directions = np.linalg.svd(driven, full_matrices=False)
     shares = np.maximum(strengths / max(float(strengths[0]), 1e-300), 1e-4)

@@ -1,4 +1,4 @@
-"""Mistakes of steering angles, and of a car's wheels: linear ones of steered driven wheels, and others that need a fit."""
+"""Mistakes of steering angles, and of a car's wheels: linear ones of driven wheels, and others that need a fit."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FACTORS = tuple(1.25**power for power in (*range(-14, -1), *range(2, 15)))
 _COUNTS = (2.0, 4.0, 0.5, 0.25)  # factors of one wheel of a car
 # Zeros of steering angles that are tried, degrees; smaller ones are what a calibration is for: OptiOdom's tricycle is 1
 # degree off. A car's are tried in larger steps, since each needs a fit.
-_LEAST_ZERO, _ZERO_STEP, _CAR_STEP, _CAR_MOST = 4.0, 1.0, 4.0, 40.0
+_LEAST_ZERO, _ZERO_STEP, _CAR_STEP, _CAR_MOST = 4.0, 2.0, 4.0, 40.0
 _SIMPLE, _FITTED = 4.0, 5.0  # cost of a mistake, and of one with a number that is fitted, in units of d^2; chosen
 _BEYOND = 1.9  # rad: angles that steer further may be degrees; chosen
 

@@ -1,0 +1,66 @@
+"""``check``: is a recording fit for calibration, what is wrong with it, and what to type."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from omnibench.cli.options import Force, Json, Settings
+
+check_app = typer.Typer()
+
+
+@check_app.command()
+def check(
+    source: Annotated[
+        Path, typer.Argument(help="Data set folder, folder or file of CSV tables, or a bag.", metavar="SOURCE")
+    ],
+    importer: Annotated[
+        str | None,
+        typer.Option("--format", metavar="NAME", help="Importer of the source. Default: by its files."),
+    ] = None,
+    robot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="robot.yaml, where the source does not say the robot.")
+    ] = None,
+    settings: Settings = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of clocks and findings.")
+    ] = None,
+    plugin: Annotated[
+        list[Path] | None, typer.Option("--plugin", metavar="FILE", help="A plug-in with an importer; may be repeated.")
+    ] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Say what is wrong with a recording, and what to type.
+
+    Nothing is changed. Exit 0 whatever the verdict; 2 where the source cannot be read.
+    """
+    from omnibench.cli.terminal.check_summary import print_check
+    from omnibench.cli.terminal.console import make_console, print_json
+    from omnibench.config import parse_settings
+    from omnibench.errors import PluginError
+    from omnibench.files import refuse_existing
+    from omnibench.fit.check.checking import check_recording
+    from omnibench.fit.check.recording_source import read_source
+    from omnibench.registry import load_plugin_file, load_plugins
+
+    refuse_existing(report, force=force)
+    load_plugins()
+    for file in plugin or ():
+        if (failure := load_plugin_file(file)) is not None:
+            raise PluginError(f"plug-in {failure.origin} cannot be imported: {failure.error}")
+    read = read_source(source, importer, parse_settings(settings), robot)
+    checked = check_recording(read)
+    if report is not None:
+        from omnibench.report.recording.check_document import check_document
+        from omnibench.report.render import write_document
+
+        document = check_document(read.dataset, checked.sentence, checked.findings, checked.gain)
+        write_document(document, report)
+    if as_json:
+        print_json(checked.model_dump(mode="json", include={"verdict", "needed", "findings"}))
+        return
+    print_check(make_console(), checked)
+    if report is not None:
+        typer.echo(f"report: {report}")

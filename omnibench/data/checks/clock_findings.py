@@ -1,0 +1,62 @@
+"""Findings on the reference's clock, run by run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from omnibench.data.checks.finding import Finding, Severity
+from omnibench.data.checks.stream_faults import runs_in_words
+from omnibench.data.clock_matching import ClockMatch, Streams, match_clocks
+from omnibench.data.dataset import Trajectory
+from omnibench.robot.kinematics import Robot
+
+# s that a clock must be off, and in standard errors, to be told (chosen: simulated runs, whose clocks are right, are
+# below); from _SPOILS, s, on it spoils a fit.
+_LEAST, _ERRORS, _SPOILS = 0.05, 4.0, 0.15
+
+
+def clocks_of(robot: Robot, runs: Sequence[Trajectory]) -> list[ClockMatch | None]:
+    """The clock of every run's reference; None where it does not show."""
+    return match_clocks(robot, [Streams.of_run(run) for run in runs])
+
+
+def clock_findings(runs: Sequence[Trajectory], clocks: Sequence[ClockMatch | None]) -> Iterator[Finding]:
+    """Offsets and drifts that stand out of their errors."""
+    offset, drift = [], []
+    for run, clock in zip(runs, clocks, strict=True):
+        if clock is None:
+            continue
+        if abs(clock.middle) > max(_LEAST, _ERRORS * clock.middle_error):
+            offset.append((run.id, clock.middle))
+        gone = clock.drift * clock.length
+        if abs(gone) > max(_LEAST, _ERRORS * clock.drift_error * clock.length):
+            drift.append((run.id, gone))
+    for kind, found, verb in (("clock_offset", offset, "late"), ("clock_drift", drift, "")):
+        if not found:
+            continue
+        names, values = [name for name, _ in found], np.array([value for _, value in found])
+        largest = float(values[np.abs(values).argmax()])
+        severity: Severity = "error" if abs(largest) > _SPOILS else "warning"
+        if verb:
+            early = "early" if largest > 0 else "late"
+            what = f"the stamps of the reference are up to {abs(largest):.2f} s too {early} in {_count(found, runs)}"
+        else:
+            slow = "slow" if largest > 0 else "fast"
+            what = (
+                f"the reference's clock goes too {slow}, by up to {abs(largest):.2f} s a run, in {_count(found, runs)}"
+            )
+        yield Finding.model_validate(
+            {
+                "kind": kind,
+                "what": what,
+                "where": runs_in_words(names, len(runs)) if len(names) < len(runs) else "the reference",
+                "severity": severity,
+                "changes": {"clocks": "match"},
+            }
+        )
+
+
+def _count(found: Sequence[object], runs: Sequence[Trajectory]) -> str:
+    return "every run" if len(found) == len(runs) else f"{len(found)} of {len(runs)} runs"

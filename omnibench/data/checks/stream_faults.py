@@ -1,0 +1,273 @@
+"""Faults of the streams of runs: missing samples and poses, a standing reference, dead wheels, restarted counters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.data.checks.finding import Finding, Kind, Severity
+from omnibench.data.checks.misreading import wheels_in_words
+from omnibench.data.checks.reference_jumps import reference_jumps
+from omnibench.data.dataset import Trajectory
+from omnibench.robot.kinematics import Array, Robot, wheel_equations
+from omnibench.words import plural, some
+
+# Gaps that are told, s, and as a multiple of the usual period (chosen: a Robotino's log has gaps of 0.24 s at 31 ms).
+_LEAST_GAP, _PERIODS = 0.4, 6.0
+_DRIVEN = 0.05  # m that the wheels drive in a gap or while the reference stands, less than which does no harm; chosen
+_STANDING, _STILL = 0.8, 0.03  # s that a reference stands, and share of the wheels' way that it may move then; chosen
+_MOSTLY = 0.25  # share of a run for which a reference stands, from which on it counts as frozen; chosen
+_FASTEST = 8.0  # m/s of a rim: no robot of this kind is faster; chosen
+_RARE = 0.02  # share of the samples: more that are too fast are another unit
+_DEAD, _EXPECTED = 0.01, 3.0  # share of the angle that the reference asks of a wheel, and that angle, rad; chosen
+# s of a run's begin, and share of its usual speed above which wheels and reference do not begin at rest (chosen).
+_BEGIN, _MOVING = 0.12, 0.5
+_SAME = 1e-4  # m and rad: a pose that is repeated, below the noise of any reference; chosen
+
+
+def stream_faults(robot: Robot, runs: Sequence[Trajectory], *, readable: bool) -> Iterator[Finding]:
+    """Faults of runs with poses. readable: True if the wheels are read rightly, which tells jumps of the reference."""
+    yield from _restarts(robot, runs)
+    yield from _gaps(robot, runs)
+    frozen = _standing(robot, runs)
+    yield from _frozen(runs, frozen)
+    yield from dead_wheels(robot, runs)
+    if readable:
+        yield from _jumps(robot, [run for run in runs if run.id not in frozen])
+    yield from _moving_starts(robot, runs)
+
+
+def runs_in_words(runs: Sequence[str], every: int) -> str:
+    """``run x``, ``runs x, y``, or ``all runs``."""
+    if len(runs) == every and every > 1:
+        return "all runs"
+    return f"run{'' if len(runs) == 1 else 's'} {some(list(runs), 5)}"
+
+
+def _restarts(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
+    found = []
+    for run in runs:
+        fast = np.abs(run.rates) * robot.radii > _FASTEST
+        share = float(fast.any(axis=1).mean())
+        if 0 < share < _RARE:
+            found.append(run.id)
+    if found:
+        yield Finding(
+            kind="counter_restart",
+            what=f"single wheel rates of {plural(len(found), 'run')} are faster than any wheel turns, as where a "
+            "counter begins again",
+            where=runs_in_words(found, len(runs)),
+            severity="error",
+            fix="import the positions of the encoders, which are then counted on; or leave these runs out",
+            changes={"leave_out": found},
+        )
+
+
+def _gaps(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
+    """Samples or poses that are missing for long while the robot drives."""
+    for kind, times_of, what in (
+        ("wheel_dropout", lambda run: np.append(0.0, run.times), "wheel samples"),
+        ("reference_dropout", lambda run: run.pose_times, "reference poses"),
+    ):
+        yield from _gaps_of(robot, runs, kind, times_of, what)  # type: ignore[arg-type]
+
+
+def _gaps_of(
+    robot: Robot, runs: Sequence[Trajectory], kind: Kind, times_of: Callable[[Trajectory], Array], what: str
+) -> Iterator[Finding]:
+    found, lengths = [], []
+    usual = float(np.median(np.concatenate([np.diff(times_of(run)) for run in runs])))
+    least = max(_LEAST_GAP, _PERIODS * usual)
+    for run in runs:
+        times = times_of(run)
+        gaps = np.flatnonzero(np.diff(times) > least)
+        gaps = (
+            gaps[[_moved_about(robot, run, times[gap], times[gap + 1]) > _DRIVEN for gap in gaps]]
+            if len(gaps)
+            else gaps
+        )
+        if len(gaps):
+            found.append(run.id)
+            lengths += np.diff(times)[gaps].tolist()
+    if found:
+        longest = float(f"{max(2 * usual, 0.5 * min(lengths)):.2g}")
+        yield Finding(
+            kind=kind,
+            what=f"{what} are missing {plural(len(lengths), 'time')} while the robot drives, for up to "
+            f"{max(lengths):.1f} s; what it did then is not known",
+            where=runs_in_words(found, len(runs)),
+            severity="error",
+            changes={"longest_gap": longest},
+        )
+
+
+def _ways(robot: Robot, run: Trajectory) -> Array:
+    """Ways (F + 1,) that the wheels' design drives up to each sample's end, m; turning counts at the robot's size."""
+    twists = run.signals @ robot.inverse_kinematic_matrix.T
+    speeds = np.hypot(twists[:, 0], twists[:, 1]) + robot.reach * np.abs(twists[:, 2])
+    return np.append(0.0, np.cumsum(speeds * np.diff(run.times, prepend=0.0)))
+
+
+def _moved_about(robot: Robot, run: Trajectory, begin: float, end: float) -> float:
+    """Way of the robot, m, between two times by the larger of wheels and reference."""
+    wheels = np.interp([begin, end], np.append(0.0, run.times), _ways(robot, run))
+    at = np.searchsorted(run.pose_times, [begin - 1e-9, end + 1e-9])
+    first, last = max(int(at[0]) - 1, 0), min(int(at[1]), len(run.poses) - 1)
+    moved = run.poses[last] - run.poses[first]
+    seen = float(np.hypot(moved[0], moved[1]) + robot.reach * abs(moved[2]))
+    return max(float(wheels[1] - wheels[0]), seen)
+
+
+def _standing(robot: Robot, runs: Sequence[Trajectory]) -> dict[str, float]:
+    """Seconds in which the reference of a run stands while its wheels drive, by the runs' names."""
+    found = {}
+    for run in runs:
+        period = float(np.median(np.diff(run.pose_times)))
+        apart = max(_STANDING, 3 * period)
+        last = np.searchsorted(run.pose_times, run.pose_times + apart)
+        first = np.flatnonzero(last < len(run.pose_times))
+        last = last[first]
+        if not len(first):
+            first, last = np.array([0]), np.array([len(run.pose_times) - 1])
+        moved = run.poses[last] - run.poses[first]
+        seen = np.hypot(moved[:, 0], moved[:, 1]) + robot.reach * np.abs(moved[:, 2])
+        driven = np.interp(run.pose_times, np.append(0.0, run.times), _ways(robot, run))
+        wheels = driven[last] - driven[first]
+        still = (seen < _STILL * wheels) & (wheels > _DRIVEN) & _equal(run.poses, first, last)
+        if still.any():
+            covered = np.zeros(len(run.pose_times), dtype=bool)
+            for begin, end in zip(first[still], last[still], strict=True):
+                covered[begin : end + 1] = True
+            found[run.id] = float((np.diff(run.pose_times) * (covered[1:] & covered[:-1])).sum())
+    return found
+
+
+def _equal(poses: Array, first: NDArray[np.intp], last: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """True where the reference does not even scatter between two poses."""
+    changes = np.append(0, np.cumsum(np.abs(np.diff(poses, axis=0)).max(axis=1) > _SAME))
+    same: NDArray[np.bool_] = changes[last] == changes[first]
+    return same
+
+
+def _frozen(runs: Sequence[Trajectory], frozen: dict[str, float]) -> Iterator[Finding]:
+    lengths = {run.id: float(run.pose_times[-1]) for run in runs}
+    long = [run for run, seconds in frozen.items() if seconds > _MOSTLY * lengths[run]]
+    short = [run for run in frozen if run not in long]
+    every = len(long) == len(runs)
+    if long:
+        words = "in every run: check its tracking, and record again" if every else ""
+        yield Finding(
+            kind="reference_frozen",
+            what=f"the reference stands still for up to {max(frozen[run] for run in long):.1f} s while wheels drive",
+            where="the reference" if every else runs_in_words(long, len(runs)),
+            severity="error",
+            fix=words,
+            changes={} if every else {"leave_out": long},
+        )
+    if short:
+        yield Finding(
+            kind="reference_dropout",
+            what=f"the reference repeats a pose for up to {max(frozen[run] for run in short):.1f} s while the wheels "
+            "drive, as where its tracking was lost",
+            where=runs_in_words(short, len(runs)),
+            severity="error",
+            changes={"leave_out": short},
+        )
+
+
+def dead_wheels(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
+    """Wheels that count nothing though the reference shows that they turn."""
+    dead: dict[str, list[str]] = {}
+    for run in runs:
+        expected = expected_angles(robot, run)
+        counted = np.abs(run.rates).T @ np.diff(run.times, prepend=0.0)
+        still = (counted < _DEAD * expected) & (expected > _EXPECTED)
+        if still.all() and len(still) > 1:
+            continue  # a reference that moves by itself is told otherwise
+        for name, is_dead in zip(robot.wheel_names, still.tolist(), strict=True):
+            if is_dead:
+                dead.setdefault(name, []).append(run.id)
+    for name, names in dead.items():
+        every = len(names) > 0.8 * len(runs)
+        where = wheels_in_words([name])
+        at = "" if every else f" in {runs_in_words(names, len(runs))}"
+        yield Finding(
+            kind="wheel_dead",
+            what=f"{where} never turns{at}, though the reference shows that it must: its encoder or column is dead",
+            where=where if every else f"{where} in {runs_in_words(names, len(runs))}",
+            severity="error",
+            fix="check its cable and the column that is read, and record again" if every else "",
+            changes={} if every else {"leave_out": names},
+        )
+
+
+def expected_angles(robot: Robot, run: Trajectory) -> Array:
+    """Angles (N,), rad, by which wheels must turn for the reference's motion, at least about."""
+    every = max(1, round(0.5 / float(np.median(np.diff(run.pose_times)))))
+    poses = run.poses[::every]
+    steps = np.diff(poses, axis=0)
+    middle = (poses[1:, 2] + poses[:-1, 2]) / 2
+    cosine, sine = np.cos(middle), np.sin(middle)
+    twists = np.column_stack(
+        [cosine * steps[:, 0] + sine * steps[:, 1], -sine * steps[:, 0] + cosine * steps[:, 1], steps[:, 2]]
+    )
+    if robot.mount is not None:
+        twists = twists @ np.linalg.inv(robot.mount.twist).T
+    angles = []
+    for wheel in robot.measured:
+        x, y = wheel.position
+        if wheel.has_steering:
+            moved = np.hypot(twists[:, 0] - y * twists[:, 2], twists[:, 1] + x * twists[:, 2]) / wheel.radius
+        else:
+            moved = np.abs(twists @ wheel_equations([wheel])[0])
+        moved[moved < 0.1] = 0.0  # rad in a step: noise of the reference
+        angles.append(float(moved.sum()))
+    return np.array(angles)
+
+
+def _jumps(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
+    found, count = [], 0
+    for run in runs:
+        jumps = reference_jumps(robot, run.log(run.pose_times), run.poses)
+        if len(jumps):
+            found.append(run.id)
+            count += len(jumps)
+    if found:
+        yield Finding(
+            kind="reference_jump",
+            what=f"the reference jumps {plural(count, 'time')}, farther than the wheels drive",
+            where=f"poses of {runs_in_words(found, len(runs))}",
+            severity="error",
+            changes={"jumps": "cut"},
+        )
+
+
+def _moving_starts(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
+    found = [run.id for run in runs if _starts_moving(robot, run)]
+    if found:
+        severity: Severity = "warning" if len(found) > len(runs) / 2 else "note"
+        yield Finding(
+            kind="not_at_rest",
+            what=f"{plural(len(found), 'run')} {'begins' if len(found) == 1 else 'begin'} while the robot drives: the "
+            "start pose is uncertain then, and what was driven before the first sample is lost",
+            where=runs_in_words(found, len(runs)),
+            severity=severity,
+            fix="let the robot stand for a second at the begin of every run, with recording on",
+        )
+
+
+def _starts_moving(robot: Robot, run: Trajectory) -> bool:
+    """True if wheels and reference move from the first sample on nearly as fast as they ever do."""
+    edges, ways = np.append(0.0, run.times), _ways(robot, run)
+    seen = np.append(
+        0.0, np.cumsum(np.hypot(*np.diff(run.poses[:, :2], axis=0).T) + robot.reach * np.abs(np.diff(run.poses[:, 2])))
+    )
+    for stamps, way in ((edges, ways), (run.pose_times, seen)):
+        moments = np.arange(0.0, stamps[-1], _BEGIN)
+        speeds = np.diff(np.interp(moments, stamps, way))
+        moving = speeds[speeds > 0.1 * speeds.max(initial=0.0)]
+        if not len(moving) or speeds[0] < _MOVING * float(np.median(moving)):
+            return False
+    return True

@@ -1,0 +1,172 @@
+"""The check of a recording, step by step: what is misread, what is missing, and whether a calibration is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from omnibench.data.checks.alike_runs import copied_runs
+from omnibench.data.checks.clock_findings import clock_findings, clocks_of
+from omnibench.data.checks.finding import Finding
+from omnibench.data.checks.misread_search import Explained, search
+from omnibench.data.checks.motion_fit import continuous
+from omnibench.data.checks.stream_faults import stream_faults
+from omnibench.data.clock_matching import ClockMatch
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.importers.copied_reference import follows_the_wheels
+from omnibench.fit.check.driven_motions import missing_motions, too_few
+from omnibench.fit.check.expected_gain import Gain, expected_gain
+from omnibench.fit.check.fixes import command, with_fixes
+from omnibench.fit.check.recording_source import RecordingSource, of_dataset, read_source, recorded
+from omnibench.fit.check.result import CheckReport, Verdict
+from omnibench.words import plural
+
+_SPOILED = ("reference_frozen", "reference_is_odometry")  # after which the wheels cannot be judged by the reference
+_ORDER = {"error": 0, "warning": 1, "note": 2}
+
+
+def check(
+    source: Dataset | Path | str,
+    *,
+    importer: str | None = None,
+    options: Mapping[str, Any] | None = None,
+    robot: Path | str | None = None,
+) -> CheckReport:
+    """Check whether a recording is fit for calibration, what is wrong with it, and what to type.
+
+    source: a data set, its folder, or recordings that an importer reads. importer, options: of recordings; by default
+    the importer is recognised. robot: file of the robot, where the source has none. DataError or ConfigError in one
+    line where the source cannot be read.
+    """
+    if isinstance(source, Dataset):
+        return check_recording(of_dataset(source))
+    return check_recording(read_source(Path(source), importer, options, None if robot is None else Path(robot)))
+
+
+def check_recording(read: RecordingSource) -> CheckReport:
+    """The check of a recording that was read."""
+    dataset = read.dataset
+    runs = [replace(run, poses=continuous(run.pose_times, run.poses)) for run in dataset.trajectories if run.has_poses]
+    if not runs:
+        return _without_poses(read)
+    clocks = clocks_of(dataset.robot, runs)
+    aligned = [_by_wheels(run, clock) for run, clock in zip(runs, clocks, strict=True)]
+    found = [*read.findings, *_noted(dataset)]
+    faults = list(stream_faults(dataset.robot, aligned, readable=True))
+    odometry = list(_odometry(dataset, runs))
+    spoiled = {finding.kind for finding in (*faults, *odometry)} & set(_SPOILED)
+    explained = search(recorded(replace(dataset, trajectories=tuple(aligned))))
+    misread = list(_misreadings(explained))
+    if misread:
+        faults = list(stream_faults(dataset.robot, aligned, readable=False))
+    found += [*misread, *odometry, *faults, *copied_runs(runs)]
+    if not spoiled:
+        found += clock_findings(runs, clocks)
+    found += [*missing_motions(dataset.robot, aligned), *too_few(runs)]
+    findings = with_fixes(read, sorted(_distinct(found), key=lambda finding: _ORDER[finding.severity]))
+    gain = Gain(None, "") if misread or spoiled else expected_gain(dataset.robot, runs)
+    return _report(read, findings, gain)
+
+
+def _report(read: RecordingSource, findings: Sequence[Finding], gain: Gain) -> CheckReport:
+    errors = [finding for finding in findings if finding.severity == "error"]
+    typed = [finding for finding in errors if finding.changes]
+    lacking = [finding for finding in findings if finding.kind in ("motion_missing", "few_runs", "few_repetitions")]
+    verdict: Verdict = "fix" if typed else "record more" if errors or lacking else "ready"
+    name = read.dataset.name
+    first = (typed or errors or lacking or list(findings))[:1]
+    what = first[0].what if first else ""
+    more = f" (and {plural(len(findings) - 1, 'finding')} more)" if len(findings) > 1 else ""
+    if verdict == "ready":
+        sentence = f"{name} is ready for calibration" + (
+            f"; {plural(len(findings), 'remark')} below" if findings else ""
+        )
+    elif verdict == "fix":
+        sentence = f"{name} must be mended before a calibration: {what}{more}"
+    else:
+        sentence = f"{name} needs more recordings: {what}{more}"
+    if gain.needed is False and verdict == "ready":
+        sentence += ", and hardly needs one: it would gain no more than chance"
+    return CheckReport(
+        verdict=verdict,
+        needed=gain.needed,
+        findings=tuple(findings),
+        sentence=sentence,
+        gain=gain.sentence,
+        command=command(read, typed),
+    )
+
+
+def _without_poses(read: RecordingSource) -> CheckReport:
+    """The report on runs whose only reference is a distance, an angle and the like."""
+    found = [*read.findings, *_noted(read.dataset), *too_few(read.dataset.trajectories)]
+    return _report(read, with_fixes(read, found), Gain(None, ""))
+
+
+def _by_wheels(run: Trajectory, clock: ClockMatch | None) -> Trajectory:
+    """A run with its poses by the wheels' clock."""
+    if clock is None:
+        return run
+    times = clock.corrected(run.pose_times)
+    kept = np.flatnonzero((times >= 0) & (times <= run.times[-1]))
+    if len(kept) < max(3, len(times) // 2):
+        return run
+    return replace(run, pose_times=times[kept], poses=run.poses[kept], pose_covariances=None)
+
+
+def _misreadings(explained: Explained) -> Iterator[Finding]:
+    others = " or ".join("; ".join(mistake.what for mistake in mistakes) for mistakes in explained.alike)
+    for index, mistake in enumerate(explained.mistakes):
+        alike = f" (this recording cannot tell that from another reading: {others})" if others and not index else ""
+        yield Finding(
+            kind=mistake.kind,
+            what=mistake.what + alike,
+            where=mistake.where,
+            severity="error",
+            changes=mistake.changes,
+        )
+
+
+def _odometry(dataset: Dataset, runs: Sequence[Trajectory]) -> Iterator[Finding]:
+    if dataset.simulated or (residual := follows_the_wheels(runs)) is None:
+        return
+    yield Finding(
+        kind="reference_is_odometry",
+        what="the reference is the robot's own odometry, or simulated without noise: some matrix makes its headings of "
+        f"the wheels to {residual:.1g} rad a second, and nothing can be learnt from it",
+        where="the reference",
+        severity="error",
+        fix="record an independent reference, such as motion capture, SLAM, or a tape measure (omnibench guide data)",
+    )
+
+
+# Kinds of the notes that importers leave, by words that only these hold.
+_NOTES = (("begin anew", "counter_restart", "all wheels"), ("ran back while", "counter_restart", "all wheels"))
+
+
+def _noted(dataset: Dataset) -> Iterator[Finding]:
+    """Restarts of counters that the importer has mended."""
+    for warning in dataset.warnings:
+        for words, kind, where in _NOTES:
+            if words in warning:
+                yield Finding.model_validate(
+                    {
+                        "kind": kind,
+                        "what": warning,
+                        "where": where,
+                        "severity": "note",
+                        "fix": "nothing: runs end there",
+                    }
+                )
+
+
+def _distinct(findings: Sequence[Finding]) -> list[Finding]:
+    """Each kind and place once."""
+    kept: dict[tuple[str, str], Finding] = {}
+    for finding in findings:
+        kept.setdefault((finding.kind, finding.where), finding)
+    return list(kept.values())

@@ -1,0 +1,116 @@
+"""Motions that a recording lacks, and runs and repetitions that are too few, in words."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.data.checks.finding import Finding
+from omnibench.data.checks.motion_fit import Windows
+from omnibench.data.dataset import Trajectory
+from omnibench.fit.span import driven_span
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.odometry import Complex
+from omnibench.words import plural
+
+_TURNING, _STRAIGHT = 0.06, 0.04  # rad/s from which on a robot turns, and up to which it goes straight; chosen
+_MOVING = 0.02  # m/s from which on it moves; chosen
+_SHARE = 0.02  # of the time that a motion must be driven; chosen: some seconds in a minute
+_SLIDING = 0.35  # rad between two directions of motion that count as different; chosen
+_FEW_RUNS, _SOME_RUNS = 3, 7  # runs up to which no interval can be had, and few
+_LEAST_REPEATED = 2
+_ALIKE = 0.1  # by which the angles that wheels turn may differ in repetitions of a command; chosen
+
+
+def missing_motions(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
+    """Motions that a robot of this kind needs and that were not driven."""
+    windows = Windows.of([run.log(run.pose_times) for run in runs], [run.poses for run in runs])
+    if windows is None:
+        return
+    seconds = windows.times[:, 1] - windows.times[:, 0]
+    turning, speed = windows.turned / seconds, np.abs(windows.moved) / seconds
+    active = (np.abs(turning) > _TURNING) | (speed > _MOVING)
+    if not active.any():
+        return
+    whole = float(seconds[active].sum())
+
+    def share(chosen: NDArray[np.bool_]) -> float:
+        return float(seconds[active & chosen].sum()) / whole
+
+    left, right = share(turning > _TURNING), share(turning < -_TURNING)
+    if left < _SHARE and right < _SHARE:
+        yield _missing("the robot never turned", f"drive {_turns(robot)}, to either side")
+    elif min(left, right) < _SHARE:
+        side = "left" if left < _SHARE else "right"
+        yield _missing(f"the robot never turned {side}", f"drive {_turns(robot)}, to the {side}")
+    if share((np.abs(turning) < _STRAIGHT) & (speed > _MOVING)) < _SHARE:
+        yield _missing("the robot never went straight", "drive three straight lines of 2 m and more")
+    if robot.slides and not robot.skid and not _sideways(windows.moved[active & (speed > _MOVING)]):
+        yield _missing("the robot went in one direction only", "drive forward, and sideways to either side, 2 m each")
+    if not robot.drive.steered and left >= _SHARE and right >= _SHARE and robot.slides:
+        spot = share((np.abs(turning) > _TURNING) & (speed < 0.1 * robot.reach * np.abs(turning) + _MOVING))
+        if spot < _SHARE and driven_span(runs).shares[-1] < _SHARE / 2 and len(driven_span(runs).shares) == 3:
+            yield _missing("the robot never turned on the spot", "drive three turns at 0.5 rad/s, to either side")
+
+
+def _missing(what: str, fix: str) -> Finding:
+    return Finding(kind="motion_missing", what=what, where="the recording", severity="warning", fix=fix)
+
+
+def _turns(robot: Robot) -> str:
+    return "three circles" if robot.drive.steered else "three turns on the spot at 0.5 rad/s"
+
+
+def _sideways(moved: Complex) -> bool:
+    """True if a robot moved in directions that are no line in its frame. moved (W,): complex, m."""
+    if not len(moved):
+        return True
+    spread = abs(complex(np.sum(moved**2))) / float(np.sum(np.abs(moved) ** 2))  # 1 along one line, 0 all round
+    return spread < math.cos(2 * _SLIDING)
+
+
+def too_few(runs: Sequence[Trajectory]) -> Iterator[Finding]:
+    """Runs or repetitions by which neither noise nor intervals can be had."""
+    count = len(runs)
+    if count <= _FEW_RUNS:
+        yield Finding(
+            kind="few_runs",
+            what=f"there {'is' if count == 1 else 'are'} only {plural(count, 'run')}: nothing is left to judge a "
+            "calibration by",
+            where="the recording",
+            severity="warning",
+            fix=f"record {_SOME_RUNS + 1} runs or more, of several commands",
+        )
+    repeated = max(Counter(command_names(runs)).values())
+    if repeated < _LEAST_REPEATED:
+        yield Finding(
+            kind="few_repetitions",
+            what="no command was driven twice: noise and errors of the model cannot be told apart",
+            where="the recording",
+            severity="warning",
+            fix="drive every command three times",
+        )
+
+
+def command_names(runs: Sequence[Trajectory]) -> list[str]:
+    """The command of every run; of runs without one, runs whose wheels turn alike share a name."""
+    names: list[str] = []
+    known: list[tuple[str, Array]] = []
+    for run in runs:
+        if run.command is not None:
+            names.append(run.command)
+            continue
+        seconds = np.diff(run.times, prepend=0.0)
+        driven = np.concatenate([run.signals.T @ seconds, np.abs(run.signals).T @ seconds])
+        size = float(np.abs(driven).max(initial=0.0))
+        same = (name for name, other in known if float(np.abs(driven - other).max()) <= _ALIKE * size)
+        name = next(same, None)
+        if name is None:
+            name = f"like {run.id}"
+            known.append((name, driven))
+        names.append(name)
+    return names
