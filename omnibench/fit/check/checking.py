@@ -18,9 +18,9 @@ from omnibench.data.checks.stream_faults import stream_faults
 from omnibench.data.clock_matching import ClockMatch
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importers.copied_reference import follows_the_wheels
-from omnibench.fit.check.driven_motions import missing_motions, too_few
 from omnibench.fit.check.expected_gain import Gain, expected_gain
 from omnibench.fit.check.fixes import command, with_fixes
+from omnibench.fit.check.missing_motions import missing_motions, too_few
 from omnibench.fit.check.recording_source import RecordingSource, of_dataset, read_source, recorded
 from omnibench.fit.check.result import CheckReport, Verdict
 from omnibench.words import plural

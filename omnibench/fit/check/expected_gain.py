@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.check.driven_motions import command_names
+from omnibench.fit.check.missing_motions import command_names
 from omnibench.fit.held_out import judge
 from omnibench.fit.linear_fit import linear_fit
 from omnibench.fit.span import directions_kept, driven_span

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel
-
 from omnibench.data.checks.finding import Finding
-from omnibench.errors import OmnibenchError
 from omnibench.fit.check.recording_source import RecordingSource
 from omnibench.registry import importers
-from omnibench.robot.kinematics import Robot
 
 _POSE = ("x", "y", "theta")
 _RATES = {"rpm": 2 * 3.141592653589793 / 60, "deg/s": 3.141592653589793 / 180, "rev/s": 2 * 3.141592653589793}
 _POSITIONS = {"deg/s": "deg", "rev/s": "rev"}
+_TABLES = 8  # whose headers are looked at
 _IDENTITY = {"position_unit": "m", "heading_unit": "rad", "wheel_time_unit": "s", "pose_time_unit": "s"}
 
 
@@ -108,8 +106,7 @@ def _with_change(
     robot = read.dataset.robot
     changed = dict(options)
     if key == "wheel_order":
-        names = _columns(read, importer, options, robot)
-        changed["wheel_columns"] = [names[column] for column in value]
+        changed = _permuted(read, importer, options, "wheel_columns", value)
         for option in ("wheel_signs", "ticks_per_turn", "gear_ratio"):
             if isinstance(options.get(option), list | tuple) and len(options[option]) == len(value):
                 changed[option] = [options[option][column] for column in value]
@@ -121,8 +118,7 @@ def _with_change(
     elif key == "wheel_unit":
         changed |= _wheel_unit(options, value, len(robot.wheel_names))
     elif key == "steering_order":
-        names = list(options.get("steering_columns") or _steering_names(importer, robot))
-        changed["steering_columns"] = [names[column] for column in value]
+        changed = _permuted(read, importer, options, "steering_columns", value)
     elif key == "steering_signs":
         changed["steering_signs"] = _product(options.get("steering_signs"), value)
         if options.get("steering_offsets_deg"):
@@ -132,8 +128,7 @@ def _with_change(
     elif key == "steering_offsets_deg":
         changed[key] = _one_or_all(_sum(options.get(key), value))
     elif key == "pose_order":
-        names = list(options.get("pose_columns") or _POSE)
-        changed["pose_columns"] = [names[column] for column in value]
+        changed = _permuted(read, importer, options, "pose_columns", value)
     elif key == "pose_signs":
         changed[key] = _product(options.get(key), value)
     elif key == "heading_offset_deg":
@@ -158,26 +153,56 @@ def _wheel_unit(options: Mapping[str, Any], unit: str, count: int) -> dict[str, 
     return {option: _one_or_all(_product(options.get(option), [float(f"{1 / _RATES[unit]:.6g}")] * count))}
 
 
-def _columns(read: RecordingSource, importer: str, options: Mapping[str, Any], robot: Robot) -> list[Any]:
-    """Names of the wheels' columns, in the robot's order, as they are read."""
-    if options.get("wheel_columns"):
-        return list(options["wheel_columns"])
+def _columns(read: RecordingSource, importer: str, options: Mapping[str, Any], key: str) -> list[str]:
+    """Names of the columns that are read, in the robot's order. key: wheel_columns, steering_columns or pose_columns.
+
+    CannotBeTypedError: they are not known.
+    """
+    robot = read.dataset.robot
+    names = {"wheel_columns": robot.wheel_names, "steering_columns": robot.drive.steered, "pose_columns": _POSE}[key]
     if importer == "dataset":
-        return list(robot.wheel_names)
-    entry = importers.entry(importer)
-    try:
-        validated: BaseModel = entry.options.model_validate(entry.cls.completed(options, read.source))
-    except (ValueError, OmnibenchError):
-        raise CannotBeTypedError("wheel_columns") from None
-    columns = getattr(validated, "columns", None)
-    if not isinstance(columns, tuple) or len(columns) != len(robot.wheel_names):
-        raise CannotBeTypedError("wheel_columns")
-    return list(columns)
+        return list(options.get(key) or names)
+    if importer != "csv":
+        raise CannotBeTypedError(key)
+    prefix = {"wheel_columns": _prefix(options), "steering_columns": "steer_", "pose_columns": ""}[key]
+    mapping = options.get("columns") or {}
+    given = options.get(key) or [prefix + name for name in names]
+    columns = [
+        str(mapping.get(prefix + name) or mapping.get(name) or present)
+        for name, present in zip(names, given, strict=True)
+    ]
+    if not options.get(key) and not set(columns) <= _header_words(read.source):
+        raise CannotBeTypedError(key)
+    return columns
 
 
-def _steering_names(importer: str, robot: Robot) -> list[str]:
-    prefix = "" if importer == "dataset" else "steer_"
-    return [prefix + wheel for wheel in robot.drive.steered]
+def _prefix(options: Mapping[str, Any]) -> str:
+    """What the columns of the wheels begin with, by their unit."""
+    unit = str(options.get("wheel_unit", "rad/s"))
+    return "omega_" if unit.endswith("/s") or unit == "rpm" else "ticks_" if "ticks" in unit else "phi_"
+
+
+def _header_words(source: Path) -> set[str]:
+    """Words of the first lines of a source's tables."""
+    files = [source] if source.is_file() else sorted(source.rglob("*.csv"))
+    words: set[str] = set()
+    for file in files[:_TABLES]:
+        with file.open(errors="replace") as lines:
+            words |= set(re.split(r"[\s,;]+", lines.readline().strip()))
+    return words
+
+
+def _permuted(
+    read: RecordingSource, importer: str, options: Mapping[str, Any], key: str, order: Sequence[int]
+) -> dict[str, Any]:
+    """The options with columns in another order."""
+    columns = _columns(read, importer, options, key)
+    changed = {**options, key: [columns[column] for column in order]}
+    if mapping := options.get("columns"):
+        kept = {name: column for name, column in mapping.items() if str(column) not in columns}
+        changed = {name: value for name, value in changed.items() if name != "columns"}
+        changed |= {"columns": kept} if kept else {}
+    return changed
 
 
 def _pattern(name: str) -> str:

@@ -165,7 +165,7 @@ def _time_units(name: str, given: Mapping[str, Any]) -> Iterator[dict[str, Any]]
         return
     for unit in _UNITS:
         yield {wheels: unit, poses: unit}
-        yield {poses: unit, wheels: given.get(wheels, "s")}
+        yield {poses: unit}
         yield {wheels: unit, poses: given.get(poses) or "s"}
 
 
