@@ -61,7 +61,7 @@ def test_a_topic_is_set_for_reading_on_a_terminal(command: Command, monkeypatch:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     printed = command("guide", "data").stdout
     assert "# Data" not in printed
-    assert "omnibench guide plugins" in printed
+    assert "omnibench guide importing" in printed
     assert all(len(line) <= 80 for line in re.sub(r"\x1b[^m]*m", "", printed).splitlines())
 
 

@@ -31,4 +31,4 @@ def parse(command: str) -> None:
     while hasattr(group, "commands"):
         context = group.context_class(group, info_name=name, parent=context)
         name, group, arguments = group.resolve_command(context, arguments)
-    group.make_context(name, arguments, parent=context)
+    group.make_context(name, [argument for argument in arguments if argument != "--help"], parent=context)
