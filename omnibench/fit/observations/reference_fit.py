@@ -43,6 +43,7 @@ from omnibench.robot.odometry import Integration
 
 # Shares of the references' own variance at which the search for the odometry's begins: nothing, and as much again.
 _STARTS = (0.0, 1.0)
+_UNTOLD = 1e3  # times the sigma of positions that do not tell the heading from which they count: they have no weight
 _MANY = 1e9  # degrees of freedom that stand for any number
 _MOST = 1e6  # times the references' own variance: the most that is searched
 
@@ -165,7 +166,8 @@ class ReferenceFit:
     def _own(self) -> list[Array]:
         """Standard deviations (k,) that the references of each run have."""
         rows = self.batch.rows
-        return [rows.sigmas[own][rows.measured[own]] for own in self._owned]
+        sigmas = rows.sigmas * np.where(rows.tells_no_heading, _UNTOLD, 1.0)[:, None]
+        return [sigmas[own][rows.measured[own]] for own in self._owned]
 
     @cached_property
     def _sizes(self) -> list[list[tuple[Array, NDArray[np.bool_]]]]:

@@ -48,6 +48,12 @@ class StartPoses:
     position_weights: Array
     heading_weights: Array
 
+    @property
+    def spread(self) -> Array:
+        """Squares (Z,) of the measured positions about their means and of heading's information, in units of sigma."""
+        squares = self.position_weights * np.square(self._centred(self.positions))
+        return self._sum_placed(squares.sum(axis=1)) + self._sum_headings(self.heading_weights)
+
     def fitted(self, positions: Array, headings: Array) -> tuple[Array, Array]:
         """Positions (P, I, 2) and headings (P, J) of odometry from the origin, seen from the likeliest starts."""
         turns = self.turns(positions, headings)
