@@ -1,4 +1,4 @@
-"""Runs that hold the same wheel samples, also under other names, later in time or with other ends."""
+"""Runs that hold the same reference poses, also under other names, later in time or with other ends."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from omnibench.data.checks.stream_faults import runs_in_words
 from omnibench.data.dataset import Trajectory
 from omnibench.words import plural
 
-# Samples in a row that two runs must share, changes of rates among them, and share of the shorter run's rows (chosen:
-# encoders' whole ticks repeat themselves for some samples, not for these).
-_ROWS, _CHANGES, _SHARED = 24, 12, 0.3
-_DIGITS = 6  # of rates that are compared: computed from positions at other epochs they differ in the last ones
+# Poses in a row that two runs must share, changes among them, and share of the later run's rows (chosen: a reference
+# scatters, so that no two drives share any; wheel rates as commanded are alike in all repetitions).
+_ROWS, _CHANGES, _SHARED = 12, 8, 0.3
+_DIGIT = 1e-7  # m, to which positions are compared; below the noise of any reference
 
 
 def copied_runs(runs: Sequence[Trajectory]) -> Iterator[Finding]:
@@ -32,7 +32,7 @@ def copied_runs(runs: Sequence[Trajectory]) -> Iterator[Finding]:
         first = next(iter(copies.items()))
         yield Finding(
             kind="copies",
-            what=f"{plural(len(copies), 'run')} {'repeats' if len(copies) == 1 else 'repeat'} the wheel samples of "
+            what=f"{plural(len(copies), 'run')} {'repeats' if len(copies) == 1 else 'repeat'} the poses of "
             f"others, as {first[0]} those of {first[1]}: what validates then was trained on",
             where=runs_in_words(list(copies), len(runs)),
             severity="error",
@@ -41,11 +41,9 @@ def copied_runs(runs: Sequence[Trajectory]) -> Iterator[Finding]:
 
 
 def _keys(run: Trajectory) -> Iterator[bytes]:
-    """Digests of every stretch of samples in which the rates change often enough."""
-    rates = run.rates if run.steering is None else np.hstack([run.rates, run.steering])
-    scale = 10.0 ** np.floor(np.log10(max(float(np.abs(rates).max(initial=0.0)), 1e-12)))
-    rounded = np.round(rates / scale * 10**_DIGITS).astype(np.int64) // 10
+    """Digests of every stretch of reference positions that change often enough."""
+    rounded = np.round(run.poses[:, :2] / _DIGIT).astype(np.int64)
     changes = np.append(0, np.cumsum(np.any(np.diff(rounded, axis=0) != 0, axis=1)))
-    for row in range(len(rounded) - _ROWS):
+    for row in range(len(rounded) - _ROWS + 1):
         if changes[row + _ROWS - 1] - changes[row] >= _CHANGES:
             yield rounded[row : row + _ROWS].tobytes()

@@ -21,9 +21,13 @@ _STANDING, _STILL = 0.8, 0.03  # s that a reference stands, and share of the whe
 _MOSTLY = 0.25  # share of a run for which a reference stands, from which on it counts as frozen; chosen
 _FASTEST = 8.0  # m/s of a rim: no robot of this kind is faster; chosen
 _RARE = 0.02  # share of the samples: more that are too fast are another unit
-_DEAD, _EXPECTED = 0.01, 3.0  # share of the angle that the reference asks of a wheel, and that angle, rad; chosen
+# Share of the angle of the wheel that turns most, up to which one is dead; angle, rad, and share of the largest, that
+# the reference must ask of it (chosen).
+_DEAD, _EXPECTED, _ASKED = 0.002, 3.0, 0.25
 # s of a run's begin, and share of its usual speed above which wheels and reference do not begin at rest (chosen).
 _BEGIN, _MOVING = 0.12, 0.5
+# Steps of the robot's size that are needed, and spread of the turns over them, rad, that one angle cannot give; chosen.
+_FEWEST, _BENDS = 10, 0.3
 _SAME = 1e-4  # m and rad: a pose that is repeated, below the noise of any reference; chosen
 
 
@@ -34,6 +38,7 @@ def stream_faults(robot: Robot, runs: Sequence[Trajectory], *, readable: bool) -
     frozen = _standing(robot, runs)
     yield from _frozen(runs, frozen)
     yield from dead_wheels(robot, runs)
+    yield from _frozen_steering(robot, runs)
     if readable:
         yield from _jumps(robot, [run for run in runs if run.id not in frozen])
     yield from _moving_starts(robot, runs)
@@ -183,7 +188,8 @@ def dead_wheels(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
     for run in runs:
         expected = expected_angles(robot, run)
         counted = np.abs(run.rates).T @ np.diff(run.times, prepend=0.0)
-        still = (counted < _DEAD * expected) & (expected > _EXPECTED)
+        # Shares of the wheel that moves most, so that units which are misread do not matter.
+        still = (counted <= _DEAD * counted.max()) & (expected > max(_EXPECTED, _ASKED * expected.max()))
         if still.all() and len(still) > 1:
             continue  # a reference that moves by itself is told otherwise
         for name, is_dead in zip(robot.wheel_names, still.tolist(), strict=True):
@@ -201,6 +207,38 @@ def dead_wheels(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
             fix="check its cable and the column that is read, and record again" if every else "",
             changes={} if every else {"leave_out": names},
         )
+
+
+def _frozen_steering(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
+    """Steering angles that never change though the robot's turns do."""
+    angles = [run.steering for run in runs if run.steering is not None]
+    if not angles:
+        return
+    spans = np.ptp(np.concatenate(angles), axis=0)
+    bends = np.concatenate([_bends(robot, run) for run in runs])
+    if len(bends) < _FEWEST or np.subtract(*np.quantile(bends, [0.9, 0.1])) < _BENDS:
+        return
+    for name in [name for name, span in zip(robot.drive.steered, spans.tolist(), strict=True) if span < _SAME]:
+        yield Finding(
+            kind="steering_frozen",
+            what=f"the steering angle of wheel {name} never changes, though the robot drives straight and in curves",
+            where=f"steering of wheel {name}",
+            severity="error",
+            fix=f"read the column or topic that holds the angle of wheel {name}, or record it, and import again",
+        )
+
+
+def _bends(robot: Robot, run: Trajectory) -> Array:
+    """Turns of the reference over steps of the robot's size, rad, signed by the wheels' direction of rolling."""
+    way = np.append(0.0, np.cumsum(np.hypot(*np.diff(run.poses[:, :2], axis=0).T)))
+    turned = np.abs(np.diff(run.poses[:, 2], prepend=run.poses[0, 2])).sum() * robot.reach
+    length = max(robot.reach, 1e-3)
+    if way[-1] + turned < 3 * length:
+        return np.zeros(0)
+    whole = way + robot.reach * np.append(0.0, np.cumsum(np.abs(np.diff(run.poses[:, 2]))))
+    marks = np.arange(0.0, whole[-1], length)
+    bends: Array = np.diff(np.interp(marks, whole, run.poses[:, 2]))
+    return bends
 
 
 def expected_angles(robot: Robot, run: Trajectory) -> Array:

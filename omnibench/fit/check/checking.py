@@ -60,7 +60,8 @@ def check_recording(read: RecordingSource) -> CheckReport:
     odometry = list(_odometry(dataset, runs))
     spoiled = {finding.kind for finding in (*faults, *odometry)} & set(_SPOILED)
     explained = search(recorded(replace(dataset, trajectories=tuple(aligned))))
-    misread = list(_misreadings(explained))
+    frozen = any(fault.kind == "steering_frozen" for fault in faults)  # which no other reading of it mends
+    misread = [] if frozen else list(_misreadings(explained))
     if misread:
         faults = list(stream_faults(dataset.robot, aligned, readable=False))
     found += [*misread, *odometry, *faults, *copied_runs(runs)]
@@ -159,7 +160,7 @@ def _noted(dataset: Dataset) -> Iterator[Finding]:
                         "what": warning,
                         "where": where,
                         "severity": "note",
-                        "fix": "nothing: runs end there",
+                        "fix": "nothing: the import has mended it",
                     }
                 )
 

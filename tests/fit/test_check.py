@@ -1,0 +1,170 @@
+"""The check of a recording as a user types it: verdict, findings, and fixes that mend what they are said to mend."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import omnibench as command
+from config_robots import experiment
+
+from omnibench import check, save_dataset
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.fit.check.result import CheckReport
+from omnibench.robot.path import Path as Driven
+from omnibench.simulate.simulate import simulate_dataset
+
+Change = Callable[[Trajectory], Trajectory]
+
+
+@cache
+def recording() -> Dataset:
+    """Eight drives of a differential robot from rest, in legs, with a reference that scatters."""
+    robot = simulate_dataset(experiment("diff")).dataset.robot
+    runs = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed % 4)  # four commands, each twice
+        edges = np.arange(0.0, 24.01, 0.04)
+        levels = np.vstack([np.zeros((1, 2)), rng.uniform(-4, 5, (8, 2)), [[3.0, 3.0]], [[4.0, 4.0]], np.zeros((2, 2))])
+        rates = levels[np.minimum((edges[1:] / 2).astype(int), len(levels) - 1)]
+        rates = np.array([np.convolve(each, np.ones(8) / 8)[: len(rates)] for each in rates.T]).T
+        matrix = robot.inverse_kinematic_matrix * np.array([[1.03], [1.0], [0.96]])
+        noise = np.random.default_rng(100 + seed)
+        moved = rates * (1 + 0.01 * noise.normal(size=rates.shape)) * 0.04
+        path = Driven(edges[1:], np.zeros(3), moved @ matrix.T, "arc")
+        stamps = np.arange(0.0, 24.0, 0.05)
+        poses = path.poses(stamps) + noise.normal(0, [0.001, 0.001, 0.003], (len(stamps), 3))
+        runs.append(Trajectory(f"run{seed}", "train", edges[1:], rates, stamps, poses, command=f"c{seed % 4}"))
+    return make_dataset("base", robot, 0.04, runs)
+
+
+def changed(change: Change, only: str = "") -> Dataset:
+    runs = [change(run) if only in ("", run.id) else run for run in recording().trajectories]
+    return make_dataset("base", recording().robot, 0.04, runs)
+
+
+def without(begin: float, end: float, wheels: bool) -> Change:
+    def change(run: Trajectory) -> Trajectory:
+        if wheels:
+            kept = (run.times < begin) | (run.times > end)
+            return replace(run, times=run.times[kept], rates=run.rates[kept])
+        kept = (run.pose_times < begin) | (run.pose_times > end)
+        return replace(run, pose_times=run.pose_times[kept], poses=run.poses[kept])
+
+    return change
+
+
+def jumped(run: Trajectory) -> Trajectory:
+    return replace(run, poses=run.poses + 0.5 * (run.pose_times > 10)[:, None] * (1, 0, 0))
+
+
+def standing(run: Trajectory) -> Trajectory:
+    half = int(np.searchsorted(run.pose_times, 10.0))
+    return replace(
+        run, poses=np.vstack([run.poses[:half], np.repeat(run.poses[half : half + 1], len(run.poses) - half, 0)])
+    )
+
+
+def late(run: Trajectory) -> Trajectory:
+    stamps = np.append(0.0, run.pose_times + 0.4)
+    return replace(run, pose_times=stamps[:-9], poses=np.vstack([run.poses[:1], run.poses])[:-9])
+
+
+def kinds(report: CheckReport) -> set[str]:
+    return {finding.kind for finding in report.findings}
+
+
+def test_a_sound_recording_is_ready_and_its_calibration_is_needed() -> None:
+    report = check(recording())
+    assert (report.verdict, kinds(report)) == ("ready", set())
+    assert report.needed is True
+
+
+TYPED = {
+    "wheel_dropout": (without(6.0, 8.0, wheels=True), "run1"),
+    "reference_dropout": (without(6.0, 8.5, wheels=False), "run1"),
+    "reference_jump": (jumped, "run1"),
+    "reference_frozen": (standing, "run1"),
+    "clock_offset": (late, ""),
+    "wheel_negated": (lambda run: replace(run, rates=run.rates * (1, -1)), ""),
+    "wheel_scale": (lambda run: replace(run, rates=run.rates * 4), ""),
+}
+
+
+@pytest.mark.parametrize("kind", TYPED)
+def test_a_fault_is_found_and_what_is_typed_for_it_mends_it(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_dataset(changed(*TYPED[kind]), "log")
+    report = check("log")
+    assert report.verdict == "fix"
+    (fix,) = {finding.fix for finding in report.findings if finding.kind == kind}
+    program, *words = shlex.split(fix)
+    assert program == "omnibench"
+    assert command(*words).returncode == 0
+    assert kind not in kinds(check("log_mended"))
+
+
+def test_a_wheel_that_never_turns_is_dead() -> None:
+    report = check(changed(lambda run: replace(run, rates=run.rates * (1, 0))))
+    assert report.verdict == "record more"
+    assert [f.where for f in report.findings if f.kind == "wheel_dead"] == [f"wheel {recording().robot.wheel_names[1]}"]
+
+
+def test_copies_of_runs_are_named() -> None:
+    first, *others = recording().trajectories
+    copy = replace(others[3], id="copy", times=others[3].times[:-40], rates=others[3].rates[:-40])
+    copy = replace(copy, pose_times=copy.pose_times[:-60], poses=copy.poses[:-60])
+    dataset = make_dataset("base", recording().robot, 0.04, [first, *others[1:], copy])
+    assert [f.where for f in check(dataset).findings if f.kind == "copies"] == ["run copy"]
+
+
+def test_runs_that_begin_in_motion_are_told() -> None:
+    def cut(run: Trajectory) -> Trajectory:
+        kept, seen = run.times > 5.01, run.pose_times >= 4.99
+        moved = {"pose_times": run.pose_times[seen] - run.pose_times[seen][0], "poses": run.poses[seen]}
+        return replace(run, times=run.times[kept] - 5.0, rates=run.rates[kept], **moved)
+
+    assert "not_at_rest" in kinds(check(changed(cut)))
+
+
+def test_a_recording_without_turns_lacks_them_in_words() -> None:
+    def straight(run: Trajectory) -> Trajectory:
+        kept = run.times > 17.6
+        moved = Driven(run.times, np.zeros(3), np.abs(run.rates[:, :1]) * (0.004, 0, 0), "arc")
+        noise = np.random.default_rng(0).normal(0, [0.001, 0.001, 0.002], (len(run.pose_times), 3))
+        rates = np.repeat(np.abs(run.rates[:, :1]), 2, axis=1)
+        assert kept.any()
+        return replace(run, rates=rates, poses=moved.poses(run.pose_times) + noise)
+
+    findings = [finding for finding in check(changed(straight)).findings if finding.kind == "motion_missing"]
+    assert [(finding.what, finding.fix[:17]) for finding in findings] == [
+        ("the robot never turned", "drive three turns")
+    ]
+
+
+def test_json_holds_verdict_need_and_findings_alone(tmp_path: Path) -> None:
+    save_dataset(changed(jumped, "run1"), tmp_path / "log")
+    document = json.loads(command("check", str(tmp_path / "log"), "--json").stdout)
+    assert set(document) == {"verdict", "needed", "findings"}
+    assert set(document["findings"][0]) == {"kind", "what", "where", "severity", "fix"}
+
+
+def test_a_source_that_is_not_there_ends_in_one_line(tmp_path: Path) -> None:
+    done = command("check", str(tmp_path / "nothing"))
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+
+
+def test_the_report_shows_stamps_before_and_after(tmp_path: Path) -> None:
+    save_dataset(changed(late), tmp_path / "log")
+    assert command("check", str(tmp_path / "log"), "--report", str(tmp_path / "check.html")).returncode == 0
+    page = (tmp_path / "check.html").read_text()
+    assert "With matched stamps" in page
+    assert "--set clocks=match" in page
