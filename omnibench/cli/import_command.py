@@ -1,7 +1,9 @@
 """``import``: recordings into a data set, the options of every importer, and tables to fill in."""
 
+import shlex
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer.core import TyperCommand
@@ -15,9 +17,12 @@ from omnibench.cli.options import (
     load_given_plugins,
     output_option,
 )
-from omnibench.cli.terminal.console import print_ending, warn
+from omnibench.cli.terminal.console import make_console, print_ending, warn
 from omnibench.errors import ConfigError, DataError
 from omnibench.words import plural
+
+if TYPE_CHECKING:
+    from omnibench.fit.check.recording_source import RecordingSource
 
 import_app = typer.Typer()
 
@@ -62,6 +67,7 @@ def import_(
         Literal["diff", "omni3", "mecanum", "tricycle", "car", "swerve", "skid"] | None,
         typer.Option(help="With --template: the robot's type. Default: diff."),
     ] = None,
+    no_check: Annotated[bool, typer.Option("--no-check", help="Leave out the check of what was recorded.")] = False,
     table_format: TableFormat = "parquet",
     force: Force = False,
     plugins: Plugins = None,
@@ -78,6 +84,7 @@ def import_(
     from omnibench.data.splits import division_in_words
     from omnibench.data.storage import check_dataset_folder, save_dataset
     from omnibench.files import refuse_existing, resolved
+    from omnibench.fit.check.recording_source import RecordingSource
     from omnibench.registry import importers
     from omnibench.slam.import_dataset import import_dataset
 
@@ -98,30 +105,48 @@ def import_(
     if "name" in entry.cls.Options.model_fields and folder.isprintable() and folder:
         options.setdefault("name", folder)
     dataset = import_dataset(importer, source, options)
-    _refuse_units(dataset.warnings, output, accept_units)
-    from dataclasses import replace
-
+    read = RecordingSource(dataset, importer, source, given, output)
+    if not accept_units:
+        _refuse_units(read, output)
     dataset = replace(dataset, imported=Imported.of(importer, source, given))
     save_dataset(dataset, output, table_format, overwrite=force)
     warn(dataset.warnings)
     typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {output}")
     way = " (other: --set validation=PATTERN)" if "validation" in entry.cls.Options.model_fields else ""
     typer.echo(f"{division_in_words(dataset.trajectories, options)}{way}", err=True)
+    then: tuple[str, tuple[object, ...]] = ("see what they tell", ("omnibench", "inspect", output))
+    if not no_check:
+        then = _checked(read, output)
     print_ending(
-        f"{output} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}",
-        "see what they tell",
-        *("omnibench", "inspect", output),
+        f"{output} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}", then[0], *then[1]
     )
     return None
 
 
-def _refuse_units(warnings: tuple[str, ...], output: Path, accepted: bool) -> None:
-    """DataError: the units of a recording cannot be right by their magnitude, and nobody said that they are."""
+def _refuse_units(read: "RecordingSource", output: Path) -> None:
+    """DataError: the units of a recording cannot be right by their magnitude; it says what to type."""
     from omnibench.data.checks.misfit import UnitWarning
+    from omnibench.fit.check.checking import check_recording
 
-    wrong = [warning for warning in warnings if isinstance(warning, UnitWarning)]
-    if wrong and not accepted:
-        raise DataError(f"{'; '.join(wrong)}; {output} is not written (--accept-units writes it as it is)")
+    wrong = [warning for warning in read.dataset.warnings if isinstance(warning, UnitWarning)]
+    if not wrong:
+        return
+    mended = check_recording(read).command
+    way = f"type {mended}, or " if mended else ""
+    raise DataError(f"{'; '.join(wrong)}; {output} is not written: {way}--accept-units to write it as it is")
+
+
+def _checked(read: "RecordingSource", output: Path) -> tuple[str, tuple[str | Path, ...]]:
+    """Print the sentence of the check; what to do next, and the words to type for it."""
+    from omnibench.fit.check.checking import check_recording
+
+    report = check_recording(read)
+    make_console(error=True).print(f"check: {report.sentence}.", soft_wrap=True)
+    if report.command:
+        return "mend it", tuple(shlex.split(report.command))
+    if report.verdict == "ready":
+        return "calibrate it", ("omnibench", "calibrate", output, "-o", "calibration.yaml")
+    return "see what is missing", ("omnibench", "check", output)
 
 
 def _write_template(

@@ -16,7 +16,7 @@ from omnibench.robot.kinematics import Array
 
 AUTO = "auto"  # as a separator: the one that the header holds
 BLANK = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})  # cells without a value, in any case
-_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
+DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
 _COMMAS = " (decimal commas? --set decimal=comma with --set separator)"
 
 
@@ -139,7 +139,7 @@ class CellTable:
         try:
             return float(text)
         except ValueError:
-            hint = "; of decimal commas say --set decimal=comma" if _DECIMAL_COMMA.fullmatch(text) else ""
+            hint = "; of decimal commas say --set decimal=comma" if DECIMAL_COMMA.fullmatch(text) else ""
             what = f"{name} is {text!r}, expected a number{hint}"
             raise self.fail(row, what) from None
 

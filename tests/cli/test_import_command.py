@@ -121,5 +121,6 @@ def test_a_data_set_keeps_what_was_typed(command: Command, filled_in: Path) -> N
 
 def test_import_ends_with_what_came_out_and_what_to_do(command: Command, filled_in: Path) -> None:
     ended = command("import", "csv", filled_in, "-o", filled_in.parent / "data").stderr.splitlines()
-    assert ended[-2].endswith("data holds 6 runs of my_robot; next, see what they tell:")
-    assert ended[-1].startswith("  omnibench inspect ")
+    assert ended[-3].startswith("check: data ")
+    assert ended[-2].split("; next, ")[0].endswith("data holds 6 runs of my_robot")
+    assert ended[-1].startswith("  omnibench ")

@@ -212,3 +212,13 @@ def test_robot_yaml_in_the_source_or_beside_it_is_the_robot(tmp_path: Path, plac
     )
     (tmp_path / "log" / place / "robot.yaml").write_text(robot)
     assert odometry_error(import_dataset("csv", tmp_path / "log")) < FITS
+
+
+def test_names_that_look_like_repetitions_are_told_with_the_pattern_to_type(tmp_path: Path) -> None:
+    for seed, name in enumerate(("left_1", "left_2", "right_1", "right_2")):
+        both(seed).write_csv(tmp_path / f"{name}.csv")
+    (told,) = read(tmp_path).warnings
+    assert "look like repetitions of 2 commands" in told
+    pattern = told.partition("command_pattern=")[2].partition("'")[0]
+    runs = read(tmp_path, command_pattern=pattern).trajectories
+    assert [run.command for run in runs] == ["left", "left", "right", "right"]

@@ -163,7 +163,7 @@ def test_the_command_imports_a_bag(command: Command, tmp_path: Path) -> None:
     run = command("import", "rosbag", source, "-o", "data", "--set", "robot=robot.yaml", "--set", "name=lab")
     assert run.returncode == 0
     assert run.stderr.startswith("training 1 run, validation 1 run, ")
-    assert run.stderr.count("\n") == 1
+    assert "\ndata holds 2 runs of " in run.stderr
     assert "2 trajectories: data" in run.stdout
     data = load_dataset(tmp_path / "data")
     assert data.name == "lab"

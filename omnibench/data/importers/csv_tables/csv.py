@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,10 @@ from omnibench.data.importers.runs.recorded_streams import RecordedStreams, by_o
 from omnibench.data.importers.runs.recording_runs import recording_runs
 from omnibench.errors import DataError
 from omnibench.registry import importers
+from omnibench.words import plural
 
+_NUMBERED = re.compile(r"[_-]?\d+$")
+_PATTERN = r"^(.*?)[_-]?\d+$"
 _FAR = 100.0  # times; wheels' and poses' times that last so differently are in other units; chosen
 
 
@@ -74,6 +78,7 @@ class Csv(Importer):
             for run in options.divided(runs, otherwise=splits)
         ]
         dataset = options.dataset(divided)
+        warnings += _unsaid_commands([recording.name for recording in recordings], dataset)
         if (residual := follows_the_wheels(dataset.trajectories)) is not None:
             warnings.append(
                 "the reference is the robot's odometry, or simulated without noise: some matrix makes its headings of "
@@ -104,6 +109,18 @@ class Csv(Importer):
         if not runs:
             raise _apart(recording)
         return [run.trajectory for run in runs]
+
+
+def _unsaid_commands(names: Sequence[str], dataset: Dataset) -> list[str]:
+    """A word on commands that the names of runs seem to say, where nothing else does: ``left_1``, ``left_2`` ..."""
+    stems = Counter(_NUMBERED.sub("", name) for name in names)
+    said = any(run.command for run in dataset.trajectories)
+    if said or len(stems) < 2 or min(stems.values()) < 2 or "" in stems:
+        return []
+    return [
+        f"names such as {names[0]} look like repetitions of {plural(len(stems), 'command')}; if they are, say --set "
+        f"'command_pattern={_PATTERN}', since noise is known from repetitions"
+    ]
 
 
 def _apart(recording: RecordedStreams) -> DataError:

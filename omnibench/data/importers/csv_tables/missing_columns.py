@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
-from omnibench.data.delimited import CellTable, ColumnError
+from omnibench.data.delimited import DECIMAL_COMMA, CellTable, ColumnError
 from omnibench.data.importers.csv_tables.csv_options import CsvOptions
 from omnibench.data.importers.csv_tables.wanted_columns import Wanted, pose_columns, wheel_columns
 
@@ -62,12 +62,18 @@ def _way_out(table: CellTable, missing: Sequence[Wanted], options: CsvOptions) -
         free = [name for name in table.names if name and name not in taken.values() and name not in used]
         if (likely := _likely(wanted, free, options)) is not None:
             taken[wanted.key] = likely
-    units = "".join(f" --set {unit}" for unit in dict.fromkeys(_units(taken, options)))
+    units = "".join(f" --set {unit}" for unit in dict.fromkeys([*_units(taken, options), *_decimals(table, taken)]))
     if len(taken) < len(missing):
         shown = ", ".join(f"{wanted.key}: {taken.get(wanted.key, 'NAME')}" for wanted in missing)
         return f'name {"it" if len(missing) == 1 else "them"}: --set "columns={{{shown}}}"{units}'
     mapping = ", ".join(f"{key}: {name}" for key, name in taken.items())
     return f'did you mean --set "columns={{{mapping}}}"{units}?'
+
+
+def _decimals(table: CellTable, taken: Mapping[str, str]) -> list[str]:
+    """The option of decimal commas, where cells of the columns have them."""
+    commas = any(DECIMAL_COMMA.fullmatch(cell) for name in taken.values() for cell in table.texts(name))
+    return ["decimal=comma"] if commas else []
 
 
 def _likely(wanted: Wanted, names: Sequence[str], options: CsvOptions) -> str | None:
