@@ -1,30 +1,41 @@
 """Coverage of the 95 % intervals of calibrations from distances, angles, displacements, positions and headings.
 
-    python tests/benchmarks/reference_coverage.py --sets 300
+    python tests/benchmarks/reference_coverage.py --out coverage.jsonl --sets 300 [--kinds distance turn] [--table]
+    python tests/benchmarks/reference_coverage.py --out shrunk.jsonl --sets 100 --robots diff --unidentified shrink
+
+One line of JSON a set, added as it comes: run again with the same file, and it goes on where it was. With --table the
+table is printed from what is there.
 
 Robots are simulated with exact poses, of which this file makes the references: it shares nothing with what fits them.
-Counted are the elements that have an interval, and, of the combinations that the references tell, those that are
-independent in the covariance.
+Their matrices are off the design by 2 % of a row's largest element, or, where answers are shrunk, drawn from the
+design's tolerance, of which shrinkage knows. Counted are the elements that have an interval, and, of the combinations
+that the references tell, those that are independent in the covariance.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
+from scipy.stats import norm
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.references.run_references import Reference, References
 from omnibench.fit.calibrate import calibrate
+from omnibench.fit.observations.open_combinations import WORST
+from omnibench.fit.shrinkage.prior import prior_root, tolerance_of
+from omnibench.fit.span import Unidentified
+from omnibench.processes import one_thread
 from omnibench.robot.calibration import matrix_rows
+from omnibench.robot.kinematics import Robot
 from omnibench.simulate.config import FlowerConfig, Truth
 from omnibench.simulate.simulate import simulate_dataset
 from omnibench.simulate.source import read_simulation
@@ -45,8 +56,10 @@ class Drive:
 
     @property
     def length(self) -> float:
-        """The way along the path, m."""
-        return float(np.hypot(*np.diff(self.poses[:, :2], axis=0).T).sum())
+        """The way along the path, m, of arcs from pose to pose."""
+        chords = np.hypot(*np.diff(self.poses[:, :2], axis=0).T)
+        turns = np.diff(np.unwrap(self.poses[:, 2]))
+        return float((chords / np.sinc(turns / (2 * math.pi))).sum())
 
     def at(self, time: float) -> np.ndarray:
         """The pose (3,) at a time."""
@@ -117,83 +130,159 @@ def _reduced(run: Trajectory, kind: str, rng: np.random.Generator) -> Trajectory
     return replace(run, pose_times=np.zeros(1), poses=np.zeros((1, 3)), references=references)
 
 
-def simulated(robot: str, seed: int, encoder: float = 0.02) -> tuple[Dataset, np.ndarray]:
-    """A simulated data set with exact poses, and the robot's true matrix. encoder: noise of each wheel rate, rad/s."""
+@lru_cache(maxsize=4)
+def simulated(robot: str, seed: int, encoder: float = 0.02, tolerance: bool = False) -> tuple[Dataset, np.ndarray]:
+    """A simulated data set with exact poses, and the robot's true matrix. encoder: noise of each wheel rate, rad/s.
+
+    tolerance: the matrix is drawn from the tolerance of the robot's design.
+    """
     name, changes, length = ROBOTS[robot]
     flower = read_simulation(CONFIGS / f"{name}.yaml").config
     assert isinstance(flower, FlowerConfig)
     train = flower.train.model_copy(update={"seed": 30_000 + seed, "noise_scale": 0.0, "distance": length})
-    design = flower.robot.inverse_kinematic_matrix
-    off = OFF * np.random.default_rng([seed, 7]).normal(size=design.shape) * flower.robot.row_scales[:, None]
-    off[1] *= bool(design[1].any())  # a robot on two fixed wheels does not slide
+    truth = Truth(matrix=matrix_rows(_true_matrix(flower.robot, np.random.default_rng([seed, 7]), tolerance)))
     noise = flower.noise.model_copy(update={"encoder": encoder})
-    truth = Truth(matrix=matrix_rows(design + off))
     made = simulate_dataset(flower.model_copy(update={**changes, "train": train, "truth": truth, "noise": noise}))
     return made.dataset, np.array(made.truth.matrix)
 
 
-@dataclass(frozen=True, eq=False)
-class Coverage:
-    """One set: which intervals hold the truth, of elements (NaN: no interval) and of independent combinations."""
+def _true_matrix(robot: Robot, rng: np.random.Generator, tolerance: bool) -> np.ndarray:
+    design = robot.inverse_kinematic_matrix
+    if tolerance:
+        root = prior_root(robot, tolerance_of(robot))
+        off = (root @ rng.normal(size=root.shape[1])).reshape(design.shape)
+    else:
+        off = OFF * rng.normal(size=design.shape) * robot.row_scales[:, None]
+    off[1] *= bool(design[1].any())  # a robot on two fixed wheels does not slide
+    moved: np.ndarray = design + off
+    return moved
 
-    elements: np.ndarray
-    combinations: np.ndarray
+
+@dataclass(frozen=True)
+class Case:
+    """One line of the table."""
+
+    robot: str
+    kind: str
+    calibrator: str = "trajectory_ml"
+    unidentified: Unidentified = "keep"
+
+    def __str__(self) -> str:
+        return f"{self.robot}, {self.kind}, {self.calibrator}, {self.unidentified}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """Intervals of one set: errors about the truth over the half-widths, of elements and of independent combinations.
+
+    deviations: errors of the combinations in standard deviations. source: of the intervals, or why there are none.
+    """
+
+    case: str
+    seed: int
+    elements: tuple[float, ...]
+    combinations: tuple[float, ...]
+    deviations: tuple[float, ...]
     source: str
 
 
-def covered(seed: int, kind: str, robot: str, calibrator: str, unidentified: Any) -> Coverage:
+def covered(case: Case, seed: int) -> Row:
     """Calibrate one simulated set of references and compare it with its truth."""
-    exact, truth = simulated(robot, seed)
-    dataset = reduced(exact, kind, np.random.default_rng([seed, *kind.encode()]))
-    run = calibrate(dataset, calibrator, unidentified=unidentified, seed=seed)
-    found = run.uncertainty
-    assert found is not None, run.warnings
-    low, high = found.intervals.low, found.intervals.high
-    told = ~np.isnan(low) & (found.standard_deviations > 0)  # a robot that cannot slide has elements that are 0
-    elements = np.where(told, (truth >= low) & (truth <= high), np.nan).ravel()
+    shrinks = case.unidentified == "shrink"
+    exact, truth = simulated(case.robot, seed, tolerance=shrinks)
+    dataset = reduced(exact, case.kind, np.random.default_rng([seed, *case.kind.encode()]))
+    run = calibrate(dataset, case.calibrator, unidentified=case.unidentified, seed=seed)
+    if (found := run.uncertainty) is None:
+        return Row(str(case), seed, (), (), (), "; ".join(run.warnings))
+    reach, spread = ((found.intervals.high - found.intervals.low) / 2).ravel(), found.standard_deviations.ravel()
+    off = (run.calibration.matrix_array - truth).ravel()
+    told = ~np.isnan(reach) & (spread > 0)  # a robot that cannot slide has elements that are 0
     units = np.repeat(dataset.robot.row_scales, truth.shape[1])
     values, vectors = np.linalg.eigh(found.covariance / np.outer(units, units))
-    known = (values > 1e-9 * values.max()) & (values < 0.1**2)
-    away = vectors.T @ ((run.calibration.matrix_array - truth).ravel() / units)
-    reach = (
-        (high - low).ravel()
-        / 2
-        / np.where(found.standard_deviations.ravel() > 0, found.standard_deviations.ravel(), np.nan)
-    )
-    quantile = 1.96 if np.isnan(reach).all() else float(np.nanmedian(reach))
-    return Coverage(elements, (np.abs(away) <= quantile * np.sqrt(np.maximum(values, 0)))[known], found.source)
+    known = (values > 1e-9 * values.max()) & ((values < WORST**2) | shrinks)
+    away = (vectors.T @ (off / units))[known] / np.sqrt(values[known])
+    quantiles = np.where(told, reach / np.where(spread > 0, spread, 1.0), 0.0)
+    shares = np.square(vectors.T[known] * (spread / units)) * told  # of the elements in a combination
+    quantile = (shares @ quantiles) / np.maximum(shares.sum(axis=1), 1e-300)
+    quantile = np.where(shares.any(axis=1), quantile, norm.ppf(0.975))
+    rounded = [tuple(each.round(4).tolist()) for each in (off[told] / reach[told], away / quantile, away)]
+    return Row(str(case), seed, *rounded, f"{found.source}; {run.result.reason}"[:240])
+
+
+def read_rows(path: Path) -> list[Row]:
+    """The rows of a file, none if it is not there; a last line that was cut off is left out."""
+    lines = path.read_text().split("\n")[:-1] if path.exists() else []
+    return [Row(**json.loads(line)) for line in lines]
+
+
+def carry_out(missing: Sequence[tuple[Case, int]], path: Path, workers: int) -> Iterator[Row]:
+    """Fit sets and add each row to the file at once."""
+    written = path.read_bytes() if path.exists() else b""
+    with path.open("wb") as file:
+        file.write(written[: written.rfind(b"\n") + 1])
+    with one_thread(), ProcessPoolExecutor(workers) as pool, path.open("a") as file:
+        for done in as_completed([pool.submit(covered, case, seed) for case, seed in missing]):
+            row = done.result()
+            file.write(json.dumps(asdict(row)) + "\n")
+            file.flush()
+            yield row
+
+
+def table(rows: Iterable[Row], cases: Iterable[Case]) -> Iterator[str]:
+    """A line for every case: share of the intervals that hold the truth, with its 95 % interval by sets.
+
+    deviations: root mean square of the combinations' errors, in standard deviations. without: sets without intervals.
+    """
+    rows = list(rows)
+    yield f"{'':52s} sets   elements, %            combinations, %        deviations   without"
+    for case in cases:
+        every = [row for row in rows if row.case == str(case)]
+        own = [row for row in every if row.combinations]
+        if own:
+            errors = np.concatenate([row.deviations for row in own])
+            yield (
+                f"{case!s:52s} {len(own):4d}   {_share([row.elements for row in own])}   "
+                f"{_share([row.combinations for row in own])}   {np.sqrt(np.mean(errors**2)):.2f}         "
+                f"{len(every) - len(own):4d}"
+            )
+
+
+def _share(errors: Sequence[Sequence[float]]) -> str:
+    """Share of errors within their intervals, %, with its own interval: 1.96 standard errors of a ratio over sets."""
+    hits = np.array([sum(abs(each) <= 1 for each in of_set) for of_set in errors], dtype=float)
+    sizes = np.array([len(of_set) for of_set in errors], dtype=float)
+    if not sizes.any():
+        return f"{'none':19s}"
+    share = hits.sum() / sizes.sum()
+    error = np.sqrt(np.square(hits - share * sizes).sum()) / sizes.sum()
+    return f"{100 * share:5.1f} ({100 * (share - 1.96 * error):5.1f} to {100 * (share + 1.96 * error):5.1f})"
 
 
 def main() -> None:
-    """Print the coverage of every kind of reference."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Fit the sets that are missing, then print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--sets", type=int, default=300)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first set")
     parser.add_argument("--kinds", nargs="*", default=list(KINDS))
     parser.add_argument("--robots", nargs="*", default=list(ROBOTS))
     parser.add_argument("--calibrator", default="trajectory_ml")
     parser.add_argument("--unidentified", default="keep")
-    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--table", action="store_true", help="only print the table")
     arguments = parser.parse_args()
-    with ProcessPoolExecutor(arguments.workers) as pool:
-        for robot in arguments.robots:
-            for kind in arguments.kinds:
-                study = partial(
-                    covered,
-                    kind=kind,
-                    robot=robot,
-                    calibrator=arguments.calibrator,
-                    unidentified=arguments.unidentified,
-                )
-                found = list(pool.map(study, range(arguments.sets)))
-                elements = np.concatenate([each.elements[~np.isnan(each.elements)] for each in found])
-                combinations = np.concatenate([each.combinations for each in found])
-                words = [f"{robot}, {kind}:"]
-                for name, hits in (("elements", elements), ("combinations", combinations)):
-                    share = f"{100 * hits.mean():.1f} %" if len(hits) else "none"
-                    words.append(f"{name} {share} of {len(hits)};")
-                print(*words, found[0].source, flush=True)
-    one = binomtest(round(0.95 * arguments.sets), arguments.sets).proportion_ci(0.95, "wilson")
-    print(f"95 % interval of the coverage of one number, if it is 95 %: {100 * one.low:.1f} to {100 * one.high:.1f} %")
+    cases = [
+        Case(robot, kind, arguments.calibrator, arguments.unidentified)
+        for robot in arguments.robots
+        for kind in arguments.kinds
+    ]
+    rows = read_rows(arguments.out)
+    if not arguments.table:
+        done = {(row.case, row.seed) for row in rows}
+        seeds = range(arguments.first, arguments.first + arguments.sets)
+        missing = [(case, seed) for seed in seeds for case in cases if (str(case), seed) not in done]
+        rows += carry_out(missing, arguments.out, arguments.workers)
+    print("\n".join(table(rows, cases)))
 
 
 if __name__ == "__main__":
