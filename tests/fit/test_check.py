@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from commands import omnibench as command
 from config_robots import experiment
@@ -110,6 +111,19 @@ def test_a_fault_is_found_and_what_is_typed_for_it_mends_it(
     assert program == "omnibench"
     assert command(*words).returncode == 0
     assert kind not in kinds(check("log_mended"))
+
+
+def test_a_data_set_in_ms_is_told_and_mended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_dataset(recording(), "log")
+    for table in ("wheels", "poses"):
+        file = tmp_path / "log" / f"{table}.parquet"
+        frame = pl.read_parquet(file)
+        frame.with_columns(t=frame["t"] * 1000).write_parquet(file)
+    (finding,) = check("log").findings
+    assert finding.kind == "time_unit"
+    assert command(*shlex.split(finding.fix)[1:]).returncode == 0
+    assert check("log_mended").verdict == "ready"
 
 
 def test_a_wheel_that_never_turns_is_dead() -> None:

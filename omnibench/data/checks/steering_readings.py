@@ -24,6 +24,8 @@ _COUNTS = (2.0, 4.0, 0.5, 0.25)  # factors of one wheel of a car
 # degree off. A car's are tried in larger steps, since each needs a fit.
 _LEAST_ZERO, _ZERO_STEP, _CAR_STEP, _CAR_MOST = 4.0, 2.0, 4.0, 40.0
 _SIMPLE, _FITTED = 4.0, 5.0  # cost of a mistake, and of one with a number that is fitted, in units of d^2; chosen
+# Cost of a zero beyond a right angle, which is nearly the same as its wheel counted the other way round; chosen.
+_REVERSED = 9.0
 _BEYOND = 1.9  # rad: angles that steer further may be degrees; chosen
 
 
@@ -101,7 +103,8 @@ def steering_transforms(robot: Robot) -> Iterator[Transform]:
         for degrees in np.arange(-180.0 + _ZERO_STEP, 180.1, _ZERO_STEP).tolist():
             if abs(degrees) >= _LEAST_ZERO:
                 turn = _blocks(drive.pairs, begins, group, rotation(-degrees * DEGREE)[:2, :2])
-                yield Transform(np.eye(3), turn, _FITTED, (zero(robot, group, degrees),))
+                cost = _FITTED if abs(degrees) <= 90 else _REVERSED
+                yield Transform(np.eye(3), turn, cost, (zero(robot, group, degrees),))
     modules = [wheel for wheel, pair in enumerate(drive.pairs) if pair >= 0]
     for first, second in combinations(modules, 2):
         order = np.arange(count)

@@ -13,8 +13,8 @@ from omnibench.data.dataset import Dataset
 from omnibench.data.importer import Importer
 from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.importers.encoder_options import EncoderOptions, Signs
-from omnibench.data.importers.runs.reference_options import RADIANS, HeadingUnit
-from omnibench.data.importers.runs.reread_runs import Columns, reread_runs, scans_of
+from omnibench.data.importers.runs.reference_options import RADIANS, SECONDS, HeadingUnit, TimeUnit
+from omnibench.data.importers.runs.reread_runs import Columns, in_seconds, reread_runs, scans_of
 from omnibench.data.splits import Names, complete
 from omnibench.data.storage import read_recorded
 from omnibench.errors import DataError
@@ -31,6 +31,8 @@ class DatasetOptions(EncoderOptions):
     name: str = Field("dataset", min_length=1, description="name of the data set")
     wheel_columns: Names = Field((), description="its wheels in the robot's order, as [b,a]; default by name")
     wheel_signs: Signs = Field((), description="-1 for wheels that count the other way round, as [-1,1]")
+    wheel_time_unit: TimeUnit = Field("s", description="unit of the times of its wheels, whose rates stay")
+    pose_time_unit: TimeUnit = Field("s", description="unit of the times of its poses")
     steering_columns: Names = Field((), description="its steered wheels in the robot's order; default by name")
     pose_columns: Names = Field(_POSE, description="columns of x, y and heading, as [y,x,theta]")
     heading_unit: HeadingUnit = Field("rad", description="unit of the headings as the data set has them")
@@ -51,7 +53,8 @@ class DatasetOptions(EncoderOptions):
 
 @importers.register("dataset")
 class DatasetFolder(Importer):
-    """A data set folder, read again with options that mend it: units, signs, order of wheels, clocks, cuts, robot.
+    """A data set folder, read again with options that mend it: units, signs, order of wheels, times, clocks, cuts,
+    robot.
 
     Options are relative to what the data set holds: ``wheel_signs=[-1,1,1]`` turns wheel a round, whatever it was
     imported with. The robot is the data set's unless ``robot`` is given. Splits, commands and sessions stay; ``train``
@@ -77,8 +80,9 @@ class DatasetFolder(Importer):
         header = recorded.header
         columns = Columns.of(header.robot, options, options.wheel_columns, options.steering_columns)
         poses = [_POSE.index(column) for column in options.pose_columns]
+        wheel_second, pose_second = SECONDS[options.wheel_time_unit], SECONDS[options.pose_time_unit]
         parts = reread_runs(
-            [columns.read(run, options) for run in recorded.trajectories],
+            [in_seconds(columns.read(run, options), wheel_second, pose_second) for run in recorded.trajectories],
             options,
             poses,
             RADIANS[options.heading_unit],
@@ -94,7 +98,7 @@ class DatasetFolder(Importer):
         ]
         scans = None if recorded.scans is None else scans_of(recorded.scans, parts)
         said = {key: getattr(options, key) or getattr(header, key) for key in ("description", "source", "licence")}
-        said["sample_period"] = options.sample_period or header.sample_period
+        said["sample_period"] = options.sample_period or header.sample_period * wheel_second
         dataset = replace(options.model_copy(update=said).dataset(runs, scans), simulated=header.simulated)
         if not header.simulated and (residual := follows_the_wheels(dataset.trajectories)) is not None:
             warnings.append(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +53,20 @@ def read_source(
         raise DataError(f"{source}: no such file or folder")
     name = form or recognised(source)
     if name == "dataset" and not given:
-        return of_dataset(load_dataset(source), source)
+        return _of_folder(source)
     return _imported(name, source, given)
+
+
+def _of_folder(folder: Path) -> RecordingSource:
+    """A data set folder, in other units of time if it cannot be read, or makes no sense, in s."""
+    try:
+        dataset = load_dataset(folder)
+    except DataError:
+        if (mended := _by_other_times("dataset", folder, {})) is None:
+            raise
+        return replace(mended, folder=folder)
+    mended = _by_other_times("dataset", folder, {}) if _odd_times(dataset) else None
+    return of_dataset(dataset, folder) if mended is None else replace(mended, folder=folder)
 
 
 def of_dataset(dataset: Dataset, folder: Path | None = None) -> RecordingSource:

@@ -77,6 +77,29 @@ def test_headings_in_degrees_are_read_as_they_stand_in_the_table(tmp_path: Path)
     assert odometry_error(again(folder, heading_unit="deg")) < FITS
 
 
+def in_ms(file: Path) -> None:
+    table = pl.read_parquet(file)
+    table.with_columns(t=table["t"] * 1000).write_parquet(file)
+
+
+def test_times_in_ms_are_read_as_such_and_rates_stay(tmp_path: Path) -> None:
+    folder = saved(tmp_path / "data", drive(1), drive(2))
+    first = load_dataset(folder)
+    in_ms(folder / "wheels.parquet")
+    in_ms(folder / "poses.parquet")
+    data = again(folder, wheel_time_unit="ms", pose_time_unit="ms", sample_period=first.sample_period)
+    for run, old in zip(data.trajectories, first.trajectories, strict=True):
+        assert run.times == pytest.approx(old.times)
+        assert run.pose_times == pytest.approx(old.pose_times)
+        assert run.rates == pytest.approx(old.rates)
+
+
+def test_only_the_times_of_the_poses_are_in_ms(tmp_path: Path) -> None:
+    folder = saved(tmp_path / "data", drive(1), drive(2))
+    in_ms(folder / "poses.parquet")
+    assert odometry_error(again(folder, pose_time_unit="ms")) < FITS
+
+
 def test_matched_clocks_are_said_run_by_run(tmp_path: Path) -> None:
     late = drive(1)
     late = replace(late, poses=np.roll(late.poses, 5, axis=0))

@@ -10,12 +10,11 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from omnibench.config import Positive
 from omnibench.data.importers.encoder_options import EncoderOptions, Signs
-from omnibench.data.importers.runs.reference_options import HeadingUnit
+from omnibench.data.importers.runs.reference_options import HeadingUnit, TimeUnit
 from omnibench.data.splits import Names
 from omnibench.errors import nearest
 from omnibench.words import plural
 
-TimeUnit = Literal["s", "ms", "us", "ns"]
 WHEEL_SUFFIXES = ("_wheels.csv", "_wheels.parquet")
 POSE_SUFFIXES = ("_poses.csv", "_poses.tum", "_poses.parquet")
 BLANKS = "blanks"

@@ -12,14 +12,13 @@ from omnibench.data.alignment import median_period
 from omnibench.data.delimited import CellTable, NumberTable
 from omnibench.data.importers.csv_tables.csv_options import CsvOptions
 from omnibench.data.importers.csv_tables.wanted_columns import WantedColumns
-from omnibench.data.importers.runs.reference_options import RADIANS
+from omnibench.data.importers.runs.reference_options import RADIANS, SECONDS
 from omnibench.data.importers.runs.reference_stream import ReferenceStream
 from omnibench.data.importers.wheel_samples import WheelReadings, WheelSamples, wheel_samples
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _MOST_REPEATED = 0.5  # of a table's rows; more mean that its times are too coarse
 
 
@@ -75,7 +74,7 @@ def _stream(
     if 0 < repeated < _MOST_REPEATED * len(fresh):
         numbers = numbers.only(fresh)
         warnings.append(f"{table.file}: {plural(repeated, 'row')} that repeat the {time} of the one before left out")
-    return numbers, numbers.increasing(time) * _SECONDS[unit], names
+    return numbers, numbers.increasing(time) * SECONDS[unit], names
 
 
 def _filled(table: CellTable, names: Sequence[str]) -> NDArray[np.intp]:

@@ -14,6 +14,8 @@ from omnibench.words import plural
 
 PositionUnit = Literal["m", "cm", "mm"]
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+TimeUnit = Literal["s", "ms", "us", "ns"]
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 HeadingUnit = Literal["rad", "deg"]
 RADIANS = {"rad": 1.0, "deg": math.pi / 180}
 Sign = Literal[1, -1]

@@ -56,6 +56,14 @@ class Columns:
         )
 
 
+def in_seconds(run: Trajectory, wheels: float, poses: float) -> Trajectory:
+    """A run whose wheels' and whose poses' times were recorded in units of so many seconds."""
+    if wheels == poses == 1.0:
+        return run
+    duration = None if run.duration is None else run.duration * wheels
+    return replace(run, times=run.times * wheels, pose_times=run.pose_times * poses, duration=duration)
+
+
 def _indices(names: Sequence[str], known: Sequence[str], prefix: str, option: str) -> tuple[int, ...]:
     bare = [name.removeprefix(prefix) for name in names]
     for name in bare:
