@@ -1,7 +1,7 @@
-"""Files that ``omnibench example`` writes: configs and plug-ins to begin with, and a small simulated recording.
+"""Files that ``omnibench example`` writes: configs and plug-ins to begin with, and small recordings.
 
-An example is laid out as the repository is, ``configs`` beside ``plugins``, so that the paths in a config hold.
-Notebooks are the handbook's.
+An example is laid out as the repository is, ``configs`` beside ``plugins``, so that the paths in a config hold;
+a sample recording is laid out as its folder in ``samples``. Notebooks are the handbook's.
 """
 
 from __future__ import annotations
@@ -19,21 +19,23 @@ class Example(Model):
 
     summary: what it is, in one line. files: its files; ``plugins/*`` stands for all plug-ins. commands: what to type
     next, in the folder it was written to. note: what a user must know beforehand. recording: the folder of a data set
-    that is simulated from the first file.
+    that is simulated from the first file. sample: the folder in ``samples`` of a real recording.
     """
 
     name: str
     summary: str
-    files: tuple[str, ...]
+    files: tuple[str, ...] = ()
     commands: tuple[str, ...]
     note: str = ""
     recording: str = ""
+    sample: str = ""
 
 
 class _Catalogue(Model):
     examples: tuple[Example, ...]
 
 
+SAMPLES = Path(__file__).with_name("samples")
 EXAMPLES = read_model(_Catalogue, Path(__file__).with_name("examples.yaml")).examples
 
 
@@ -77,10 +79,11 @@ def bundled_folder() -> Path:
 
 def _contents(example: Example) -> list[tuple[str, bytes]]:
     """The example's files by their path in the folder that it is written to."""
+    places = [(folder, pattern) for pattern in example.files for folder in (bundled_folder(), HANDBOOK)]
+    places += [(SAMPLES / example.sample, "**/*")] if example.sample else []
     return [
         (file.relative_to(folder).as_posix(), file.read_bytes())
-        for pattern in example.files
-        for folder in (bundled_folder(), HANDBOOK)
+        for folder, pattern in places
         for file in sorted(folder.glob(pattern))
         if file.is_file()
     ]

@@ -1,0 +1,116 @@
+"""Pages of the README and the handbook, whose commands are typed one after the other, as a reader types them.
+
+``python tests/cli/typed_pages.py PAGE...`` does so by hand, with the omnibench that is installed, and says how long
+each command took.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+LONGEST = 900  # s, of one command
+ENOUGH = 8.0  # s after which the reader of a command that runs until Ctrl-C has seen enough
+_STREAMS = ("live", "replay", "listen", "record")  # run until Ctrl-C, or as long as the recording that they play
+_TYPED = re.compile(r"^    ((?:omnibench|cd) (?:.*\\\n)*.*)$", re.MULTILINE)
+# ``live`` ends the one before: one node runs a robot. A file is read once ``record`` has ended.
+_ENDED_BY = {"live": ("live",), "import": ("record",)}
+
+
+def shell_commands(markdown: str) -> list[str]:
+    """The commands of a page's indented blocks, as they stand there; those of pip, git and python are left out."""
+    return [re.sub(r"\\\n +", "", command).strip() for command in _TYPED.findall(markdown)]
+
+
+@dataclass
+class Terminal:
+    """A shell in ``folder``, and other terminals for the commands that run until Ctrl-C.
+
+    before: called with every command before it is typed. environment: of the commands.
+    """
+
+    folder: Path
+    before: Callable[[str, Path], None] = lambda _command, _folder: None
+    environment: dict[str, str] = field(default_factory=lambda: dict(os.environ))
+    seconds: dict[str, float] = field(default_factory=dict)
+    _running: list[tuple[str, subprocess.Popen[str]]] = field(default_factory=list)
+
+    def type(self, line: str) -> None:
+        """Run one line to its end, or, where it runs until Ctrl-C, leave it running. AssertionError: it failed."""
+        for command in line.split(" && "):
+            self.before(command, self.folder)
+            began = time.monotonic()
+            self._type(command)
+            self.seconds[command] = time.monotonic() - began
+
+    def close(self) -> None:
+        """Press Ctrl-C in the terminals where something runs still."""
+        for verb in reversed(_STREAMS):
+            self._end(verb)
+
+    def _type(self, command: str) -> None:
+        words = command.split()
+        if words[0] == "cd":
+            self.folder = self.folder / words[1]
+            return None
+        for verb in _ENDED_BY.get(words[1], ()):
+            self._end(verb)
+        process = subprocess.Popen(
+            ["bash", "-c", f"exec {command}"],
+            cwd=self.folder,
+            env=self.environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+        if words[1] not in _STREAMS:
+            return _assert_fine(command, process, process.communicate(timeout=LONGEST)[0])
+        self._running.append((words[1], process))
+        time.sleep(ENOUGH)
+        if process.poll() not in (None, 0):
+            _assert_fine(command, process, process.communicate()[0])
+        return None
+
+    def _end(self, verb: str) -> None:
+        ended = [process for name, process in self._running if name == verb]
+        self._running = [(name, process) for name, process in self._running if name != verb]
+        for process in ended:
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+            printed = process.communicate(timeout=60)[0]
+            assert process.returncode in (0, 130), printed
+            assert "Traceback" not in printed, printed
+
+
+@contextmanager
+def terminal(folder: Path, before: Callable[[str, Path], None] | None = None) -> Iterator[Terminal]:
+    """A terminal in a folder; whatever runs in it at the end is ended."""
+    opened = Terminal(folder, before or (lambda _command, _folder: None))
+    try:
+        yield opened
+    finally:
+        opened.close()
+
+
+def _assert_fine(command: str, process: subprocess.Popen[str], printed: str) -> None:
+    assert process.returncode == 0, f"{command}\nexit {process.returncode}\n{printed}"
+    assert "Traceback" not in printed, f"{command}\n{printed}"
+
+
+if __name__ == "__main__":
+    with terminal(Path.cwd()) as typing:
+        for page in sys.argv[1:]:
+            for line in shell_commands(Path(page).read_text(encoding="utf-8")):
+                typing.type(line)
+        for line, seconds in typing.seconds.items():
+            print(f"{seconds:7.1f} s  {line}")  # noqa: T201
