@@ -193,7 +193,7 @@ def test_a_robot_of_a_fleet_cannot_write_for_another_and_the_node_logs_it(
     assert made.returncode == 0, made.stderr
     for name in ("live_fleet.yaml", "live_fleet_client.yaml"):
         text = (CONFIGS / name).read_text().replace("0.0.0.0:7447", f"127.0.0.1:{port}")
-        (tmp_path / name).write_text(text.replace("base.local:7447", f"127.0.0.1:{port}").replace("screen.", "apr02."))
+        (tmp_path / name).write_text(text.replace("localhost:7447", f"127.0.0.1:{port}").replace("screen.", "apr02."))
     shutil.copy(CONFIGS / "apr02_calibration.yaml", tmp_path)
     client = tmp_path / "live_fleet_client.yaml"
     with Command("live", tmp_path / "live_fleet.yaml") as node:

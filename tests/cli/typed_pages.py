@@ -22,7 +22,7 @@ ENOUGH = 8.0  # s after which the reader of a command that runs until Ctrl-C has
 _STREAMS = ("live", "replay", "listen", "record")  # run until Ctrl-C, or as long as the recording that they play
 _TYPED = re.compile(r"^    ((?:omnibench|cd) (?:.*\\\n)*.*)$", re.MULTILINE)
 # ``live`` ends the one before: one node runs a robot. A file is read once ``record`` has ended.
-_ENDED_BY = {"live": ("live",), "import": ("record",)}
+_ENDED_BY = {"live": ("listen", "record", "replay", "live"), "import": ("record",)}
 
 
 def shell_commands(markdown: str) -> list[str]:
@@ -82,14 +82,21 @@ class Terminal:
         return None
 
     def _end(self, verb: str) -> None:
+        """Press Ctrl-C where a verb runs. AssertionError: one had failed, or did not end in order."""
         ended = [process for name, process in self._running if name == verb]
         self._running = [(name, process) for name, process in self._running if name != verb]
         for process in ended:
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
-            printed = process.communicate(timeout=60)[0]
-            assert process.returncode in (0, 130), printed
-            assert "Traceback" not in printed, printed
+        printed = [process.communicate(timeout=60)[0] for process in ended]
+        for process, text in zip(ended, printed, strict=True):
+            assert process.returncode in (0, 130), text
+            assert "Traceback" not in text, text
+
+    def kill(self) -> None:
+        """End whatever runs still, in no order."""
+        for _, process in self._running:
+            process.kill()
 
 
 @contextmanager
@@ -98,8 +105,9 @@ def terminal(folder: Path, before: Callable[[str, Path], None] | None = None) ->
     opened = Terminal(folder, before or (lambda _command, _folder: None))
     try:
         yield opened
-    finally:
         opened.close()
+    finally:
+        opened.kill()
 
 
 def _assert_fine(command: str, process: subprocess.Popen[str], printed: str) -> None:
