@@ -11,8 +11,8 @@ from omnibench.errors import UnknownNameError
 HANDBOOK = Path(__file__).with_name("handbook")
 
 _GROUP = re.compile(r"^## (.+)$")
-_ENTRY = re.compile(r"^- \[([a-z-]+)\]\(([a-z/-]+\.md)\): (.+)$")
-_LINK = re.compile(r"\[([^\]]+)\]\((?:[./a-z-]*/)?([a-z-]+)\.md(?:#[a-z-]+)?\)")
+_ENTRY = re.compile(r"^- \[([a-z0-9-]+)\]\(([a-z0-9/-]+\.md)\): (.+)$")
+_LINK = re.compile(r"\[([^\]]+)\]\((?:[./a-z-]*/)?([a-z0-9-]+)\.md(?:#[a-z-]+)?\)")
 
 
 @dataclass(frozen=True)

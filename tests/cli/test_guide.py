@@ -6,6 +6,7 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from commands import ROOT, Command, Prepared, assert_refused
@@ -126,12 +127,29 @@ def test_the_handbook_tells_of_every_public_name() -> None:
     assert [name for name in omnibench.__all__ if f"`{name}`" not in text] == []
 
 
-def test_the_config_and_the_robot_that_are_shown_are_right() -> None:
+def test_the_config_that_is_shown_is_right() -> None:
     (config,) = (block for block in blocks(BY_NAME["compare"].file) if block.startswith("name:"))
     CompareConfig.model_validate(yaml.safe_load(config))
-    (robot,) = (block for block in blocks(BY_NAME["getting-started"].file) if block.startswith("name:"))
-    load = TypeAdapter(RobotOption)
-    assert load.validate_python(yaml.safe_load(robot)).wheel_names == ("a", "b", "c")
+
+
+SHOWN = [yaml.safe_load(block[block.index("name:") :]) for block in blocks(BY_NAME["robot"].file) if "name:" in block]
+ROBOTS = {robot["name"]: robot for robot in SHOWN}
+
+
+@pytest.mark.parametrize(("name", "pushed", "turned"), [
+    ("two_wheels", [1, 1], [-1, 1]),
+    ("omni", [-1, 0, 1], [1, 1, 1]),
+    ("mecanum", [1, 1, 1, 1], [-1, 1, -1, 1]),
+])  # fmt: skip
+def test_wheels_count_as_the_page_of_robots_says(name: str, pushed: list[int], turned: list[int]) -> None:
+    robot = TypeAdapter(RobotOption).validate_python(ROBOTS[name])
+    rates = robot.signal_equations @ np.array([[1.0, 0, 0], [0, 0, 1]]).T
+    np.testing.assert_array_equal(np.sign(rates.round(9)).T, [pushed, turned])
+
+
+@pytest.mark.parametrize("name", ["tricycle", "car", "swerve"])
+def test_a_robot_that_steers_is_taken_as_the_page_of_robots_writes_it(name: str) -> None:
+    assert TypeAdapter(RobotOption).validate_python(ROBOTS[name]).drive.steered
 
 
 def test_the_readme_is_short_and_holds_the_test_command_that_ci_looks_for() -> None:
