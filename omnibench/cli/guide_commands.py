@@ -2,7 +2,8 @@
 
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from textwrap import fill
 from typing import Annotated
@@ -12,11 +13,13 @@ import typer
 from omnibench.cli.options import Force, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, say
 from omnibench.errors import ConfigError
+from omnibench.words import plural
 
 guide_app = typer.Typer()
 
 _READING_WIDTH = 100  # columns: longer lines are hard to follow
 _NAME_WIDTH = 15  # columns, of the longest topic
+_MOST_LISTED = 10  # files of a folder that are written out by name
 _NAMES = _NAME_WIDTH + 4  # columns, with the spaces around it
 
 
@@ -52,8 +55,7 @@ def example(
     chosen = find_example(name)
     if output is None:
         raise ConfigError(f"say where the example goes: omnibench example {name} -o DIR")
-    for path in write_example(chosen, output, force=force):
-        typer.echo(f"written: {path}")
+    _list_written(write_example(chosen, output, force=force))
     if chosen.note:
         say(f"note: {chosen.note}")
     typer.echo("to go on, type:")
@@ -62,6 +64,17 @@ def example(
     for command in chosen.commands:
         typer.echo(f"  {command}")
     return print_ending(f"{output} holds the example {name}", "type the lines above")
+
+
+def _list_written(files: Sequence[Path]) -> None:
+    """A line for each file, and one for a folder of many."""
+    for folder, group in groupby(files, lambda file: file.parent):
+        listed = list(group)
+        if len(listed) > _MOST_LISTED:
+            typer.echo(f"written: {folder} ({plural(len(listed), 'file')})")
+        else:
+            for file in listed:
+                typer.echo(f"written: {file}")
 
 
 def _list_topics() -> None:
