@@ -154,7 +154,7 @@ def test_a_robot_that_steers_is_taken_as_the_page_of_robots_writes_it(name: str)
 
 def test_the_readme_is_short_and_holds_the_test_command_that_ci_looks_for() -> None:
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
-    assert len(lines) <= 120
+    assert len(lines) <= 140
     assert [line for line in lines if re.match(r"^    pip install .*\[test\]", line)] == [
         '    pip install -e ".[test]" && pytest -n 4'
     ]
