@@ -35,7 +35,9 @@ def test_the_sample_is_small_and_brings_its_licence() -> None:
     files = [file for file in ROBOT.rglob("*") if file.is_file()]
     assert sum(file.stat().st_size for file in files) <= 300_000
     assert (ROBOT / "LICENSE").read_text(encoding="utf-8").startswith("MIT License")
-    assert sorted(file.stem for file in files if file.suffix == ".csv") == sorted(f"{c}_{r}" for c, r in RUNS)
+    runs = pl.read_csv(ROBOT / "log" / "runs.csv").rows()
+    assert sorted(runs) == sorted((f"{command}_{repetition}", command) for command, repetition in RUNS)
+    assert {file.stem for file in files if file.suffix == ".csv"} == {"runs", *(run for run, _ in runs)}
 
 
 @pytest.mark.skipif(not OPTIODOM.is_dir(), reason=f"{OPTIODOM} is absent: the recordings that the sample is made of")
