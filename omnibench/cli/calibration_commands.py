@@ -132,8 +132,8 @@ def calibrate(
     warn([*recordings.warnings, *run.warnings])
     if result.at_bounds:
         warn([f"on a bound of the box {box!r}: {', '.join(result.at_bounds)}; a wider box may fit better"])
-    if result.held:
-        warn([f"not fitted, kept at the start value by the box {box!r} or the cost: {', '.join(result.held)}"])
+    if run.untouched:
+        warn([f"not fitted, kept at the start value by the box {box!r} or the cost: {', '.join(run.untouched)}"])
     if as_json:
         return print_json(calibration)
     print_calibration(make_console(), run)

@@ -68,6 +68,15 @@ class CalibrationRun(Shown):
     kept: tuple[WheelDirection, ...]
     units: Units
 
+    @property
+    def untouched(self) -> tuple[str, ...]:
+        """Names of the numbers that the box or the cost kept at the design: not those that are 0 for every such robot.
+
+        Row 2 of a robot that its fixed wheels keep from moving sideways is 0 by design, and nothing there is to fit.
+        """
+        sideways = self.calibration.robot.slides or any(self.calibration.matrix[1])
+        return tuple(name for name in self.result.held if sideways or not name.startswith("m2"))
+
 
 def calibrate(
     dataset: Dataset,

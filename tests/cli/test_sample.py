@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import polars as pl
 import pytest
 from real_recordings import OPTIODOM
+from rich.console import Console
 
+import omnibench
 from omnibench.cli.examples import SAMPLES
+from omnibench.cli.terminal.calibration_tables import print_calibration
 
 ROBOT = SAMPLES / "robot"
 # Session of each kind of path, and the runs of each command.
@@ -55,3 +60,14 @@ def test_the_sample_holds_every_second_row_of_its_source(command: str, repetitio
     assert known[::5].all()
     assert known[-1]
     np.testing.assert_allclose(poses[known], source[rows, 1:4][known], rtol=0, atol=6e-5)
+
+
+def test_a_row_that_is_zero_by_design_is_called_so_and_warned_of_nowhere() -> None:
+    options = {"wheel_unit": "ticks/sample", "ticks_per_turn": 2796.8}
+    run = omnibench.calibrate(omnibench.import_dataset("csv", ROBOT / "log", options))
+    console = Console(file=io.StringIO(), width=100)
+    print_calibration(console, run)
+    assert isinstance(console.file, io.StringIO)
+    assert console.file.getvalue().count("by design") == 2
+    assert run.result.held == ("m21", "m22")
+    assert run.untouched == ()

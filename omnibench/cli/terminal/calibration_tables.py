@@ -96,7 +96,7 @@ def _matrix_table(run: CalibrationRun) -> Table:
         motions = " and ".join(f"{each.words} ({each.motion})" for each in run.kept)
         only = f"* only if the design values are right along {motions}: these data say nothing of it, and they are kept"
         notes.append(only if listed else f"the design values are kept along {motions}, of which these data say nothing")
-    if stopped := [*run.result.held, *run.result.at_bounds] if listed else []:
+    if stopped := [*run.untouched, *run.result.at_bounds] if listed else []:
         notes.append(f"{_NONE} of what rests on {', '.join(stopped)}, held by the box or on a bound of it")
     drive, design = calibration.robot.drive, calibration.robot.inverse_kinematic_matrix
     signals = [f"wheel {name}" if drive.direct else name for name in drive.names]
@@ -130,6 +130,8 @@ def _cells(rows: Sequence[Sequence[Cell]]) -> npt.NDArray[np.object_]:
 
 
 def _interval(low: float, high: float, mark: str) -> str:
+    if low == high:
+        return "by design"  # fixed wheels keep the robot from moving sideways
     return _NONE if math.isnan(low) else f"{low:+.7f} to {high:+.7f}{mark}"
 
 
