@@ -91,9 +91,9 @@ class EncoderOptions(ReferenceOptions, ABC):
         ):
             value, given = getattr(self, unit), getattr(self, key)
             if value.startswith("ticks") and not given:
-                raise ValueError(f"{unit} {value} needs {key} ({what})")
+                raise ValueError(f"{unit} {value} needs {key} ({what}): --set {key}=N")
             if given and not value.startswith("ticks"):
-                raise ValueError(f"{key} is for {unit} ticks, not for {value}; set {unit}")
+                raise ValueError(f"{key} is for {unit} ticks, not for {value}; --set {unit}=ticks")
         if isinstance(self.wraps_at, float) and self.quantity != "positions":
             raise ValueError(
                 f"wraps_at is for positions ({', '.join(_POSITIONS)}), not for wheel_unit {self.wheel_unit}"
@@ -181,7 +181,7 @@ class EncoderOptions(ReferenceOptions, ABC):
         if (beyond & (shown == np.round(shown)).all(axis=0)).any():
             raise DataError(
                 f"{place}: the steering angles, read in {unit}, are whole numbers from {shown.min():g} to "
-                f"{shown.max():g}; set steering_unit=ticks and steering_ticks_per_turn, or another steering_unit "
+                f"{shown.max():g}; --set steering_unit=ticks --set steering_ticks_per_turn=N, or another steering_unit "
                 f"({', '.join(_POSITIONS)})"
             )
 
@@ -206,9 +206,9 @@ class EncoderOptions(ReferenceOptions, ABC):
         others = "wraps_at where positions begin again, or fastest if the wheels are that fast"
         whole = (np.abs(counts - np.round(counts)) < _WHOLE).all(axis=0)
         if whole.any() and unit == "rad":  # of other wheels they may be interpolated
-            return DataError(f"{what}; positions are whole numbers: set wheel_unit=ticks and ticks_per_turn")
-        first = "ticks_per_turn" if "ticks" in unit else f"wheel_unit ({', '.join(_POSITIONS)}, rad/s, rpm ...)"
-        return DataError(f"{what}; set {first}, gear_ratio (turns of the motor for one of the wheel), {others}")
+            return DataError(f"{what}; positions are whole numbers: --set wheel_unit=ticks --set ticks_per_turn=N")
+        first = "ticks_per_turn=N" if "ticks" in unit else f"wheel_unit=UNIT ({', '.join(_POSITIONS)}, rad/s, rpm ...)"
+        return DataError(f"{what}; --set {first}, gear_ratio=N (turns of the motor for one of the wheel), {others}")
 
 
 def _restored(counts: Array, times: Array, register: float, place: str, warnings: list[str]) -> Array:

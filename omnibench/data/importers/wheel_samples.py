@@ -81,7 +81,7 @@ class Losses:
         if self.restarts:
             words.append(
                 f"the positions begin anew {plural(self.restarts, 'time')}, faster than any wheel turns (if that is a "
-                "counter that wraps, set wraps_at); runs end there"
+                "counter that wraps, --set wraps_at=N); runs end there"
             )
         if self.repeats:
             repeated = "that repeats the one before" if self.repeats == 1 else "that repeat the ones before"

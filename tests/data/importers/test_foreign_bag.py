@@ -24,12 +24,12 @@ def test_every_error_line_names_the_option_that_leads_on(command: Command, tmp_p
         return ["import", "rosbag", str(foreign_bag), "-o", "data", *said]
 
     assert_refused(command(*attempt()), "key 'robot' is missing (name and wheels: --set robot=FILE.yaml")
-    assert_refused(command(*attempt("robot=robot.yaml")), "whole numbers: set wheel_unit=ticks and ticks_per_turn")
+    assert_refused(command(*attempt("robot=robot.yaml")), "whole numbers: --set wheel_unit=ticks --set ticks_per_turn")
     assert_refused(
         command(*attempt("wheel_unit=ticks")), "needs ticks_per_turn (of the wheel, gear included; of the motor"
     )
     assert_refused(
-        command(*attempt(f"ticks_per_turn={TICKS}")), "set ticks_per_turn, gear_ratio (turns of the motor for"
+        command(*attempt(f"ticks_per_turn={TICKS}")), "set ticks_per_turn=N, gear_ratio=N (turns of the motor for"
     )
     turned = command(*attempt(f"gear_ratio={GEAR}"))
     assert turned.returncode == 0

@@ -102,11 +102,11 @@ def test_ticks_taken_for_radians_are_told_from_a_wrong_gear(tmp_path: Path) -> N
     source = write_table(tmp_path / "log.csv", dict(DRIVE) | {"angle": ticks})
     columns = {"wheel_columns": "angle", "steering_columns": "phi"}
     with pytest.raises(
-        DataError, match=r"log\.csv: .* positions are whole numbers: set wheel_unit=ticks and ticks_per"
+        DataError, match=r"log\.csv: .* positions are whole numbers: --set wheel_unit=ticks --set ticks_per"
     ):
         read(source, **columns, wheel_unit="rad")
     with pytest.raises(
-        DataError, match=r"read in ticks, turn at up to 330 rad/s; set ticks_per_turn, gear_ratio \(turns"
+        DataError, match=r"read in ticks, turn at up to 330 rad/s; --set ticks_per_turn=N, gear_ratio=N \(turns"
     ):
         read(source, **columns, wheel_unit="ticks", ticks_per_turn=2048)
 

@@ -175,7 +175,7 @@ def test_the_command_lists_candidates_in_one_line(command: Command, tmp_path: Pa
     source = write_mcap(tmp_path / "drive", [*part(3), *two])
     (tmp_path / "robot.yaml").write_text(yaml.safe_dump(ROBOT.model_dump(mode="json")))
     run = command("import", "rosbag", source, "-o", "data", "--set", "robot=robot.yaml")
-    assert_refused(run, "set wheel_topic to one of", "/r2/joint_states", "/robot/joint_states")
+    assert_refused(run, "--set wheel_topic=NAME, one of", "/r2/joint_states", "/robot/joint_states")
 
 
 def test_looking_the_importers_up_does_not_load_rosbags() -> None:

@@ -49,7 +49,7 @@ def test_several_candidates_are_listed(tmp_path: Path) -> None:
     source = write_mcap(tmp_path / "drive", [*part(7), *two])
     with pytest.raises(ConfigError) as caught:
         read(source)
-    assert "several topics could be the wheel_topic; set wheel_topic to one of: " in str(caught.value)
+    assert "several topics could be the wheel_topic; --set wheel_topic=NAME, one of: " in str(caught.value)
     count = sum(each.topic == WHEELS for each in part(7))
     assert f"/r2/joint_states (sensor_msgs/msg/JointState, {count} messages), /robot/joint_states" in str(caught.value)
     assert odometry_error(read(source, wheel_topic="/r2/joint_states")) < 1e-9  # its own slam_pose goes with it
@@ -86,7 +86,7 @@ def test_joints_can_be_named(tmp_path: Path) -> None:
     sent = edited(part(12.4), WHEELS, lambda each: changed(each, name=["m3", "m1", "m2"]))
     source = write_mcap(tmp_path / "drive", sent)
     assert odometry_error(read(source, joints=["m3", "m1", "m2"])) < 1e-9
-    with pytest.raises(ConfigError, match=r"which joints are the wheels a, b, c; set joints.*found: m3, m1, m2"):
+    with pytest.raises(ConfigError, match=r"which joints are the wheels a, b, c; --set joints.*found: m3, m1, m2"):
         read(source)
     with pytest.raises(ConfigError, match=r"no joint 'm4'; did you mean 'm3'\? found: m3, m1, m2"):
         read(source, joints=["m4", "m1", "m2"])

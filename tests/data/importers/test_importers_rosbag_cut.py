@@ -49,7 +49,7 @@ def test_runs_keep_a_little_rest_with_a_reference_pose_at_both_ends(bag: Path) -
 def test_shorter_rests_do_not_cut(bag: Path) -> None:
     data = read(bag, least_rest=2.0)
     assert len(data.trajectories) == 1
-    assert "no rest of 2 s cuts it; set cut=topic or cut=windows" in data.warnings[0]
+    assert "no rest of 2 s cuts it; --set cut=topic or cut=windows" in data.warnings[0]
     assert odometry_error(data) < 1e-9
 
 

@@ -101,7 +101,7 @@ def test_positions_in_degrees_are_refused(tmp_path: Path) -> None:
     degrees = edited(
         part(5), WHEELS, lambda each: changed(each, position=np.degrees(each.content["position"]).tolist())
     )
-    with pytest.raises(DataError, match=r"wheels, read in rad, turn at up to \d+ rad/s; set wheel_unit"):
+    with pytest.raises(DataError, match=r"wheels, read in rad, turn at up to \d+ rad/s; --set wheel_unit"):
         read(write_mcap(tmp_path / "drive", degrees))
 
 

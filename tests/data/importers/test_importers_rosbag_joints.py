@@ -82,10 +82,10 @@ def test_velocities_of_joints_may_be_in_rpm_of_the_motor(tmp_path: Path) -> None
 def test_all_wheels_may_come_as_plain_numbers(tmp_path: Path) -> None:
     rows = np.column_stack([np.zeros(len(DRIVE.stamps), dtype=int), ticks(DRIVE.angles[:, [2, 0, 1]])])
     source = write_rosbag1(tmp_path / "drive", [*TRACKER, *numbers("/enc", "Int32MultiArray", rows)])
-    with pytest.raises(ConfigError, match=r"set wheel_topic to one of plain numbers, or to a list .*: /enc \(std_msgs"):
+    with pytest.raises(ConfigError, match=r"--set wheel_topic=NAME of plain numbers, or a list .*: /enc \(std_msgs"):
         read(source)
     with pytest.raises(
-        ConfigError, match=r"set joints \(numbers of elements\), in that order; joints found: 0, 1, 2, 3"
+        ConfigError, match=r"--set joints=.* \(numbers of elements\), in that order; joints found: 0, 1, 2, 3"
     ):
         read(source, wheel_topic="/enc", **TICKS)
     data = read(source, wheel_topic="/enc", joints=[2, 3, 1], **TICKS)
@@ -138,7 +138,8 @@ def test_a_steering_joint_is_known_by_its_name(tmp_path: Path) -> None:
     unnamed = edited(joints, WHEELS, lambda each: changed(each, name=["m1", "front"]))
     source = write_mcap(tmp_path / "other", [*unnamed, *PLACES])
     with pytest.raises(
-        ConfigError, match=r"which joints steer the wheels front; set steering_joints, or steering_topic.*m1, front"
+        ConfigError,
+        match=r"which joints steer the wheels front; --set steering_joints=.*steering_topic.*m1, front",
     ):
         read(source, robot=TRICYCLE, **options)
     assert steered_error(read(source, robot=TRICYCLE, steering_joints="m1", **options)) < 1e-9

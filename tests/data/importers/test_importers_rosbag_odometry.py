@@ -32,7 +32,7 @@ from omnibench.robot.odometry import Integration, WheelLog
 from omnibench.robot.planar import compose, relative
 
 WHEELS_ONLY = [each for each in messages(DRIVE) if each.topic == WHEELS]
-OWN = "is the robot's own odometry: .* set pose_topic to an independent reference"
+OWN = "is the robot's own odometry: .* --set pose_topic=NAME of an independent reference"
 
 
 def odometry(poses: Array, stamps: Array = DRIVE.pose_stamps) -> list[Sent]:

@@ -221,7 +221,7 @@ def test_a_mount_that_nothing_tells_is_said_and_can_be_given(tmp_path: Path) -> 
     source = write_mcap(tmp_path / "drive", with_scans(extra=()))
     data = read(source)
     assert "it is unknown where the scanner (laser) is mounted" in data.warnings[0]
-    assert "set scanner_mount={x: 0.1, y: 0, yaw: 0}" in data.warnings[0]
+    assert "--set 'scanner_mount={x: 0.1, y: 0, yaw: 0}'" in data.warnings[0]
     assert scanner_of(data).mount == Mount()
     given = read(source, scanner_mount={"x": 0.1, "yaw": 3.0})
     assert given.warnings == ()
@@ -285,7 +285,7 @@ def test_the_topic_ending_in_scan_is_taken_and_else_one_must_be_named(tmp_path: 
     assert scanner_of(beside).name == SCAN
     two = [*part(SECONDS), MOUNTED, *elsewhere("/front"), *elsewhere("/rear")]
     source = write_mcap(tmp_path / "two", two)
-    with pytest.raises(ConfigError, match=r"several topics could be the scan_topic; set scan_topic to one of: /front"):
+    with pytest.raises(ConfigError, match=r"could be the scan_topic; --set scan_topic=NAME, one of: /front"):
         read(source)
     assert scanner_of(read(source, scan_topic="rear")).name == "/rear"
     with pytest.raises(ConfigError, match=r"scan_topic: /robot/slam_pose is .*, expected sensor_msgs/msg/LaserScan"):

@@ -139,7 +139,7 @@ def test_a_bag_without_steering_joints_lists_the_joints_that_it_has(tmp_path: Pa
     bare = edited(
         [*JOINTS, *PLACES], WHEELS, lambda each: changed(each, name=NAMES[1:], position=each.content["position"][1:])
     )
-    with pytest.raises(ConfigError, match=r"which joints steer the wheels front; set steering_joints.*found: front_wh"):
+    with pytest.raises(ConfigError, match=r"joints steer the wheels front; --set steering_joints.*found: front_wh"):
         read(tmp_path, bare)
 
 
@@ -161,7 +161,7 @@ def test_ticks_of_a_steering_joint_taken_for_an_angle_are_refused(tmp_path: Path
 
     sent = steering(ticks)
     with pytest.raises(
-        DataError, match=rf"read in {unit}, are whole numbers .* set steering_unit=ticks and steering_t"
+        DataError, match=rf"read in {unit}, are whole numbers .* --set steering_unit=ticks --set steering_t"
     ):
         read(tmp_path, sent, steering_unit=unit)
     data = read(tmp_path, sent, steering_unit="ticks", steering_ticks_per_turn=8192)
@@ -192,6 +192,6 @@ def test_odometry_that_a_robot_made_of_its_steering_is_refused(tmp_path: Path) -
     ):
         read(tmp_path, [*JOINTS, *own])
     with pytest.raises(
-        DataError, match=r"/odom is the robot's own odometry: .* set pose_topic to an independent refer"
+        DataError, match=r"/odom is the robot's own odometry: .* --set pose_topic=NAME of an independent refer"
     ):
         read(tmp_path, [*JOINTS, *own], pose_topic="/odom")

@@ -138,7 +138,7 @@ def cut_into_runs(recording: Recording, options: RosbagOptions, *, alone: bool =
     if not runs:
         return runs, [f"{recording.place}: {_nothing(options)}"]
     if alone and options.cut == "rests" and uncut == len(runs):
-        advice = f"no rest of {options.least_rest:g} s cuts it; set cut=topic or cut=windows for more runs"
+        advice = f"no rest of {options.least_rest:g} s cuts it; --set cut=topic or cut=windows for more runs"
         return runs, [f"{recording.place}: {advice}"]
     return runs, []
 

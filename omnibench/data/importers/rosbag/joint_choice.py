@@ -62,8 +62,8 @@ class JointChoice:
             return ConfigError(f"{place}: no message holds all of {', '.join(self.asked)} once; joints found: {shown}")
         way = " (numbers of elements)" if numbered(found) else f", or {topic}"
         return ConfigError(
-            f"{place}: cannot tell which joints {role} {', '.join(self.wheels)}; set {key}{way}, in that order; "
-            f"joints found: {shown}"
+            f"{place}: cannot tell which joints {role} {', '.join(self.wheels)}; --set {key}=[...]{way}, in that "
+            f"order; joints found: {shown}"
         )
 
 

@@ -67,7 +67,7 @@ def read_wheels(bag: Bag, topics: JointTopics, options: RosbagOptions, warnings:
     steering = _joints(bag, topics.steering, topics, options, warnings, steering=True) if topics.steering else []
     first, *others = wheels + steering
     if len({each.counted for each in wheels}) > 1:
-        raise DataError(f"{bag.path}: some wheel topics hold positions and some velocities; set use=velocities")
+        raise DataError(f"{bag.path}: some wheel topics hold positions and some velocities; --set use=velocities")
     kept = np.flatnonzero(np.logical_and.reduce([_covers(each.stamps, first.stamps) for each in (first, *others)]))
     if len(kept) < 2:
         names = ", ".join(topic.name for topic in dict.fromkeys((*topics.wheels, *topics.steering)))

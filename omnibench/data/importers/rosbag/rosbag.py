@@ -103,7 +103,7 @@ class Rosbag(Importer):
         if doubtful and (residual := follows_the_wheels(dataset.trajectories)) is not None:
             raise DataError(
                 f"{source}: {', '.join(sorted(doubtful))} is the robot's own odometry: some matrix makes its headings "
-                f"of the wheels to {residual:.1g} rad a second, and no error can show; set pose_topic to an "
+                f"of the wheels to {residual:.1g} rad a second, and no error can show; --set pose_topic=NAME of an "
                 "independent reference (motion capture, SLAM), or record one"
             )
         if unreferenced:  # the data set is checked once more when it has its poses

@@ -218,7 +218,7 @@ def _mounting(bag: Bag, frame: str, mount: Mount | None, place: str, warnings: l
     if mounting is None:
         warnings.append(
             f"{place}: it is unknown where the scanner ({frame or 'a frame without a name'}) is mounted (no /tf_static "
-            "from base_link); the robot's middle is taken; set scanner_mount={x: 0.1, y: 0, yaw: 0} (m, rad)"
+            "from base_link); the robot's middle is taken; --set 'scanner_mount={x: 0.1, y: 0, yaw: 0}' (m, rad)"
         )
     return mounting or ScannerMounting(Mount())
 

@@ -45,13 +45,13 @@ def joint_topics(bag: Bag, wheels: Sequence[str], steering: Sequence[str], steer
         numbers = [topic for topic in bag.topics if topic.type in NUMBER_TYPES and topic.messages]
         if not candidates and numbers:
             raise ConfigError(
-                f"{bag.path}: no topic of type {JOINT_TYPES[0]}; set wheel_topic to one of plain numbers, or to a list "
+                f"{bag.path}: no topic of type {JOINT_TYPES[0]}; --set wheel_topic=NAME of plain numbers, or a list "
                 f"of one for each wheel: {_listed(numbers)}"
             )
         named = (_only(bag, "wheel_topic", candidates, "joint_states", JOINT_TYPES),)
     angles = tuple(_named(bag, name, "steering_topic", types, f"{JOINT_TYPES[0]} or {_NUMBERS}") for name in steering)
     if steers and not angles and len(named) > 1:
-        raise ConfigError(f"{bag.path}: every wheel has its own topic; set steering_topic, too")
+        raise ConfigError(f"{bag.path}: every wheel has its own topic; --set steering_topic=[...], too")
     return JointTopics(named, (angles or named) if steers else ())
 
 
@@ -114,7 +114,7 @@ def _only(bag: Bag, key: str, candidates: Sequence[Topic], ending: str, types: S
     chosen = filled if len(filled) == 1 else [topic for topic in filled if _ends_in(topic, ending)]
     if len(chosen) == 1:
         return chosen[0]
-    raise ConfigError(f"{bag.path}: several topics could be the {key}; set {key} to one of: {_listed(filled)}")
+    raise ConfigError(f"{bag.path}: several topics could be the {key}; --set {key}=NAME, one of: {_listed(filled)}")
 
 
 def _listed(topics: Sequence[Topic]) -> str:
