@@ -67,6 +67,12 @@ def import_(
         Literal["diff", "omni3", "mecanum", "tricycle", "car", "swerve", "skid"] | None,
         typer.Option(help="With --template: the robot's type. Default: diff."),
     ] = None,
+    references: Annotated[
+        bool,
+        typer.Option(
+            "--references", help="With --template: distances and turned angles, measured by hand, instead of poses."
+        ),
+    ] = False,
     no_check: Annotated[bool, typer.Option("--no-check", help="Leave out the check of what was recorded.")] = False,
     table_format: TableFormat = "parquet",
     force: Force = False,
@@ -91,7 +97,9 @@ def import_(
     load_given_plugins(plugins, plugin_files)
     entry, given = importers.entry(importer, "import"), parse_settings(settings)
     if template is not None:
-        return _write_template(importer, template, robot_type or "diff", force, source, output)
+        return _write_template(importer, template, robot_type or "diff", references, force, source, output)
+    if references:
+        raise ConfigError("--references is for --template DIR; a references.csv among the tables is read by itself")
     if robot_type is not None:
         raise ConfigError("--robot-type is for --template DIR; the robot of a recording is --set robot=FILE")
     if source is None or output is None:
@@ -150,7 +158,13 @@ def _checked(read: "RecordingSource", output: Path) -> tuple[str, tuple[str | Pa
 
 
 def _write_template(
-    importer: str, folder: Path, robot_type: str, force: bool, source: Path | None, output: Path | None
+    importer: str,
+    folder: Path,
+    robot_type: str,
+    references: bool,
+    force: bool,
+    source: Path | None,
+    output: Path | None,
 ) -> None:
     """Write tables and robot.yaml to fill in, and say what to type then."""
     from omnibench.data.importers.csv_tables.csv_template import write_template
@@ -161,7 +175,7 @@ def _write_template(
     if source is not None or output is not None:
         raise ConfigError("--template DIR writes tables to fill in; leave SOURCE and -o out")
     refuse_existing(folder, force=force, folders=True)
-    files = write_template(folder, robot_type)
+    files = write_template(folder, robot_type, references=references)
     typer.echo(f"{plural(len(files), 'file')}: {folder}")
     for file in files:
         typer.echo(f"  {file.name}", err=True)

@@ -80,6 +80,15 @@ def test_a_template_imports_as_it_is_written(command: Command, tmp_path: Path, r
     assert [(run.id, run.command, run.repetition) for run in runs[:2]] == [("left_1", "left", 1), ("left_2", "left", 2)]
 
 
+def test_a_template_of_references_imports_and_calibrates_as_it_is_written(command: Command, tmp_path: Path) -> None:
+    made = command("import", "csv", "--template", tmp_path / "log", "--references")
+    assert made.returncode == 0, made.stderr
+    done = command("import", "csv", tmp_path / "log", "-o", tmp_path / "data")
+    assert (done.returncode, "warning" in done.stderr) == (0, False), done.stderr
+    fitted = command("calibrate", tmp_path / "data", "-o", tmp_path / "calibration.yaml")
+    assert fitted.returncode == 0, fitted.stderr
+
+
 def test_import_says_what_lacks(command: Command, filled_in: Path) -> None:
     assert_refused(command("import", "csv"), "say SOURCE, the file or folder with the recordings")
     assert_refused(command("import", "csv", filled_in), "say -o DIR, the folder to write")

@@ -58,8 +58,8 @@ class DatasetFolder(Importer):
 
     Options are relative to what the data set holds: ``wheel_signs=[-1,1,1]`` turns wheel a round, whatever it was
     imported with. The robot is the data set's unless ``robot`` is given. Splits, commands and sessions stay; ``train``
-    and ``validation`` divide the runs anew. Distances, turns and the like that were measured in the place of poses stay
-    as they are; a run that is cut loses them.
+    and ``validation`` divide the runs anew. Units, signs and clocks hold for distances, turns and the like, too, that
+    were measured in the place of poses; a run that is cut keeps those within one of its parts.
     """
 
     Options = DatasetOptions

@@ -25,6 +25,14 @@ def reference_flaw(references: References, times: Array) -> Flaw | None:
     return None
 
 
+def measurement_flaw(references: References) -> Flaw | None:
+    """The first flaw in kinds, values and standard deviations, whatever their times; None if there is none."""
+    for row, kind in enumerate(references.kinds.tolist()):
+        if what := _kind_flaw(kind) or _numbers_flaw(kind, references.values[row], references.sigmas[row]):
+            return row, what
+    return None
+
+
 def _kind_flaw(kind: str) -> str:
     if kind in KINDS:
         return ""

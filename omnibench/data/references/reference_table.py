@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from omnibench.data.references.reference_columns import NUMBERS, references_of
 from omnibench.data.references.reference_flaws import reference_flaw
 from omnibench.data.references.run_references import AT_ONE_TIME, PLANAR, References
 from omnibench.data.tables.table import Table
@@ -19,7 +20,6 @@ from omnibench.robot.kinematics import Array
 
 TABLE = "references"
 REFERENCE_COLUMNS = ("trajectory", "kind")  # those that every such table has
-_NUMBERS = ("t0", "t1", "value", "value_x", "value_y", "sigma", "sigma_x", "sigma_y")
 
 
 def read_references(
@@ -34,7 +34,7 @@ def read_references(
         return {}
     owners, kinds = table.frame["trajectory"], table.frame["kind"]
     table.refuse(~owners.is_in(list(wheel_times)), lambda row: f"trajectory {owners[row]} is not in {runs_file}")
-    numbers = {name: _column(table, name) for name in _NUMBERS}
+    numbers = {name: _column(table, name) for name in NUMBERS}
     texts = np.array(["" if kind is None else str(kind).strip() for kind in kinds], dtype=str)
     found: dict[str, References] = {}
     names = owners.to_list()
@@ -42,7 +42,8 @@ def read_references(
         rows = np.array([index for index, name in enumerate(names) if name == run], dtype=np.intp)
         if not len(rows):
             continue
-        references = _of_rows(rows, texts, numbers, float(times[-1]), run in started)
+        chosen = {name: values[rows] for name, values in numbers.items()}
+        references = references_of(texts[rows], chosen, start_known=run in started).of_run(0.0, float(times[-1]))
         if (flaw := reference_flaw(references, times)) is not None:
             raise table.fail(int(rows[flaw[0]]), flaw[1])
         found[run] = references.by_time()
@@ -64,7 +65,7 @@ def reference_frame(references: Sequence[tuple[str, References]]) -> pl.DataFram
             )
             rows.append({"trajectory": run, "t0": start, "t1": t1, "kind": kind} | numbers)
     schema = {"trajectory": pl.String, "t0": pl.Float64, "t1": pl.Float64, "kind": pl.String}
-    frame = pl.DataFrame(rows, schema=schema | dict.fromkeys(_NUMBERS[2:], pl.Float64))
+    frame = pl.DataFrame(rows, schema=schema | dict.fromkeys(NUMBERS[2:], pl.Float64))
     return frame.select(column for column in frame.iter_columns() if column.null_count() < len(frame))
 
 
@@ -72,24 +73,7 @@ def _column(table: Table, name: str) -> Array:
     """A column of numbers (rows,), NaN where a cell is empty or the column is missing."""
     if name not in table.frame.columns:
         return np.full(len(table.frame), np.nan)
-    return table.floats(name).fill_null(np.nan).to_numpy()
-
-
-def _of_rows(rows: Any, kinds: Any, numbers: Mapping[str, Array], end: float, start_known: bool) -> References:
-    """The references in some rows of a table, of a run that ends after ``end`` s."""
-    chosen = {name: values[rows] for name, values in numbers.items()}
-    of_rows = kinds[rows]
-    planar, instant = np.isin(of_rows, list(PLANAR)), np.isin(of_rows, list(AT_ONE_TIME))
-    t1 = np.where(np.isnan(chosen["t1"]), end, chosen["t1"])
-    t0 = np.where(np.isnan(chosen["t0"]), np.where(instant, t1, 0.0), chosen["t0"])
-    both = chosen["sigma"]
-    values = np.column_stack([np.where(planar, chosen["value_x"], chosen["value"]), chosen["value_y"]])
-    sigmas = np.column_stack(
-        [np.where(planar, _filled(chosen["sigma_x"], both), both), _filled(chosen["sigma_y"], both)]
-    )
-    values[~planar, 1] = sigmas[~planar, 1] = np.nan
-    return References(of_rows, t0, t1, values, sigmas, start_known)
-
-
-def _filled(values: Array, others: Array) -> Array:
-    return np.where(np.isnan(values), others, values)
+    values = table.floats(name).fill_null(np.nan).to_numpy()
+    if name in ("t0", "t1"):
+        table.refuse(np.isinf(values), lambda row: f"{name} is {values[row]}; remove or repair the row")
+    return values

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from omnibench.data.checks.misfit import UnitWarning
 from omnibench.data.references.run_references import KINDS, UNITS, References
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
@@ -14,6 +15,7 @@ from omnibench.robot.odometry import WheelLog
 
 # How many times too large references in another unit are, and that unit.
 _FACTORS = {"m": ((1000.0, "mm"), (100.0, "cm")), "rad": ((float(np.degrees(1)), "degrees"),)}
+_SHORT = {"degrees": "deg"}
 _NEAR = 1.5  # a ratio to the odometry within this factor of a unit's is that unit; chosen: designs are off by less
 _LEAST = {"m": 0.02, "rad": 0.05}  # m, rad: motions that are smaller tell nothing of a unit; chosen
 
@@ -38,9 +40,12 @@ def _warnings(kind: str, ratios: Sequence[float]) -> list[str]:
     ratio = float(np.median(ratios))
     for factor, unit in _FACTORS[UNITS[kind]]:
         if factor / _NEAR < ratio < factor * _NEAR:
+            option = f"heading_unit={_SHORT[unit]}" if UNITS[kind] == "rad" else f"position_unit={unit}"
             return [
-                f"references of kind {kind} are {ratio:.3g} times what the wheels say, as if they were in {unit}: they "
-                f"must be in {UNITS[kind]}"
+                UnitWarning(
+                    f"references of kind {kind} are {ratio:.3g} times what the wheels say, as if they were in {unit}: "
+                    f"they must be in {UNITS[kind]} (import with --set {option})"
+                )
             ]
     return []
 

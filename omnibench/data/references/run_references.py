@@ -46,7 +46,8 @@ class References:
 
     kinds (R,): of KINDS. t0, t1 (R,): s; equal for what is measured at one time. values, sigmas (R, 2): the second of
     kinds of one number is NaN. start_known: True if the run's start pose is known in the frame of positions and
-    headings; else it is a nuisance of the run.
+    headings; else it is a nuisance of the run. Before a recording is cut into runs, -inf is the start of a run to come,
+    and inf its end.
     """
 
     kinds: NDArray[np.str_]
@@ -97,6 +98,23 @@ class References:
     def with_values(self, values: Array) -> References:
         """These measurements with other values (R, 2)."""
         return References(self.kinds, self.t0, self.t1, values, self.sigmas, self.start_known)
+
+    def of_run(self, zero: float, end: float, kept: NDArray[np.bool_] | slice = slice(None)) -> References:
+        """These measurements, or those kept (R,), by the time of a run that began at ``zero`` and lasted ``end`` s.
+
+        t0 = -inf becomes the run's start, and t1 = inf its end.
+        """
+        kinds, t0, t1 = self.kinds[kept], self.t0[kept] - zero, self.t1[kept] - zero
+        t0, t1 = np.where(np.isneginf(t0), 0.0, t0), np.where(np.isposinf(t1), end, t1)
+        t0 = np.where(np.isposinf(t0), t1, t0)
+        return References(kinds, t0, t1, self.values[kept], self.sigmas[kept], self.start_known)
+
+    def open_ended(self, end: float) -> References:
+        """These measurements of a run of ``end`` s, with -inf for its start and inf for its end: see ``of_run``."""
+        spans = self.t0 < self.t1
+        t0 = np.where(spans & (self.t0 == 0), -np.inf, self.t0)
+        t1 = np.where(spans & (self.t1 == end) & (self.kinds != "heading"), np.inf, self.t1)
+        return References(self.kinds, t0, t1, self.values, self.sigmas, self.start_known)
 
     @property
     def content(self) -> tuple[Hashable, ...]:

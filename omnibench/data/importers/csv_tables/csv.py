@@ -37,6 +37,7 @@ class Csv(Importer):
         one table      the same with a column run, which names the run of each row
         three tables   wheels.csv and poses.csv, both with a column run, and runs.csv with run, command, repetition,
                        split, session (each optional; runs.csv may stand beside any other tables, too)
+        references     <run>_references.csv, or references.csv with a column run, beside poses or in their place
 
     ``robot`` (a YAML file or a mapping; robot.yaml in the source is found) is the only option that must be given; with
     ``omnibench import csv --template DIR`` come tables and a robot to fill in. Columns are named in a header, in any
@@ -49,6 +50,10 @@ class Csv(Importer):
     on where they can be recognised, or ``wraps_at`` gives the value (65536, 2^32, 360 deg). ``gear_ratio`` is for
     encoders at the motor. A run ends where positions begin anew. The sense of a positive rate is in ``omnibench guide
     conventions``; ``wheel_signs: [-1, 1, 1]`` turns a wheel round. Steering angles are those at the rows' times.
+
+    references: what was measured without motion capture, a row each with its kind (distance, turn, displacement,
+    position, heading), value or value_x and value_y, sigma (or sigma_x, sigma_y), and t0 and t1, which are empty for
+    the whole run (``omnibench guide references``). The options of unit, sign and time of the poses hold for them, too.
 
     times: in any epoch (unix time, say), wheels and poses by one clock, or ``clocks=match`` finds what is between them.
     t = 0 becomes the first pose, or, where poses begin before the wheels, the begin of the wheels with the pose
@@ -126,6 +131,11 @@ def _unsaid_commands(names: Sequence[str], dataset: Dataset) -> list[str]:
 def _apart(recording: RecordedStreams) -> DataError:
     """The error of wheels and poses that share no time."""
     samples, times = recording.samples, recording.reference.times
+    if len(times) < 2 and recording.reference.measured is not None:
+        return DataError(
+            f"{recording.place}: none of its references lies within its wheels' samples, {samples.begins[0]:.10g} to "
+            f"{samples.ends[-1]:.10g} s; times count by the wheels' clock (--set pose_time_unit=ms, pose_time_offset=S)"
+        )
     spans = f"poses {times[0]:.10g} to {times[-1]:.10g} s, wheels {samples.begins[0]:.10g} to {samples.ends[-1]:.10g} s"
     share = (times[-1] - times[0]) / (samples.ends[-1] - samples.begins[0])
     way = "check time units (--set wheel_time_unit=ms, pose_time_unit=ms), or --set clocks=match for clocks apart"

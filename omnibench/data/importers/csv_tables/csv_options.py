@@ -16,6 +16,7 @@ from omnibench.errors import nearest
 from omnibench.words import plural
 
 WHEEL_SUFFIXES = ("_wheels.csv", "_wheels.parquet")
+REFERENCE_SUFFIXES = ("_references.csv", "_references.parquet")
 POSE_SUFFIXES = ("_poses.csv", "_poses.tum", "_poses.parquet")
 BLANKS = "blanks"
 _SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t"}

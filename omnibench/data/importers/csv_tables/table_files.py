@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from omnibench.data.delimited import AUTO, CellTable, NoRowsError, read_cells
-from omnibench.data.importers.csv_tables.csv_options import BLANKS, POSE_SUFFIXES, WHEEL_SUFFIXES, CsvOptions
+from omnibench.data.importers.csv_tables.csv_options import (
+    BLANKS,
+    POSE_SUFFIXES,
+    REFERENCE_SUFFIXES,
+    WHEEL_SUFFIXES,
+    CsvOptions,
+)
 from omnibench.data.importers.csv_tables.missing_columns import missing_error
-from omnibench.data.importers.csv_tables.wanted_columns import Wanted, pose_columns, wheel_columns
+from omnibench.data.importers.csv_tables.wanted_columns import Wanted, WantedColumns, pose_columns, wheel_columns
 from omnibench.errors import DataError
 from omnibench.words import some
 
@@ -20,11 +26,20 @@ _TEMPLATE = "omnibench import csv --template DIR writes tables to fill in"
 
 @dataclass(frozen=True)
 class TablePair:
-    """The files of wheels and of poses of a recording; one file where they stand in the same rows."""
+    """The files of wheels and of poses of a recording; one file where they stand in the same rows.
+
+    references: that of distances, turns and the like, of this recording or of all; without poses there is one.
+    """
 
     name: str
     wheels: Path
-    poses: Path
+    poses: Path | None
+    references: Path | None = None
+
+    @property
+    def place(self) -> Path:
+        """The file of the reference, for messages."""
+        return self.poses or self.references or self.wheels
 
 
 def find_tables(source: Path, options: CsvOptions, warnings: list[str]) -> list[TablePair]:
@@ -32,11 +47,30 @@ def find_tables(source: Path, options: CsvOptions, warnings: list[str]) -> list[
     if source.is_file():
         return [_of_file(source, options)]
     wheels, poses = _by_suffix(source, _wheel_suffixes(options)), _by_suffix(source, _pose_suffixes(options))
+    references = _References(_by_suffix(source, REFERENCE_SUFFIXES), _common(source))
     if wheels or (poses and options.wheel_suffix):
-        return _pairs(wheels, poses, options)
+        return _pairs(wheels, poses, references, options)
     if options.wheel_suffix:
         raise DataError(f"{source}: no *{options.wheel_suffix} below it; --set wheel_suffix=ENDING for other names")
-    return _by_headers(source, options, warnings)
+    return _by_headers(source, references, options, warnings)
+
+
+@dataclass(frozen=True)
+class _References:
+    """The tables of references: of recordings by their names, and one beside all of them."""
+
+    own: Mapping[str, Path]
+    common: Path | None
+
+    def of(self, name: str) -> Path | None:
+        """The table that may hold references of a recording."""
+        return self.own.get(name, self.common)
+
+
+def _common(folder: Path) -> Path | None:
+    """The table of references of all runs in a folder."""
+    names = [suffix.lstrip("_") for suffix in REFERENCE_SUFFIXES]
+    return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
 def load(file: Path, options: CsvOptions) -> CellTable:
@@ -72,11 +106,27 @@ def _of_file(source: Path, options: CsvOptions) -> TablePair:
         bare = source.name == ending.lstrip("_-.")
         if name == source.name and not bare:
             continue
-        for suffix in _pose_suffixes(options):
-            beside = source.with_name(suffix.lstrip("_-.") if bare else name + suffix)
-            if beside.is_file() and beside != source:
-                return TablePair(source.resolve().parent.name if bare else name, source, beside)
-    return TablePair(source.stem, source, source)
+        recording = source.resolve().parent.name if bare else name
+        poses, references = (
+            _next_to(source, [suffix.lstrip("_-.") if bare else name + suffix for suffix in suffixes])
+            for suffixes in (_pose_suffixes(options), REFERENCE_SUFFIXES)
+        )
+        references = references or _common(source.parent)
+        if poses or references:
+            return TablePair(recording, source, poses, references)
+    table, references = load(source, options), _common(source.parent)
+    posed = references is None or not _all_missing(pose_columns(options, shared=True), table)
+    return TablePair(source.stem, source, source if posed else None, references)
+
+
+def _next_to(source: Path, names: Sequence[str]) -> Path | None:
+    beside = [source.with_name(name) for name in names]
+    return next((file for file in beside if file.is_file() and file != source), None)
+
+
+def _all_missing(wanted: WantedColumns, table: CellTable) -> bool:
+    """True if a table has none of the values of a stream."""
+    return all(value.found(table) is None for value in wanted.values)
 
 
 def _by_suffix(source: Path, suffixes: Sequence[str]) -> dict[str, Path]:
@@ -93,42 +143,49 @@ def _by_suffix(source: Path, suffixes: Sequence[str]) -> dict[str, Path]:
     return found
 
 
-def _pairs(wheels: dict[str, Path], poses: dict[str, Path], options: CsvOptions) -> list[TablePair]:
+def _pairs(
+    wheels: dict[str, Path], poses: dict[str, Path], references: _References, options: CsvOptions
+) -> list[TablePair]:
     for name in sorted(wheels):
-        if name not in poses:
+        if name not in poses and references.of(name) is None:
             missing = " or ".join(name + suffix for suffix in _pose_suffixes(options))
             raise DataError(
                 f"{wheels[name]}: run {name!r} has no {missing}; --set pose_suffix=ENDING for other names, or name "
-                "this file as the source if it holds the poses, too"
+                "this file as the source if it holds the poses, too; distances, turns and the like go into "
+                f"{name}{REFERENCE_SUFFIXES[0]} (omnibench guide references)"
             )
-    for name in sorted(poses):
+    own = {name: file for name, file in references.own.items() if file != references.common}
+    for name, file in sorted({**own, **poses}.items()):
         if name not in wheels:
             missing = name + _wheel_suffixes(options)[0]
-            raise DataError(f"{poses[name]}: run {name!r} has no {missing}; --set wheel_suffix=ENDING for other names")
-    return [TablePair(name, wheels[name], poses[name]) for name in sorted(wheels)]
+            raise DataError(f"{file}: run {name!r} has no {missing}; --set wheel_suffix=ENDING for other names")
+    return [TablePair(name, wheels[name], poses.get(name), references.of(name)) for name in sorted(wheels)]
 
 
-def _by_headers(source: Path, options: CsvOptions, warnings: list[str]) -> list[TablePair]:
-    """The tables under a folder whose headers hold columns of wheels and of poses."""
-    files = [file for file in _tables(source) if file.name not in RUN_TABLES]
+def _by_headers(source: Path, references: _References, options: CsvOptions, warnings: list[str]) -> list[TablePair]:
+    """The tables under a folder whose headers hold columns of wheels and of poses, or of wheels with references."""
+    measured = {*references.own.values(), references.common}
+    files = [file for file in _tables(source) if file.name not in RUN_TABLES and file not in measured]
     if not files:
         raise DataError(
             f"{source}: no tables below it; a recording is a pair <run>_wheels.csv and <run>_poses.csv, or one table "
             f"of both ({_TEMPLATE})"
         )
     lacking: dict[Path, tuple[CellTable, list[Wanted]]] = {}
-    fitting = []
+    fitting: list[TablePair] = []
     for file in files:
         try:
             table = load(file, options)
         except NoRowsError:
             warnings.append(f"{file}: left out, as it has no rows")
             continue
-        missing = [*wheel_columns(options).missing(table), *pose_columns(options, shared=True).missing(table)]
+        name, wanted = _stem(file, source), pose_columns(options, shared=True)
+        posed = references.of(name) is None or not _all_missing(wanted, table)
+        missing = [*wheel_columns(options).missing(table), *(wanted.missing(table) if posed else ())]
         if missing:
             lacking[file] = table, list(dict.fromkeys(missing))
         else:
-            fitting.append(file)
+            fitting.append(TablePair(name, file, file if posed else None, references.of(name)))
     if not fitting:
         if not lacking:
             raise DataError(f"{source}: none of its tables has rows ({_TEMPLATE})")
@@ -137,7 +194,7 @@ def _by_headers(source: Path, options: CsvOptions, warnings: list[str]) -> list[
     if lacking:
         others = some([file.relative_to(source).as_posix() for file in lacking])
         warnings.append(f"tables without columns of wheels and poses were left out: {others}")
-    return [TablePair(_stem(file, source), file, file) for file in fitting]
+    return fitting
 
 
 def _tables(source: Path) -> Iterable[Path]:

@@ -12,7 +12,7 @@ from omnibench.data.alignment import median_period
 from omnibench.data.delimited import CellTable, NumberTable
 from omnibench.data.importers.csv_tables.csv_options import CsvOptions
 from omnibench.data.importers.csv_tables.wanted_columns import WantedColumns
-from omnibench.data.importers.runs.reference_options import RADIANS, SECONDS
+from omnibench.data.importers.runs.reference_options import SECONDS
 from omnibench.data.importers.runs.reference_stream import ReferenceStream
 from omnibench.data.importers.wheel_samples import WheelReadings, WheelSamples, wheel_samples
 from omnibench.errors import DataError
@@ -46,12 +46,12 @@ def read_wheels(
 def read_poses(
     table: CellTable, wanted: WantedColumns, options: CsvOptions, warnings: list[str], *, shared: bool
 ) -> ReferenceStream:
-    """The reference poses of the rows of a run as the options say. shared: wheels stand in the same rows."""
+    """The reference poses of the rows of a run as they were recorded. shared: wheels stand in the same rows."""
     unit = options.pose_time_unit or (options.wheel_time_unit if shared else "s")
     said: list[str] = []
     numbers, times, names = _stream(table, wanted, unit, said, shared)
     warnings.extend(() if shared else said)  # of the same rows it was said
-    return ReferenceStream(times, numbers.columns(names)).read_as(options, RADIANS[options.heading_unit])
+    return ReferenceStream(times, numbers.columns(names))
 
 
 def _stream(

@@ -33,8 +33,11 @@ def cut_run(
 ) -> CutRun | None:
     """The run of the chosen samples and the poses that were seen then; None if it has not two poses.
 
-    whole: the recording as a run, whose id, split and command are taken over; its arrays are replaced.
+    whole: the recording as a run, whose id, split and command are taken over; its arrays are replaced. A recording that
+    has references of other kinds, and a start pose at most, begins with its wheels.
     """
+    if len(reference.times) < 2 and reference.measured is not None:
+        return _without_poses(whole, samples, chosen, reference)
     times, poses = reference.times[seen], reference.poses[seen]
     if len(times) < 2:
         return None
@@ -42,17 +45,37 @@ def cut_run(
     if aligned is None:
         return None
     kept = chosen[aligned.kept]
-    ends = samples.ends[kept] - aligned.zero
     shown = np.searchsorted(reference.times, aligned.pose_times + (aligned.zero - _SAME_TIME / 2))
     trajectory = replace(
-        whole,
-        times=ends,
-        rates=samples.rates[kept],
+        _sampled(whole, samples, kept, aligned.zero),
         pose_times=aligned.pose_times,
         poses=aligned.poses,
-        duration=float(ends[-1]),
-        angles=None if samples.angles is None else samples.angles[kept],
-        steering=None if samples.steering is None else samples.steering[kept],
         pose_covariances=None if reference.covariances is None else reference.covariances[shown],
     )
     return CutRun(trajectory, aligned.zero, kept)
+
+
+def _without_poses(
+    whole: Trajectory, samples: WheelSamples, chosen: NDArray[np.intp], reference: ReferenceStream
+) -> CutRun:
+    """The run of the chosen samples, from the one pose there is or from the origin of a frame of its own."""
+    zero = float(samples.begins[chosen[0]])
+    start = reference.poses if len(reference.poses) else np.zeros((1, 3))
+    return CutRun(
+        replace(_sampled(whole, samples, chosen, zero), pose_times=np.zeros(1), poses=start, pose_covariances=None),
+        zero,
+        chosen,
+    )
+
+
+def _sampled(whole: Trajectory, samples: WheelSamples, kept: NDArray[np.intp], zero: float) -> Trajectory:
+    """The recording's run with the wheel samples that are kept, from a time of the recording on, s."""
+    ends = samples.ends[kept] - zero
+    return replace(
+        whole,
+        times=ends,
+        rates=samples.rates[kept],
+        duration=float(ends[-1]),
+        angles=None if samples.angles is None else samples.angles[kept],
+        steering=None if samples.steering is None else samples.steering[kept],
+    )

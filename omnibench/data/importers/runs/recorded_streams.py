@@ -34,11 +34,12 @@ def by_one_clock(
     """The recordings with poses by the wheels' clock, which is matched if the options say so, and said then."""
     if options.clocks == "same":
         return list(recordings)
-    begun = [_begun_together(recording) for recording in recordings]
-    search = {} if begun == list(recordings) else {"search": _UNKNOWN}
+    posed = [recording for recording in recordings if len(recording.reference.times) > 1]
+    begun = [_begun_together(recording) for recording in posed]
+    search = {} if begun == posed else {"search": _UNKNOWN}
     matches = match_clocks(options.robot, [_streams(options.robot, each) for each in begun], **search)
     matched, said, unknown = [], [], []
-    for given, recording, match in zip(recordings, begun, matches, strict=True):
+    for given, recording, match in zip(posed, begun, matches, strict=True):
         if match is None:
             matched.append(given)
             unknown.append(given.name)
@@ -55,7 +56,8 @@ def by_one_clock(
             f"clocks not matched, as the motion is too short or too even: {some(unknown)}; give "
             "--set pose_time_offset=SECONDS, or drive with more turns"
         )
-    return matched
+    by_name = {recording.name: recording for recording in matched}
+    return [by_name.get(recording.name, recording) for recording in recordings]
 
 
 def _begun_together(recording: RecordedStreams) -> RecordedStreams:

@@ -10,6 +10,7 @@ import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.data.importers.runs.cut_run import CutRun, cut_run
+from omnibench.data.importers.runs.measured_runs import with_measured
 from omnibench.data.importers.runs.reference_options import ReferenceOptions
 from omnibench.data.importers.runs.reference_stream import ReferenceStream
 from omnibench.data.importers.runs.run_spans import Span, breaks, from_rest, parted
@@ -72,7 +73,7 @@ def recording_runs(
     if runs and any(reasons.values()):
         said = ", ".join(reason for reason, count in reasons.items() if count)
         notes.append(f"{place}: {sum(reasons.values())} of {plural(len(pieces), 'run')} left out: {said}")
-    return runs
+    return with_measured(runs, reference.measured, notes, place, whole=not named)
 
 
 def _pieces(samples: WheelSamples, window: float | None) -> Iterator[_Piece]:

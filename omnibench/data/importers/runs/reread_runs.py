@@ -90,25 +90,18 @@ def reread_runs(
 ) -> list[Part]:
     """The runs with references, clocks and cuts as the options say.
 
-    columns: of x, y and heading. radian: unit of the headings. Runs without poses stay as they are.
+    columns: of x, y and heading. radian: unit of the headings. Distances, turns and the like are read alike; a run that
+    is cut keeps those that lie within one of its parts.
     """
-    posed = [run for run in runs if run.has_poses]
-    streams = [_streams(run, options, columns, radian) for run in posed]
-    found = dict(zip([run.id for run in posed], by_one_clock(streams, options, notes), strict=True))
-    parts, bare, lost = [], [], []
-    for run in runs:
-        if run.id not in found:
-            parts.append(Part(run, run.id, 0.0, whole=True))
-            continue
-        made = _parts(run, found[run.id], options, notes)
+    streams = by_one_clock([_streams(run, options, columns, radian) for run in runs], options, notes)
+    parts, bare = [], []
+    for run, stream in zip(runs, streams, strict=True):
+        made = _parts(run, stream, options, notes)
         parts += made
         bare += [] if made else [run.id]
-        lost += [run.id] if run.references is not None and not all(part.whole for part in made) else []
     if bare:
         rest = " or never stand still before they drive (start_at_rest)" if options.start_at_rest else ""
         notes.append(f"{plural(len(bare), 'run')} left out that have too few poses{rest}: {some(bare)}")
-    if lost:
-        notes.append(f"runs that were cut lost their distances, turns and the like: {some(lost)}")
     return parts
 
 
@@ -127,13 +120,17 @@ def _streams(run: Trajectory, options: ReferenceOptions, columns: Sequence[int],
         reference = ReferenceStream(run.pose_times, run.poses[:, columns], covariances)
     else:
         reference = ReferenceStream(run.pose_times, run.poses, covariances)
+    if run.references is not None:
+        reference = replace(reference, measured=run.references.open_ended(float(run.times[-1])))
     return RecordedStreams(run.id, f"trajectory {run.id}", samples, reference.read_as(options, radian))
 
 
 def _parts(run: Trajectory, streams: RecordedStreams, options: ReferenceOptions, notes: list[str]) -> list[Part]:
     reference = streams.reference
     if not options.cuts and reference.times is run.pose_times:
-        read = replace(run, poses=reference.poses, pose_covariances=reference.covariances)
+        poses = reference.poses if run.start_known else run.poses
+        measured = None if reference.measured is None else reference.measured.of_run(0.0, float(run.times[-1]))
+        read = replace(run, poses=poses, pose_covariances=reference.covariances, references=measured)
         return [Part(read, run.id, 0.0, whole=True)]
     parts = []
     recorded = _recorded(run, streams.samples)
@@ -141,7 +138,6 @@ def _parts(run: Trajectory, streams: RecordedStreams, options: ReferenceOptions,
         targets = None if run.targets is None else run.targets[recorded[cut.kept]]
         whole = cut.zero == 0 and len(cut.kept) == len(run.times)
         made = replace(cut.trajectory, targets=targets, distance=run.distance if whole else None)
-        made = replace(made, references=run.references if whole else None)
         parts.append(Part(replace(made, duration=run.duration) if whole else made, run.id, cut.zero, whole))
     return parts
 
