@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 import time
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -20,10 +17,9 @@ from numpy.random import Generator
 from check_exam.faults import MAKERS, Damage
 from check_exam.judging import Finding, false_findings, known_kinds, right_kinds, table, unsound
 from check_exam.recordings import Recording, recording
+from check_exam.shell import typed
 from check_exam.writing import Source, read_dataset, write
 
-ROOT = Path(__file__).resolve().parents[3]
-_LONGEST = 300.0  # s, of a command
 _WORDS = re.compile(
     r"\b(drive|record|repeat|turn|log|track|measure|check|leave|look|name|connect|another)", re.IGNORECASE
 )
@@ -53,28 +49,6 @@ class Result:
     @property
     def passed(self) -> bool:
         return self.found and self.fixed is not False
-
-
-@dataclass(frozen=True)
-class Typed:
-    """What a typed command printed."""
-
-    status: int
-    output: str
-    errors: str
-
-
-def typed(command: str, folder: Path) -> Typed:
-    """Type a command into a shell. Its omnibench is this project's."""
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
-    environment = os.environ | {"PATH": path, "PYTHONPATH": str(ROOT), "COLUMNS": "80", "NO_COLOR": "1"}
-    try:
-        ended = subprocess.run(
-            command, shell=True, cwd=folder, env=environment, capture_output=True, text=True, timeout=_LONGEST
-        )
-    except subprocess.TimeoutExpired:
-        return Typed(-1, "", f"ran longer than {_LONGEST:g} s")
-    return Typed(ended.returncode, ended.stdout, ended.stderr)
 
 
 def generator(robot: str, kind: str, seed: int) -> Generator:

@@ -52,7 +52,7 @@ def write(damage: Damage, form: str, folder: Path) -> Source:
     (folder / "log").mkdir()
     for run in recording.runs:
         if form == ONE_TABLE:
-            _one_table(recording, run).write(folder / "log" / f"{file_name(run)}_log.csv", {})
+            _one_table(damage, run).write(folder / "log" / f"{file_name(run)}_log.csv", {})
             continue
         wheels = _wheels(damage, run, form)
         wheels.write(folder / "log" / f"{file_name(run)}_wheels.csv", {})
@@ -97,9 +97,10 @@ def _poses(run: Run, stamps: Array) -> Table:
     return Table({"t": stamps, "x": run.poses[:, 0], "y": run.poses[:, 1], "theta": run.poses[:, 2]})
 
 
-def _one_table(recording: Recording, run: Run) -> Table:
+def _one_table(damage: Damage, run: Run) -> Table:
     """Wheels and poses by one clock in the same rows; blanks where there is no pose."""
-    columns = {"t": run.times}
+    recording = damage.recording
+    columns = {"t": run.times * damage.wheel_stamps}
     columns |= {f"ticks_{name}": column for name, column in zip(recording.wheels, run.counts.T, strict=True)}
     columns |= {f"steer_{name}": column for name, column in zip(recording.steered, run.steering.T, strict=True)}
     poses = np.full((len(run.times), 3), np.nan)
