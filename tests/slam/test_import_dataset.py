@@ -84,10 +84,11 @@ def test_the_options_under_slam_are_those_of_slam(blind: Path, found: Dataset) -
 
 
 def test_a_wrong_option_of_slam_is_refused_before_the_recording_is_read(tmp_path: Path) -> None:
+    (tmp_path / "empty.mcap").touch()
     with pytest.raises(ConfigError, match=r"importer 'rosbag': slam: unknown key 'spacng'; did you mean 'spacing'\?"):
-        read(tmp_path / "missing.mcap", slam={"spacng": 0.3})
+        read(tmp_path / "empty.mcap", slam={"spacng": 0.3})
     with pytest.raises(ConfigError, match="slam"):
-        read(tmp_path / "missing.mcap", slam=3)
+        read(tmp_path / "empty.mcap", slam=3)
 
 
 def test_importers_of_other_formats_have_no_options_of_slam(tmp_path: Path) -> None:
