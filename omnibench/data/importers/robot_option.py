@@ -13,6 +13,8 @@ from omnibench.robot.kinematics import Robot
 
 
 def _load(value: Any) -> Any:
+    if value in (None, ""):
+        raise ValueError("nothing is given; name the robot's YAML file, as robot=robot.yaml")
     if not isinstance(value, str | Path):
         return value
     content = read_yaml(Path(value))

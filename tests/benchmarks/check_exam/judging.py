@@ -26,6 +26,7 @@ _SPOILT = {"wheel_dropout", "reference_dropout", "reference_jump", "counter_rest
 _CLOCKS = {"clock_offset", "clock_drift"}
 _CLOCK_LEFT, _CLOCK_MORE, _SURE = 0.1, 0.05, 0.3  # s left at most, or more than in the sound recording; contrast
 _FEW_RUNS, _OPEN_RUNS = 3, 7
+_STRAIGHT = 2.5  # m, the least radius of a path that counts as straight
 _MISSING, _WAYS = 0.02, ("left", "right", "straight")  # share of the time below which a motion was not driven
 
 
@@ -92,7 +93,7 @@ def driven(recording: Recording) -> dict[str, float]:
     body = np.vstack([windows(recording, run)[1] for run in recording.runs])
     turn, speed = lever(recording) * body[:, 2], np.hypot(body[:, 0], body[:, 1])
     moving = np.hypot(turn, speed) > 0.1 * np.percentile(np.hypot(turn, speed), 90)
-    straight = moving & (np.abs(turn) < 0.1 * speed)
+    straight = moving & (np.abs(body[:, 2]) * max(10 * lever(recording), _STRAIGHT) < speed)
     shares = (moving & ~straight & (turn > 0), moving & ~straight & (turn < 0), straight)
     return {way: float(share.mean()) for way, share in zip(_WAYS, shares, strict=True)}
 

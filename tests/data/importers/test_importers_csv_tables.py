@@ -11,7 +11,7 @@ import pytest
 from drive_samples import DIFF, PERIOD, drive, odometry_error
 
 from omnibench.data.dataset import Dataset
-from omnibench.errors import DataError
+from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import Array
 from omnibench.slam.import_dataset import import_dataset
 
@@ -55,6 +55,33 @@ def quarter_ticks(seed: int, turn: int = 1000) -> Array:
 
 def ids(data: Dataset) -> list[str]:
     return [run.id for run in data.trajectories]
+
+
+def write_pair(folder: Path, seed: int, turning: float = 0.0) -> None:
+    """A run's two tables, with wheels that turn by so much, rad/s, all the time."""
+    of = wheels(seed).with_columns(pl.col("omega_left", "omega_right") + turning)
+    of.write_csv(folder / f"run{seed}_wheels.csv")
+    poses(seed).write_csv(folder / f"run{seed}_poses.csv")
+
+
+def test_runs_that_never_rest_are_left_out_where_runs_begin_at_rest(tmp_path: Path) -> None:
+    write_pair(tmp_path, 1, turning=1.0)
+    write_pair(tmp_path, 2)
+    data = read(tmp_path, start_at_rest=True)
+    assert ids(data) == ["run2"]
+    assert any(warning.startswith("run1: left out: it never stands still") for warning in data.warnings)
+
+
+def test_no_run_that_rests_is_said_with_the_option_that_asks_for_it(tmp_path: Path) -> None:
+    write_pair(tmp_path, 1, turning=1.0)
+    with pytest.raises(DataError, match="no run stands still before it drives, so that start_at_rest leaves none"):
+        read(tmp_path, start_at_rest=True)
+
+
+def test_a_robot_that_is_not_named_is_said(tmp_path: Path) -> None:
+    write_pair(tmp_path, 1)
+    with pytest.raises(ConfigError, match=r"robot: nothing is given; name the robot's YAML file, as robot=robot\.yaml"):
+        read(tmp_path, robot=None)
 
 
 def test_a_table_a_run_is_told_by_its_header(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from omnibench.data.importers.runs.recorded_streams import RecordedStreams, by_o
 from omnibench.data.importers.runs.recording_runs import recording_runs
 from omnibench.errors import DataError
 from omnibench.registry import importers
+from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
 _NUMBERED = re.compile(r"[_-]?\d+$")
@@ -76,6 +77,11 @@ class Csv(Importer):
         check_names(attributes, [recording.name for recording in recordings], warnings)
         recordings = by_one_clock(recordings, options, warnings)
         runs = [run for recording in recordings for run in self._runs(recording, attributes, warnings)]
+        if not runs:
+            raise DataError(
+                f"{source}: no run stands still before it drives, so that start_at_rest leaves none; leave that option "
+                "out, and record from a standstill"
+            )
         splits = [run.split for run in runs] if any(each.split for each in attributes.values()) else None
         numbers = {run.id: run.repetition for run in runs if run.repetition is not None}
         divided = [
@@ -111,7 +117,9 @@ class Csv(Importer):
             started_at=said.started_at,
         )
         runs = recording_runs(whole, samples, reference, options, warnings, recording.place, options.window)
-        if not runs:
+        if not runs and options.start_at_rest and len(_poses_within(recording)) > 1:
+            warnings.append(f"{name}: left out: it never stands still before it drives (start_at_rest)")
+        elif not runs:
             raise _apart(recording)
         return [run.trajectory for run in runs]
 
@@ -126,6 +134,12 @@ def _unsaid_commands(names: Sequence[str], dataset: Dataset) -> list[str]:
         f"names such as {names[0]} look like repetitions of {plural(len(stems), 'command')}; if they are, say --set "
         f"'command_pattern={_PATTERN}', since noise is known from repetitions"
     ]
+
+
+def _poses_within(recording: RecordedStreams) -> Array:
+    """Times of the poses while the wheels were recorded, s."""
+    samples, times = recording.samples, recording.reference.times
+    return times[(times >= samples.begins[0]) & (times <= samples.ends[-1])]
 
 
 def _apart(recording: RecordedStreams) -> DataError:
