@@ -15,7 +15,15 @@ from omnibench.data.importers.rosbag.joint_streams import WheelStream, read_whee
 from omnibench.data.importers.rosbag.message_streams import PoseStream, Stamps, header_stamp, read_poses
 from omnibench.data.importers.rosbag.rosbag_options import RosbagOptions
 from omnibench.data.importers.rosbag.scan_stream import RunScans, ScanStream, read_scans
-from omnibench.data.importers.rosbag.topic_choice import TRANSFORMS, joint_topics, pose_topic, scan_topic
+from omnibench.data.importers.rosbag.sensors.sensor_references import SensorReferences, read_sensors
+from omnibench.data.importers.rosbag.topic_choice import (
+    TRANSFORMS,
+    has_sensors,
+    joint_topics,
+    pose_topic,
+    scan_topic,
+    sensor_topics,
+)
 from omnibench.data.importers.rosbag.transform_poses import read_transforms
 from omnibench.data.importers.runs.cut_run import cut_run
 from omnibench.data.importers.runs.reference_stream import ReferenceStream
@@ -32,7 +40,8 @@ _SAME_TIME = 1e-9  # s, the resolution of the stamps
 class Recording:
     """Content of a bag, in s since ``origin`` (ns), the first wheel message. place: bag and wheel topic, for messages.
 
-    reference: topic of the reference poses; None: poses are zeros at the stamps of the scans.
+    reference: topic of the reference poses; None: poses are zeros at the stamps of the scans. sensors: references of
+    other kinds; where there are no poses, either.
     """
 
     name: str
@@ -43,11 +52,12 @@ class Recording:
     cuts: tuple[Cut, ...]
     scans: ScanStream | None
     reference: Topic | None
+    sensors: SensorReferences | None = None
 
     @property
     def referenced(self) -> bool:
-        """True if the bag holds reference poses."""
-        return self.reference is not None
+        """True if the bag holds reference poses, or other references."""
+        return self.reference is not None or self.sensors is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +74,10 @@ def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list
         topics = joint_topics(bag, options.wheel_topic, options.steering_topic, bool(options.robot.drive.steered))
         topic = topics.wheels[0]
         scan = scan_topic(bag, options.scan_topic, topic) if options.scans else None
-        reference = pose_topic(bag, options.pose_topic, topic, scan)
+        named = bool(options.references)
+        reference = pose_topic(bag, options.pose_topic, topic, scan, sensors=named or has_sensors(bag))
+        measured = named or (reference is None and scan is None)
+        sensed = sensor_topics(bag, options.references) if measured else ()
         commands = bag.topic(options.cut_topic, "cut_topic") if options.cut_topic else None
         wheels = read_wheels(bag, topics, options, warnings)
         poses = None
@@ -74,11 +87,14 @@ def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list
             poses = read_poses(bag, reference, warnings)
         cuts = _read_cuts(bag, commands, wheels) if commands else []
         scans = read_scans(bag, scan, options.scanner_mount, warnings) if scan else None
+        sensors = read_sensors(bag, sensed, int(wheels.stamps[0]), options, warnings)
+    for sensor, stamps in zip(sensed, sensors.stamps if sensors else (), strict=True):
+        _check_clocks(path, topic, wheels, "messages", sensor, stamps)
     if reference and poses:
         _check_clocks(path, topic, wheels, "poses", reference, poses.stamps)
     if scan and scans:
         _check_clocks(path, topic, wheels, "scans", scan, scans.stamps)
-    if poses is None:
+    if poses is None and sensors is None:
         assert scans is not None  # else a topic of poses is asked for
         poses = PoseStream(scans.stamps, np.zeros((len(scans.stamps), 3)), None)
     place = f"{path}: topic {topic.name}"
@@ -95,9 +111,13 @@ def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list
     warnings.extend(f"{place}: {loss}" for loss in _losses_in_words(losses))
     origin = int(wheels.stamps[0])
     # Exact to the nanosecond, which a double of unix time is not.
-    stream = ReferenceStream((poses.stamps - origin) / 1e9, poses.poses, poses.covariances)
+    stream = ReferenceStream.without_poses()
+    if poses is not None:
+        stream = ReferenceStream((poses.stamps - origin) / 1e9, poses.poses, poses.covariances)
     stream = stream.read_as(options) if reference else stream
-    return Recording(name, place, origin, samples, stream, tuple(cuts), scans, reference)
+    if sensors is not None:
+        sensors = sensors.without_bias(samples, options.least_rest, options.still, warnings, place)
+    return Recording(name, place, origin, samples, stream, tuple(cuts), scans, reference, sensors)
 
 
 def cut_into_runs(recording: Recording, options: RosbagOptions, *, alone: bool = True) -> tuple[list[Run], list[str]]:
@@ -128,7 +148,7 @@ def cut_into_runs(recording: Recording, options: RosbagOptions, *, alone: bool =
     if short:
         reasons.append(f"{short} shorter than {options.least_run:g} s (least_run)")
     if bare:
-        reasons.append(f"{bare} with fewer than two {'reference poses' if recording.referenced else 'scans'}")
+        reasons.append(f"{bare} with fewer than two {_references_in_words(recording)}")
     if driving:
         reasons.append(f"{driving} that never rest (start_at_rest)")
     if reasons:
@@ -141,6 +161,10 @@ def cut_into_runs(recording: Recording, options: RosbagOptions, *, alone: bool =
         advice = f"no rest of {options.least_rest:g} s cuts it; --set cut=topic or cut=windows for more runs"
         return runs, [f"{recording.place}: {advice}"]
     return runs, []
+
+
+def _references_in_words(recording: Recording) -> str:
+    return "references" if recording.sensors else "reference poses" if recording.referenced else "scans"
 
 
 def _nothing(options: RosbagOptions) -> str:
@@ -194,6 +218,12 @@ def _run(recording: Recording, part: slice, piece: Piece, number: str, session: 
         return None
     started = cut.zero - float(samples.begins[0 if samples.angles is None else part.start])
     run = replace(cut.trajectory, started_at=started)
+    if recording.sensors is not None:
+        run = replace(
+            run, references=recording.sensors.of_run(cut.zero, float(run.times[-1]), start_known=run.has_poses)
+        )
+        if run.references is None and not run.has_poses:
+            return None
     scans = recording.scans
     end = cut.zero + float(run.times[-1])
     return Run(run, None if scans is None else scans.between(cut.zero, end, recording.origin))

@@ -36,6 +36,10 @@ class Rosbag(Importer):
     these are interpolated at the stamps of the first, as steering angles of another topic are. A nav_msgs/Odometry or
     a tf (``pose_frames: [world, robot]``) is a reference only when named, and refused where it is made of the wheels.
 
+    references: a sensor_msgs/NavSatFix gives positions, east and north of its first fix, an Imu headings (orientation)
+    or turned angles (its rates about z, without their mean at rest), one each ``reference_period``. They are taken
+    where a bag has neither poses nor scans, or where ``references`` names them.
+
     scans: those of a sensor_msgs/LaserScan (``scan_topic``; ``scans: false`` leaves them out) go into the data set.
     Where the scanner is mounted comes from /tf_static or from ``scanner_mount: {x, y, yaw}`` (m, rad). A bag with scans
     and without reference poses (odometry does not count as one) gets them from its scans by SLAM, with the options in

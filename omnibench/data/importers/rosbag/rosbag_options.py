@@ -38,6 +38,22 @@ class RosbagOptions(EncoderOptions):
         "ending in slam_pose; or, if independent of the wheels, Odometry or tf",
     )
     pose_frames: Names = Field((), description="with a tf pose_topic: frame of the reference, and the tracked one")
+    references: Names = Field(
+        (),
+        description="sensor_msgs/NavSatFix and Imu that are references, as [/fix,/imu]; default: those that there are, "
+        "where there are neither poses nor scans",
+    )
+    imu: Literal["auto", "gyro"] = Field(
+        "auto", description="gyro: its rates of turn; auto: its headings, where it tells them (orientation)"
+    )
+    fix_sigma: Positive | None = Field(None, description="m, standard deviation of a fix; default: its covariance's")
+    heading_sigma_deg: Positive | None = Field(
+        None, description="deg, standard deviation of an Imu's heading; default: its covariance's"
+    )
+    gyro_noise_deg: Positive = Field(
+        0.1, description="deg per sqrt(s), by which the angle of a gyro wanders; its offset at rest is taken off"
+    )
+    reference_period: Positive = Field(1.0, description="s; one fix, heading or turn is taken in each")
     scan_topic: str | None = Field(
         None, min_length=1, description="sensor_msgs/LaserScan; default: the only one, or the one ending in /scan"
     )

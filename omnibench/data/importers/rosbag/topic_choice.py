@@ -21,7 +21,10 @@ POSE_TYPES = (
     "geometry_msgs/msg/TransformStamped",
 )
 ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
+FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
+SENSOR_TYPES = (FIX, IMU)
 SCAN_TYPES = ("sensor_msgs/msg/LaserScan",)
+_REFERENCES = "poses, sensor_msgs/LaserScan, NavSatFix or Imu"
 _NUMBERS = "std_msgs numbers (Int32, Float64MultiArray ...)"
 
 
@@ -69,25 +72,50 @@ def scan_topic(bag: Bag, name: str | None, wheels: Topic) -> Topic | None:
     return _only(bag, "scan_topic", candidates, "/scan", SCAN_TYPES) if candidates else None
 
 
-def pose_topic(bag: Bag, name: str | None, wheels: Topic, scans: Topic | None = None) -> Topic | None:
+def sensor_topics(bag: Bag, names: Sequence[str]) -> tuple[Topic, ...]:
+    """The topics of fixes and inertial sensors: those that are named, else the only one of each type, if any.
+
+    ConfigError: there are several of a type.
+    """
+    if names:
+        return tuple(_named(bag, name, "references", SENSOR_TYPES) for name in names)
+    by_type = [[topic for topic in bag.topics if topic.type == kind and topic.messages] for kind in SENSOR_TYPES]
+    if several := next((topics for topics in by_type if len(topics) > 1), None):
+        shown = ",".join(topic.name for topic in several[:1])
+        raise ConfigError(
+            f"{bag.path}: several topics could be the reference: {_listed(several)}; say which: "
+            f"--set references=[{shown}]"
+        )
+    return tuple(topic for topics in by_type for topic in topics)
+
+
+def has_sensors(bag: Bag) -> bool:
+    """True if the bag holds fixes, or messages of an inertial sensor."""
+    return any(topic.type in SENSOR_TYPES and topic.messages for topic in bag.topics)
+
+
+def pose_topic(
+    bag: Bag, name: str | None, wheels: Topic, scans: Topic | None = None, *, sensors: bool = False
+) -> Topic | None:
     """The topic of the reference poses: the one named, the only one, or the only one that ends in slam_pose.
 
     Among several that do, the one of the wheels' namespace. Odometry and transforms are never taken unasked: a
     calibration against the robot's own odometry would find nothing wrong. None: there is none, but there are ``scans``,
-    from which poses can be made.
+    from which poses can be made, or ``sensors``, which are references themselves.
     """
     types = (*POSE_TYPES, ODOMETRY, TRANSFORMS)
     if name is not None:
         return _named(bag, name, "pose_topic", types)
     candidates = [topic for topic in bag.topics if topic.type in POSE_TYPES]
     references = [topic for topic in candidates if topic.messages and not _is_odometry(topic)]
-    if not references and scans is not None:
+    if not references and (scans is not None or sensors):
         return None
     others = [topic for topic in bag.topics if topic.type in types and topic.messages and not _is_fixed(topic)]
     if not references and others:
         raise ConfigError(
             f"{bag.path}: the only poses are {_listed(others)}, by name or type the robot's own odometry and not a "
-            "reference for it; if one is independent of the wheels, set pose_topic to it"
+            "reference for it; if one is independent of the wheels, set pose_topic to it, or record a reference: "
+            f"{_REFERENCES}"
         )
     beside = [topic for topic in references if _ends_in(topic, "slam_pose") and _space(topic) == _space(wheels)]
     if len(beside) == 1:
@@ -107,7 +135,8 @@ def _named(bag: Bag, name: str, key: str, types: Sequence[str], words: str = "")
 def _only(bag: Bag, key: str, candidates: Sequence[Topic], ending: str, types: Sequence[str]) -> Topic:
     if not candidates:
         known = ", ".join(map(str, bag.topics)) or "none"
-        raise DataError(f"{bag.path}: no topic of type {_either(types)}; topics found: {known}")
+        others = f", nor another reference ({_REFERENCES})" if key == "pose_topic" else ""
+        raise DataError(f"{bag.path}: no topic of type {_either(types)}{others}; topics found: {known}")
     filled = [topic for topic in candidates if topic.messages]
     if not filled:
         raise DataError(f"{bag.path}: {_listed(candidates)}: nothing was recorded on it")

@@ -36,7 +36,7 @@ def cut_run(
     whole: the recording as a run, whose id, split and command are taken over; its arrays are replaced. A recording that
     has references of other kinds, and a start pose at most, begins with its wheels.
     """
-    if len(reference.times) < 2 and reference.measured is not None:
+    if not len(reference.times) or (len(reference.times) == 1 and reference.measured is not None):
         return _without_poses(whole, samples, chosen, reference)
     times, poses = reference.times[seen], reference.poses[seen]
     if len(times) < 2:
