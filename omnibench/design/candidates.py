@@ -107,9 +107,15 @@ def candidates_of_dataset(dataset: Dataset, integration: Integration = "arc", so
     """
     place = source or f"data set {dataset.name}"
     training = training_split(dataset)
+    if not any(run.has_poses for run in training):
+        raise DataError(
+            f"{place}: its runs have distances, turns and the like and no reference poses, from whose noise a design "
+            "is chosen; without a recording: omnibench design --robot FILE; what to drive without poses: "
+            "omnibench guide references"
+        )
     commands: dict[str, list[Trajectory]] = {}
     for run in training:
-        if run.command is not None and len(run.pose_times) > 1:
+        if run.command is not None and run.has_poses:
             commands.setdefault(run.command, []).append(run)
     if not commands:
         raise DataError(f"{place}: no training run has a command; fill the column command, so that a design can choose")

@@ -37,8 +37,9 @@ _TARGET = LegendItem("", "reference's end", INK, symbol="cross-thin-open")
 def paths_before_after(runs: Sequence[Trajectory], models: Models, which: str) -> FigureGrid | None:
     """Paths of two typical runs by the reference and two models, and the ends of all runs; None without a run.
 
-    models: before and after. which: the runs in words, such as ``held-out``.
+    models: before and after. which: the runs in words, such as ``held-out``. Runs without poses are left out.
     """
+    runs = [run for run in runs if run.has_poses]
     if not runs:
         return None
     ends = [_final_errors(model, runs) for _, model in models]
@@ -74,10 +75,9 @@ def _typical(runs: Sequence[Trajectory], ends: Sequence[Array]) -> tuple[dict[st
     """
     gains = np.linalg.norm(ends[0], axis=1) - np.linalg.norm(ends[-1], axis=1)
     gain_of = {run.id: float(gain) for run, gain in zip(runs, gains, strict=True)}
-    drawn = [run for run in runs if len(run.poses) > 1]
-    kinds = {kind: like for kind, like in kinds_of(drawn).items() if kind != ON_THE_SPOT}
+    kinds = {kind: like for kind, like in kinds_of(runs).items() if kind != ON_THE_SPOT}
     if len(kinds) < _PATHS:
-        chosen = spread(drawn, _PATHS) if drawn else []
+        chosen = spread(runs, _PATHS)
         return motion_titles(chosen), f"{plural(len(chosen), 'run')} of different motions." if chosen else ""
     medians = {kind: _median(like, gain_of) for kind, like in kinds.items()}
     largest = sorted(medians, key=lambda kind: gain_of[medians[kind].id], reverse=True)[:_PATHS]

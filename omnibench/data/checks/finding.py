@@ -37,6 +37,7 @@ Kind = Literal[
     "reference_is_odometry",
     "not_at_rest",
     "motion_missing",
+    "references_leave_open",
     "few_repetitions",
     "few_runs",
     "simulated_like",

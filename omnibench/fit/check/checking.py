@@ -23,6 +23,7 @@ from omnibench.fit.check.fixes import command, with_fixes
 from omnibench.fit.check.missing_motions import missing_motions, too_few
 from omnibench.fit.check.recording_source import RecordingSource, of_dataset, read_source, recorded
 from omnibench.fit.check.result import CheckReport, Verdict
+from omnibench.fit.observations.open_in_words import open_sentences
 from omnibench.words import plural
 
 _SPOILED = ("reference_frozen", "reference_is_odometry")  # after which the wheels cannot be judged by the reference
@@ -104,8 +105,24 @@ def _report(read: RecordingSource, findings: Sequence[Finding], gain: Gain) -> C
 
 def _without_poses(read: RecordingSource) -> CheckReport:
     """The report on runs whose only reference is a distance, an angle and the like."""
-    found = [*read.findings, *_noted(read.dataset), *too_few(read.dataset.trajectories)]
+    dataset = read.dataset
+    found = [*read.findings, *_noted(dataset), *_left_open(dataset), *too_few(dataset.trajectories)]
     return _report(read, with_fixes(read, found), Gain(None, ""))
+
+
+def _left_open(dataset: Dataset) -> Iterator[Finding]:
+    """What the references of the training runs leave open: with none of turning, or none of lengths, a warning."""
+    training = [run for run in dataset.split("train") if run.references is not None]
+    for number, sentence in enumerate(open_sentences(dataset.robot, training) if training else ()):
+        what, _, fix = sentence.rpartition("; " if "; " in sentence else ": ")
+        missing = what.startswith(("no reference tells of turning", "no reference tells of lengths"))
+        yield Finding(
+            kind="motion_missing" if missing else "references_leave_open",
+            what=what,
+            where="the recording" if not number else f"the recording, {number + 1}",
+            severity="warning" if missing else "note",
+            fix=fix,
+        )
 
 
 def _by_wheels(run: Trajectory, clock: ClockMatch | None) -> Trajectory:

@@ -30,6 +30,11 @@ def open_sentences(robot: Robot, runs: Sequence[Trajectory], unidentified: Unide
     return tuple(_sentences(searched, runs, end))
 
 
+def _of_several(end: str) -> str:
+    """The end of a sentence on several things: keep and rest for keeps and rests."""
+    return end.replace("keeps ", "keep ").replace("rests ", "rest ")
+
+
 def _sentences(searched: MatrixElements, runs: Sequence[Trajectory], end: str) -> Iterator[str]:
     angles = any(run.has_poses or _has(run, "rad") for run in runs)
     left = searched.open
@@ -54,7 +59,7 @@ def _sentences(searched: MatrixElements, runs: Sequence[Trajectory], end: str) -
     if min(shares[0]) > _MOST and (not searched.rows[1, 1] or min(shares[1]) > _MOST):
         said = np.vstack([said, *[_element(left, row, motion) for row in (0, 1) for motion in motions]])
         yield (
-            f"no reference tells of lengths: rows 1 (x) and 2 (y) of the matrix {end.replace('keeps', 'keep')}; "
+            f"no reference tells of lengths: rows 1 (x) and 2 (y) of the matrix {_of_several(end)}; "
             "measure distances or displacements"
         )
     turned = _turned(searched)
@@ -69,7 +74,7 @@ def _sentences(searched: MatrixElements, runs: Sequence[Trajectory], end: str) -
     if rest > 0:
         yield (
             f"{plural(rest, 'further combination' if len(said) else 'combination')} of matrix elements that the "
-            f"references tell to worse than 10 % {end if rest == 1 else end.replace('keeps', 'keep')}: "
+            f"references tell to worse than 10 % {end if rest == 1 else _of_several(end)}: "
             "drive other motions, or measure more exactly"
         )
 

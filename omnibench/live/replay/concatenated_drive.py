@@ -182,6 +182,11 @@ def _ordered(dataset: Dataset, split: Split | None) -> list[Trajectory]:
             runs.sort(key=lambda run: run.started_at or 0.0)
     ordered = [run for runs in sessions.values() for run in runs]
     for run in ordered:
+        if not run.has_poses and run.references is not None:
+            raise DataError(
+                f"data set {dataset.name}: run {run.id} has distances, turns and the like and no reference poses, so "
+                "that nothing says where the next run begins; replay runs with poses, or others of --split"
+            )
         if len(run.pose_times) < 2:
             raise DataError(
                 f"data set {dataset.name}: run {run.id} has a single reference pose; it cannot be concatenated"
