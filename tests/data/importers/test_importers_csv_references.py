@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from omnibench.data.importers.csv_tables.csv import Csv
 from omnibench.data.importers.csv_tables.csv_options import CsvOptions
 from omnibench.data.importers.csv_tables.csv_template import write_template
 from omnibench.data.importers.dataset_folder import DatasetFolder, DatasetOptions
+from omnibench.data.importers.runs.reread_runs import in_seconds
 from omnibench.data.storage import save_dataset
 from omnibench.errors import DataError
 
@@ -213,3 +215,14 @@ def test_a_run_of_a_data_set_that_is_cut_keeps_the_references_of_each_part(tmp_p
     save_dataset(read(write(tmp_path / "log", a_wheels=with_gap, a_references=table)), tmp_path / "old")
     runs = reread(tmp_path / "old", longest_gap=0.2).trajectories
     assert [(run.id, len(measured(run))) for run in runs] == [("a#1", 1), ("a#2", 1)]
+
+
+def test_a_data_set_with_times_in_ms_has_its_references_in_seconds_too(tmp_path: Path) -> None:
+    table = "kind,t0,t1,value,sigma\ndistance,500,2000,0.3,0.003\ndistance,,,1,0.003\n"
+    rows = [f"{0.05 * k:.3f},4,4" for k in range(1, 101)]
+    source = write(tmp_path / "log", a_wheels="\n".join(["t,omega_left,omega_right", *rows]), a_references=table)
+    run = the_run(source, pose_time_unit="ms")
+    assert run.references is not None
+    slow = replace(run, references=replace(run.references, t0=run.references.t0 * 1e3, t1=run.references.t1 * 1e3))
+    mended = in_seconds(replace(slow, times=run.times * 1e3), 1e-3, 1e-3)
+    assert measured(mended) == [(kind, pytest.approx(t0), pytest.approx(t1), v) for kind, t0, t1, v in measured(run)]

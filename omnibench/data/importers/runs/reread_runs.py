@@ -61,7 +61,11 @@ def in_seconds(run: Trajectory, wheels: float, poses: float) -> Trajectory:
     if wheels == poses == 1.0:
         return run
     duration = None if run.duration is None else run.duration * wheels
-    return replace(run, times=run.times * wheels, pose_times=run.pose_times * poses, duration=duration)
+    times, references = run.times * wheels, run.references
+    if references is not None:
+        given = references.open_ended(float(run.times[-1]))
+        references = replace(given, t0=given.t0 * poses, t1=given.t1 * poses).of_run(0.0, float(times[-1]))
+    return replace(run, times=times, pose_times=run.pose_times * poses, duration=duration, references=references)
 
 
 def _indices(names: Sequence[str], known: Sequence[str], prefix: str, option: str) -> tuple[int, ...]:
