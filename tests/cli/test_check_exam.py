@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import typer
 from check_exam.exam import QUICK
 from check_exam.faults import MAKERS, Damage
 from check_exam.judging import applies, table, unsound
@@ -13,8 +12,6 @@ from check_exam.motion import misfit
 from check_exam.recordings import DATA, NAMES
 from check_exam.sitting import chosen_runs, generator, sit
 from check_exam.writing import read_dataset, write
-
-from omnibench.cli.app import app
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"the recordings are not at {DATA}")
 
@@ -24,10 +21,6 @@ _SHOWN = (
     "wheels_swapped", "wheel_negated", "wheels_negated", "wheel_scale", "wheel_unit", "steering_unit", "steering_sign",
     "heading_unit", "position_unit", "reference_mirrored", "reference_turned", "wheel_dead",
 )  # fmt: skip
-
-
-def command_names() -> set[str]:
-    return {str(name) for name in typer.main.get_command(app).commands}  # type: ignore[attr-defined]
 
 
 def damage_of(robot: str, kind: str) -> Damage:
@@ -61,7 +54,6 @@ def test_a_fault_that_was_left_in_is_judged_unsound(kind: str, tmp_path: Path) -
     assert unsound(kind, damage, read_dataset(source.folder / source.name, damage.sound))
 
 
-@pytest.mark.skipif("check" not in command_names(), reason="omnibench has no command check yet")
 @pytest.mark.parametrize(("robot", "kind"), QUICK)
 def test_check_finds_a_fault_and_its_fix_works(robot: str, kind: str, tmp_path: Path) -> None:
     result = sit(robot, kind, _SEED, tmp_path)
