@@ -261,7 +261,7 @@ class _Windows:
                 return False
             left = self._left(fitted, other) / deviations[:, None]
             cost, least = (float(_huber(each[:, both]).sum()) for each in (left, best))
-            if cost - least < _TOLD * least:
+            if cost - least <= _TOLD * least:  # both are 0 where the reference stands still
                 return False
         return True
 

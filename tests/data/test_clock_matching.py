@@ -94,6 +94,12 @@ def test_an_even_drive_does_not_tell_its_clock() -> None:
     assert match_clocks(ROBOT, [streams(4, driven=False)]) == [None]
 
 
+def test_a_reference_that_stands_still_does_not_tell_its_clock() -> None:
+    of = streams(4)
+    still = replace(of, poses=np.zeros_like(of.poses))
+    assert match_clocks(ROBOT, [still]) == [None]
+
+
 def test_each_run_has_its_own_clock() -> None:
     first, second = matched(streams(5, 0.3, 0.0), streams(6, -0.4, 0.0))
     assert first.offset == pytest.approx(0.3, abs=0.02)

@@ -132,6 +132,11 @@ def test_a_wheel_that_never_turns_is_dead() -> None:
     assert [f.where for f in report.findings if f.kind == "wheel_dead"] == [f"wheel {recording().robot.wheel_names[1]}"]
 
 
+def test_a_reference_that_stands_still_throughout_is_frozen_and_nothing_else() -> None:
+    report = check(changed(lambda run: replace(run, poses=np.repeat(run.poses[:1], len(run.poses), 0))))
+    assert (report.verdict, kinds(report)) == ("record more", {"reference_frozen"})
+
+
 def test_copies_of_runs_are_named() -> None:
     first, *others = recording().trajectories
     copy = replace(others[3], id="copy", times=others[3].times[:-40], rates=others[3].rates[:-40])

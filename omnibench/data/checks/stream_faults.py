@@ -24,8 +24,9 @@ _RARE = 0.02  # share of the samples: more that are too fast are another unit
 # Share of the angle of the wheel that turns most, up to which one is dead; angle, rad, and share of the largest, that
 # the reference must ask of it (chosen).
 _DEAD, _EXPECTED, _ASKED = 0.002, 3.0, 0.25
-# s of a run's begin, and share of its usual speed above which wheels and reference do not begin at rest (chosen).
-_BEGIN, _MOVING = 0.12, 0.5
+# s of a run's begin, and share of its usual speed above which wheels and reference do not begin at rest (chosen: real
+# robots that start from rest reach up to 0.32).
+_BEGIN, _MOVING = 0.12, 0.35
 # Steps of the robot's size that are needed, and spread of the turns over them, rad, that one angle cannot give; chosen.
 _FEWEST, _BENDS = 10, 0.3
 _SAME = 1e-4  # m and rad: a pose that is repeated, below the noise of any reference; chosen

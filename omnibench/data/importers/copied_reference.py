@@ -34,12 +34,14 @@ _FEWEST = 8  # degrees of freedom, from which the residual of an independent ref
 def follows_the_wheels(runs: Sequence[Trajectory]) -> float | None:
     """The residual of the headings, rad in a second, of reference poses that are odometry; None for independent ones.
 
-    None, too, where the runs are too short to tell. Runs without poses are left out.
+    None, too, where the runs are too short or turn too little to tell. Runs without poses are left out.
     """
     runs = [run for run in runs if run.has_poses]
     if not runs:
         return None
     headings = np.concatenate([_increments(run, run.poses[:, 2:]) for run in runs])[:, 0]
+    if float(np.abs(headings).max(initial=0.0)) < _COPIED:  # of a reference that stands still
+        return None
     residuals = []
     readings = [_readings(run) for run in runs]
     for reading, behind in product(range(len(readings[0])), (None, *range(_MOST_BEHIND + 1))):

@@ -162,24 +162,22 @@ def _odometry(dataset: Dataset, runs: Sequence[Trajectory]) -> Iterator[Finding]
     )
 
 
-# Kinds of the notes that importers leave, by words that only these hold.
-_NOTES = (("begin anew", "counter_restart", "all wheels"), ("ran back while", "counter_restart", "all wheels"))
+# Words that only the importers' notes on counters hold.
+_RESTARTED = ("begin anew", "ran back while")
+_TOLD = 12  # restarts that are told one by one; chosen
 
 
 def _noted(dataset: Dataset) -> Iterator[Finding]:
     """Restarts of counters that the importer has mended."""
-    for warning in dataset.warnings:
-        for words, kind, where in _NOTES:
-            if words in warning:
-                yield Finding.model_validate(
-                    {
-                        "kind": kind,
-                        "what": warning,
-                        "where": where,
-                        "severity": "note",
-                        "fix": "nothing: the import has mended it",
-                    }
-                )
+    notes = [warning for warning in dataset.warnings if any(words in warning for words in _RESTARTED)]
+    if notes:
+        yield Finding(
+            kind="counter_restart",
+            what="; ".join(notes[:_TOLD]) + (f" and {len(notes) - _TOLD} more" if len(notes) > _TOLD else ""),
+            where="all wheels",
+            severity="note",
+            fix="nothing: the import has mended it",
+        )
 
 
 def _distinct(findings: Sequence[Finding]) -> list[Finding]:

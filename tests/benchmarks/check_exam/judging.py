@@ -68,7 +68,13 @@ def right_kinds(kind: str, robot: str) -> set[str]:
 def known_kinds(robot: str) -> set[str]:
     """Kinds that are true of the untouched recordings, or open."""
     entry = table()["robots"][robot]
-    return {*entry["known"], *entry["open"]}
+    return {kind for kind, why in (entry["known"] | entry["open"]).items() if isinstance(why, str)}
+
+
+def _known_of_a_run(finding: Finding, robot: str) -> bool:
+    """True if a finding is known of a run that it names."""
+    known = table()["robots"][robot]["known"].get(finding.kind)
+    return isinstance(known, dict) and finding.names([known["run"]])
 
 
 def false_findings(findings: Sequence[Finding], recording: Recording) -> list[Finding]:
@@ -84,6 +90,7 @@ def false_findings(findings: Sequence[Finding], recording: Recording) -> list[Fi
         finding
         for finding in findings
         if finding.kind not in allowed
+        and not _known_of_a_run(finding, recording.robot)
         and not (finding.kind == "motion_missing" and (missing or finding.severity == "note"))
     ]
 
