@@ -26,7 +26,7 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.span import driven_span, unidentified_directions
 from omnibench.fit.uncertainty.information import information_of_runs, noise_of_matrix
 from omnibench.fit.uncertainty.intervals import MANY
-from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, covariance_of_answer
+from omnibench.fit.uncertainty.uncertainty import NoCovarianceError, covariance_of_answer, runs_without_heading
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
@@ -47,7 +47,8 @@ def shrunk(problem: CalibrationProblem, result: RunResult, *, fitted: bool = Tru
     """A calibrator's result, shrunk to the design where the problem ``shrinks``; otherwise, or unanswered, as it is.
 
     fitted: False for an answer that was not fitted to the runs, which is not shrunk. Covariance and degrees of freedom
-    of the result are the posterior's; elements that lay on a bound before are said to, since it bent the others.
+    of the result are the posterior's; an answer without its own that runs without a start heading mislead has none.
+    Elements that lay on a bound before are said to, since it bent the others.
     """
     if not (problem.shrinks and fitted) or result.vector is None or result.cost is None:
         return result
@@ -59,12 +60,13 @@ def shrunk(problem: CalibrationProblem, result: RunResult, *, fitted: bool = Tru
     deviation = problem.parameterisation.projection @ (result.vector - problem.start)
     vector = problem.settled(problem.start + posterior @ known.information @ deviation)
     cost = float(problem.values(vector[None])[0])
+    misled = result.covariance is None and bool(runs_without_heading(problem))
     return replace(
         result,
         vector=vector,
         matrix=problem.matrix(vector),
         cost=cost,
-        covariance=posterior,
+        covariance=None if misled else posterior,
         degrees_of_freedom=_freedom(posterior, known),
         noise=known.noise,
         shrinkage=Shrinkage(result.cost, f"the design's tolerance and {known.words}"),

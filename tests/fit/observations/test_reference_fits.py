@@ -101,6 +101,15 @@ def test_intervals_hold_the_truth(study, kind: str) -> None:
     assert (np.abs(errors) < 1).mean() > 0.75  # the study of 300 sets is tests/benchmarks/reference_coverage.py
 
 
+def test_only_trajectory_ml_has_intervals_where_positions_do_not_tell_how_runs_start(study) -> None:
+    exact, _ = study.simulated("diff", 6)
+    dataset = study.reduced(exact, "position", np.random.default_rng(6))
+    assert calibrate(dataset).uncertainty is not None
+    run = calibrate(dataset, "closed_form")
+    assert run.uncertainty is None
+    assert any("positions of 8 runs" in warning and "trajectory_ml" in warning for warning in run.warnings)
+
+
 def test_distances_alone_leave_turning_and_the_direction_of_x_open() -> None:
     dataset = a_set(*[[Reference("distance", 1.0, 0.002)]] * 8)
     said = " ".join(inspect_dataset(dataset).findings)
