@@ -55,6 +55,8 @@ def compare(
     from omnibench.progress import Progress
 
     refuse_figures_without_browser(figures)
+    if config.is_dir() and not (config / "dataset.yaml").is_file():
+        raise ConfigError(f"{config}: is a folder without dataset.yaml; name a config, or the folder of a data set")
     if config.is_dir():
         if data:
             raise ConfigError(f"--data is for a config, and {config} is a data set; leave it out")

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("registries_as_before")
     ("arguments", "parts"),
     [
         (["compre"], ["No such command 'compre'. Did you mean 'compare'? (see omnibench --help)"]),
-        (["compare"], ["Missing argument 'config'", "(see omnibench compare --help)"]),
+        (["compare"], ["Missing argument 'CONFIG|DATASET'", "(see omnibench compare --help)"]),
         (["compare", "a.yaml", "b.yaml"], ["unexpected extra argument"]),
         (["compare", "nowhere.yaml"], ["nowhere.yaml: no such file"]),
         (["compare", "CONFIG", "--outptu", "x"], ["No such option", "--output"]),
@@ -44,7 +44,7 @@ pytestmark = pytest.mark.usefixtures("registries_as_before")
         (["compare", "CONFIG", "--plugins", "nowhere"], ["plug-in folder ", "nowhere does not exist"]),
         (["compare", "CONFIG", "--plugins", "CONFIG"], ["plug-in folder ", "small.yaml is a file; name the folder"]),
         (["compare", "CONFIG", "--output", "x" * 300], ["File name too long"]),
-        (["compare", "."], [".: is a folder; name the file in it"]),
+        (["compare", "."], [".: is a folder without dataset.yaml; name a config, or the folder of a data set"]),
         (["compare", "DATA/dataset.yaml"], ["unknown key 'format'"]),
         (["calibrate", "nowhere", "-o", "x"], ["nowhere: no such folder"]),
         (
