@@ -143,7 +143,7 @@ def test_a_mistake_in_a_config_is_one_line(changes: dict[str, Any], parts: list[
         ("name: 2023-99-99\n", "not valid YAML: month must be in 1..12"),
         ("name: 0b_\n", "not valid YAML: invalid literal for int()"),
         ("name: [\n", "not valid YAML: "),
-        ("", "key 'name' is missing"),
+        ("", "keys 'name', 'datasets' and 'calibrators' are missing"),
         ("- a\n", "expected keys and values, found list"),
     ],
 )

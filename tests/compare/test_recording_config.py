@@ -60,4 +60,4 @@ def test_data_is_for_a_config(command: Command, prepared: Prepared) -> None:
 
 def test_a_folder_that_is_no_data_set_is_named(command: Command, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    assert_refused(command("compare", tmp_path / "empty"), "dataset.yaml", "no such file")
+    assert_refused(command("compare", tmp_path / "empty"), "is a folder without dataset.yaml")
