@@ -19,8 +19,9 @@ from omnibench.registry import calibrators, costs
 
 _PACKAGE = Path(__file__).parents[1]
 # Files that every run depends on; ** takes in subfolders.
-_SHARED = ("robot/**/*.py", "fit/**/*.py", "data/dataset.py", "compare/plan.py")
+_SHARED = ("robot/**/*.py", "fit/**/*.py", "data/dataset.py", "data/references/*.py", "compare/plan.py")
 _CALIBRATORS = "fit/calibrators/*.py"
+_NO_PART = "fit/check/*.py"  # judges recordings before they are fitted
 
 
 def run_key(config: CompareConfig, dataset: Dataset, entry: CalibratorEntry, seed: int) -> str:
@@ -45,7 +46,7 @@ def run_key(config: CompareConfig, dataset: Dataset, entry: CalibratorEntry, see
 
 def shared_code(package: Path) -> str:
     """Hash of the code that every run uses: paths and contents of the files in ``package``, an omnibench folder."""
-    files = {file for pattern in _SHARED for file in package.glob(pattern)} - {*package.glob(_CALIBRATORS)}
+    files = {file for pattern in _SHARED for file in package.glob(pattern)} - {*package.glob(_CALIBRATORS), *package.glob(_NO_PART)}
     return code_digest(package, files)
 
 
