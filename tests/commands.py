@@ -184,7 +184,7 @@ def commands_of_this_process(capfd: pytest.CaptureFixture[str], monkeypatch: pyt
 
     def command(*arguments: object) -> Printed:
         monkeypatch.setattr(sys, "argv", ["omnibench", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as ended, registries_restored():
             main()
         printed = capfd.readouterr()
         assert "Traceback" not in printed.err
@@ -199,7 +199,7 @@ def run_here(*arguments: object, cwd: Path) -> Printed:
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
         patch.chdir(cwd)
         patch.setattr(sys, "argv", ["omnibench", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as ended, registries_restored():
             main()
     return Printed(int(ended.value.code or 0), out.getvalue(), err.getvalue())
 

@@ -42,7 +42,7 @@ def pytest_configure(config: pytest.Config) -> None:
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def registries_as_before() -> Iterator[None]:
     """What a test registers or loads is gone after it."""
     with registries_restored():

@@ -46,7 +46,10 @@ def run_key(config: CompareConfig, dataset: Dataset, entry: CalibratorEntry, see
 
 def shared_code(package: Path) -> str:
     """Hash of the code that every run uses: paths and contents of the files in ``package``, an omnibench folder."""
-    files = {file for pattern in _SHARED for file in package.glob(pattern)} - {*package.glob(_CALIBRATORS), *package.glob(_NO_PART)}
+    files = {file for pattern in _SHARED for file in package.glob(pattern)} - {
+        *package.glob(_CALIBRATORS),
+        *package.glob(_NO_PART),
+    }
     return code_digest(package, files)
 
 

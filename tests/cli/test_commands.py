@@ -30,8 +30,6 @@ from omnibench.robot.calibration import read_calibration
 from omnibench.robot.published_matrices import published_matrix
 from omnibench.testing.synthetic import synthetic_robot
 
-pytestmark = pytest.mark.usefixtures("registries_as_before")
-
 
 def document(printed: Printed) -> Any:
     """Standard output as one strict JSON document."""

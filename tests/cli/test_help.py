@@ -12,8 +12,6 @@ from commands import Command, flower, write_config
 
 from omnibench.cli.app import FAMILIES, app
 
-pytestmark = pytest.mark.usefixtures("registries_as_before")
-
 
 def commands() -> dict[str, Any]:
     """Every command by what is typed for it."""

@@ -11,8 +11,6 @@ from commands import Command, assert_refused
 from omnibench.data.storage import load_dataset
 from omnibench.registry import importers
 
-pytestmark = pytest.mark.usefixtures("registries_as_before")
-
 PLUGIN = '''
 from pathlib import Path
 from pydantic import Field

@@ -25,8 +25,6 @@ from timing import PATIENCE
 
 from omnibench.data.storage import load_dataset
 
-pytestmark = pytest.mark.usefixtures("registries_as_before")
-
 
 @pytest.mark.parametrize(
     ("arguments", "parts"),

@@ -33,8 +33,6 @@ from omnibench.testing.synthetic import PERIOD, synthetic_robot, synthetic_traje
 ROBOT = synthetic_robot()
 LIDAR = Lidar(rays=540)
 
-pytestmark = pytest.mark.usefixtures("registries_as_before")
-
 
 class Driven(NamedTuple):
     """A data set with scans, in which the poses recorded are wrong, and its truth."""

@@ -163,7 +163,6 @@ def test_failed_runs_are_not_kept_and_the_others_are(comparison: Compared) -> No
     assert len(list((comparison.output / "runs").iterdir())) == kept
 
 
-@pytest.mark.usefixtures("registries_as_before")
 def test_when_everything_fails_there_are_results_and_exit_code_1(command: Command, tmp_path: Path) -> None:
     plugins = write_plugin(tmp_path / "plugins", "raises", CALIBRATOR.format(name="raises", body=BODIES["raises"]))
     config = write_config(tmp_path, plugins=[str(plugins)], calibrators=["raises"])
@@ -173,7 +172,6 @@ def test_when_everything_fails_there_are_results_and_exit_code_1(command: Comman
     assert (tmp_path / "out" / "report.html").is_file()
 
 
-@pytest.mark.usefixtures("registries_as_before")
 def test_when_every_search_fails_beside_the_design_values_the_exit_code_is_1_and_a_long_message_is_cut(
     command: Command, tmp_path: Path
 ) -> None:
@@ -200,7 +198,6 @@ def test_when_every_search_fails_beside_the_design_values_the_exit_code_is_1_and
     ],
     ids=["calibrator", "cost", "importer"],
 )
-@pytest.mark.usefixtures("registries_as_before")
 def test_an_unknown_name_beside_a_broken_plugin_names_both(changes: dict[str, Any], name: str, tmp_path: Path) -> None:
     plugins = write_plugin(tmp_path / "plugins", "broken", BROKEN)
     with pytest.raises(OmnibenchError) as failure:

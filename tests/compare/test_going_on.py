@@ -33,8 +33,6 @@ from omnibench.data.storage import save_dataset
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.simulate import simulate_dataset
 
-pytestmark = pytest.mark.usefixtures("registries_as_before")
-
 # Ends soon after its file is there, and not before: what Ctrl-C finds under way.
 WAITING = """
 @calibrators.register("waiting")

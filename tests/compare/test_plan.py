@@ -18,8 +18,6 @@ from omnibench.compare.read_config import read_compare_config
 from omnibench.config import to_yaml
 from omnibench.errors import OmnibenchError
 
-pytestmark = pytest.mark.usefixtures("registries_as_before")
-
 AWAY = {"lower": [[0.5] * 3] * 3, "upper": [[1.0] * 3] * 3}
 
 

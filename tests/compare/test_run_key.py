@@ -16,8 +16,6 @@ from omnibench.compare.effective_config import effective_config, load_calibrator
 from omnibench.compare.plan import load_datasets, make_plan
 from omnibench.compare.run_key import shared_code
 
-pytestmark = pytest.mark.usefixtures("registries_as_before")
-
 PACKAGE = Path(omnibench.__file__).parent
 # Imported by the code of runs, without a say in their results. What has one belongs to the key's files instead.
 NEUTRAL = {

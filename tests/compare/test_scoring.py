@@ -186,7 +186,6 @@ class RootMeanSquare(Cost):
 """
 
 
-@pytest.mark.usefixtures("registries_as_before")
 def test_a_cost_that_is_no_mean_over_trajectories_is_warned_of(tmp_path: Path) -> None:
     plugins = write_plugin(tmp_path / "plugins", "root_mean_square", ROOT_MEAN_SQUARE)
     result = compared_here(

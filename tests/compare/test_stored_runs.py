@@ -15,8 +15,6 @@ from omnibench.compare.plan import load_datasets, make_plan
 from omnibench.compare.run import run_comparison
 from omnibench.progress import Progress
 
-pytestmark = pytest.mark.usefixtures("registries_as_before")
-
 
 class Watch:
     """A reporter that notes which runs were run and which were there."""

@@ -22,8 +22,6 @@ from omnibench.compare.run import run_comparison
 from omnibench.data.storage import save_dataset
 from omnibench.progress import Progress
 
-pytestmark = pytest.mark.usefixtures("registries_as_before")
-
 # Looks through all that can be reached from the problem, from every frame and from every module, for arrays that hold
 # given bytes and for texts that hold a given word.
 SPY = """

@@ -65,7 +65,7 @@ def test_nothing_is_not_said_to_be_missing_where_sessions_cannot_be_compared() -
     for words in (found.headline, verdict_in_words(found), told, report):
         assert "othing is missing" not in words
     assert "whether the sessions differ cannot be said" in " ".join(told.split())
-    assert "none, sessions not compared" in report
+    assert ", sessions not compared" in report
 
 
 def test_a_change_of_the_radii_closes_the_gap_to_the_held_out_session() -> None:

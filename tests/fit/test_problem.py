@@ -286,7 +286,6 @@ def holds(owner: Array, array: Array) -> bool:
     return np.ascontiguousarray(array).tobytes() in np.ascontiguousarray(owner).tobytes()
 
 
-@pytest.mark.usefixtures("registries_as_before")
 class TestValidationData:
     """A calibrator cannot see the validation data, whatever it follows from its problem."""
 

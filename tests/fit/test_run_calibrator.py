@@ -185,7 +185,6 @@ def test_rounding_on_the_boxs_surface_is_forgiven() -> None:
     assert result.outcome is Outcome.CONVERGED
 
 
-@pytest.mark.usefixtures("registries_as_before")
 def test_an_answer_whose_cost_is_not_finite_is_invalid() -> None:
     @costs.register("undefined")
     class Undefined(Cost):
@@ -198,7 +197,6 @@ def test_an_answer_whose_cost_is_not_finite_is_invalid() -> None:
     assert (result.outcome, result.reason, result.cost) == (Outcome.INVALID, "the answer's cost is not finite", None)
 
 
-@pytest.mark.usefixtures("registries_as_before")
 def test_a_cost_that_raises_fails_the_run_even_of_a_calibrator_that_never_asked() -> None:
     @costs.register("broken")
     class Broken(Cost):

@@ -11,8 +11,6 @@ from omnibench.fit.calibrator import Calibrator, run_calibrator
 from omnibench.registry import calibrators, load_plugin_file, load_plugins, registered_from
 from omnibench.testing import synthetic_problem
 
-pytestmark = pytest.mark.usefixtures("registries_as_before")
-
 PLUGIN = """
 from pydantic import Field
 from omnibench.fit.calibrator import Calibrator, Solution

@@ -188,7 +188,6 @@ def test_the_model_of_a_file_gives_the_same_poses_to_the_last_bit(tmp_path: Path
     np.testing.assert_array_equal(again.reported([log])[0], written.model.reported([log])[0])
 
 
-@pytest.mark.usefixtures("registries_as_before")
 def test_an_effect_of_a_plug_in_is_run(tmp_path: Path) -> None:
     @effects.register("standstill")
     class Standstill(MotionEffect):

@@ -200,7 +200,6 @@ def test_a_model_with_effects_needs_the_sample_period() -> None:
         OdometryModel(APR_02, APR_02.inverse_kinematic_matrix, "arc", (term("heading_drift", b=0.001),))
 
 
-@pytest.mark.usefixtures("registries_as_before")
 @pytest.mark.parametrize(("stage", "shape"), [("wheel", (40, 1)), ("body", (40, 1)), ("world", (40, 3))])
 def test_a_correction_of_another_shape_is_not_spread_over_wheels(stage: Stage, shape: tuple[int, int]) -> None:
     @effects.register("careless")

@@ -117,7 +117,6 @@ class TestEffectsOfTheCommandLine:
             read_simulation(only(tmp_path)).with_effects([DRIFT, DRIFT])
 
 
-@pytest.mark.usefixtures("registries_as_before")
 class TestTheCommand:
     def test_it_hides_an_effect_and_writes_the_truth_elsewhere(self, command: Command, tmp_path: Path) -> None:
         made = command("simulate", only(tmp_path), "-o", "data", "--truth", "truth", "--effect", DRIFT)

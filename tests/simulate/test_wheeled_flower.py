@@ -24,7 +24,7 @@ from omnibench.simulate.simulate import simulate_dataset
 
 
 @pytest.fixture
-def misread_steering(registries_as_before: None) -> str:  # noqa: ARG001
+def misread_steering() -> str:
     """The name of an effect that is known in one test alone."""
     return effects.register("misread_steering")(MisreadSteering).name
 

@@ -304,7 +304,6 @@ class Broken(MotionEffect):
 '''
 
 
-@pytest.mark.usefixtures("registries_as_before")
 class TestOnTheCommandLine:
     def test_an_effect_is_made_by_its_flag_and_by_its_kind(self, command: Command) -> None:
         for name, kind in (("first_slip", ["--effect"]), ("second_slip", ["--kind", "effect"])):

@@ -17,8 +17,6 @@ from omnibench.registry import registered_from
 from omnibench.testing import CaseOutcome, load_plugin
 from omnibench.testing.plugin_files import PLUGIN_KINDS, CheckReport, check_plugin, check_plugin_apart, new_plugin
 
-pytestmark = pytest.mark.usefixtures("registries_as_before")
-
 FLAWED = """
 from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.registry import calibrators

@@ -156,7 +156,10 @@ def _text(cell: Cell, layout: _Layout, index: int) -> Text:
 
 
 def _wrapped(text: str, width: int) -> str:
-    return "\n".join(wrap(_tied(text), width, break_on_hyphens=False)).replace(_NO_BREAK, " ")
+    """A text in lines; a path that is longer than a line breaks behind a slash."""
+    tied = re.sub(rf"\S{{{width + 1},}}", lambda path: path[0].replace("/", "/\v"), _tied(text))
+    lines = wrap(tied, width, break_on_hyphens=False, replace_whitespace=False)
+    return "\n".join(lines).replace("\v", "").replace(_NO_BREAK, " ")
 
 
 def _tied(text: str) -> str:

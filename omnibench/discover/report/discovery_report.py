@@ -62,13 +62,14 @@ from omnibench.words import plural
 def discovery_report(discovery: Discovery, options: str) -> Document:
     """The report as blocks. options: the effective options, in YAML."""
     dataset, better = discovery.dataset, "How much better" if discovery.extends else "How well it predicts"
+    runs = "held-out runs" if discovery.held_out else "training runs"
     return Document(
         title=f"What the odometry model lacks: {dataset.name}",
         subtitle=dataset.description,
         sections=(
             _answer(discovery),
             Section("what", "What", tuple(what_blocks(discovery)), about="What is missing, with its parameters."),
-            _folded("better", better, "Errors before and after, on held-out runs.", _how_much_better(discovery)),
+            _folded("better", better, f"Errors before and after, on {runs}.", _how_much_better(discovery)),
             replace(where_section(discovery), about="What the errors of the plain matrix depend on.", folded=True),
             _folded("sure", "How sure", "Rivals of the name, and what could still hide.", sure_blocks(discovery)),
             _folded("basis", "What this rests on", "Data, noise, options and files.", _basis(discovery, options)),

@@ -221,7 +221,6 @@ def test_the_geometry_is_refused_in_words() -> None:
     assert "closed_form works on the matrix parameterisation" in result.reason
 
 
-@pytest.mark.usefixtures("registries_as_before")
 def test_a_cost_that_is_no_sum_of_norms_is_refused_in_words() -> None:
     @costs.register("largest")
     class Largest(Cost):

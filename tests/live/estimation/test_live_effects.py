@@ -307,7 +307,6 @@ class StretchedTurns(MotionEffect):
 '''
 
 
-@pytest.mark.usefixtures("registries_as_before")
 def test_a_node_runs_effects_of_the_plugins_that_its_config_names(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "stretched_turns.py").write_text(PLUGIN)
@@ -320,7 +319,6 @@ def test_a_node_runs_effects_of_the_plugins_that_its_config_names(tmp_path: Path
     np.testing.assert_allclose(odometry(updates)[:, 2], 1.1 * path.poses[:, 2], atol=1e-9)
 
 
-@pytest.mark.usefixtures("registries_as_before")
 def test_live_takes_the_plugins_that_are_named(command: InProcess, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "stretched_turns.py").write_text(PLUGIN)
