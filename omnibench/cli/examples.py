@@ -50,7 +50,7 @@ def find_example(name: str) -> Example:
 def write_example(example: Example, folder: Path, *, force: bool = False) -> list[Path]:
     """Write the example into ``folder`` and return what was written; a file that is there and equal is left as it is.
 
-    force: replace what is there. ConfigError in one line: a file that differs is there, or all of the example is.
+    force: replace what is there. ConfigError in one line: a file that differs is there, or the recording is.
     DataError: the disk refuses.
     """
     wanted = {folder / file: content for file, content in _contents(example)}
@@ -60,10 +60,6 @@ def write_example(example: Example, folder: Path, *, force: bool = False) -> lis
     missing = {path: content for path, content in wanted.items() if force or not path.exists()}
     recording = folder / example.recording if example.recording else None
     refuse_existing(recording, force=force, folders=True)
-    if not missing and recording is None:
-        raise ConfigError(
-            f"{folder}: all of the example {example.name!r} is there already; choose another folder, or --force"
-        )
     write_files(missing)
     if recording is None:
         return list(missing)

@@ -55,7 +55,10 @@ def example(
     chosen = find_example(name)
     if output is None:
         raise ConfigError(f"say where the example goes: omnibench example {name} -o DIR")
-    _list_written(write_example(chosen, output, force=force))
+    written = write_example(chosen, output, force=force)
+    _list_written(written)
+    if not written:
+        typer.echo("nothing is written: all of it is there already, unchanged")
     if chosen.note:
         say(f"note: {chosen.note}")
     typer.echo("to go on, type:")

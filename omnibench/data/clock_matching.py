@@ -45,6 +45,9 @@ _FEWEST = 10  # windows of a run, below which its clock is not told; chosen
 _LEAST_DRIFTING = 10.0  # s: the drift of a shorter run is not told apart from its offset; chosen
 _LARGEST_DRIFT = 0.05  # s per s: no clock goes more wrong; OptiOdom's tricycle has 0.014
 _DELTA = 0.01  # s: half the step of derivatives by time
+# s: standard deviation that chords in place of arcs, Eq. (3), add to an offset. Chosen by 200 simulated drives each at
+# 10, 20 and 50 Hz: with it 99 % of their errors are within 2.3 of the standard errors that are given, without 5.
+_CHORDS = 2e-4
 # Robust cost that an offset _AWAY, s, from the best one must add, as a share. Chosen: every run of four robots under
 # motion capture (OptiOdom) adds 0.43 or more, and the 72 of a Robotino that drives evenly throughout add 0.07 or less.
 _AWAY, _TOLD = 0.5, 0.2
@@ -285,7 +288,8 @@ class _Windows:
         sums = np.add.reduceat(scores, np.flatnonzero(np.diff(blocks, prepend=-1.0)), axis=2)
         sums = sums.reshape(len(design), -1)
         inverse = np.linalg.inv(normal)
-        errors = np.sqrt(np.diag(inverse @ (sums @ sums.T) @ inverse))
+        chords = np.array([_CHORDS, _CHORDS * np.sqrt(12.0) / self.length])[: len(design)]
+        errors = np.sqrt(np.diag(inverse @ (sums @ sums.T) @ inverse) + chords**2)
         drift_error = float(errors[1]) if len(errors) > 1 else np.inf
         return ClockMatch(clock[0], float(errors[0]), clock[1], drift_error, self.length)
 

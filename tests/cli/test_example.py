@@ -12,7 +12,6 @@ from typed_commands import parse
 from omnibench.cli import examples
 from omnibench.cli.examples import EXAMPLES, Example, find_example, write_example
 from omnibench.compare.read_config import read_compare_config
-from omnibench.errors import ConfigError
 
 TYPED = [(example, command) for example in EXAMPLES for command in example.commands]
 
@@ -72,10 +71,16 @@ def test_a_file_that_differs_is_not_overwritten(command: Command) -> None:
     assert not Path("plugins").exists()
 
 
-@pytest.mark.parametrize("name", ["apr02", "recording"])
-def test_an_example_that_is_there_is_not_written_again(command: Command, name: str) -> None:
-    assert command("example", name, "-o", "demo").returncode == 0
-    assert_refused(command("example", name, "-o", "demo"), "is there already", "choose another folder")
+def test_an_example_that_is_there_unchanged_is_as_good_as_written(command: Command) -> None:
+    assert command("example", "apr02", "-o", "demo").returncode == 0
+    again = command("example", "apr02", "-o", "demo")
+    assert again.returncode == 0
+    assert again.stdout.startswith("nothing is written: all of it is there already")
+
+
+def test_a_recording_that_is_there_is_not_simulated_again(command: Command) -> None:
+    assert command("example", "recording", "-o", "demo").returncode == 0
+    assert_refused(command("example", "recording", "-o", "demo"), "is there already", "choose another folder")
 
 
 def test_a_wrong_name_is_answered_with_the_nearest(command: Command) -> None:
@@ -91,5 +96,4 @@ def test_an_installed_package_has_its_own_copies(monkeypatch: pytest.MonkeyPatch
     (tmp_path / "example_files" / "configs" / "small.yaml").write_text("name: bundled\n", encoding="utf-8")
     monkeypatch.setattr(examples, "__file__", str(tmp_path / "examples.py"))
     assert write_example(find_example("small"), tmp_path / "demo") == [tmp_path / "demo" / "configs" / "small.yaml"]
-    with pytest.raises(ConfigError, match="all of the example 'small' is there already"):
-        write_example(find_example("small"), tmp_path / "demo")
+    assert write_example(find_example("small"), tmp_path / "demo") == []
