@@ -78,13 +78,16 @@ class CandidatePool:
 
 
 def read_candidates(
-    source: Path | str, *, dataset: str | None = None, integration: Integration | None = None
+    source: Path | str | Dataset, *, dataset: str | None = None, integration: Integration | None = None
 ) -> CandidatePool:
-    """The candidates of a data set folder, of a comparison config's data set, or of a design config.
+    """The candidates of a data set or its folder, of a comparison config's data set, or of a design config.
 
     dataset: the one to use where a comparison config has several. integration: default: the config's, or arc for a data
     set. OmnibenchError in one line that names the source, what is wrong and what to do.
     """
+    if isinstance(source, Dataset):
+        refuse_choice(dataset, source.name)
+        return candidates_of_dataset(source, integration or "arc")
     path = Path(source)
     if path.is_dir():
         refuse_choice(dataset, path)
@@ -320,7 +323,7 @@ def require_every_motion(robot: Robot, runs: Sequence[Trajectory], place: str, e
         )
 
 
-def refuse_choice(dataset: str | None, path: Path) -> None:
+def refuse_choice(dataset: str | None, source: Path | str) -> None:
     """ConfigError: ``--dataset`` chooses where there is nothing to choose from."""
     if dataset is not None:
-        raise ConfigError(f"--dataset: only a comparison config with several data sets needs it; {path} is none")
+        raise ConfigError(f"--dataset: only a comparison config with several data sets needs it; {source} is none")

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
+from omnibench.data.dataset import Dataset
 from omnibench.design.candidates import CandidatePool, read_candidates
 from omnibench.design.config import Per, Use
 from omnibench.design.d_optimality import ContinuousDesign, Counts, continuous_optimum, equal_design, exact_designs
@@ -25,7 +26,7 @@ _LEAST_SHARE = 1e-4  # a command with less of the continuous optimum is not list
 
 
 def design_experiment(
-    source: Path | str | CandidatePool,
+    source: Path | str | Dataset | CandidatePool,
     *,
     use: Use = "trajectory",
     per: Per = "run",
@@ -36,7 +37,7 @@ def design_experiment(
 ) -> Design:
     """Choose the runs that shrink the covariance of the matrix elements most, from each set of candidates.
 
-    source: a data set folder, a comparison config or a design config. use: the reference poses that a calibration
+    source: a data set or its folder, a comparison config or a design config. use: the reference poses that a calibration
     uses. per: the cost that is saved: runs, s of driving, or m that the wheels roll. runs: how many to choose; default:
     the fewest within 1 % of the D-optimum. repetitions: how often a command may be chosen at most. dataset,
     integration: see ``read_candidates``. The Fisher information is taken at the design values, with wheel rates as

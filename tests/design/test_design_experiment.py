@@ -189,6 +189,13 @@ def test_recordings_give_candidates_their_noise_and_their_baseline(tmp_path: Pat
     assert design.sets[0].reached
 
 
+def test_a_data_set_in_memory_is_designed_for_as_its_folder_is(tmp_path: Path) -> None:
+    dataset = simulated()
+    save_dataset(dataset, tmp_path / "data")
+    chosen = [found.steps for found in design_experiment(dataset, runs=9).sets]
+    assert chosen == [found.steps for found in design_experiment(tmp_path / "data", runs=9).sets]
+
+
 def test_recordings_tell_the_same_as_the_config_that_they_were_simulated_from(tmp_path: Path) -> None:
     """But for the estimate of the noise model; encoder noise would add to the walk."""
     changes = {"noise": NOISE, "repetitions": 20}
