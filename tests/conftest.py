@@ -49,6 +49,13 @@ def registries_as_before() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module", autouse=True)
+def registries_as_before_the_module() -> Iterator[None]:
+    """What is registered or loaded for all tests of a module is gone after them."""
+    with registries_restored():
+        yield
+
+
 @pytest.fixture
 def command(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
     """Commands, in an empty folder."""

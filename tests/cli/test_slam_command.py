@@ -177,8 +177,9 @@ def test_an_effect_of_a_plug_in_works_in_the_calibration(command: Command, drive
 
 def _parameters(name: str) -> dict[str, float]:
     """Small values of a plug-in effect's parameters."""
-    from omnibench.registry import effects
+    from omnibench.registry import effects, load_plugins
 
+    load_plugins(["plugins"], installed=False)
     effect = effects.entry(name, "test").cls
     return {parameter.name: 0.0 for parameter in effect().parameters(ROBOT)}
 
