@@ -80,9 +80,10 @@ class Shown:
     def to_frame(self, table: str | None = None) -> pl.DataFrame:
         """One of the object's tables as a Polars data frame, in SI units; default: the first.
 
-        Of a data set: trajectories, wheels, poses, references. A trajectory: wheels, poses. A robot: wheels. A
-        calibration: matrix; a run of ``calibrate`` also parameters. An evaluation: splits. A comparison: statistics,
-        runs, errors, history. A discovery: effects, residuals. UnknownNameError lists those that there are.
+        Of a data set: trajectories, wheels, poses, references. A trajectory: wheels, poses, references. A robot:
+        wheels. A calibration: matrix; a run of ``calibrate`` also parameters. An evaluation: splits, references. A
+        comparison: statistics, runs, errors, history. A discovery: effects, residuals. UnknownNameError lists those
+        that there are.
         """
         tables = _view(self).tables()
         name = next(iter(tables)) if table is None else table
@@ -96,9 +97,10 @@ class Shown:
         """The object as a Plotly figure.
 
         A data set: the reference paths of its runs from one start. A trajectory: its path. A robot: its wheels from
-        above. A calibration: each element's deviation from the design with its 95 % interval, or with ``dataset=`` the
-        paths of a few runs before and after. A comparison: the cost of every entry (``dataset=`` names one of several).
-        A discovery: the errors before and after.
+        above. A calibration: each element's difference from the design with its standard deviation, of a run of
+        ``calibrate`` with its 95 % interval; or with ``dataset=`` the paths of a few runs before and after. A
+        comparison: the cost of every entry (``dataset=`` names one of several). A discovery: the errors before and
+        after.
         """
         view = _view(self)
         if unknown := options.keys() - signature(view.figure).parameters.keys():

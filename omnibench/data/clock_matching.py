@@ -94,11 +94,6 @@ class ClockMatch:
         """Seconds to add to the times of the run's first pose."""
         return self.middle - self.drift * self.length / 2
 
-    @property
-    def offset_error(self) -> float:
-        """Standard error of ``offset``, s."""
-        return float(np.hypot(self.middle_error, self.drift_error * self.length / 2 if self.drift else 0.0))
-
     def corrected(self, pose_times: Array) -> Array:
         """Pose times (K,) by the wheels' clock, s, Eq. (1)."""
         times: Array = pose_times + self.offset + self.drift * (pose_times - pose_times[0])

@@ -7,12 +7,16 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.errors import DataError, nearest
 from omnibench.robot.kinematics import Array
+
+if TYPE_CHECKING:
+    import polars as pl
 
 AUTO = "auto"  # as a separator: the one that the header holds
 BLANK = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})  # cells without a value, in any case
@@ -247,7 +251,7 @@ def read_text(file: Path) -> str:
 
 
 def _read_parquet(file: Path) -> CellTable:
-    """The columns of a Parquet file; times become seconds since 1970."""
+    """The columns of a Parquet file; dates become seconds since 1970, durations seconds."""
     import polars as pl
 
     try:
@@ -259,10 +263,21 @@ def _read_parquet(file: Path) -> CellTable:
     columns = [
         column.fill_null("").to_list()
         if column.dtype == pl.String
-        else column.cast(pl.Float64, strict=False).fill_null(np.nan).to_numpy()
+        else _seconds(column).cast(pl.Float64, strict=False).fill_null(np.nan).to_numpy()
         for column in frame.iter_columns()
     ]
     return CellTable(file, tuple(frame.columns), tuple(columns), np.arange(1, len(frame) + 1))
+
+
+def _seconds(column: pl.Series) -> pl.Series:
+    """A column of dates or durations in seconds; another as it is."""
+    import polars as pl
+
+    if column.dtype == pl.Date:
+        column = column.cast(pl.Datetime("ns"))
+    if column.dtype == pl.Datetime:
+        return column.dt.epoch("ns") / 1e9
+    return column.dt.total_nanoseconds() / 1e9 if column.dtype == pl.Duration else column
 
 
 def _separator(text: str, header_lines: int) -> str:

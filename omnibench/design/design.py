@@ -37,11 +37,11 @@ def design_experiment(
 ) -> Design:
     """Choose the runs that shrink the covariance of the matrix elements most, from each set of candidates.
 
-    source: a data set or its folder, a comparison config or a design config. use: the reference poses that a calibration
-    uses. per: the cost that is saved: runs, s of driving, or m that the wheels roll. runs: how many to choose; default:
-    the fewest within 1 % of the D-optimum. repetitions: how often a command may be chosen at most. dataset,
-    integration: see ``read_candidates``. The Fisher information is taken at the design values, with wheel rates as
-    exact, so that designs are optimal for matrices near them.
+    source: a data set or its folder, a comparison config or a design config. use: the reference poses that a
+    calibration uses. per: the cost that is saved: runs, s of driving, or m that the wheels roll. runs: how many to
+    choose; default: the fewest within 1 % of the D-optimum. repetitions: how often a command may be chosen at most.
+    dataset, integration: see ``read_candidates``. The Fisher information is taken at the design values, with wheel
+    rates as exact, so that designs are optimal for matrices near them.
 
     OmnibenchError in one line: bad source or arguments, candidates that do not determine the whole matrix.
     """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 
@@ -13,7 +12,7 @@ import polars as pl
 from omnibench.data.dataset import Dataset
 from omnibench.errors import DataError, require_type
 from omnibench.fit.calibrate import CalibrationRun
-from omnibench.fit.evaluate import Evaluation
+from omnibench.fit.evaluate import Evaluation, SplitErrors
 from omnibench.notebook.single_figure import drawn
 from omnibench.report.blocks import LegendItem
 from omnibench.report.path_pictures import CALIBRATED, DESIGN_ITEM, paths_before_after
@@ -25,9 +24,9 @@ from omnibench.views import View
 
 _ROWS = (("x", "m/rad"), ("y", "m/rad"), ("heading", "rad/rad"))
 _CALIBRATED = LegendItem("calibrated", "calibration", CALIBRATED)
-_STANDARD = 1.96  # standard deviations of a normal distribution to either side that hold 95 %
 _SIGNALS = 4  # columns of a matrix that a text shows
 _WARNINGS = 4  # shown of a run
+_FINAL = ("trajectories", "cost", "position_mean_m", "position_max_m", "heading_mean_rad", "heading_max_rad")
 
 
 class CalibrationView(View):
@@ -55,36 +54,53 @@ class CalibrationView(View):
             yield f"  {origin.held_out.sentence}"
 
     def intervals(self) -> tuple[Array, Array] | None:
-        """Ends (3, M) of the elements' 95 % intervals."""
+        """Ends (3, M) of the elements' 95 % intervals; a file does not say by how many runs its covariance is known."""
+        return None
+
+    def deviations(self) -> Array | None:
+        """Standard deviations (3, M) of the elements by the covariance; NaN where it tells nothing."""
         if self.calibration.covariance is None:
             return None
         matrix = self.calibration.matrix_array
         variances = np.diag(np.array(self.calibration.covariance))[: matrix.size].reshape(matrix.shape)
-        half = _STANDARD * np.sqrt(variances)
-        return matrix - half, matrix + half
+        return np.sqrt(np.where(variances > 0, variances, np.nan))
 
     def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
         return {"matrix": self._matrix}
 
     def _matrix(self) -> pl.DataFrame:
-        calibration, design = self.calibration, self.calibration.robot.inverse_kinematic_matrix
-        ends = self.intervals()
-        rows = []
-        for (name, unit), row in zip(_ROWS, range(3), strict=True):
-            for column, signal in enumerate(calibration.robot.drive.names):
-                low, high = (math.nan, math.nan) if ends is None else (float(end[row, column]) for end in ends)
-                value, first = calibration.matrix[row][column], float(design[row, column])
-                rows.append((name, signal, unit, value, first, low, high))
-        names = ("row", "signal", "unit", "value", "design", "low", "high")
-        return pl.DataFrame(rows, names, orient="row")
+        calibration = self.calibration
+        columns: dict[str, Array | None] = {
+            "value": calibration.matrix_array,
+            "design": calibration.robot.inverse_kinematic_matrix,
+            "deviation": self.deviations(),
+        }
+        if (ends := self.intervals()) is not None:
+            columns |= dict(zip(("low", "high"), ends, strict=True))
+        signals = calibration.robot.drive.names
+        named = {
+            "row": [name for name, _ in _ROWS for _ in signals],
+            "signal": [*signals] * len(_ROWS),
+            "unit": [unit for _, unit in _ROWS for _ in signals],
+        }
+        untold = np.full(len(named["row"]), np.nan)
+        numbers = {name: untold if each is None else each.ravel() for name, each in columns.items()}
+        return pl.DataFrame({**named, **numbers}).fill_nan(None)
 
     def figure(self, dataset: Dataset | None = None) -> go.Figure:
         return self._deviations() if dataset is None else self._paths(dataset)
 
     def _deviations(self) -> go.Figure:
-        """Each element's deviation from the design, in % of its row's largest element, with its 95 % interval."""
-        frame = self._matrix().with_columns(pl.col("design").abs().max().over("row").alias("scale"))
-        scaled = {name: 100 * (frame[name] - frame["design"]) / frame["scale"] for name in ("value", "low", "high")}
+        """Each element's difference from the design, in % of its row's scale, with its interval or its deviation."""
+        frame = self._matrix()
+        scales = np.repeat(self.calibration.robot.row_scales, len(self.calibration.robot.drive.names)) / 100
+        told = "low" in frame.columns
+        value, deviation = frame["value"], frame["deviation"]
+        ends = (frame["low"], frame["high"]) if told else (value - deviation, value + deviation)
+        scaled = {
+            name: (column - frame["design"]) / scales
+            for name, column in zip(("value", "low", "high"), (frame["value"], *ends), strict=True)
+        }
         names = [text(f"{row}: {signal}") for row, signal in zip(frame["row"], frame["signal"], strict=True)]
         error = {
             "type": "data",
@@ -93,10 +109,11 @@ class CalibrationView(View):
         }
         marker = {"color": PALETTE[0], "size": 9}
         dots = go.Scatter(x=scaled["value"].to_list(), y=names, mode="markers", marker=marker, error_x=error)
-        figure = plot(dots, x_title="deviation from the design, % of the row's largest element")
+        figure = plot(dots, x_title="difference from the design, % of the row's scale")
         figure.add_vline(x=0.0, line={"width": 1, "dash": "dot"})
         figure.update_yaxes(autorange="reversed")
-        title = f"{text(self.calibration.name)}: elements of the matrix with 95 % intervals"
+        bars = "95 % intervals" if told else "standard deviations"
+        title = f"{text(self.calibration.name)}: elements of the matrix with {bars}"
         figure.update_layout(title_text=title, title_x=0.02, height=160 + 28 * len(names), margin={"l": 110, "t": 60})
         return figure
 
@@ -154,22 +171,33 @@ class EvaluationView(View):
         yield f"Evaluation on {evaluation.dataset!r}, {evaluation.trajectories} runs"
         for split, errors in evaluation.splits.items():
             design = evaluation.design[split]
-            yield (
-                f"  {split}: mean position error {design.position_mean_m:.4f} -> {errors.position_mean_m:.4f} m, "
-                f"heading {design.heading_mean_rad:.4f} -> {errors.heading_mean_rad:.4f} rad"
-            )
+            yield f"  {split}: {_before_after(design, errors)}"
         yield f"  {evaluation.held_out.sentence}"
 
     def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
-        return {"splits": self._splits}
+        told = any(errors.references for errors in self.shown.splits.values())
+        return {"splits": self._splits, **({"references": self._references} if told else {})}
 
     def _splits(self) -> pl.DataFrame:
         models = {"calibration": self.shown.splits, "design": self.shown.design}
         return pl.DataFrame(
             [
-                {"split": split, "model": model, **vars(errors)}
+                {"split": split, "model": model, **{name: vars(errors)[name] for name in _FINAL}}
                 for model, splits in models.items()
                 for split, errors in splits.items()
+            ],
+            infer_schema_length=None,
+        )
+
+    def _references(self) -> pl.DataFrame:
+        """Errors at the references, by split, model and kind."""
+        models = {"calibration": self.shown.splits, "design": self.shown.design}
+        return pl.DataFrame(
+            [
+                {"split": split, "model": model, **dict(at)}
+                for model, splits in models.items()
+                for split, errors in splits.items()
+                for at in errors.references
             ]
         )
 
@@ -179,8 +207,21 @@ class EvaluationView(View):
         bars = []
         for model, colour in (("design", DESIGN_ITEM.colour), ("calibration", CALIBRATED)):
             rows = frame.filter(pl.col("model") == model)
-            values = (1000 * rows["position_mean_m"]).to_list()
+            values = (1000 * rows["position_mean_m"].cast(pl.Float64)).to_list()
             bars.append(go.Bar(x=rows["split"].to_list(), y=values, name=model, marker_color=colour))
         figure = go.Figure(bars, layout=plot(y_title="mean position error at the end (mm)").layout)
         figure.update_layout(title_text=text(f"{self.shown.dataset}: before and after"), showlegend=True)
         return figure
+
+
+def _before_after(design: SplitErrors, errors: SplitErrors) -> str:
+    """Mean errors by the design and by a calibration; of runs that have no poses by their references."""
+    told = [
+        f"{what} {before:.4f} -> {after:.4f} {unit}"
+        for what, before, after, unit in (
+            ("position error", design.position_mean_m, errors.position_mean_m, "m"),
+            ("heading error", design.heading_mean_rad, errors.heading_mean_rad, "rad"),
+        )
+        if before is not None and after is not None
+    ]
+    return f"mean {', '.join(told)}" if told else f"cost {design.cost:.4f} -> {errors.cost:.4f}"

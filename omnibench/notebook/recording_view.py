@@ -10,6 +10,8 @@ import plotly.graph_objects as go
 import polars as pl
 
 from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.references.reference_table import reference_frame
+from omnibench.data.references.run_references import References
 from omnibench.data.tables.dataset_tables import tables_of
 from omnibench.notebook.single_figure import drawn
 from omnibench.report.blocks import Figure, FigureGrid
@@ -42,10 +44,10 @@ class DatasetView(View):
         yield from (f"  warning: {warning}" for warning in dataset.warnings[:_WARNINGS])
 
     def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
-        run = self.shown.trajectories[0]
+        runs = self.shown.trajectories
         names = ["trajectories", "wheels"]
-        names += ["poses"] if any(each.start_known for each in self.shown.trajectories) else []
-        names += ["references"] if run.references is not None else []
+        names += ["poses"] if any(run.start_known for run in runs) else []
+        names += ["references"] if any(run.references is not None for run in runs) else []
         return {name: partial(_table, self.shown, name) for name in names}
 
     def figure(self) -> go.Figure:
@@ -59,6 +61,10 @@ def _table(dataset: Dataset, name: str) -> pl.DataFrame:
     return frame.select(column for column in frame.iter_columns() if column.null_count() < len(frame))
 
 
+def _reference_table(references: References) -> pl.DataFrame:
+    return reference_frame([("", references)]).drop("trajectory")
+
+
 class TrajectoryView(View):
     """A run: how long, how far, and its reference path."""
 
@@ -68,14 +74,22 @@ class TrajectoryView(View):
         run = self.shown
         command = "" if run.command is None else f", command {run.command}"
         yield f"Trajectory {run.id!r} ({run.split}{command}): {run.times[-1]:.2f} s"
-        end = ", ".join(f"{value:.3f}" for value in run.final_pose - run.start)
-        yield (
-            f"  {plural(len(run.times), 'wheel sample')} of {plural(run.rates.shape[1], 'wheel')}, "
-            f"{plural(len(run.pose_times), 'reference pose')}; end - start: {end} (m, m, rad)"
-        )
+        samples = f"{plural(len(run.times), 'wheel sample')} of {plural(run.rates.shape[1], 'wheel')}"
+        yield f"  {samples}, {self._reference()}"
+
+    def _reference(self) -> str:
+        """The reference in words: poses with the way from start to end, or what there is in their place."""
+        run = self.shown
+        told = [] if run.references is None else [plural(len(run.references), "reference")]
+        if run.has_poses:
+            end = ", ".join(f"{value:.3f}" for value in run.final_pose - run.start)
+            told.insert(0, f"{plural(len(run.pose_times), 'reference pose')}; end - start: {end} (m, m, rad)")
+        return "; ".join(told) or "no reference"
 
     def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
-        return {"wheels": self._wheels, "poses": self._poses}
+        references = self.shown.references
+        named = {} if references is None else {"references": partial(_reference_table, references)}
+        return {"wheels": self._wheels, "poses": self._poses, **named}
 
     def _wheels(self) -> pl.DataFrame:
         run = self.shown

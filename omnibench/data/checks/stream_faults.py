@@ -231,14 +231,15 @@ def _frozen_steering(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Findi
 
 def _bends(robot: Robot, run: Trajectory) -> Array:
     """Turns of the reference over steps of the robot's size, rad, signed by the wheels' direction of rolling."""
-    way = np.append(0.0, np.cumsum(np.hypot(*np.diff(run.poses[:, :2], axis=0).T)))
-    turned = np.abs(np.diff(run.poses[:, 2], prepend=run.poses[0, 2])).sum() * robot.reach
+    steps = np.diff(run.poses, axis=0)
+    whole = np.append(0.0, np.cumsum(np.hypot(steps[:, 0], steps[:, 1]) + robot.reach * np.abs(steps[:, 2])))
     length = max(robot.reach, 1e-3)
-    if way[-1] + turned < 3 * length:
+    if whole[-1] < 3 * length:
         return np.zeros(0)
-    whole = way + robot.reach * np.append(0.0, np.cumsum(np.abs(np.diff(run.poses[:, 2]))))
-    marks = np.arange(0.0, whole[-1], length)
-    bends: Array = np.diff(np.interp(marks, whole, run.poses[:, 2]))
+    rolled = np.append(0.0, np.cumsum(run.rates.mean(axis=1) * np.diff(run.times, prepend=0.0)))
+    rolling = np.sign(np.diff(np.interp(run.pose_times, np.append(0.0, run.times), rolled)))
+    signed = np.append(0.0, np.cumsum(steps[:, 2] * rolling))
+    bends: Array = np.diff(np.interp(np.arange(0.0, whole[-1], length), whole, signed))
     return bends
 
 

@@ -13,12 +13,13 @@ from omnibench.data.importers.orientation import planar_headings
 from omnibench.errors import DataError
 from omnibench.files import write_text
 from omnibench.robot.kinematics import Array
+from omnibench.views import Brief
 
 FIELDS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
-@dataclass(frozen=True, eq=False)
-class PoseTrack:
+@dataclass(frozen=True, eq=False, repr=False)
+class PoseTrack(Brief):
     """Planar poses: times (K,) in s as recorded, poses (K, 3) as x, y (m) and heading (rad, within a turn)."""
 
     times: Array

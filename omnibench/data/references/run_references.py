@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array
+from omnibench.views import Brief
 
 ReferenceKind = Literal["distance", "turn", "displacement", "position", "heading"]
 KINDS: tuple[ReferenceKind, ...] = get_args(ReferenceKind)
@@ -40,8 +41,8 @@ class Reference:
     t0: float | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class References:
+@dataclass(frozen=True, eq=False, repr=False)
+class References(Brief):
     """The R measurements of one run.
 
     kinds (R,): of KINDS. t0, t1 (R,): s; equal for what is measured at one time. values, sigmas (R, 2): the second of

@@ -108,15 +108,6 @@ def value_and_interval(parameter: EstimatedParameter) -> tuple[str, str, str]:
     return fixed(value, decimals, signed=True), span(low, high, decimals, signed=True), shown.unit
 
 
-def parameter_in_words(parameter: EstimatedParameter) -> str:
-    """``tau = +31.2 ms (+30.1 to +32.3)``."""
-    value, interval, unit = value_and_interval(parameter)
-    words = f"{parameter.name} = {with_unit(value, unit)}"
-    if parameter.shape:
-        return f"{words} (chosen)"
-    return f"{words} ({interval})" if interval else words
-
-
 def effect_in_words(effect: NamedEffect) -> str:
     """An effect's name with those that it cannot be told apart from."""
     others = [name for name in effect.confusable_with if name != effect.name]

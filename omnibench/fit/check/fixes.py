@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from omnibench.config import parse_yaml
 from omnibench.data.checks.finding import Finding
 from omnibench.fit.check.recording_source import RecordingSource
 from omnibench.registry import importers
@@ -35,10 +36,16 @@ def with_fixes(read: RecordingSource, findings: Sequence[Finding]) -> list[Findi
 
 
 def command(read: RecordingSource, findings: Sequence[Finding]) -> str:
-    """The command line that reads a recording again, mended; by way of a data set where its importer cannot."""
+    """The command line that reads a recording again, mended; of a data set in memory it says that it is to be saved."""
     changes = [finding.changes for finding in findings if finding.changes]
     if not changes:
         return ""
+    typed = _command(read, changes)
+    return typed if read.source.exists() else f"{typed}  # after save_dataset(dataset, {str(read.source)!r})"
+
+
+def _command(read: RecordingSource, changes: Sequence[Mapping[str, Any]]) -> str:
+    """The command line; by way of a data set where the importer cannot."""
     try:
         return _import(read.importer, read.source, _mended(read, read.importer, read.options, changes), _target(read))
     except CannotBeTypedError:
@@ -74,7 +81,7 @@ def as_yaml(value: Any) -> str:
         return "true" if value else "false"
     if isinstance(value, str):
         plain = value and all(letter.isalnum() or letter in "._/*-" for letter in value) and value[0] != "*"
-        return value if plain else json.dumps(value)
+        return value if plain and parse_yaml(value, "value") == value else json.dumps(value)
     if isinstance(value, float) and value.is_integer():
         return str(int(value))
     if isinstance(value, Mapping):

@@ -17,8 +17,8 @@ from omnibench.discover.report.wording import (
     gap_in_words,
     held_out_in_words,
     noise_in_words,
-    parameter_in_words,
     reading,
+    value_and_interval,
     weight_in_words,
 )
 from omnibench.discover.result import EstimatedParameter, Extrapolation, Gap, Step
@@ -43,19 +43,12 @@ def test_quantities_are_read_in_the_units_of_people(value: float, unit: str, wor
 
 def test_a_parameter_shares_its_decimals_with_its_interval() -> None:
     parameter = EstimatedParameter("tau", 0.0312, "s", 0.0301, 0.0323)
-    assert parameter_in_words(parameter) == "tau = +31.2 ms (+30.1 to +32.3)"
+    assert value_and_interval(parameter) == ("+31.2", "+30.1 to +32.3", "ms")
 
 
-def test_a_shape_is_chosen() -> None:
-    assert (
-        parameter_in_words(EstimatedParameter("rollers", 10.0, "1", 10.0, 10.0, shape=True)) == "rollers = 10 (chosen)"
-    )
-
-
-def test_a_length_that_was_chosen_keeps_its_unit() -> None:
-    assert (
-        parameter_in_words(EstimatedParameter("length", 0.1, "m", 0.1, 0.1, shape=True)) == "length = 100 mm (chosen)"
-    )
+def test_a_length_that_was_chosen_keeps_its_unit_and_a_number_has_none() -> None:
+    assert value_and_interval(EstimatedParameter("rollers", 10.0, "1", 10.0, 10.0, shape=True)) == ("10", "", "")
+    assert value_and_interval(EstimatedParameter("length", 0.1, "m", 0.1, 0.1, shape=True)) == ("100", "", "mm")
 
 
 @pytest.mark.parametrize(

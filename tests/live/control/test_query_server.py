@@ -75,7 +75,7 @@ def test_the_pose_at_a_time_is_interpolated(driven: Any, form: str) -> None:
         *((f"pose?at={number}", None, "is not a time") for number in ("nan", "snan", "-inf", "")),
         ("pose?at=" + "7" * 5000, None, "777...' is not a time"),
         ("pose?at=12", None, "at: 12.000000 s is not within"),
-        ("set_pose", '{"x": 1}', "set_pose: key 'y' is missing (and 1 more mistake)"),
+        ("set_pose", '{"x": 1}', "set_pose: keys 'y' and 'theta' are missing"),
         ("set_pose", '{"x": 1, "y": 2, "theta": 3, "z": 4}', "set_pose: unknown key 'z'"),
         ("set_pose", b"\xff\xfe", "the payload is not text"),
         ("calibration", "format: something", "put it there, or ask omnibench/apr/swap"),

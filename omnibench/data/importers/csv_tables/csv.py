@@ -150,6 +150,9 @@ def _apart(recording: RecordedStreams) -> DataError:
             f"{recording.place}: none of its references lies within its wheels' samples, {samples.begins[0]:.10g} to "
             f"{samples.ends[-1]:.10g} s; times count by the wheels' clock (--set pose_time_unit=ms, pose_time_offset=S)"
         )
+    for what, count in (("poses", len(times)), ("wheels", len(samples.ends))):
+        if count < 2:
+            return DataError(f"{recording.place}: {what}: has one row; two are needed, or the run is no run")
     spans = f"poses {times[0]:.10g} to {times[-1]:.10g} s, wheels {samples.begins[0]:.10g} to {samples.ends[-1]:.10g} s"
     share = (times[-1] - times[0]) / (samples.ends[-1] - samples.begins[0])
     way = "check time units (--set wheel_time_unit=ms, pose_time_unit=ms), or --set clocks=match for clocks apart"

@@ -37,7 +37,9 @@ def read_wheels(
     values = options.wheel_angles(shown, times, str(file), warnings) if counted else shown * options.wheel_radians
     angles = options.steering_angles(numbers.columns(names[count:]), str(file)) if len(names) > count else None
     readings = WheelReadings(times, values, counted, options.quantity == "positions", angles)
-    period = options.sample_period or (median_period([times]) if len(times) > 1 else float(times[0]))
+    if len(times) < 2 and not options.sample_period:
+        raise DataError(f"{file}: wheels: has one row; two are needed, or --set sample_period=S")
+    period = options.sample_period or median_period([times])
     samples, losses = wheel_samples(readings, options, str(file), period, longest_gap=options.longest_gap or np.inf)
     warnings.extend(f"{file}: {loss}" for loss in losses.in_words("row"))
     return samples

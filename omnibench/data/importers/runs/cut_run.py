@@ -31,11 +31,13 @@ def cut_run(
     reference: ReferenceStream,
     seen: NDArray[np.bool_] | slice,
 ) -> CutRun | None:
-    """The run of the chosen samples and the poses that were seen then; None if it has not two poses.
+    """The run of the chosen samples and the poses that were seen then; None if there are no samples or not two poses.
 
     whole: the recording as a run, whose id, split and command are taken over; its arrays are replaced. A recording that
     has references of other kinds, and a start pose at most, begins with its wheels.
     """
+    if not len(chosen):
+        return None
     if not len(reference.times) or (len(reference.times) == 1 and reference.measured is not None):
         return _without_poses(whole, samples, chosen, reference)
     times, poses = reference.times[seen], reference.poses[seen]
