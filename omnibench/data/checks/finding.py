@@ -1,8 +1,8 @@
-"""A finding about a recording: what is wrong, where, how bad it is, and what to type."""
+"""A finding about a recording: what is wrong, where, how bad it is, and what to type; and a warning that holds one."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 from pydantic import Field
@@ -61,3 +61,30 @@ class Finding(Model):
     severity: Severity
     fix: str = ""
     changes: Mapping[str, Any] = Field(default_factory=dict, exclude=True)
+
+
+class FindingWarning(str):
+    """A warning of a data set that holds a finding.
+
+    finding: what ``check`` says of it. unit: a unit cannot be right, by the magnitude of what was recorded.
+    """
+
+    finding: Finding
+    unit: bool
+
+    @classmethod
+    def of(cls, finding: Finding, text: str = "", *, unit: bool = False) -> FindingWarning:
+        """The warning of a finding, in its words unless a text is given."""
+        warning = cls(text or finding.what)
+        warning.finding, warning.unit = finding, unit
+        return warning
+
+    @classmethod
+    def of_restart(cls, note: str) -> FindingWarning:
+        """An importer's note on counters that began again, which it has mended."""
+        return cls.of(Finding(kind="counter_restart", what=note, where="all wheels", severity="note"))
+
+
+def findings_of(warnings: Iterable[str]) -> list[Finding]:
+    """The findings that warnings hold."""
+    return [warning.finding for warning in warnings if isinstance(warning, FindingWarning)]

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
 
 from omnibench.config import Positive
+from omnibench.data.checks.finding import FindingWarning
 from omnibench.data.importers.encoder_counts import (
     POWERS_OF_TWO,
     about_zero,
@@ -217,11 +218,11 @@ def _restored(counts: Array, times: Array, register: float, place: str, warnings
     while not np.array_equal(again := turns_restored(restored, times, register), restored):
         restored = again
     lost = int((np.round((np.diff(restored) - np.diff(counts)) / register) != 0).sum())
-    _say(
+    note = (
         f"{place}: {plural(lost, 'step')} of wheel positions ran back while the wheel turned on, as in a register of "
-        f"{register:.10g} ticks that was read late; they got a turn of it back (wraps_at=2^32 or never keeps them)",
-        warnings,
+        f"{register:.10g} ticks that was read late; they got a turn of it back (wraps_at=2^32 or never keeps them)"
     )
+    _say(FindingWarning.of_restart(note), warnings)
     return restored
 
 

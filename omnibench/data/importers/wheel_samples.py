@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from omnibench.data.checks.finding import FindingWarning
 from omnibench.data.importers.encoder_counts import repeated_readings
 from omnibench.data.importers.encoder_options import EncoderOptions
 from omnibench.robot.kinematics import Array
@@ -75,17 +76,16 @@ class Losses:
     restarts: int
     repeats: int
 
-    def in_words(self, reading: str) -> list[str]:
-        """Restarts and repeats in words. reading: a message, or a row."""
-        words = []
+    def in_words(self, place: str, reading: str) -> list[str]:
+        """Warnings of restarts and repeats. place: their recording. reading: a message, or a row."""
+        words: list[str] = []
         if self.restarts:
-            words.append(
-                f"the positions begin anew {plural(self.restarts, 'time')}, faster than any wheel turns (if that is a "
-                "counter that wraps, --set wraps_at=N); runs end there"
-            )
+            anew = f"the positions begin anew {plural(self.restarts, 'time')}, faster than any wheel turns"
+            way = "if that is a counter that wraps, --set wraps_at=N"
+            words.append(FindingWarning.of_restart(f"{place}: {anew} ({way}); runs end there"))
         if self.repeats:
             repeated = "that repeats the one before" if self.repeats == 1 else "that repeat the ones before"
-            words.append(f"{plural(self.repeats, reading)} {repeated} while the wheels turn left out")
+            words.append(f"{place}: {plural(self.repeats, reading)} {repeated} while the wheels turn left out")
         return words
 
 

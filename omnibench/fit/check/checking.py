@@ -11,7 +11,7 @@ import numpy as np
 
 from omnibench.data.checks.alike_runs import copied_runs
 from omnibench.data.checks.clock_findings import clock_findings, clocks_of
-from omnibench.data.checks.finding import Finding
+from omnibench.data.checks.finding import Finding, findings_of
 from omnibench.data.checks.misread_search import Explained, search
 from omnibench.data.checks.motion_fit import continuous
 from omnibench.data.checks.stream_faults import stream_faults
@@ -162,14 +162,12 @@ def _odometry(dataset: Dataset, runs: Sequence[Trajectory]) -> Iterator[Finding]
     )
 
 
-# Words that only the importers' notes on counters hold.
-_RESTARTED = ("begin anew", "ran back while")
 _TOLD = 12  # restarts that are told one by one; chosen
 
 
 def _noted(dataset: Dataset) -> Iterator[Finding]:
     """Restarts of counters that the importer has mended."""
-    notes = [warning for warning in dataset.warnings if any(words in warning for words in _RESTARTED)]
+    notes = [finding.what for finding in findings_of(dataset.warnings) if finding.kind == "counter_restart"]
     if notes:
         yield Finding(
             kind="counter_restart",

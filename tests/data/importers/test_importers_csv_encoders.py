@@ -12,6 +12,7 @@ import pytest
 from corelli import CORELLI, CORELLI_OPTIONS, corelli_dataset
 from tricycle_samples import PERIOD, TRICYCLE, tricycle_drive
 
+from omnibench.data.checks.finding import findings_of
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError
@@ -122,6 +123,7 @@ def test_a_counter_that_is_set_to_zero_ends_a_run(tmp_path: Path) -> None:
     assert odometry_error(data, runs=2) < 0.01
     assert [(run.id, run.session) for run in data.trajectories] == [("log#1", "log"), ("log#2", "log")]
     assert "the positions begin anew 1 time, faster than any wheel turns" in data.warnings[0]
+    assert "counter_restart" in {finding.kind for finding in findings_of(data.warnings)}
 
 
 def test_rows_that_repeat_a_time_are_left_out_and_said(tmp_path: Path) -> None:
@@ -232,6 +234,9 @@ def corelli(**options: Any) -> Trajectory:
     data = corelli_dataset(**options)
     assert "4 steps of wheel positions ran back while the wheel turned on, as in a register of 65" in data.warnings[1]
     assert "wheel positions begin again after 4294967296 ticks and were counted on" in data.warnings[0]
+    assert [(finding.kind, finding.what) for finding in findings_of(data.warnings)] == [
+        ("counter_restart", data.warnings[1])
+    ]
     assert "51 rows that repeat the ones before while the wheels turn" in data.warnings[2]
     return data.trajectories[0]
 

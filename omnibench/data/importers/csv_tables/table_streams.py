@@ -41,7 +41,7 @@ def read_wheels(
         raise DataError(f"{file}: wheels: has one row; two are needed, or --set sample_period=S")
     period = options.sample_period or median_period([times])
     samples, losses = wheel_samples(readings, options, str(file), period, longest_gap=options.longest_gap or np.inf)
-    warnings.extend(f"{file}: {loss}" for loss in losses.in_words("row"))
+    warnings.extend(losses.in_words(str(file), "row"))
     return samples
 
 

@@ -108,7 +108,7 @@ def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list
         longest_gap=gap,
         still=options.still,
     )
-    warnings.extend(f"{place}: {loss}" for loss in _losses_in_words(losses))
+    warnings.extend(_losses_in_words(losses, place))
     origin = int(wheels.stamps[0])
     # Exact to the nanosecond, which a double of unix time is not.
     stream = ReferenceStream.without_poses()
@@ -262,11 +262,11 @@ def _check_clocks(path: Path, topic: Topic, wheels: WheelStream, what: str, othe
     )
 
 
-def _losses_in_words(losses: Losses) -> list[str]:
+def _losses_in_words(losses: Losses, place: str) -> list[str]:
     words = []
     if losses.gaps:
         words.append(
-            f"wheel samples are missing {plural(losses.gaps, 'time')} while the wheels turned, "
+            f"{place}: wheel samples are missing {plural(losses.gaps, 'time')} while the wheels turned, "
             f"up to {losses.longest:.3g} s; runs end there"
         )
-    return words + losses.in_words("message")
+    return words + losses.in_words(place, "message")
