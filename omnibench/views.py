@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     import plotly.graph_objects as go
     import polars as pl
 
-# Module and class of the room ``notebook``, by the class that is shown.
+# Module and class of the room ``notebook``, by the class that is shown: a plug-in's may be called the same.
 _VIEWS = {
-    "Calibration": ("calibration_view", "CalibrationView"),
-    "CalibrationRun": ("calibration_view", "CalibrationRunView"),
-    "ComparisonResult": ("comparison_view", "ComparisonView"),
-    "Dataset": ("recording_view", "DatasetView"),
-    "Discovery": ("discovery_view", "DiscoveryView"),
-    "Evaluation": ("calibration_view", "EvaluationView"),
-    "Robot": ("robot_view", "RobotView"),
-    "Trajectory": ("recording_view", "TrajectoryView"),
+    "omnibench.robot.calibration.Calibration": ("calibration_view", "CalibrationView"),
+    "omnibench.fit.calibrate.CalibrationRun": ("calibration_view", "CalibrationRunView"),
+    "omnibench.compare.result.ComparisonResult": ("comparison_view", "ComparisonView"),
+    "omnibench.data.dataset.Dataset": ("recording_view", "DatasetView"),
+    "omnibench.discover.result.Discovery": ("discovery_view", "DiscoveryView"),
+    "omnibench.fit.evaluate.Evaluation": ("calibration_view", "EvaluationView"),
+    "omnibench.robot.kinematics.Robot": ("robot_view", "RobotView"),
+    "omnibench.data.dataset.Trajectory": ("recording_view", "TrajectoryView"),
 }
 _LINES = 20  # of a text, at most: a screenful with what was typed
 _WIDTH = 120  # characters of a line of such a text
@@ -147,6 +147,7 @@ def _shortened(value: Any) -> str:
 
 def _view(shown: Shown) -> View:
     """The view of an object, by its class."""
-    module, name = next(_VIEWS[kind.__name__] for kind in type(shown).__mro__ if kind.__name__ in _VIEWS)
+    kinds = (f"{kind.__module__}.{kind.__qualname__}" for kind in type(shown).__mro__)
+    module, name = next(_VIEWS[kind] for kind in kinds if kind in _VIEWS)
     view: View = getattr(import_module(f"omnibench.notebook.{module}"), name)(shown)
     return view

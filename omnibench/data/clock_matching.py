@@ -285,7 +285,8 @@ class _Windows:
         inverse = np.linalg.inv(normal)
         chords = np.array([_CHORDS, _CHORDS * np.sqrt(12.0) / self.length])[: len(design)]
         errors = np.sqrt(np.diag(inverse @ (sums @ sums.T) @ inverse) + chords**2)
-        drift_error = float(errors[1]) if len(errors) > 1 else np.inf
+        told = len(errors) > 1 and abs(clock[1]) < _LARGEST_DRIFT
+        drift_error = float(errors[1]) if told else np.inf
         return ClockMatch(clock[0], float(errors[0]), clock[1], drift_error, self.length)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import plotly.graph_objects as go
 import polars as pl
 import pytest
+from pydantic import BaseModel
 from commands import CONFIGS, compared_here, prepare
 from shared_results import shared_folder
 from wheeled_samples import CAR, DIFF, SWERVE, TRICYCLE
@@ -60,7 +61,7 @@ def with_parts(found: Any) -> list[Any]:
     """An object and what its fields hold, whose reprs people meet next."""
     if is_dataclass(found):
         return [found, *(getattr(found, field.name) for field in fields(found))]
-    return [found, *vars(found).values()] if hasattr(found, "model_fields") else [found]
+    return [found, *vars(found).values()] if isinstance(found, BaseModel) else [found]
 
 
 def test_there_is_an_object_of_every_kind() -> None:

@@ -10,7 +10,7 @@ from omnibench.data.checks.finding import Finding, Severity
 from omnibench.data.checks.stream_faults import runs_in_words
 from omnibench.data.clock_matching import ClockMatch, Streams, match_clocks
 from omnibench.data.dataset import Trajectory
-from omnibench.robot.kinematics import Robot
+from omnibench.robot.kinematics import Array, Robot
 
 # s that a clock must be off, and in standard errors, to be told (chosen: simulated runs, whose clocks are right, are
 # below); from _SPOILS, s, on it spoils a fit.
@@ -33,15 +33,14 @@ def clock_findings(runs: Sequence[Trajectory], clocks: Sequence[ClockMatch | Non
         gone = clock.drift * clock.length
         if abs(gone) > max(_LEAST, _ERRORS * clock.drift_error * clock.length):
             drift.append((run.id, gone))
-    for kind, found, verb in (("clock_offset", offset, "late"), ("clock_drift", drift, "")):
+    for kind, found in (("clock_offset", offset), ("clock_drift", drift)):
         if not found:
             continue
         names, values = [name for name, _ in found], np.array([value for _, value in found])
         largest = float(values[np.abs(values).argmax()])
         severity: Severity = "error" if abs(largest) > _SPOILS else "warning"
-        if verb:
-            early = "early" if largest > 0 else "late"
-            what = f"the stamps of the reference are up to {abs(largest):.2f} s too {early} in {_count(found, runs)}"
+        if kind == "clock_offset":
+            what = f"the stamps of the reference are {_off(values)} in {_count(found, runs)}"
         else:
             slow = "slow" if largest > 0 else "fast"
             what = (
@@ -56,6 +55,12 @@ def clock_findings(runs: Sequence[Trajectory], clocks: Sequence[ClockMatch | Non
                 "changes": {"clocks": "match"},
             }
         )
+
+
+def _off(values: Array) -> str:
+    """Offsets in words: the largest one, or the largest to either side."""
+    told = [f"{size:.2f} s too {side}" for side, size in (("late", -values.min()), ("early", values.max())) if size > 0]
+    return " to ".join(told) if len(told) > 1 else f"up to {told[0]}"
 
 
 def _count(found: Sequence[object], runs: Sequence[Trajectory]) -> str:

@@ -56,8 +56,8 @@ def _restarts(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
     found = []
     for run in runs:
         fast = np.abs(run.rates) * robot.radii > _FASTEST
-        share = float(fast.any(axis=1).mean())
-        if 0 < share < _RARE:
+        count = int(fast.any(axis=1).sum())
+        if 0 < count <= max(1.0, _RARE * len(fast)):
             found.append(run.id)
     if found:
         yield Finding(
