@@ -154,3 +154,12 @@ def test_wrapped_headings_of_a_compass_become_continuous() -> None:
 def test_references_in_other_units_are_warned_of(reference: Reference, unit: str) -> None:
     (warning,) = a_set(measured("run-1", reference)).warnings
     assert f"as if they were in {unit}" in warning
+
+
+def test_references_of_a_data_set_and_of_a_run_are_tables() -> None:
+    dataset = a_set(a_trajectory("run-1", 0.1), measured("run-2"))
+    assert dataset.to_frame("references")["trajectory"].to_list() == ["run-2"] * len(ALL_KINDS)
+    run = dataset.trajectories[1]
+    assert run.to_frame("references")["kind"].to_list() == dataset.to_frame("references")["kind"].to_list()
+    assert repr(run).splitlines()[1].endswith(f"{len(ALL_KINDS)} references")
+    assert len(repr(run.references).splitlines()) <= 20

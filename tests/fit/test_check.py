@@ -14,10 +14,17 @@ import polars as pl
 import pytest
 from commands import omnibench as command
 from config_robots import experiment
+from hypothesis import example, given
+from hypothesis import strategies as st
+from wheeled_samples import TRICYCLE
 
 from omnibench import check, save_dataset
+from omnibench.config import parse_settings
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.fit.check.fixes import as_yaml
 from omnibench.fit.check.result import CheckReport
+from omnibench.robot.model import OdometryModel
+from omnibench.robot.odometry import WheelLog
 from omnibench.robot.path import Path as Driven
 from omnibench.simulate.simulate import simulate_dataset
 
@@ -187,3 +194,28 @@ def test_the_report_shows_stamps_before_and_after(tmp_path: Path) -> None:
     page = (tmp_path / "check.html").read_text()
     assert "With matched stamps" in page
     assert "--set clocks=match" in page
+
+
+@given(st.lists(st.text("0123456789abenotrufxy_./*-: #,", min_size=1, max_size=8), min_size=1, max_size=3))
+@example(["01", "no", "1e3", "2024-01-02", "null", "0x10"])
+def test_values_are_typed_so_that_they_are_read_as_they_are(names: list[str]) -> None:
+    assert parse_settings([f"leave_out={as_yaml(names)}"]) == {"leave_out": names}
+
+
+def test_a_data_set_in_memory_is_to_be_saved_before_its_fix_is_typed() -> None:
+    swapped = changed(lambda run: replace(run, rates=run.rates[:, ::-1]))
+    assert check(swapped).command.endswith("# after save_dataset(dataset, 'base')")
+
+
+def test_a_steering_that_is_held_forward_and_backward_is_not_frozen() -> None:
+    """Its turns differ in sign by the way the wheels roll, and by nothing else."""
+    times, stamps = 0.05 * np.arange(1, 201), np.arange(0.0, 10.0, 0.1)
+    angles, runs = np.full((200, 1), 0.4), []
+    for name, rate in (("f1", 6.0), ("b1", -6.0), ("f2", 5.0), ("b2", -5.0)):
+        rates = np.full((200, 1), rate)
+        log = WheelLog(times, rates, np.zeros(3), stamps, steering=angles, drive=TRICYCLE.drive)
+        (poses,) = OdometryModel.of_design(TRICYCLE, "arc").poses([log])
+        scattered = poses + np.random.default_rng(len(runs)).normal(0, 0.001, poses.shape)
+        runs.append(Trajectory(name, "train", times, rates, stamps, scattered, steering=angles))
+    found = check(make_dataset("held", TRICYCLE, 0.05, runs)).findings
+    assert "steering_frozen" not in {finding.kind for finding in found}

@@ -6,16 +6,18 @@ from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Any
 
+import numpy as np
 import plotly.graph_objects as go
 import polars as pl
 import pytest
-from pydantic import BaseModel
 from commands import CONFIGS, compared_here, prepare
+from pydantic import BaseModel
 from shared_results import shared_folder
 from wheeled_samples import CAR, DIFF, SWERVE, TRICYCLE
 
 import omnibench
-from omnibench.data.dataset import Dataset
+from omnibench.data.dataset import Dataset, Split, Trajectory, make_dataset
+from omnibench.data.references.run_references import Reference, References
 from omnibench.robot.kinematics import Robot
 from omnibench.views import Shown, brief
 
@@ -138,3 +140,30 @@ def test_long_values_are_shortened_and_many_fields_are_counted() -> None:
     text = brief("Thing", [(f"field_{number}", "x" * 100) for number in range(30)])
     assert len(text.splitlines()) == 20
     assert "... 13 more lines" in text
+
+
+def test_an_evaluation_of_runs_without_poses_shows_the_errors_that_there_are() -> None:
+    robot, rolled = DIFF, np.linspace(0.0, 10.0, 101)[1:]
+    signals = robot.signal_equations @ np.array([0.3, 0.0, 0.0])
+    runs = []
+    for index in range(4):
+        tape = Reference("distance", 3.0 + 0.01 * index, 0.01)
+        references = References.of([tape], rolled[-1])
+        rates = np.tile(signals, (100, 1))
+        split: Split = "train" if index < 3 else "validation"
+        runs.append(
+            Trajectory(f"run{index}", split, rolled, rates, np.zeros(1), np.zeros((1, 3)), references=references)
+        )
+    dataset = make_dataset("tape", robot, 0.1, runs)
+    evaluation = omnibench.evaluate(omnibench.calibrate(dataset).calibration, dataset)
+    assert "mean position error" in repr(evaluation)
+    assert "heading error" not in repr(evaluation)
+    assert evaluation.to_frame("references")["kind"].unique().to_list() == ["distance"]
+    assert len(evaluation.plot().data) == 2
+
+
+def test_a_calibration_file_states_deviations_and_no_intervals_that_its_runs_do_not_bear() -> None:
+    run = results()["run"]
+    kept, told = run.calibration.to_frame(), run.to_frame()
+    assert "low" not in kept.columns
+    assert ((told["high"] - told["low"]) > 2 * 1.95 * kept["deviation"]).all()

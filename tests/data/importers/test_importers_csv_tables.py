@@ -249,3 +249,29 @@ def test_names_that_look_like_repetitions_are_told_with_the_pattern_to_type(tmp_
     pattern = told.partition("command_pattern=")[2].partition("'")[0]
     runs = read(tmp_path, command_pattern=pattern).trajectories
     assert [run.command for run in runs] == ["left", "left", "right", "right"]
+
+
+def test_dates_in_parquet_files_are_seconds(tmp_path: Path) -> None:
+    start = pl.datetime(2024, 1, 1)
+    for name, made in (("wheels", wheels(1)), ("poses", poses(1))):
+        dated = made.with_columns((start + pl.duration(microseconds=(1e6 * pl.col("t")).round())).alias("t"))
+        dated.write_parquet(tmp_path / f"run1_{name}.parquet")
+    data = read(tmp_path, wheel_suffix="_wheels.parquet", pose_suffix="_poses.parquet")
+    assert data.sample_period == pytest.approx(PERIOD, rel=1e-3)
+    assert odometry_error(data) < FITS
+
+
+@pytest.mark.parametrize(("table", "rows"), [("wheels", 1), ("poses", 1)])
+def test_a_table_of_one_row_is_said_to_be_one(tmp_path: Path, table: str, rows: int) -> None:
+    write_pair(tmp_path, 1)
+    file = tmp_path / f"run1_{table}.csv"
+    pl.read_csv(file).head(rows).write_csv(file)
+    with pytest.raises(DataError, match=f"{table}: has one row; two are needed"):
+        read(tmp_path)
+
+
+def test_wheels_that_end_before_their_first_pose_are_refused_in_a_line(tmp_path: Path) -> None:
+    write_pair(tmp_path, 1)
+    wheels(1).head(15).write_csv(tmp_path / "run1_wheels.csv")
+    with pytest.raises(DataError, match="run1"):
+        read(tmp_path, wheel_time_unit="us")

@@ -96,3 +96,9 @@ def test_poses_that_no_tum_file_can_hold_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="row 2 of the poses: times must increase"):
         write_tum(tmp_path / "run.tum", [0, 0], np.zeros((2, 3)))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_track_of_many_poses_is_shown_in_a_line(tmp_path: Path) -> None:
+    lines = [f"{0.1 * row:.1f} {row} 0 0 0 0 0 1" for row in range(300)]
+    (tmp_path / "long.tum").write_text("\n".join(lines), encoding="utf-8")
+    assert repr(read_tum(tmp_path / "long.tum")) == "PoseTrack(times=<array (300,)>, poses=<array (300, 3)>)"
