@@ -5,7 +5,14 @@ from typing import Annotated
 
 import typer
 
-from omnibench.cli.options import Force, Json, Settings
+from omnibench.cli.options import (
+    Figures,
+    Force,
+    Json,
+    Settings,
+    refuse_figures_without_browser,
+    write_asked_figures,
+)
 
 check_app = typer.Typer()
 
@@ -26,6 +33,7 @@ def check(
     report: Annotated[
         Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of clocks and findings.")
     ] = None,
+    figures: Figures = None,
     plugin: Annotated[
         list[Path] | None, typer.Option("--plugin", metavar="FILE", help="A plug-in with an importer; may be repeated.")
     ] = None,
@@ -46,18 +54,21 @@ def check(
     from omnibench.registry import load_plugin_file, load_plugins
 
     refuse_existing(report, force=force)
+    refuse_figures_without_browser(figures)
     load_plugins()
     for file in plugin or ():
         if (failure := load_plugin_file(file)) is not None:
             raise PluginError(f"plug-in {failure.origin} cannot be imported: {failure.error}")
     read = read_source(source, importer, parse_settings(settings), robot)
     checked = check_recording(read)
-    if report is not None:
+    if report is not None or figures is not None:
         from omnibench.report.recording.check_document import check_document
         from omnibench.report.render import write_document
 
         document = check_document(read.dataset, checked.sentence, checked.findings, checked.gain)
-        write_document(document, report)
+        if report is not None:
+            write_document(document, report)
+        write_asked_figures(document, figures)
     if as_json:
         print_json(checked.model_dump(mode="json", include={"verdict", "needed", "findings"}))
         return

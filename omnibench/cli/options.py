@@ -72,7 +72,12 @@ def write_asked_figures(document: Document, folder: Path | None) -> None:
         from omnibench.report.figure_files import write_figures
 
         names = write_figures(document, folder)
-        typer.echo(f"figures: {folder} ({len(names)}, each as SVG and PNG; the first: {names[0]}.svg)", err=True)
+        what = (
+            f"{folder} ({len(names)}, each as SVG and PNG; the first: {names[0]}.svg)"
+            if names
+            else "none in the report"
+        )
+        typer.echo(f"figures: {what}", err=True)
 
 
 def plugin_folders(given: Sequence[Path] | None) -> list[Path]:

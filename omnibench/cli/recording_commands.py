@@ -51,10 +51,10 @@ def inspect(
     inspection = inspect_dataset(recordings)
     if report is not None or figures is not None:
         document = inspection_document(recordings, inspection)
-        write_asked_figures(document, figures)
         if report is not None:
             write_document(document, report)
             typer.echo(f"report: {report}", err=True)
+        write_asked_figures(document, figures)
     if as_json:
         return print_json(inspection)
     print_inspection(make_console(), inspection)
@@ -217,9 +217,9 @@ def slam(
         if report is not None or figures is not None:
             watch(Progress("writing the report"))
             document = recording_document(result.dataset, truth=result.truth, accuracy=result.accuracy)
-            write_asked_figures(document, figures)
             if report is not None:
                 write_document(document, report)
+            write_asked_figures(document, figures)
     warn(result.summary.warnings)
     if as_json:
         return print_json(result.summary)
@@ -289,9 +289,9 @@ def simulate(
             shown = made.simulation
             known: dict[str, Any] = {"truth": shown.paths, "plan": shown.plan, "starts": shown.starts} if shown else {}
             document = recording_document(made.dataset, accuracy=made.accuracy, **known)
-            write_asked_figures(document, figures)
             if report is not None:
                 write_document(document, report)
+            write_asked_figures(document, figures)
     warn(made.dataset.warnings)
     if made.accuracy is not None:
         print_slam_accuracy(make_console(), made.accuracy)

@@ -40,6 +40,8 @@ def write_figures(document: Document, folder: Path) -> list[str]:
     """
     program = browser()
     grids = named_grids(document)
+    if not grids:
+        return []
     with tempfile.TemporaryDirectory() as scratch:
         page = Path(scratch, "figures.html")
         page.write_text(figures_page([_described(name, grid) for name, grid in grids.items()]), encoding="utf-8")

@@ -71,13 +71,14 @@ def _seen_from_end(run: Trajectory, pose: Array) -> Array:
 def _typical(runs: Sequence[Trajectory], ends: Sequence[Array]) -> tuple[dict[str, Trajectory], str]:
     """Two runs to draw by their titles, one of a kind of motion where kinds are known, and how they were chosen.
 
+    Turns on the spot, which have no path to see, are drawn only where there is nothing else.
     Of a kind it is the run whose error, m and rad as one length, falls by the median of its kind.
     """
     gains = np.linalg.norm(ends[0], axis=1) - np.linalg.norm(ends[-1], axis=1)
     gain_of = {run.id: float(gain) for run, gain in zip(runs, gains, strict=True)}
     kinds = {kind: like for kind, like in kinds_of(runs).items() if kind != ON_THE_SPOT}
     if len(kinds) < _PATHS:
-        chosen = spread(runs, _PATHS)
+        chosen = spread([run for run in runs if np.ptp(run.poses[:, :2], axis=0).max() > _LEAST_WINDOW] or runs, _PATHS)
         return motion_titles(chosen), f"{plural(len(chosen), 'run')} of different motions." if chosen else ""
     medians = {kind: _median(like, gain_of) for kind, like in kinds.items()}
     largest = sorted(medians, key=lambda kind: gain_of[medians[kind].id], reverse=True)[:_PATHS]

@@ -54,6 +54,17 @@ def test_every_figure_is_written_as_svg_and_png_with_titles_and_legend(tmp_path:
     assert (tmp_path / "figures" / "wheels-more.png").read_bytes()[1:4] == b"PNG"
 
 
+def test_a_figure_of_a_megabyte_is_written(tmp_path: Path) -> None:
+    try:
+        browser()
+    except DataError:
+        pytest.skip("no Chromium on this machine to draw figures with")
+    dots = go.Scatter(x=list(range(6000)), y=[1] * 6000, mode="markers")
+    grids = (FigureGrid((Figure("many dots", plot(dots), "many dots", 200),), (), 1, "", "dots"),)
+    assert write_figures(Document("A report", "", (Section("a", "Answer", grids),)), tmp_path / "figures") == ["dots"]
+    assert (tmp_path / "figures" / "dots.svg").stat().st_size > 1e6
+
+
 def test_without_a_browser_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "which", lambda _: None)
     monkeypatch.setattr(Path, "exists", lambda _: False)

@@ -24,6 +24,7 @@ from omnibench.report.blocks import (
     simulated_badge,
 )
 from omnibench.report.numbers import fixed
+from omnibench.report.recording.section import path_overview
 from omnibench.report.style import PALETTE, REFERENCE, plot
 from omnibench.report.traces import line
 from omnibench.robot.kinematics import Array, Robot
@@ -40,12 +41,14 @@ def check_document(dataset: Dataset, sentence: str, findings: Sequence[Finding],
     """The report as blocks. sentence: the verdict. gain: what a calibration would gain, in words."""
     runs = [run for run in dataset.trajectories if run.has_poses]
     clocks = clocks_of(dataset.robot, runs) if runs else []
-    picture = _clock_picture(dataset.robot, runs, clocks)
+    picture = _clock_picture(dataset.robot, runs, clocks) or path_overview(dataset)
     counts = {severity: sum(each.severity == severity for each in findings) for severity in _WORDS}
     tiles = [Fact(_WORDS[severity], str(count)) for severity, count in counts.items()]
     tiles.append(Fact("Runs", str(len(dataset.trajectories))))
     sections = [
-        answer_section(f"{sentence}.", tiles, picture, *([Paragraph(gain, "note")] if gain else []), title="Verdict"),
+        answer_section(
+            f"{sentence}.", tiles, picture, *([Paragraph(_gain(gain), "note")] if gain else []), title="Verdict"
+        ),
         Section("findings", "Findings, each with what to type", tuple(_blocks(findings))),
     ]
     return Document(
@@ -54,6 +57,10 @@ def check_document(dataset: Dataset, sentence: str, findings: Sequence[Finding],
         sections=tuple(sections),
         badges=simulated_badge(dataset.simulated),
     )
+
+
+def _gain(gain: str) -> str:
+    return f"What a calibration would gain on runs that it was not fitted to, each in turn; {gain}."
 
 
 def _blocks(findings: Sequence[Finding]) -> list[Block]:
