@@ -39,7 +39,11 @@ _WORDS: tuple[tuple[str, str, str], ...] = (
     ("matrix", r"matrix", "the numbers that turn wheel rates into the robot's motion (inverse kinematic matrix)"),
     ("command", r"commands?", "a motion that the robot is told to drive; its repetitions share it"),
     ("residual", r"residuals?", "reference minus odometry"),
-    ("noise floor", r"floor", "the error that repetitions of one command leave to any model"),
+    (
+        "noise floor",
+        r"(?<!free )(?<!on the )(?<!over the )floor",
+        "the error that repetitions of one command leave to any model",
+    ),
     (
         "weight",
         r"weight(?= of (?:the name|\d)| [\d<])",

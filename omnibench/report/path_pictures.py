@@ -117,7 +117,7 @@ def _all_ends(runs: Sequence[Trajectory], ends: Sequence[Array], models: Models,
         hover = f"%{{text}}, {text(item.label)}<br>%{{x:.0f}} mm, %{{y:.0f}} mm"
         traces.append(marks(item, 6, *at.T, hover=hover, words=names, marker_opacity=0.65))
     traces.append(marks(_TARGET, 14, [0.0], [0.0], hover="the reference's end", marker_line_width=2.5))
-    axes = {"x_title": "ahead of the reference (mm)", "y_title": "left of it (mm)"}
+    axes = {"x_title": "ahead (mm)", "y_title": "to the left (mm)"}
     drawn = np.vstack([np.zeros((1, 2)), *(1e3 * errors[picks, :2] for errors in ends)])
     figure = plan(*traces, window=_window(drawn, np.zeros(2)), **axes)
     words = " → ".join(map(_error_in_words, ends))

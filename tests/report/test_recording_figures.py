@@ -13,7 +13,9 @@ from recording_samples import COMMANDS, NOISE, TICK, Sample, sample
 from wheeled_samples import ROBOTS, driven
 
 from omnibench.data.scans import Mount, Scanner, ScansInMemory, TrajectoryScans
+from omnibench.report.recording.drawing import ODOMETRY_ITEM
 from omnibench.report.recording.player import player
+from omnibench.report.recording.room_figures import all_runs
 from omnibench.report.recording.runs import representative_runs
 from omnibench.report.recording.scan_points import scan_points, thinned
 from omnibench.report.recording.wheel_figures import rate_step, wheel_rates
@@ -177,3 +179,13 @@ def test_a_mecanum_wheel_given_by_its_lever_arm_only_is_not_drawn(made: Sample) 
         True,
         True,
     ]
+
+
+def test_without_reference_poses_the_overview_shows_the_odometry(made: Sample) -> None:
+    runs = tuple(
+        replace(run, pose_times=run.pose_times[:1], poses=run.poses[:1], pose_covariances=None)
+        for run in made.dataset.trajectories
+    )
+    drawn = all_runs(replace(made.dataset, trajectories=runs, scans=None), runs[0], ())
+    assert drawn.legend[0] == ODOMETRY_ITEM
+    assert np.ptp([x for x in drawn.figures[0].plot.data[0].x if x is not None]) > 0.5

@@ -92,7 +92,7 @@ def _verdict(view: DatasetView, best: EntryStatistics) -> str:
     interval = best.improvement(split)
     if interval is not None:
         fell, sure = improvement_in_words(best, split, 1)
-        words += f": the error fell by {fell}{_with_interval(sure)}"
+        words += f": the cost fell by {fell}{_with_interval(sure)}"
         chance = interval.known is not None and interval.holds(0.0)
         words += ", which the noise alone could explain" if chance else ""
     return f"{words}. {_standing(view, best)}."

@@ -81,8 +81,17 @@ class DatasetView:
 
     @property
     def level(self) -> list[EntryStatistics]:
-        """Entries that are practically equal to the best, itself among them."""
-        return [entry for entry in self.statistics if entry.practically_equal or entry.is_best]
+        """Entries that are practically equal to the best, itself among them.
+
+        The design values are not, where the best one's improvement on them is more than chance.
+        """
+        gained = None if self.best is None else self.best.improvement(self.scored)
+        better = gained is not None and gained.known is not None and not gained.holds(0.0)
+        return [
+            entry
+            for entry in self.statistics
+            if entry.is_best or (entry.practically_equal and not (better and entry.calibrator == THEORETICAL_NAME))
+        ]
 
     @property
     def of_the_paper(self) -> bool:

@@ -34,9 +34,7 @@ def validation_runs(dataset: Dataset, fit: Fit) -> ValidationRuns:
     able = [run for run in recorded if not _lacks_inputs(fit.model, run)]
     warnings = list(_beyond_training(fit, able))
     if len(able) < len(recorded):
-        warnings.append(
-            f"{len(recorded) - len(able)} validation runs lack what an effect of the model needs: left out."
-        )
+        warnings.append(f"{len(recorded) - len(able)} held-out runs lack what an effect of the model needs: left out.")
     if not able:
         return ValidationRuns((), (), tuple(warnings))
     try:
@@ -46,7 +44,7 @@ def validation_runs(dataset: Dataset, fit: Fit) -> ValidationRuns:
         return ValidationRuns((), (), tuple(warnings))
     kept, jumps = without_jumps(runs, in_start_frames(runs, at_runs(fit, runs).residuals), fit.noise.noise)
     if jumps:
-        warnings.append(f"{jumps} validation poses contradict their neighbours; chi2 is without them.")
+        warnings.append(f"{jumps} held-out poses contradict their neighbours; whitened χ² is without them.")
     return ValidationRuns(runs, kept, tuple(warnings))
 
 
@@ -79,6 +77,6 @@ def _beyond_training(fit: Fit, runs: Sequence[Trajectory]) -> Iterator[str]:
     late = [run.id for run in runs if (run.started_at or 0.0) > _LATER * latest + _LATER_S]
     if "session_time" in needs and late:
         yield (
-            f"{needs['session_time']} was fitted to the first {latest:.0f} s of a session; {len(late)} validation runs "
+            f"{needs['session_time']} was fitted to the first {latest:.0f} s of a session; {len(late)} held-out runs "
             "are later, where it is not known to hold."
         )

@@ -40,7 +40,7 @@ VERDICTS_AT_LENGTH: Mapping[Verdict, str] = {
 }
 _FEW = "nothing was found, but so few runs can show hardly anything"
 _DIFFER = "nothing is missing in the training runs, but the sessions differ"
-_OTHER_COMMANDS = "nothing is missing in the training runs, but the validation runs, of other commands, deviate"
+_OTHER_COMMANDS = "nothing is missing in the training runs, but the held-out runs, of other commands, deviate"
 _UNTESTED = "nothing was found in the training runs, but whether the sessions differ cannot be said"
 STAGES: Mapping[Stage, str] = {
     "actuator": "target to wheel rate",

@@ -70,13 +70,13 @@ def shrunk(problem: CalibrationProblem, result: RunResult, *, fitted: bool = Tru
         degrees_of_freedom=_freedom(posterior, known),
         noise=known.noise,
         shrinkage=Shrinkage(result.cost, f"the design's tolerance and {known.words}"),
-        reason=f"{result.reason}; shrunk to the design, which adds {_added(problem, result.cost, cost)} to the cost",
+        reason=f"{result.reason}; shrunk to the design, which changes the cost by {_added(problem, result.cost, cost)}",
     )
 
 
 def _added(problem: CalibrationProblem, before: float, after: float) -> str:
-    """What a cost grew by, in words: as a share, which a cost that is rounding has not."""
-    return f"{100 * (after / before - 1):.2g} %" if before > problem.objective.rounding else f"{after - before:.2g}"
+    """What a cost changed by, in words: as a share, which a cost that is rounding has not."""
+    return f"{100 * (after / before - 1):+.2g} %" if before > problem.objective.rounding else f"{after - before:+.2g}"
 
 
 def _knowledge(problem: CalibrationProblem, result: RunResult) -> _Knowledge:

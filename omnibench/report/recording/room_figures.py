@@ -39,19 +39,24 @@ _SHOWN_AS = 0.07  # half axis of the largest ellipse, as a share of the picture'
 
 
 def all_runs(dataset: Dataset, shown: Trajectory, outlines: Sequence[Array]) -> FigureGrid:
-    """The reference paths of all runs, moved to one start, and the room that the scans of the run ``shown`` saw.
+    """The paths of all runs, moved to one start, and the room that the scans of the run ``shown`` saw.
+
+    They are the reference's or, where no run has reference poses, those of the odometry by the design values.
 
     outlines: the walls of the floor plan as seen from that start, closed (n, 2) each, m; empty where not known.
     """
     runs = [dataset.trajectories[index] for index in evenly(len(dataset.trajectories), _RUNS)]
-    flower = joined([seen_from(run.start, _thin(run.poses)) for run in runs])
-    paths = [line(REFERENCE_ITEM, 1.0, *flower.T, opacity=0.75), _start(np.zeros(2))]
+    measured = any(run.has_poses for run in runs)
+    item = REFERENCE_ITEM if measured else ODOMETRY_ITEM
+    poses = [_thin(run.poses) for run in runs] if measured else _driven(dataset, runs)
+    flower = joined([seen_from(run.start, each) for run, each in zip(runs, poses, strict=True)])
+    paths = [line(item, 1.0, *flower.T, opacity=0.75), _start(np.zeros(2))]
     number = plural(len(dataset.trajectories), "run")
-    close = Figure(f"{number} from one start", _map(paths), "Reference paths of all runs from one start, close up", 380)
+    close = Figure(f"{number} from one start", _map(paths), "Paths of all runs from one start, close up", 380)
     words = "Each run is moved to begin at the origin along x."
     if len(runs) < len(dataset.trajectories):
         words += f" {count(len(runs))} of them are drawn."
-    items = [REFERENCE_ITEM, *_room_items(dataset, outlines)]
+    items = [item, *_room_items(dataset, outlines)]
     if dataset.scans is None:
         return FigureGrid((close,), tuple(items), 1, words, "paths")
     points = seen_from(shown.start, thinned(run_points(dataset, shown), _POINTS))
@@ -62,6 +67,12 @@ def all_runs(dataset: Dataset, shown: Trajectory, outlines: Sequence[Array]) -> 
         380,
     )
     return FigureGrid((close, room), tuple(items), 2, words, "paths")
+
+
+def _driven(dataset: Dataset, runs: Sequence[Trajectory]) -> list[Array]:
+    """Paths (n, 3) of runs by the odometry at the robot's design values, m, m, rad."""
+    model = OdometryModel.of_design(dataset.robot, "arc")
+    return [model.poses([run.log(np.linspace(0.0, run.end, _PATH))])[0] for run in runs]
 
 
 def one_run(

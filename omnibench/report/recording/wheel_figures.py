@@ -120,7 +120,7 @@ def _blocks(times: Array, values: Array, size: int) -> _Series:
     starts = np.arange(0, len(times), size)
     durations = np.diff(times, prepend=0.0)[:, None]
     weights = np.add.reduceat(durations, starts)
-    means = np.add.reduceat(values * durations, starts) / weights
+    means = np.round(np.add.reduceat(values * durations, starts) / weights, 9)  # an even rate stays even
     ends = times[np.minimum(starts + size, len(times)) - 1]
     return _Series(np.append(0.0, ends), means)
 

@@ -32,7 +32,7 @@ def test_the_headline_names_the_best_and_the_improvement_with_its_interval(
     best = next(entry for entry in result.statistics if entry.is_best)
     fell = best.improvement("validation")
     assert f"{best.label} is best." in report.text
-    assert f"the error fell by {100 * fell.value:.1f} %" in report.text
+    assert f"the cost fell by {100 * fell.value:.1f} %" in report.text
     assert f"(95 % interval {100 * fell.low:.1f} to {100 * fell.high:.1f} %)" in report.text
 
 
