@@ -1,16 +1,17 @@
-"""Every command of the README and of the handbook, run in order, as written."""
+"""Every command of the README and of the handbook, run in order, as written, and what is known of their results."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
 import yaml
-from commands import RECORDINGS, ROOT
+from commands import RECORDINGS, ROOT, rows, summary
 from tricycle_samples import TRICYCLE, tricycle_drive
 from typed_pages import shell_commands, terminal
 
@@ -100,3 +101,48 @@ def test_a_page_of_the_handbook_runs_after_the_readme(
         ended[GOES_ON[name]] = typed(PAGES[GOES_ON[name]], shutil.copytree(ten_minutes, tmp_path / "first"))
     begun = ended[GOES_ON[name]] if name in GOES_ON else shutil.copytree(ten_minutes, tmp_path / "after")
     ended[name] = typed(PAGES[name], begun)
+
+
+@pytest.fixture(scope="module")
+def paper(ten_minutes: Path) -> dict[str, dict[str, Any]]:
+    """The entries of the README's comparison on the paper's flower."""
+    return rows(ten_minutes / "results" / "apr02" / "latest")
+
+
+def test_the_theoretical_matrix_costs_what_the_paper_says(paper: dict[str, dict[str, Any]]) -> None:
+    assert paper["theoretical"]["train_cost"] == pytest.approx(0.1234, rel=0.02)
+    assert paper["theoretical"]["validation_cost"] == pytest.approx(0.1251, rel=0.03)
+
+
+@pytest.mark.parametrize("label", ["closed_form", "crs"])
+def test_a_calibration_improves_as_much_as_in_the_paper(label: str, paper: dict[str, dict[str, Any]]) -> None:
+    assert paper[label]["train_improvement"] >= 0.82
+    assert paper[label]["validation_improvement"] >= 0.81
+
+
+def test_nothing_is_below_the_exact_optimum_in_the_same_box(paper: dict[str, dict[str, Any]]) -> None:
+    assert paper["crs"]["box"] == paper["closed_form"]["box"] == "paper"
+    assert paper["crs"]["train_cost"] >= paper["closed_form"]["train_cost"] - 1e-9
+    assert -1e-9 <= paper["crs"]["gap"] < 1e-5
+
+
+def test_the_exact_optimum_takes_a_handful_of_evaluations(paper: dict[str, dict[str, Any]]) -> None:
+    assert paper["closed_form"]["evaluations"] <= 10  # times are measured in tests/benchmarks
+    assert paper["closed_form"]["outcome"] == "converged"
+
+
+def test_a_real_robot_is_calibrated_as_well_as_was_measured(ended: dict[str, Path]) -> None:
+    if "compare" not in ended:
+        pytest.skip("the page on comparisons ended before the real robot's")
+    results = ended["compare"] / "results" / "omni3" / "latest"
+    assert summary(results)["simulated"] == {"omni3": False}
+    found = rows(results)
+    assert f"{100 * found['closed_form']['validation_improvement']:.1f} %" in (ROOT / "README.md").read_text("utf-8")
+    assert found["closed_form"]["train_position_m"] <= 0.045
+    assert np.degrees(found["closed_form"]["train_heading_rad"]) <= 3.8
+    assert found["closed_form"]["validation_position_m"] <= 0.11
+    assert np.degrees(found["closed_form"]["validation_heading_rad"]) <= 5.5
+    for name in ("train_position_m", "train_heading_rad", "validation_position_m", "validation_heading_rad"):
+        assert found["theoretical"][name] > found["closed_form"][name]
+    # Other commands, other shapes: there the poses along the way, their clocks set right, are worth as much or more.
+    assert found["trajectory_ml"]["validation_cost"] <= found["closed_form"]["validation_cost"]

@@ -79,7 +79,7 @@ def test_a_sound_recording_is_misread_in_nothing(robot: str) -> None:
 
 @pytest.mark.parametrize(
     ("change", "robot"),
-    [(change, NAMES[(index + shift) % len(NAMES)]) for index, change in enumerate(CHANGES) for shift in (0, 2)],
+    [(change, NAMES[index % len(NAMES)]) for index, change in enumerate(CHANGES)],
 )
 def test_a_mistake_is_named(change: str, robot: str) -> None:
     made, kind = CHANGES[change]

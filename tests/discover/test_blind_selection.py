@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import pytest
 from hidden.judging import Judgement, judge
 from hidden.sets import LEVELS, Kind, make_set
 
@@ -49,6 +50,7 @@ def test_where_nothing_is_hidden_nothing_is_named() -> None:
     assert judged("null", level=0.0, noise="mixed").outcome in ("none", "unknown")
 
 
+@pytest.mark.study
 def test_two_strong_effects_both_get_their_names() -> None:
     assert judged("pair", "thermal_radius_drift", "wheel_eccentricity").both_right
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
+import pytest
 from discovery_samples import held_out, named, nothing, shorn, simulated
 from hidden.session_sets import session_set
 from report_page import Page
@@ -159,6 +160,7 @@ def test_of_one_run_nothing_is_held_out_and_there_is_no_floor() -> None:
         assert "held out" not in words
 
 
+@pytest.mark.study
 def test_what_is_left_over_is_looked_for_again_once_a_smooth_term_is_added() -> None:
     dataset = session_set("small", 3, effect="speed_dependent_radius")
     plain, smooth = (

@@ -61,7 +61,7 @@ def fitted(run: CalibrationRun) -> dict[str, float]:
     return {name: value for term in run.calibration.effects for name, value in term.parameters.items()}
 
 
-@pytest.mark.parametrize("gain", [0.4, 1.1, 5.5])
+@pytest.mark.parametrize("gain", [*(pytest.param(gain, marks=pytest.mark.study) for gain in (0.4, 1.1)), 5.5])
 def test_the_gain_of_a_steering_is_found_even_where_it_is_far_off(gain: float) -> None:
     run = calibrate(misread(TRICYCLE, gain), cost="trajectory", steering="fit")
     assert fitted(run)["g"] == pytest.approx(gain - 1, abs=0.02 * gain)

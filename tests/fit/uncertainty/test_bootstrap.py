@@ -59,9 +59,9 @@ def test_a_resampled_optimum_differs_from_a_full_refit_by_far_less_than_the_inte
 
 
 def test_about_95_percent_of_the_intervals_hold_the_hidden_matrix():
-    hits = np.array([study().covered(seed, resamples=150) for seed in range(6)])
-    # Binomial, 54 intervals: 95 % of them leaves fewer than 45 inside with a probability of about 2e-4.
-    assert hits.sum() >= 45
+    hits = np.array([study().covered(seed, resamples=150) for seed in range(3)])
+    # Binomial, 27 intervals: 95 % of them leaves fewer than 21 inside with a probability of about 4e-4.
+    assert hits.sum() >= 21
 
 
 def test_intervals_shrink_with_more_repetitions():
