@@ -56,8 +56,8 @@ _WORDS: tuple[tuple[str, str, str], ...] = (
     ("SLAM", r"SLAM", "poses computed from laser scans"),
 )
 _MEANINGS: Mapping[str, str] = {word: meaning for word, _, meaning in _WORDS}
-_ANY = re.compile("|".join(f"(?<![\\w-])(?:{pattern})(?![\\w-])" for _, pattern, _ in _WORDS), re.IGNORECASE)
-_EACH = [(word, re.compile(pattern, re.IGNORECASE)) for word, pattern, _ in _WORDS]
+# A group a word, in their order, so that a pattern may look ahead of its match.
+_ANY = re.compile("|".join(f"((?<![\\w-])(?:{pattern})(?![\\w-]))" for _, pattern, _ in _WORDS), re.IGNORECASE)
 
 
 class Glossary:
@@ -71,7 +71,7 @@ class Glossary:
         """A text as HTML, in which each word that occurs for the first time shows its meaning."""
         parts, end = [], 0
         for match in _ANY.finditer(text):
-            word = next(word for word, pattern in _EACH if pattern.fullmatch(match.group()))
+            word = _WORDS[(match.lastindex or 1) - 1][0]
             if word in self._known:
                 continue
             self._known.add(word)

@@ -36,3 +36,10 @@ def test_the_meanings_stand_below_the_section_that_first_uses_the_words() -> Non
     assert html.count("<dfn ") == 1
     told = Page(html).text
     assert told.index("The cost fell.") < told.index("what a calibration makes small") < told.index("The cost rose.")
+
+
+def test_a_word_of_several_meanings_is_explained_where_it_has_the_one_that_is_listed() -> None:
+    glossary = Glossary()
+    assert "<dfn" not in glossary.marked("cannot fall below the bound; the weights of x and y")
+    glossary.marked("98 % of the bound that no design exceeds; weight of 95 %")
+    assert [word for word, _ in glossary.fresh()] == ["bound", "weight"]
