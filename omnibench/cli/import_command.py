@@ -133,10 +133,10 @@ def import_(
 
 def _refuse_units(read: "RecordingSource", output: Path) -> None:
     """DataError: the units of a recording cannot be right by their magnitude; it says what to type."""
-    from omnibench.data.checks.misfit import UnitWarning
+    from omnibench.data.checks.finding import FindingWarning
     from omnibench.fit.check.checking import check_recording
 
-    wrong = [warning for warning in read.dataset.warnings if isinstance(warning, UnitWarning)]
+    wrong = [warning for warning in read.dataset.warnings if isinstance(warning, FindingWarning) and warning.unit]
     if not wrong:
         return
     mended = check_recording(read).command

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from omnibench.data.checks.explanations import HEADINGS_IN_DEGREES
+from omnibench.data.checks.finding import findings_of
 from omnibench.data.checks.implausible import implausible
 from omnibench.data.header import Imported
 from omnibench.data.headings import unwrap
@@ -241,7 +241,8 @@ def make_dataset(
     logs = [trajectory.log(trajectory.pose_times) for trajectory in raw]
     warnings = implausible(robot, logs, [trajectory.poses for trajectory in raw])
     headings, ambiguous = [trajectory.poses[:, 2] for trajectory in raw], list[int]()
-    if HEADINGS_IN_DEGREES not in warnings:  # whole turns of 2 pi would spoil them
+    wrong = {finding.kind for finding in findings_of(warnings)}
+    if "heading_unit" not in wrong:  # whole turns of 2 pi would spoil them
         headings, ambiguous = unwrap(robot, logs, headings)
     if ambiguous and not warnings:
         shown = ", ".join(raw[index].id for index in ambiguous[:5])

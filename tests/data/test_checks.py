@@ -165,20 +165,25 @@ def test_every_exchange_of_three_wheels_is_told_with_the_way_back(
         f"{names[wheel]} <- {'-' if sign < 0 else ''}{names[column]}"
         for wheel, (column, sign) in sorted(found_in.items())
     )
+    columns = ",".join(names[found_in[wheel][0]] for wheel in range(3))
+    turned = ",".join(str(found_in[wheel][1]) for wheel in range(3))
     warning = warnings_of(recorded(), rearranged(order, signs))
-    assert warning.startswith(f"wheels look swapped or sign-flipped; the reference fits with omega of {way_back} (")
-    assert "wheel_signs" in warning
+    if order != (0, 1, 2):
+        assert f"; the reference fits with omega of {way_back} (import with " in warning
+        assert f"--set wheel_columns=[{columns}], the columns of these wheels" in warning
+    assert (f"--set wheel_signs=[{turned}], times the present ones" in warning) == (min(signs) < 0)
 
 
 @pytest.mark.parametrize(("order", "signs"), arrangements(4)[5::60])
 def test_exchanged_mecanum_wheels_are_told(order: tuple[int, ...], signs: tuple[int, ...]) -> None:
-    assert "swapped or sign-flipped" in warnings_of(recorded(robot="mecanum"), rearranged(order, signs))
+    expected = "counted the wrong way round" if order == (0, 1, 2, 3) else "wheels look swapped"
+    assert expected in warnings_of(recorded(robot="mecanum"), rearranged(order, signs))
 
 
 @pytest.mark.parametrize("motion", ["straight runs only", "turns on the spot only", "one turning run"])
 @pytest.mark.parametrize("signs", [(-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, -1, -1)])
 def test_flipped_signs_are_told_in_simpler_motions_too(motion: str, signs: tuple[int, ...]) -> None:
-    assert "swapped or sign-flipped" in warnings_of(recorded(motion), rearranged((0, 1, 2), signs))
+    assert "counted the wrong way round" in warnings_of(recorded(motion), rearranged((0, 1, 2), signs))
 
 
 def test_wheels_that_never_turn_are_told() -> None:

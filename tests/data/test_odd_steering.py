@@ -65,7 +65,7 @@ def test_a_wheel_that_is_counted_the_wrong_way_is_named_with_its_option(robot: s
     (warning,) = warnings_of(robot, rates=times(-1, wheel))
     signs = ",".join("-1" if index == wheel else "1" for index in range(len(names)))
     assert f"(import with --set wheel_signs=[{signs}], times the present ones; rosbag: joint_signs)" in warning
-    assert warning.startswith(f"wheel {names[wheel]} looks") or f"{names[wheel]} <- -{names[wheel]}" in warning
+    assert warning.startswith(f"wheel {names[wheel]} looks counted the wrong way round")
 
 
 @pytest.mark.parametrize("robot", WHEELS)
@@ -117,11 +117,9 @@ def test_the_zero_of_one_of_several_steering_angles_10_degrees_off_is_named(robo
 
 
 def test_a_swerve_base_s_zeros_may_be_the_reference_s_yaw() -> None:
-    assert (
-        "; or the reference is turned: mount: {yaw_deg: 10} of the robot)"
-        in warnings_of("swerve", steering=plus(10))[0]
-    )
-    assert "mount" not in warnings_of("tricycle", steering=plus(10))[0]
+    turned = "; or the reference is turned: heading_offset_deg=-10 ("
+    assert turned in warnings_of("swerve", steering=plus(10))[0]
+    assert "heading_offset_deg" not in warnings_of("tricycle", steering=plus(10))[0]
 
 
 @each_steered
@@ -162,6 +160,6 @@ def test_a_gear_of_the_steering_is_named_relative_to_the_present_scale(robot: st
 def test_a_steering_angle_that_never_changes_is_named(robot: str, wheel: int | None) -> None:
     (warning,) = warnings_of(robot, steering=times(0, wheel))
     names = STEERED[robot] if wheel is None else (STEERED[robot][wheel],)
-    columns = ", ".join(f"steer_{name}" for name in names)
-    assert warning.startswith(f"{columns} never changes, which the reference contradicts; is that steering angle")
-    assert "(--set steering_columns=NAME on import; rosbag: steering_joints, steering_topic)" in warning
+    wheels = f"wheel{'s' if len(names) > 1 else ''} {', '.join(names)}"
+    assert warning.startswith(f"the steering angle of {wheels} never changes, though the reference shows that it must")
+    assert "(steering_columns; of bags steering_joints or steering_topic)" in warning

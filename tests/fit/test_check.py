@@ -20,8 +20,9 @@ from wheeled_samples import TRICYCLE
 
 from omnibench import check, save_dataset
 from omnibench.config import parse_settings
+from omnibench.data.checks.option_words import as_yaml
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.fit.check.fixes import as_yaml
+from omnibench.data.references.run_references import Reference, References
 from omnibench.fit.check.result import CheckReport
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
@@ -118,6 +119,52 @@ def test_a_fault_is_found_and_what_is_typed_for_it_mends_it(
     assert program == "omnibench"
     assert command(*words).returncode == 0
     assert kind not in kinds(check("log_mended"))
+
+
+def ends(run: Trajectory) -> Trajectory:
+    """The run with its first and its last pose alone."""
+    return replace(run, pose_times=run.pose_times[[0, -1]], poses=run.poses[[0, -1]])
+
+
+def taped(run: Trajectory) -> Trajectory:
+    """The run with its displacement and its turn, and no poses."""
+    (x, y), (begin, end) = (run.poses[-1] - run.poses[0])[:2], run.poses[[0, -1], 2]
+    moved = (x * np.cos(begin) + y * np.sin(begin), y * np.cos(begin) - x * np.sin(begin))
+    measured = (Reference("displacement", moved, (0.005, 0.005)), Reference("turn", end - begin, 0.01))
+    references = References.of(measured, run.times[-1])
+    return replace(run, pose_times=np.zeros(1), poses=np.zeros((1, 3)), references=references)
+
+
+def in_mm(run: Trajectory) -> Trajectory:
+    assert run.references is not None
+    lengths = np.where(run.references.kinds == "displacement", 1000.0, 1.0)[:, None]
+    measured = replace(run.references, values=run.references.values * lengths, sigmas=run.references.sigmas * lengths)
+    return replace(run, references=measured)
+
+
+SPARSE: dict[str, Change] = {
+    "wheels_swapped": lambda run: replace(ends(run), rates=run.rates[:, ::-1]),
+    "heading_unit": lambda run: replace(ends(run), poses=ends(run).poses * (1, 1, 180 / np.pi)),
+    "position_unit": lambda run: in_mm(taped(run)),
+}
+
+
+@pytest.mark.parametrize("change", [ends, taped])
+def test_sparse_references_that_are_right_are_not_to_be_mended(change: Change) -> None:
+    assert check(changed(change)).command == ""
+
+
+@pytest.mark.parametrize("kind", SPARSE)
+def test_a_misreading_that_few_references_show_is_found_and_mended_as_typed(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_dataset(changed(SPARSE[kind]), "log")
+    report = check("log")
+    assert (report.verdict, kind in kinds(report)) == ("fix", True)
+    assert command(*shlex.split(report.command)[1:]).returncode == 0
+    assert "warning" not in command("inspect", "log_mended").stderr
+    assert check("log_mended").command == ""
 
 
 def test_a_data_set_in_ms_is_told_and_mended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

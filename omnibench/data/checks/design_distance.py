@@ -33,7 +33,7 @@ class DesignDistance:
     def __init__(self, robot: Robot) -> None:
         self.design = robot.inverse_kinematic_matrix
         scales = robot.row_scales
-        self._outside = _outside(robot.signal_equations @ robot.allowed_basis)
+        self._outside = beyond_twists(robot)
         self._units = np.repeat(1 / scales, self.design.shape[1])
         self._allowed = _allowed(robot, scales) * np.outer(self._units, self._units)
 
@@ -66,8 +66,9 @@ class DesignDistance:
         return shares
 
 
-def _outside(equations: Array) -> Array:
-    """The projection (M, M) that takes from signals those that a twist gives."""
+def beyond_twists(robot: Robot) -> Array:
+    """The projection (M, M) that takes from drive signals those that a twist of the robot gives."""
+    equations = robot.signal_equations @ robot.allowed_basis
     within, strengths, _ = np.linalg.svd(equations, full_matrices=False)
     within = within[:, strengths > 1e-9 * strengths[0]]
     outside: Array = np.eye(len(equations)) - within @ within.T

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from omnibench.data.checks.contradictions import contradictions
 from omnibench.data.checks.explanations import odd_units, odd_wheels, ticks
-from omnibench.data.checks.misfit import Explanation, Recording, UnitWarning
-from omnibench.data.checks.odd_steering import frozen, odd_gears, odd_zeros
+from omnibench.data.checks.finding import Finding
+from omnibench.data.checks.misfit import Explanation, Recording
+from omnibench.data.checks.odd_steering import contradictions, frozen, odd_gears, odd_zeros
+from omnibench.data.checks.option_words import warning_of
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 
@@ -28,27 +29,32 @@ def implausible(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array]) 
     """
     if not any(log.rates.any() for log in logs):
         return ["the wheels never turn; check the omega_* columns"]
-    recording = Recording.of(robot, logs, poses)
+    findings, unit = _found(Recording.of(robot, logs, poses))
+    return [warning_of(robot, finding, unit=unit) for finding in findings]
+
+
+def _found(recording: Recording) -> tuple[list[Finding], bool]:
+    """What is wrong, and whether that is a unit."""
     if recording.misfit < _SUSPICIOUS_ZERO:
-        return contradictions(recording)
+        return contradictions(recording), False
     zeros = odd_zeros(recording)
     if recording.misfit < _SUSPICIOUS:
-        return contradictions(recording) or _best(recording, zeros)
-    units, gears, high = odd_units(recording), odd_gears(recording), ticks(recording)
-    single = [each for each in (*units, *gears) if each.unit and len(each.warnings) == 1]  # the simplest first
-    return (
-        _best(recording, single, [*zeros, *high])
-        or _best(recording, [*units, *gears, *odd_wheels(recording), *zeros, *high])
-        or contradictions(recording)
-        or frozen(recording)
-    )
+        best = None if (found := contradictions(recording)) else _best(recording, zeros)
+    else:
+        units, gears, high = odd_units(recording), odd_gears(recording), ticks(recording)
+        single = [each for each in (*units, *gears) if each.unit and len(each.mistakes) == 1]  # the simplest first
+        best = _best(recording, single, [*zeros, *high])
+        best = best or _best(recording, [*units, *gears, *odd_wheels(recording), *zeros, *high])
+        found = [] if best else contradictions(recording) or frozen(recording)
+    return ([mistake.finding() for mistake in best.mistakes], best.unit) if best else (found, False)
 
 
-def _best(recording: Recording, explanations: Sequence[Explanation], fitted: Sequence[Explanation] = ()) -> list[str]:
-    """The warnings of the best explanation, if it explains the misfit; none if a fitted one is far better."""
+def _best(
+    recording: Recording, explanations: Sequence[Explanation], fitted: Sequence[Explanation] = ()
+) -> Explanation | None:
+    """The best explanation, if it explains the misfit; none if a fitted one is far better."""
     best = min(explanations, key=lambda explanation: explanation.misfit, default=None)
     if best is None or best.misfit >= best.may_remain * recording.misfit:
-        return []
-    if best.misfit > _EXACT and any(each.misfit < _FAR_BETTER * best.misfit for each in fitted):
-        return []
-    return [UnitWarning(warning) for warning in best.warnings] if best.unit else list(best.warnings)
+        return None
+    better = any(each.misfit < _FAR_BETTER * best.misfit for each in fitted)
+    return None if best.misfit > _EXACT and better else best

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from omnibench.data.checks.misreading import Misreading, Reading
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import OdometryBatch, WheelLog
 from omnibench.robot.planar import wrapped
@@ -23,37 +24,15 @@ _TURN = 2 * math.pi  # rad
 EXPLAINED = 0.35  # share of the misfit that may remain with an explanation (chosen)
 _LEAST_TURN = 0.5  # rad, far more than references are noisy (chosen)
 
-Reading = Callable[[Array], Array]
-"""What would have been recorded, of what was."""
-
-
-def times(factor: float) -> Reading:
-    """The reading of what was recorded in another unit."""
-    return lambda values: values * factor
-
-
-def listed(values: Sequence[int]) -> str:
-    """Values as an option takes them."""
-    return f"[{','.join(map(str, values))}]"
-
-
-def rounded(value: float) -> str:
-    """A value to two digits."""
-    return f"{float(f'{value:.2g}'):,.12g}"
-
-
-class UnitWarning(str):
-    """A warning of a unit that cannot be right, by the magnitude of what was recorded."""
-
 
 @dataclass(frozen=True)
 class Explanation:
-    """Warnings of what may be wrong, and the misfit that remains if they are right.
+    """Mistakes of a recording, and the misfit that remains if it was read with them.
 
     unit: a unit is wrong. may_remain: share of the misfit that may remain.
     """
 
-    warnings: tuple[str, ...]
+    mistakes: tuple[Misreading, ...]
     misfit: float
     unit: bool = False
     may_remain: float = EXPLAINED
@@ -88,21 +67,9 @@ class Recording:
             [poses[index][stamps] for index, stamps in zip(some, seen, strict=True)],
         )
 
-    def reread(self, rates: Reading | None = None, steering: Reading | None = None) -> Recording:
-        """The recording if its wheel rates (F, N) and steering angles (F, S) were read otherwise."""
-        changed = []
-        for log in self.logs:
-            if rates is not None:
-                log = replace(log, rates=rates(log.rates))
-            if steering is not None and log.steering is not None:
-                log = replace(log, steering=steering(log.steering))
-            changed.append(log)
-        return replace(self, logs=changed)
-
-    @property
-    def farthest_steered(self) -> float:
-        """The largest steering angle, rad."""
-        return max(float(np.abs(log.steering).max()) for log in self.logs if log.steering is not None)
+    def read(self, reading: Reading) -> Recording:
+        """The recording if its wheel rates and steering angles were read otherwise."""
+        return replace(self, logs=[reading.of(log) for log in self.logs])
 
     @cached_property
     def misfit(self) -> float:

@@ -21,14 +21,16 @@ import numpy as np
 from omnibench.data.checks.design_distance import DesignDistance, transformed
 from omnibench.data.checks.misreading import (
     Misreading,
+    Reading,
     Transform,
+    headings_in_degrees,
     position_units,
     reference_transforms,
     turned_reference,
     wheel_transforms,
 )
 from omnibench.data.checks.motion_fit import FreeFit, Windows, continuous
-from omnibench.data.checks.steering_readings import SteeringReading, steering_readings, steering_transforms
+from omnibench.data.checks.steering_readings import steering_readings, steering_transforms
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 
@@ -77,7 +79,7 @@ class Recorded:
         """With headings that were recorded in degrees, and made continuous as if they were radians."""
         return replace(self, poses=[_as_degrees(*pair, row_3) for pair in zip(self.logs, self.poses, strict=True)])
 
-    def steered(self, reading: SteeringReading) -> Recorded:
+    def steered(self, reading: Reading) -> Recorded:
         """With steering angles, and rates, as a reading takes them."""
         return replace(self, logs=[reading.of(log) for log in self.logs])
 
@@ -195,19 +197,16 @@ def _bases(recording: Recorded, fit: FreeFit) -> Iterator[_Base]:
     flipped = recording.with_headings(-1.0).fit()
     if flipped is not None:
         yield _Base(flipped, flipped=True)
-    degrees = Misreading(
-        "heading_unit", "theta looks like degrees; it must be rad", "the reference", {"heading_unit": "deg"}
-    )
     in_degrees = recording.in_degrees(recording.robot.inverse_kinematic_matrix[2])
     cost = 0.0 if _beyond_a_turn(recording.poses) else _IN_DEGREES
     for factor in (1.0, -1.0):
         base = in_degrees.with_headings(factor).fit()
         if base is not None:
-            yield _Base(base, (degrees,), cost, flipped=factor < 0)
+            yield _Base(base, (headings_in_degrees(),), cost, flipped=factor < 0)
     for reading in steering_readings(recording.robot, recording.logs):
         base = recording.steered(reading).fit()
         if base is not None:
-            yield _Base(base, (reading.mistake,), reading.cost, plain=True)
+            yield _Base(base, reading.mistakes, reading.cost, plain=True)
 
 
 def _beyond_a_turn(poses: Sequence[Array]) -> bool:

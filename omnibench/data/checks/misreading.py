@@ -1,26 +1,27 @@
-"""Mistakes by which what was recorded differs from what was meant, and what each makes of a fitted matrix."""
+"""Mistakes by which what was recorded differs from what was meant, and what each makes of a log or a fitted matrix."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations, permutations, product
 from typing import Any
 
 import numpy as np
 
-from omnibench.data.checks.finding import Kind
-from omnibench.data.checks.misfit import rounded
+from omnibench.data.checks.finding import Finding, Kind
 from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.odometry import WheelLog
 from omnibench.robot.planar import rotation
 
 _ARRANGED = 4  # wheels of which every order and sign is tried, at most; of more only one mistake
-# Units of wheel rates by the factor from rad/s: names, and option for rates and for positions.
-_UNITS = ((60 / (2 * math.pi), "rpm"), (180 / math.pi, "deg/s"), (1 / (2 * math.pi), "rev/s"))
+# Other units by the size of the SI unit in them: of wheel rates, and of positions.
+RATE_UNITS = ((60 / (2 * math.pi), "rpm"), (180 / math.pi, "deg/s"), (1 / (2 * math.pi), "rev/s"))
+POSITION_UNITS = ((1e3, "mm"), (1e2, "cm"))
 _COUNTS = (4.0, 2.0, 0.5, 0.25)  # factors of counters: edges counted fourfold, twofold, or stated so and counted once
 _GEARS = 1.1 ** np.array([power for power in range(-97, 98) if abs(power) > 3])  # 1/10,000 to 10,000, not about 1
-_FEWEST_TICKS = 100  # of a turn of the wheel, from which on a factor is called ticks; chosen
+FEWEST_TICKS = 100  # of a turn of the wheel, from which on a factor is called ticks; chosen
 # Cost of a mistake, in units of d^2, so that the simplest explanation is taken of those that fit alike (chosen): each
 # wheel that is changed, a reference that is wrong, a factor that is fitted.
 _WHEEL, _REFERENCE, _FITTED = 4.0, 4.5, 6.0
@@ -34,6 +35,36 @@ class Misreading:
     what: str
     where: str
     changes: Mapping[str, Any] = field(default_factory=dict)
+
+    def finding(self, more: str = "") -> Finding:
+        """The finding of the mistake. more: words that follow."""
+        return Finding(kind=self.kind, what=self.what + more, where=self.where, severity="error", changes=self.changes)
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """The steering angles (F, S) and rates (F, N) that were meant, of those recorded.
+
+    mistakes: of the recording, if these were meant. cost: of the mistakes, in units of d^2 (misread_search.py). order,
+    factors, offsets: of the steering angles, offsets in rad. rate_order, rate_factors: of the rates.
+    """
+
+    mistakes: tuple[Misreading, ...] = ()
+    cost: float = 0.0
+    order: tuple[int, ...] = ()
+    factors: Array | float = 1.0
+    offsets: Array | float = 0.0
+    rate_order: tuple[int, ...] = ()
+    rate_factors: Array | float = 1.0
+
+    def of(self, log: WheelLog) -> WheelLog:
+        """The log as it was meant."""
+        rates = log.rates[:, list(self.rate_order)] if self.rate_order else log.rates
+        steering = log.steering
+        if steering is not None:
+            ordered = steering[:, list(self.order)] if self.order else steering
+            steering = ordered * self.factors + self.offsets
+        return replace(log, steering=steering, rates=rates * self.rate_factors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +90,7 @@ def wheel_transforms(robot: Robot) -> Iterator[Transform]:
     count = len(robot.drive.names)
     yield Transform(np.eye(3), np.eye(count), 0.0, ())
     if robot.drive.direct:
-        yield from _arrangements(robot)
+        yield from arrangements(robot)
     else:
         yield from _turned_round(robot)
     yield from _units(count)
@@ -94,11 +125,20 @@ def reference_transforms(flipped: bool) -> Iterator[Transform]:
 
 def position_units() -> Iterator[Transform]:
     """Positions in other units than metres."""
-    for factor, unit in ((1e-3, "mm"), (1e-2, "cm")):
-        mistake = Misreading(
-            "position_unit", f"positions look like {unit}; x and y must be m", "the reference", {"position_unit": unit}
-        )
-        yield Transform(np.diag([factor, factor, 1.0]), np.eye(0), _REFERENCE, (mistake,))
+    for factor, unit in POSITION_UNITS:
+        yield Transform(np.diag([1 / factor, 1 / factor, 1.0]), np.eye(0), _REFERENCE, (positions_in(unit),))
+
+
+def positions_in(unit: str) -> Misreading:
+    """Positions in another unit than m."""
+    words = f"positions look like {unit}; x and y must be m"
+    return Misreading("position_unit", words, "the reference", {"position_unit": unit})
+
+
+def headings_in_degrees() -> Misreading:
+    """Headings in degrees."""
+    words = "theta looks like degrees; it must be rad"
+    return Misreading("heading_unit", words, "the reference", {"heading_unit": "deg"})
 
 
 def turned_reference(angle: float) -> Transform:
@@ -122,7 +162,7 @@ def _mirrored_in_words(signs: Sequence[int], swapped: bool) -> str:
     return f"the reference is mirrored: {' and '.join(parts)}"
 
 
-def _arrangements(robot: Robot) -> Iterator[Transform]:
+def arrangements(robot: Robot) -> Iterator[Transform]:
     """Every order and sign of up to four wheels; of more, one mistake."""
     names, count = robot.wheel_names, len(robot.wheel_names)
     identity = tuple(range(count))
@@ -130,7 +170,7 @@ def _arrangements(robot: Robot) -> Iterator[Transform]:
         every = list(product(permutations(range(count)), product((1, -1), repeat=count)))
     else:
         every = [(identity, signs) for signs in _few_signs(count)]
-        every += [(_exchanged(count, *pair), (1,) * count) for pair in combinations(range(count), 2)]
+        every += [(exchanged(count, *pair), (1,) * count) for pair in combinations(range(count), 2)]
     for order, signs in every:
         if order == identity and min(signs) > 0:
             continue
@@ -163,12 +203,10 @@ def arrangement(names: Sequence[str], order: Sequence[int], signs: Sequence[int]
         flipped = " and sign-flipped" if negative else ""
         words = f"wheels look swapped{flipped}; the reference fits with omega of {shown}"
         return Misreading("wheels_swapped", words, wheels_in_words(moved), changes)
-    if len(negative) == len(names):
-        words = f"every wheel ({', '.join(names)}) looks counted the wrong way round"
-        return Misreading("wheels_negated", words, wheels_in_words(names), changes)
-    look = "looks" if len(negative) == 1 else "look"
-    words = f"{wheels_in_words(negative)} {look} counted the wrong way round"
-    return Misreading("wheel_negated", words, wheels_in_words(negative), changes)
+    every = len(negative) == len(names)
+    which = f"every wheel ({', '.join(names)})" if every and len(names) > 1 else wheels_in_words(negative)
+    words = f"{which} {'looks' if every or len(negative) == 1 else 'look'} counted the wrong way round"
+    return Misreading("wheels_negated" if every else "wheel_negated", words, wheels_in_words(negative), changes)
 
 
 def _turned_round(robot: Robot) -> Iterator[Transform]:
@@ -196,14 +234,15 @@ def _few_signs(count: int) -> list[tuple[int, ...]]:
     return [*single, *([(-1,) * count] if count > 1 else [])]
 
 
-def _exchanged(count: int, first: int, second: int) -> tuple[int, ...]:
+def exchanged(count: int, first: int, second: int) -> tuple[int, ...]:
+    """The numbers below ``count`` with two of them exchanged."""
     order = list(range(count))
     order[first], order[second] = second, first
     return tuple(order)
 
 
 def _units(count: int) -> Iterator[Transform]:
-    for factor, unit in _UNITS:
+    for factor, unit in RATE_UNITS:
         yield Transform(np.eye(3), factor * np.eye(count), _WHEEL, (wrong_unit(unit),))
 
 
@@ -235,12 +274,17 @@ def scaled(names: Sequence[str], group: Array, factor: float) -> Misreading:
         words += (
             f", as where counts are {'not ' if factor < 1 else ''}multiplied by {shown:g}, or by a gear of {shown:g}"
         )
-    elif 2 * math.pi * factor > _FEWEST_TICKS:
+    elif 2 * math.pi * factor > FEWEST_TICKS:
         words += f", as ticks would be at about {rounded(2 * math.pi * factor)} a turn of the wheel"
     else:
         words += "; is there a gear between the encoder and the wheel?"
     factors = [float(f"{factor:.3g}") if member else 1.0 for member in group]
     return Misreading("wheel_scale", words, where, {"rate_factors": factors})
+
+
+def rounded(value: float) -> str:
+    """A value to two digits."""
+    return f"{float(f'{value:.2g}'):,.12g}"
 
 
 def wheels_in_words(names: Sequence[str]) -> str:

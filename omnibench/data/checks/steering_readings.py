@@ -1,20 +1,30 @@
-"""Mistakes of steering angles, and of a car's wheels: linear ones of driven wheels, and others that need a fit."""
+"""Mistakes of steering angles, and of the wheels of robots that steer: readings, and those that are linear."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
-from omnibench.data.checks.misfit import rounded
-from omnibench.data.checks.misreading import Misreading, Transform, arrangement, scaled, wheels_in_words
+from omnibench.data.checks.finding import Finding
+from omnibench.data.checks.misreading import (
+    FEWEST_TICKS,
+    Misreading,
+    Reading,
+    Transform,
+    arrangement,
+    exchanged,
+    rounded,
+    scaled,
+    wheels_in_words,
+)
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.planar import rotation
-from omnibench.robot.wheels.drive import CarDrive
+from omnibench.robot.wheels.drive import CarDrive, Drive
 
 DEGREE = math.pi / 180
 # Factors of steering angles that are tried, 1.25 apart; nearer to 1 than 1.6 is what a calibration is for (chosen).
@@ -29,65 +39,46 @@ _REVERSED = 9.0
 _BEYOND = 1.9  # rad: angles that steer further may be degrees; chosen
 
 
-@dataclass(frozen=True, eq=False)
-class SteeringReading:
-    """The steering angles (F, S) and rates (F, N) that were meant, of those recorded.
-
-    order, signs, factors, offsets: of the steering angles, offsets in rad. rate_order, rate_factors: of the rates.
-    """
-
-    mistake: Misreading
-    cost: float
-    order: tuple[int, ...] = ()
-    factors: Array | float = 1.0
-    offsets: Array | float = 0.0
-    rate_order: tuple[int, ...] = ()
-    rate_factors: Array | float = 1.0
-
-    def of(self, log: WheelLog) -> WheelLog:
-        """The log as it was meant."""
-        assert log.steering is not None  # the robot steers
-        steering = log.steering[:, list(self.order)] if self.order else log.steering
-        rates = log.rates[:, list(self.rate_order)] if self.rate_order else log.rates
-        return replace(log, steering=steering * self.factors + self.offsets, rates=rates * self.rate_factors)
-
-
-def steering_readings(robot: Robot, logs: Sequence[WheelLog]) -> Iterator[SteeringReading]:
+def steering_readings(robot: Robot, logs: Sequence[WheelLog]) -> Iterator[Reading]:
     """Readings of a robot that steers that need a fit of their own; none of one that does not."""
     drive = robot.drive
     if not drive.steered:
         return
-    yield from _degrees(drive.steered, logs)
+    farthest = farthest_steered(logs)
+    for group in groups(len(drive.steered)):
+        if (farthest[group > 0] > _BEYOND).any():
+            yield in_degrees(drive.steered, group)
     for factor in _FACTORS:
-        yield SteeringReading(_scaled(factor), _FITTED, factors=factor)
-    for first, second in combinations(range(len(drive.steered)), 2):
-        order = _exchanged(len(drive.steered), first, second)
-        yield SteeringReading(_swapped(drive.steered, first, second), _SIMPLE, order=order)
+        yield gear(factor)
+    yield from _exchanged_angles(drive)
     if not isinstance(drive, CarDrive):
-        for first, second in combinations(range(len(drive.wheels)), 2):
-            order = _exchanged(len(drive.wheels), first, second)
-            mistake = arrangement(drive.wheels, order, (1,) * len(order))
-            yield SteeringReading(mistake, _SIMPLE, rate_order=order)
+        yield from _exchanged_rates(drive)
         return
-    yield from _of_a_car(robot, drive)
-
-
-def _of_a_car(robot: Robot, drive: CarDrive) -> Iterator[SteeringReading]:
-    for group, signs in _groups(len(drive.steered)):
-        yield SteeringReading(turned_round(drive.steered, signs), _SIMPLE, factors=np.array(signs, dtype=float))
+    for group in groups(len(drive.steered)):
+        yield clockwise(drive.steered, group)
         for degrees in np.arange(_CAR_STEP, _CAR_MOST + 1, _CAR_STEP).tolist():
             for sign in (-1, 1):
-                mistake = zero(robot, group, sign * degrees)
-                yield SteeringReading(mistake, _FITTED, offsets=sign * degrees * DEGREE * group)
-    count = len(drive.wheels)
-    for wheel in range(count if count > 1 else 0):
-        signs = [-1 if index == wheel else 1 for index in range(count)]
-        factors = np.array(signs, dtype=float)
-        yield SteeringReading(arrangement(drive.wheels, range(count), signs), _SIMPLE, rate_factors=factors)
-        chosen = (factors < 0).astype(float)
+                yield another_zero(robot, group, sign * degrees)
+    for group in groups(len(drive.wheels))[1:]:
+        yield _turned_back(drive.wheels, group)
         for factor in _COUNTS:
-            mistake = scaled(drive.wheels, chosen, factor)
-            yield SteeringReading(mistake, _SIMPLE, rate_factors=np.where(chosen > 0, 1 / factor, 1.0))
+            mistake = scaled(drive.wheels, group, factor)
+            yield Reading((mistake,), _SIMPLE, rate_factors=np.where(group > 0, 1 / factor, 1.0))
+
+
+def simple_readings(robot: Robot) -> Iterator[Reading]:
+    """One wheel of a robot that steers or its angle, or all, counted the wrong way round; and two exchanged."""
+    drive = robot.drive
+    for group in groups(len(drive.wheels)):
+        yield _turned_back(drive.wheels, group)
+    for group in groups(len(drive.steered)):
+        yield clockwise(drive.steered, group)
+    yield from _exchanged_rates(drive)
+    yield from _exchanged_angles(drive)
+    for wheels in combinations(_modules(drive), 2):
+        angles = tuple(drive.pairs[wheel] for wheel in wheels)
+        orders = exchanged(len(drive.steered), *angles), exchanged(len(drive.wheels), *wheels)
+        yield Reading((_exchanged_modules(drive, *wheels),), _SIMPLE, order=orders[0], rate_order=orders[1])
 
 
 def steering_transforms(robot: Robot) -> Iterator[Transform]:
@@ -97,24 +88,19 @@ def steering_transforms(robot: Robot) -> Iterator[Transform]:
         return
     begins = np.cumsum([0, *(1 if pair < 0 else 2 for pair in drive.pairs)])
     count = len(drive.names)
-    for group, signs in _groups(len(drive.steered)):
+    for group in groups(len(drive.steered)):
         flip = _blocks(drive.pairs, begins, group, np.diag([1.0, -1.0]))
-        yield Transform(np.eye(3), flip, _SIMPLE, (turned_round(drive.steered, signs),))
+        yield Transform(np.eye(3), flip, _SIMPLE, clockwise(drive.steered, group).mistakes)
         for degrees in np.arange(-180.0 + _ZERO_STEP, 180.1, _ZERO_STEP).tolist():
             if abs(degrees) >= _LEAST_ZERO:
                 turn = _blocks(drive.pairs, begins, group, rotation(-degrees * DEGREE)[:2, :2])
                 cost = _FITTED if abs(degrees) <= 90 else _REVERSED
-                yield Transform(np.eye(3), turn, cost, (zero(robot, group, degrees),))
-    modules = [wheel for wheel, pair in enumerate(drive.pairs) if pair >= 0]
-    for first, second in combinations(modules, 2):
+                yield Transform(np.eye(3), turn, cost, another_zero(robot, group, degrees).mistakes)
+    for first, second in combinations(_modules(drive), 2):
         order = np.arange(count)
         one, other = (slice(begins[wheel], begins[wheel + 1]) for wheel in (first, second))
         order[one], order[other] = order[other].copy(), order[one].copy()
-        wheels = arrangement(drive.wheels, _exchanged(len(drive.wheels), first, second), (1,) * len(drive.wheels))
-        angles = _swapped(drive.steered, drive.pairs[first], drive.pairs[second])
-        words = f"wheels {drive.wheels[first]} and {drive.wheels[second]} look swapped, rates and steering angles"
-        both = replace(wheels, what=words, changes={**wheels.changes, **angles.changes})
-        yield Transform(np.eye(3), np.eye(count)[order], _SIMPLE, (both,))
+        yield Transform(np.eye(3), np.eye(count)[order], _SIMPLE, (_exchanged_modules(drive, first, second),))
 
 
 def _blocks(pairs: Sequence[int], begins: Array, group: Array, block: Array) -> Array:
@@ -126,50 +112,54 @@ def _blocks(pairs: Sequence[int], begins: Array, group: Array, block: Array) -> 
     return whole
 
 
-def _degrees(steered: Sequence[str], logs: Sequence[WheelLog]) -> Iterator[SteeringReading]:
-    farthest = np.max([np.abs(log.steering).max(axis=0) for log in logs if log.steering is not None], axis=0)
-    for group, _ in _groups(len(steered)):
-        if (farthest[group > 0] > _BEYOND).any():
-            names = [name for name, chosen in zip(steered, group, strict=True) if chosen]
-            every = len(names) == len(steered)
-            changes = (
-                {"steering_unit": "deg"}
-                if every
-                else {"steering_factors": [DEGREE if chosen else 1.0 for chosen in group.tolist()]}
-            )
-            words = f"the steering angle of {wheels_in_words(names)} looks like degrees; it must be rad"
-            where = f"steering of {wheels_in_words(names)}"
-            mistake = Misreading("steering_unit", words, where, changes)
-            yield SteeringReading(mistake, _SIMPLE, factors=np.where(group > 0, DEGREE, 1.0))
+def farthest_steered(logs: Sequence[WheelLog]) -> Array:
+    """Largest angle (S,) of each steered wheel, rad."""
+    farthest: Array = np.max([np.abs(log.steering).max(axis=0) for log in logs if log.steering is not None], axis=0)
+    return farthest
 
 
-def _scaled(factor: float) -> Misreading:
+def groups(count: int) -> list[Array]:
+    """All wheels together, and each of several, as members (S,) of 0 and 1."""
+    return [np.ones(count), *(np.eye(count) if count > 1 else ())]
+
+
+def in_degrees(steered: Sequence[str], group: Array) -> Reading:
+    """Steering angles of a group (S,) of 0 and 1 in degrees."""
+    names = _members(steered, group)
+    factors = np.where(group > 0, DEGREE, 1.0)
+    if len(names) == len(steered):
+        words, changes = "steering angles look like degrees; steer_* must be rad", {"steering_unit": "deg"}
+    else:
+        columns = ", ".join(f"steer_{name}" for name in names)
+        words = f"the steering angle of {wheels_in_words(names)} looks like degrees; {columns} must be rad"
+        changes = {"steering_factors": factors.tolist()}
+    mistake = Misreading("steering_unit", words, f"steering of {wheels_in_words(names)}", changes)
+    return Reading((mistake,), _SIMPLE, factors=factors)
+
+
+def gear(factor: float) -> Reading:
     """Steering angles that are to be taken times a factor."""
     shown, size = (1 / factor, "large") if factor < 1 else (factor, "small")
-    words = f"steering angles look about {rounded(shown)} times too {size}; is there a gear before the encoder?"
-    return Misreading("steering_unit", words, "steering of all wheels", {"steering_factors": [float(f"{factor:.3g}")]})
+    words, count = f"steering angles look about {rounded(shown)} times too {size}", 2 * math.pi / factor
+    if count > FEWEST_TICKS:
+        words += f", as ticks would be at about {rounded(count)} a turn of the wheel"
+    else:
+        words += "; is there a gear between the encoder and the wheel?"
+    changes = {"steering_factors": [float(f"{factor:.3g}")]}
+    return Reading((Misreading("steering_unit", words, "steering of all wheels", changes),), _FITTED, factors=factor)
 
 
-def _swapped(steered: Sequence[str], first: int, second: int) -> Misreading:
-    names = f"{steered[first]}, {steered[second]}"
-    return Misreading(
-        "steering_swapped",
-        f"the steering angles of wheels {names} look swapped",
-        f"steering of wheels {names}",
-        {"steering_order": list(_exchanged(len(steered), first, second))},
-    )
-
-
-def turned_round(steered: Sequence[str], signs: Sequence[int]) -> Misreading:
-    """Steering angles that count clockwise."""
-    names = wheels_in_words([name for name, sign in zip(steered, signs, strict=True) if sign < 0])
+def clockwise(steered: Sequence[str], group: Array) -> Reading:
+    """Steering angles of a group (S,) of 0 and 1 that count clockwise."""
+    names, signs = wheels_in_words(_members(steered, group)), _signs(group)
     words = f"the steering angle of {names} looks counted clockwise; it must count counter-clockwise"
-    return Misreading("steering_sign", words, f"steering of {names}", {"steering_signs": list(signs)})
+    mistake = Misreading("steering_sign", words, f"steering of {names}", {"steering_signs": signs})
+    return Reading((mistake,), _SIMPLE, factors=np.array(signs, dtype=float))
 
 
-def zero(robot: Robot, group: Array, degrees: float) -> Misreading:
+def another_zero(robot: Robot, group: Array, degrees: float) -> Reading:
     """Steering angles of a group (S,) of 0 and 1 that lack so many degrees."""
-    names = [name for name, chosen in zip(robot.drive.steered, group, strict=True) if chosen]
+    names = _members(robot.drive.steered, group)
     free = not any(wheel.kind == "fixed" for wheel in robot.wheels) and len(names) == len(robot.drive.steered)
     turned = f"; or the reference is turned: heading_offset_deg={degrees:g}" if free else ""
     words = (
@@ -177,16 +167,65 @@ def zero(robot: Robot, group: Array, degrees: float) -> Misreading:
         f"{'large' if degrees < 0 else 'small'}, its zero not straight ahead{turned}"
     )
     changes = {"steering_offsets_deg": [degrees if chosen else 0.0 for chosen in group.tolist()]}
-    return Misreading("steering_zero", words, f"steering of {wheels_in_words(names)}", changes)
+    mistake = Misreading("steering_zero", words, f"steering of {wheels_in_words(names)}", changes)
+    return Reading((mistake,), _FITTED, offsets=degrees * DEGREE * group)
 
 
-def _groups(count: int) -> list[tuple[Array, list[int]]]:
-    """All of the steered wheels together, and each of several, as members (S,) of 0 and 1 and as signs."""
-    groups = [np.ones(count)] + [row for row in np.eye(count) if count > 1]
-    return [(group, [-1 if member else 1 for member in group.tolist()]) for group in groups]
+def frozen_steering(steered: Sequence[str]) -> Finding:
+    """Steering angles that never change though those of the robot must."""
+    names = wheels_in_words(steered)
+    return Finding(
+        kind="steering_frozen",
+        what=f"the steering angle of {names} never changes, though the reference shows that it must",
+        where=f"steering of {names}",
+        severity="error",
+        fix=f"read the column or topic that holds the angle of {names} (steering_columns; of bags steering_joints or "
+        "steering_topic), or record it, and import again",
+    )
 
 
-def _exchanged(count: int, first: int, second: int) -> tuple[int, ...]:
-    order = list(range(count))
-    order[first], order[second] = second, first
-    return tuple(order)
+def _turned_back(wheels: Sequence[str], group: Array) -> Reading:
+    signs = _signs(group)
+    mistake = arrangement(wheels, range(len(wheels)), signs)
+    return Reading((mistake,), _SIMPLE, rate_factors=np.array(signs, dtype=float))
+
+
+def _exchanged_rates(drive: Drive) -> Iterator[Reading]:
+    for pair in combinations(range(len(drive.wheels)), 2):
+        order = exchanged(len(drive.wheels), *pair)
+        yield Reading((arrangement(drive.wheels, order, (1,) * len(order)),), _SIMPLE, rate_order=order)
+
+
+def _exchanged_angles(drive: Drive) -> Iterator[Reading]:
+    for pair in combinations(range(len(drive.steered)), 2):
+        order = exchanged(len(drive.steered), *pair)
+        yield Reading((_swapped(drive.steered, *pair),), _SIMPLE, order=order)
+
+
+def _exchanged_modules(drive: Drive, first: int, second: int) -> Misreading:
+    """Two steered driven wheels whose rates and angles are exchanged."""
+    count = len(drive.wheels)
+    wheels = arrangement(drive.wheels, exchanged(count, first, second), (1,) * count)
+    angles = _swapped(drive.steered, drive.pairs[first], drive.pairs[second])
+    words = f"wheels {drive.wheels[first]} and {drive.wheels[second]} look swapped, rates and steering angles"
+    return replace(wheels, what=words, changes={**wheels.changes, **angles.changes})
+
+
+def _swapped(steered: Sequence[str], first: int, second: int) -> Misreading:
+    names = wheels_in_words((steered[first], steered[second]))
+    words, order = f"the steering angles of {names} look swapped", list(exchanged(len(steered), first, second))
+    return Misreading("steering_swapped", words, f"steering of {names}", {"steering_order": order})
+
+
+def _modules(drive: Drive) -> list[int]:
+    """Numbers of the driven wheels that steer."""
+    return [wheel for wheel, pair in enumerate(drive.pairs) if pair >= 0]
+
+
+def _members(names: Sequence[str], group: Array) -> list[str]:
+    return [name for name, member in zip(names, group.tolist(), strict=True) if member]
+
+
+def _signs(group: Array) -> list[int]:
+    """-1 for the members of a group (S,) of 0 and 1."""
+    return [-1 if member else 1 for member in group.tolist()]

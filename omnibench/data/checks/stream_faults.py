@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from omnibench.data.checks.finding import Finding, Kind, Severity
 from omnibench.data.checks.misreading import wheels_in_words
 from omnibench.data.checks.reference_jumps import reference_jumps
+from omnibench.data.checks.steering_readings import frozen_steering
 from omnibench.data.dataset import Trajectory
 from omnibench.robot.kinematics import Array, Robot, wheel_equations
 from omnibench.words import plural, some
@@ -220,13 +221,7 @@ def _frozen_steering(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Findi
     if len(bends) < _FEWEST or np.subtract(*np.quantile(bends, [0.9, 0.1])) < _BENDS:
         return
     for name in [name for name, span in zip(robot.drive.steered, spans.tolist(), strict=True) if span < _SAME]:
-        yield Finding(
-            kind="steering_frozen",
-            what=f"the steering angle of wheel {name} never changes, though the robot drives straight and in curves",
-            where=f"steering of wheel {name}",
-            severity="error",
-            fix=f"read the column or topic that holds the angle of wheel {name}, or record it, and import again",
-        )
+        yield frozen_steering([name])
 
 
 def _bends(robot: Robot, run: Trajectory) -> Array:

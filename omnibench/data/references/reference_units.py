@@ -7,15 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from omnibench.data.checks.misfit import UnitWarning
-from omnibench.data.references.run_references import KINDS, UNITS, References
+from omnibench.data.checks.finding import Kind
+from omnibench.data.checks.misreading import POSITION_UNITS, Misreading
+from omnibench.data.checks.option_words import warning_of
+from omnibench.data.references.run_references import KINDS, UNITS, ReferenceKind, References
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 
 # How many times too large references in another unit are, and that unit.
-_FACTORS = {"m": ((1000.0, "mm"), (100.0, "cm")), "rad": ((float(np.degrees(1)), "degrees"),)}
-_SHORT = {"degrees": "deg"}
+_FACTORS = {"m": POSITION_UNITS, "rad": ((float(np.degrees(1)), "deg"),)}
 _NEAR = 1.5  # a ratio to the odometry within this factor of a unit's is that unit; chosen: designs are off by less
 _LEAST = {"m": 0.02, "rad": 0.05}  # m, rad: motions that are smaller tell nothing of a unit; chosen
 
@@ -31,22 +32,22 @@ def odd_references(robot: Robot, runs: Iterable[tuple[WheelLog, References]]) ->
         for kind, size, expected in zip(references.kinds.tolist(), sizes, driven, strict=True):
             if expected > _LEAST[UNITS[kind]] and np.isfinite(size):
                 ratios[kind].append(size / expected)
-    return [warning for kind in KINDS for warning in _warnings(kind, ratios[kind])]
+    return [warning for kind in KINDS for warning in _warnings(robot, kind, ratios[kind])]
 
 
-def _warnings(kind: str, ratios: Sequence[float]) -> list[str]:
+def _warnings(robot: Robot, kind: ReferenceKind, ratios: Sequence[float]) -> list[str]:
     if not ratios:
         return []
     ratio = float(np.median(ratios))
     for factor, unit in _FACTORS[UNITS[kind]]:
         if factor / _NEAR < ratio < factor * _NEAR:
-            option = f"heading_unit={_SHORT[unit]}" if UNITS[kind] == "rad" else f"position_unit={unit}"
-            return [
-                UnitWarning(
-                    f"references of kind {kind} are {ratio:.3g} times what the wheels say, as if they were in {unit}: "
-                    f"they must be in {UNITS[kind]} (import with --set {option})"
-                )
-            ]
+            what = (
+                f"references of kind {kind} are {ratio:.3g} times what the wheels say, as if they were in "
+                f"{'degrees' if unit == 'deg' else unit}: they must be in {UNITS[kind]}"
+            )
+            option: Kind = "heading_unit" if UNITS[kind] == "rad" else "position_unit"
+            found = Misreading(option, what, f"references of kind {kind}", {option: unit}).finding()
+            return [warning_of(robot, found, unit=True)]
     return []
 
 

@@ -62,7 +62,7 @@ def check_recording(read: RecordingSource) -> CheckReport:
     spoiled = {finding.kind for finding in (*faults, *odometry)} & set(_SPOILED)
     explained = search(recorded(replace(dataset, trajectories=tuple(aligned))))
     frozen = any(fault.kind == "steering_frozen" for fault in faults)  # which no other reading of it mends
-    misread = [] if frozen else list(_misreadings(explained))
+    misread = [] if frozen else list(_misreadings(explained)) if explained.told else _warned(dataset)
     if misread:
         faults = list(stream_faults(dataset.robot, aligned, readable=False))
     found += [*misread, *odometry, *faults, *copied_runs(runs)]
@@ -106,7 +106,7 @@ def _report(read: RecordingSource, findings: Sequence[Finding], gain: Gain) -> C
 def _without_poses(read: RecordingSource) -> CheckReport:
     """The report on runs whose only reference is a distance, an angle and the like."""
     dataset = read.dataset
-    found = [*read.findings, *_noted(dataset), *_left_open(dataset), *too_few(dataset.trajectories)]
+    found = [*read.findings, *_noted(dataset), *_warned(dataset), *_left_open(dataset), *too_few(dataset.trajectories)]
     return _report(read, with_fixes(read, found), Gain(None, ""))
 
 
@@ -140,13 +140,12 @@ def _misreadings(explained: Explained) -> Iterator[Finding]:
     others = " or ".join("; ".join(mistake.what for mistake in mistakes) for mistakes in explained.alike)
     for index, mistake in enumerate(explained.mistakes):
         alike = f" (this recording cannot tell that from another reading: {others})" if others and not index else ""
-        yield Finding(
-            kind=mistake.kind,
-            what=mistake.what + alike,
-            where=mistake.where,
-            severity="error",
-            changes=mistake.changes,
-        )
+        yield mistake.finding(alike)
+
+
+def _warned(dataset: Dataset) -> list[Finding]:
+    """What reading a data set warned of, where the search for misreadings needs more poses than there are."""
+    return [finding for finding in findings_of(dataset.warnings) if finding.severity == "error"]
 
 
 def _odometry(dataset: Dataset, runs: Sequence[Trajectory]) -> Iterator[Finding]:

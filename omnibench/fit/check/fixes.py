@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from omnibench.config import parse_yaml
 from omnibench.data.checks.finding import Finding
+from omnibench.data.checks.option_words import as_yaml
 from omnibench.fit.check.recording_source import RecordingSource
 from omnibench.registry import importers
 
@@ -73,22 +72,6 @@ def _import(importer: str, source: Path, options: Mapping[str, Any], output: Pat
     for key, value in options.items():
         words += ["--set", f"{key}={as_yaml(value)}"]
     return shlex.join(words)
-
-
-def as_yaml(value: Any) -> str:
-    """A value as ``--set`` takes it."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        plain = value and all(letter.isalnum() or letter in "._/*-" for letter in value) and value[0] != "*"
-        return value if plain and parse_yaml(value, "value") == value else json.dumps(value)
-    if isinstance(value, float) and value.is_integer():
-        return str(int(value))
-    if isinstance(value, Mapping):
-        return json.dumps(value)
-    if isinstance(value, list | tuple):
-        return f"[{','.join(as_yaml(item) for item in value)}]"
-    return str(value)
 
 
 def _mended(

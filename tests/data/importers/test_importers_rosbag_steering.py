@@ -85,7 +85,7 @@ def test_placeholders_of_a_wheel_name_the_option_that_forces_positions(tmp_path:
 
 def test_a_steering_joint_that_a_driver_fills_in_is_warned_of(tmp_path: Path) -> None:
     data = read(tmp_path, steering(lambda _: 0.0))
-    assert "steer_front never changes, which the reference contradicts" in data.warnings[-1]
+    assert "the steering angle of wheel front never changes, though the reference shows" in data.warnings[-1]
 
 
 @pytest.mark.parametrize("topic", [WHEELS, SLAM])
