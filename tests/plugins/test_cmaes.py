@@ -13,7 +13,10 @@ from omnibench.fit.calibrator import Outcome, run_calibrator
 from omnibench.registry import calibrators
 from omnibench.testing import CalibratorConformance, load_plugin, synthetic_problem
 
-load_plugin(Path(__file__).parents[2] / "plugins" / "cmaes.py")
+
+@pytest.fixture(autouse=True, scope="module")
+def plugin(registries_as_before_the_module: None) -> None:  # noqa: ARG001
+    load_plugin(Path(__file__).parents[2] / "plugins" / "cmaes.py")
 
 
 class TestCmaes(CalibratorConformance):

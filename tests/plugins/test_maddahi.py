@@ -23,7 +23,10 @@ from omnibench.testing import (
     synthetic_trajectories,
 )
 
-load_plugin(Path(__file__).parents[2] / "plugins" / "maddahi.py")
+
+@pytest.fixture(autouse=True, scope="module")
+def plugin(registries_as_before_the_module: None) -> None:  # noqa: ARG001
+    load_plugin(Path(__file__).parents[2] / "plugins" / "maddahi.py")
 
 
 class TestMaddahi(CalibratorConformance):
