@@ -48,6 +48,17 @@ def test_references_come_back_from_disk_as_they_were(tmp_path: Path, fmt: Format
     assert [run.start_known for run in again.trajectories] == [False, True, False]
 
 
+def test_the_offset_that_turns_share_comes_back_from_disk(tmp_path: Path) -> None:
+    run = measured()
+    assert run.references is not None
+    dataset = a_set(replace(run, references=replace(run.references, rate_sigma=0.01)))
+    save_dataset(dataset, tmp_path / "gyro")
+    again = load_dataset(tmp_path / "gyro")
+    assert again.hash == dataset.hash
+    assert again.trajectories[0].references is not None
+    assert again.trajectories[0].references.rate_sigma == 0.01
+
+
 def test_a_data_set_without_any_pose_has_no_table_of_poses(tmp_path: Path) -> None:
     save_dataset(everything_known(), tmp_path / "tape")
     save_dataset(a_set(measured()), tmp_path / "tape", overwrite=True)

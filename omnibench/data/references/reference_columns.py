@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 from omnibench.data.references.run_references import AT_ONE_TIME, PLANAR, References
 from omnibench.robot.kinematics import Array
 
-NUMBERS = ("t0", "t1", "value", "value_x", "value_y", "sigma", "sigma_x", "sigma_y")
+NUMBERS = ("t0", "t1", "value", "value_x", "value_y", "sigma", "sigma_x", "sigma_y", "sigma_rate")
 
 
 def references_of(kinds: NDArray[np.str_], numbers: Mapping[str, Array], *, start_known: bool = False) -> References:
     """The references of rows with a kind (R,) and numbers (R,) by NUMBERS, NaN where a cell is empty.
 
-    An empty t1 becomes inf, the end of a run; an empty t0 -inf, its start, or t1 of what is measured at one time.
+    An empty t1 becomes inf, the end of a run; an empty t0 -inf, its start, or t1 of what is measured at one time. The
+    largest sigma_rate is that of the run.
     """
     planar, instant = np.isin(kinds, list(PLANAR)), np.isin(kinds, list(AT_ONE_TIME))
     t1 = np.where(np.isnan(numbers["t1"]), np.inf, numbers["t1"])
@@ -27,7 +28,8 @@ def references_of(kinds: NDArray[np.str_], numbers: Mapping[str, Array], *, star
         [np.where(planar, _filled(numbers["sigma_x"], both), both), _filled(numbers["sigma_y"], both)]
     )
     values[~planar, 1] = sigmas[~planar, 1] = np.nan
-    return References(kinds, t0, t1, values, sigmas, start_known)
+    rate_sigma = float(np.nan_to_num(numbers["sigma_rate"]).max(initial=0.0))
+    return References(kinds, t0, t1, values, sigmas, start_known, rate_sigma)
 
 
 def _filled(values: Array, others: Array) -> Array:

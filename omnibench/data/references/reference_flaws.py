@@ -22,7 +22,7 @@ def reference_flaw(references: References, times: Array) -> Flaw | None:
         )
         if what:
             return row, what
-    return None
+    return _rate_flaw(references)
 
 
 def measurement_flaw(references: References) -> Flaw | None:
@@ -30,7 +30,13 @@ def measurement_flaw(references: References) -> Flaw | None:
     for row, kind in enumerate(references.kinds.tolist()):
         if what := _kind_flaw(kind) or _numbers_flaw(kind, references.values[row], references.sigmas[row]):
             return row, what
-    return None
+    return _rate_flaw(references)
+
+
+def _rate_flaw(references: References) -> Flaw | None:
+    if np.isfinite(references.rate_sigma) and 0 <= references.rate_sigma <= LARGEST:
+        return None
+    return 0, f"sigma_rate is {references.rate_sigma:g}; the standard deviation of a gyro's offset is >= 0, rad/s"
 
 
 def _kind_flaw(kind: str) -> str:

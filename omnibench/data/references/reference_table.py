@@ -1,7 +1,8 @@
 """The table references.parquet (or .csv) of a data set: a row for each measurement of a run's motion.
 
 Columns: trajectory, kind, value and sigma of kinds of one number, value_x, value_y, sigma_x and sigma_y of those of two
-(sigma stands for both where these are empty), t0 and t1, which may be missing or empty: the run's start and end.
+(sigma stands for both where these are empty), t0 and t1, which may be missing or empty: the run's start and end;
+sigma_rate (rad/s) of a gyro's offset, which the turns of a session share.
 """
 
 from __future__ import annotations
@@ -54,8 +55,8 @@ def reference_frame(references: Sequence[tuple[str, References]]) -> pl.DataFram
     """The table of the references of some runs, given with their ids."""
     rows: list[dict[str, Any]] = []
     for run, of_run in references:
-        for kind, t0, t1, value, sigma in zip(
-            of_run.kinds.tolist(), of_run.t0, of_run.t1, of_run.values, of_run.sigmas, strict=True
+        for kind, t0, t1, value, sigma, gyro in zip(
+            of_run.kinds.tolist(), of_run.t0, of_run.t1, of_run.values, of_run.sigmas, of_run.gyro, strict=True
         ):
             start = None if kind in AT_ONE_TIME and t0 == t1 else t0
             numbers = (
@@ -63,6 +64,8 @@ def reference_frame(references: Sequence[tuple[str, References]]) -> pl.DataFram
                 if kind in PLANAR
                 else {"value": value[0], "sigma": sigma[0]}
             )
+            if gyro and of_run.rate_sigma:
+                numbers["sigma_rate"] = of_run.rate_sigma
             rows.append({"trajectory": run, "t0": start, "t1": t1, "kind": kind} | numbers)
     schema = {"trajectory": pl.String, "t0": pl.Float64, "t1": pl.Float64, "kind": pl.String}
     frame = pl.DataFrame(rows, schema=schema | dict.fromkeys(NUMBERS[2:], pl.Float64))

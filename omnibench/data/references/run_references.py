@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Literal, get_args
@@ -47,8 +47,9 @@ class References(Brief):
 
     kinds (R,): of KINDS. t0, t1 (R,): s; equal for what is measured at one time. values, sigmas (R, 2): the second of
     kinds of one number is NaN. start_known: True if the run's start pose is known in the frame of positions and
-    headings; else it is a nuisance of the run. Before a recording is cut into runs, -inf is the start of a run to come,
-    and inf its end.
+    headings; else it is a nuisance of the run. rate_sigma: standard deviation, rad/s, of a gyro's offset, which times
+    the span is in every turn and heading from the start, and is the same in all runs of a session. Before a recording
+    is cut into runs, -inf is the start of a run to come, and inf its end.
     """
 
     kinds: NDArray[np.str_]
@@ -57,9 +58,12 @@ class References(Brief):
     values: Array
     sigmas: Array
     start_known: bool = False
+    rate_sigma: float = 0.0
 
     @classmethod
-    def of(cls, references: Iterable[Reference], end: float, *, start_known: bool = False) -> References:
+    def of(
+        cls, references: Iterable[Reference], end: float, *, start_known: bool = False, rate_sigma: float = 0.0
+    ) -> References:
         """The measurements of a run that ends after ``end`` s, by their times."""
         given = list(references)
         t1 = np.array([end if each.t1 is None else each.t1 for each in given], dtype=float)
@@ -75,7 +79,7 @@ class References(Brief):
             for pairs in ([each.value for each in given], [each.sigma for each in given])
         )
         kinds = np.array([each.kind for each in given], dtype=str)
-        return cls(kinds, t0, t1, values, sigmas, start_known).by_time()
+        return cls(kinds, t0, t1, values, sigmas, start_known, rate_sigma).by_time()
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -90,15 +94,20 @@ class References(Brief):
         """True (R,) for positions, and for headings that are not counted from another time."""
         return (self.kinds == "position") | ((self.kinds == "heading") & (self.t0 == self.t1))
 
+    @cached_property
+    def gyro(self) -> NDArray[np.bool_]:
+        """True (R,) for angles since another time, in which a gyro's offset adds up."""
+        return (self.kinds == "turn") | ((self.kinds == "heading") & (self.t0 < self.t1))
+
     def by_time(self) -> References:
         """These measurements in the order of t1, then t0."""
         order = np.lexsort((self.t0, self.t1))
         t0, t1, values, sigmas = (array[order] for array in (self.t0, self.t1, self.values, self.sigmas))
-        return References(self.kinds[order], t0, t1, values, sigmas, self.start_known)
+        return replace(self, kinds=self.kinds[order], t0=t0, t1=t1, values=values, sigmas=sigmas)
 
     def with_values(self, values: Array) -> References:
         """These measurements with other values (R, 2)."""
-        return References(self.kinds, self.t0, self.t1, values, self.sigmas, self.start_known)
+        return replace(self, values=values)
 
     def of_run(self, zero: float, end: float, kept: NDArray[np.bool_] | slice = slice(None)) -> References:
         """These measurements, or those kept (R,), by the time of a run that began at ``zero`` and lasted ``end`` s.
@@ -108,20 +117,22 @@ class References(Brief):
         kinds, t0, t1 = self.kinds[kept], self.t0[kept] - zero, self.t1[kept] - zero
         t0, t1 = np.where(np.isneginf(t0), 0.0, t0), np.where(np.isposinf(t1), end, t1)
         t0 = np.where(np.isposinf(t0), t1, t0)
-        return References(kinds, t0, t1, self.values[kept], self.sigmas[kept], self.start_known)
+        return replace(self, kinds=kinds, t0=t0, t1=t1, values=self.values[kept], sigmas=self.sigmas[kept])
 
     def open_ended(self, end: float) -> References:
         """These measurements of a run of ``end`` s, with -inf for its start and inf for its end: see ``of_run``."""
         spans = self.t0 < self.t1
         t0 = np.where(spans & (self.t0 == 0), -np.inf, self.t0)
         t1 = np.where(spans & (self.t1 == end) & (self.kinds != "heading"), np.inf, self.t1)
-        return References(self.kinds, t0, t1, self.values, self.sigmas, self.start_known)
+        return replace(self, t0=t0, t1=t1)
 
     @property
     def content(self) -> tuple[Hashable, ...]:
         """All of it as plain values, for digests."""
         arrays = (np.ascontiguousarray(array, dtype=float) for array in (self.t0, self.t1, self.values, self.sigmas))
-        return (tuple(self.kinds.tolist()), self.start_known, *(array.tobytes() for array in arrays))
+        # Left out where it says nothing, as tables leave it out.
+        offset = (self.rate_sigma,) * bool(self.rate_sigma > 0 and self.gyro.any())
+        return (tuple(self.kinds.tolist()), self.start_known, *(array.tobytes() for array in arrays), *offset)
 
 
 def _pair(kind: str, given: float | tuple[float, float]) -> tuple[float, float]:

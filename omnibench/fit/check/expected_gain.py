@@ -16,6 +16,7 @@ from omnibench.robot.arrays import Array
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import OdometryBatch
 from omnibench.robot.planar import wrapped
+from omnibench.words import plural
 
 _PARTS = 5  # of the commands, each held out once
 _FEWEST = 4  # runs, below which nothing can be held out
@@ -36,20 +37,22 @@ def expected_gain(robot: Robot, runs: Sequence[Trajectory]) -> Gain:
     """Errors at the end of runs that were held out, by the design and by a linear fit to the others."""
     chosen = [run for run in runs if run.has_poses]
     chosen = chosen[:: -(-len(chosen) // _MOST)] if len(chosen) > _MOST else list(chosen)
+    unknown = "whether a calibration is needed cannot be told from"
     if len(chosen) < _FEWEST:
-        return Gain(None, f"whether a calibration is needed cannot be told from {len(chosen)} of {_FEWEST} runs")
+        return Gain(None, f"{unknown} {plural(len(chosen), 'run')}; {_FEWEST} are needed")
     names = command_names(chosen)
     known = sorted(set(names))
-    several = len(known) >= _PARTS
-    parts = [known.index(name) % _PARTS if several else index % _PARTS for index, name in enumerate(names)]
+    if len(known) < 2:
+        return Gain(None, f"{unknown} runs of one command; 2 are needed, of which one is held out")
+    count = min(_PARTS, len(known))
+    parts = [known.index(name) % count for name in names]
     before, after, held = [], [], []
-    for part in range(_PARTS):
+    for part in range(count):
         out = [run for run, of in zip(chosen, parts, strict=True) if of == part]
         rest = [run for run, of in zip(chosen, parts, strict=True) if of != part]
-        if out and rest:
-            before.append(_errors(out, robot.inverse_kinematic_matrix))
-            after.append(_errors(out, _fitted(robot, rest)))
-            held += out
+        before.append(_errors(out, robot.inverse_kinematic_matrix))
+        after.append(_errors(out, _fitted(robot, rest)))
+        held += out
     named = [replace(run, command=names[chosen.index(run)]) for run in held]
     verdict = judge(np.concatenate(before), np.concatenate(after), named)
     needed = {"better": True, "worse": False}.get(verdict.verdict)

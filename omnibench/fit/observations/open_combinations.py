@@ -53,7 +53,7 @@ def information_of_references(
 ) -> Array:
     """Information (3M, 3M) of the references of some runs about the elements at the design; poses: of these, too."""
     rows = reference_rows(runs, "reference" if poses else "none")
-    sigmas = np.where(rows.of_references[:, None], rows.sigmas, _OF_POSES)
+    sigmas = np.where(rows.of_references[:, None], rows.whole_sigmas, _OF_POSES)
     weights = np.where(rows.measured, 1 / np.nan_to_num(sigmas, nan=1.0), 0.0)
     design = robot.inverse_kinematic_matrix
     jacobian = ReferenceBatch(rows, integration).jacobian(design).reshape(len(rows.trajectory), 3, -1)

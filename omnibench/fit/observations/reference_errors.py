@@ -57,7 +57,7 @@ def errors_by_kind(model: OdometryModel, runs: Sequence[Trajectory]) -> dict[Ref
         return {}
     rows = reference_rows(measured, "none")
     errors = predicted_by(model, rows) - rows.observed
-    ratios = np.square(errors / np.where(rows.measured, rows.sigmas, np.inf))
+    ratios = np.square(errors / np.where(rows.measured, rows.whole_sigmas, np.inf))
     found: dict[ReferenceKind, Array] = {}
     for kind in KINDS:
         own = rows.kinds_in(kind)

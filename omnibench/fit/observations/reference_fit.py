@@ -10,9 +10,15 @@ where it is not known, and P = C^-1 - C^-1 N (N'C^-1 N)^-1 N'C^-1, the walks max
 
     -2 ln L = sum_z (ln |C| + ln |N'C^-1 N| + r'P r) + ln |A| - b'A^-1 b,   A = sum J'P J,   b = sum J'P r   (2)
 
-(Patterson and Thompson, Biometrika 58:545, 1971). Whitened are L^-1 r and L^-1 J, LL' = C, less what N explains. A
-variance V_i of the fit, V = A^-1, changes with w^2 by (V K V)_ii, K = sum J'P G P J, and w^2 has
-the variance 1 / I, I = 1/2 sum tr (P G)^2 times the share of numbers that the fit leaves, so that V_i has
+(Patterson and Thompson, Biometrika 58:545, 1971). A gyro's offset is one for the runs of a session: in units of its
+standard deviation it is fitted beside J, and its information in A is 1 more. Whitened are L^-1 r and L^-1 J, LL' = C,
+less what N explains. With the columns w of the offset, stacked over the runs of a session, these still have the
+covariance I + w w', whose symmetric inverse root is
+
+    I - w w' (1 - 1/sqrt(1 + w'w)) / w'w.                                                                 (4)
+
+A variance V_i of the fit, V = A^-1, changes with w^2 by (V K V)_ii, K = sum J'P G P J, and w^2 has the variance 1 / I,
+I = 1/2 sum tr (P G)^2 times the share of numbers that the fit leaves, so that V_i has
 
     2 V_i^2 / sum_w ((V K V)_ii^2 / I)                                                                    (3)
 
@@ -43,9 +49,11 @@ from omnibench.robot.odometry import Integration
 
 # Shares of the references' own variance at which the search for the odometry's begins: nothing, and as much again.
 _STARTS = (0.0, 1.0)
-_UNTOLD = 1e3  # times the sigma of positions that do not tell the heading from which they count: they have no weight
+# Times the sigma of positions that do not tell the heading from which they count; chosen: a millionth of their weight
+# is none, and the covariance still has a root.
+_UNTOLD = 1e3
 _MANY = 1e9  # degrees of freedom that stand for any number
-_MOST = 1e6  # times the references' own variance: the most that is searched
+_MOST = 1e6  # times the references' own variance: the most that is searched; chosen, odometry a thousand times as bad
 
 
 @dataclass(frozen=True)
@@ -83,10 +91,11 @@ class ReferenceFit:
         Without slopes there are no columns, n = 0.
         """
         residuals, columns, starts = self._unweighted(matrix, slopes)
-        white = [
-            _without(solve_triangular(root, np.column_stack([values, of_run, of_start]), lower=True), of_start.shape[1])
-            for root, values, of_run, of_start in zip(self._roots, residuals, columns, starts, strict=True)
-        ]
+        white = []
+        for root, *parts, of_start in zip(self._roots, residuals, columns, self._offsets, starts, strict=True):
+            values = solve_triangular(root, np.column_stack([*parts, of_start]), lower=True)
+            white.append(_without(values, of_start.shape[1]))
+        white = _without_offsets(white, self._sessions)
         return [of_run[:, 0] for of_run in white], [of_run[:, 1:] for of_run in white]
 
     def chi_square(self, matrix: Array) -> float:
@@ -104,10 +113,10 @@ class ReferenceFit:
             position, heading = (np.sqrt(max(share, 0.0) * unit) for share, unit in zip(shares, size, strict=True))
             return Walk(float(position), float(heading))
 
-        groups = _Group.of(self._own, self.wander, residuals, columns, starts)
+        groups = _Group.of(self._own, self.wander, residuals, self._with_offsets(columns), starts)
 
         def value(shares: Array) -> float:
-            return _minus_log_likelihood(groups, walk_of(shares))
+            return _minus_log_likelihood(groups, walk_of(shares), self._sessions)
 
         bounds = [(0.0, _MOST if each else 0.0) for each in known]
         tries = [
@@ -127,7 +136,8 @@ class ReferenceFit:
     def freedom(self, matrix: Array, slopes: Array, covariance: Array) -> Array:
         """Degrees of freedom (n,) of the variances on the diagonal of a covariance (n, n), Eq. (3)."""
         residuals, columns, starts = self._unweighted(matrix, slopes)
-        groups = _Group.of(self._own, self.wander, residuals, columns, starts)
+        groups = _Group.of(self._own, self.wander, residuals, self._with_offsets(columns), starts)
+        fixed = _given_offsets(groups, self.walk, self._sessions)
         rows, fitted = self.batch.rows, len(roots_of(covariance).T)
         numbers = int(rows.measured.sum()) - rows.numbers_of_starts
         left = max(numbers - fitted, 1) / max(numbers, 1)
@@ -139,7 +149,7 @@ class ReferenceFit:
             for group in groups:
                 of_run, by_columns = group.by_walk(self.walk, part)
                 information += left * of_run / 2
-                change += by_columns
+                change += fixed.T @ by_columns @ fixed
             moved = np.diag(covariance @ change @ covariance)
             reciprocals += np.square(moved) / max(information, 1e-300)
         doubled = 2 * np.square(np.diag(covariance))
@@ -166,8 +176,42 @@ class ReferenceFit:
     def _own(self) -> list[Array]:
         """Standard deviations (k,) that the references of each run have."""
         rows = self.batch.rows
-        sigmas = rows.sigmas * np.where(rows.tells_no_heading, _UNTOLD, 1.0)[:, None]
+        sigmas = rows.sigmas.copy()
+        sigmas[rows.tells_no_heading, :2] *= _UNTOLD  # a heading of the same time keeps its weight
         return [sigmas[own][rows.measured[own]] for own in self._owned]
+
+    def _with_offsets(self, columns: Sequence[Array]) -> list[Array]:
+        return [np.column_stack(pair) for pair in zip(columns, self._offsets, strict=True)]
+
+    @cached_property
+    def _offsets(self) -> list[Array]:
+        """Columns (k, G) of the offsets of G gyros, in standard deviations, at the references of each run."""
+        rows = self.batch.rows
+        # Parts of a recording, cut where samples are missing, are sessions with a number: ``name#2``.
+        names = [(run.session or "").partition("#")[0] for run in self.runs]
+        number = {
+            name: index
+            for index, name in enumerate(
+                dict.fromkeys(
+                    name
+                    for name, run in zip(names, self.runs, strict=True)
+                    if run.references and run.references.rate_sigma
+                )
+            )
+        }
+        found: list[Array] = []
+        for name, own in zip(names, self._owned, strict=True):
+            sigmas = rows.offset_sigmas[own][rows.measured[own]]
+            columns = np.zeros((len(sigmas), len(number)))
+            if name in number:
+                columns[:, number[name]] = sigmas
+            found.append(columns)
+        return found
+
+    @property
+    def _sessions(self) -> int:
+        """Number of gyros' offsets, G."""
+        return self._offsets[0].shape[1]
 
     @cached_property
     def _sizes(self) -> list[list[tuple[Array, NDArray[np.bool_]]]]:
@@ -188,6 +232,26 @@ class ReferenceFit:
             np.linalg.cholesky(np.diag(np.square(own)) + position * lengths + heading * angles)
             for own, (lengths, angles) in zip(self._own, self.wander, strict=True)
         ]
+
+
+def _without_offsets(white: Sequence[Array], count: int) -> list[Array]:
+    """Whitened values (k, n + count) of each run, whitened for the offsets of their last columns, without these."""
+    if not count:
+        return list(white)
+    values, offsets = [of_run[:, :-count] for of_run in white], [of_run[:, -count:] for of_run in white]
+    squares = sum(np.square(of_run).sum(axis=0) for of_run in offsets)
+    shared = sum(of_run.T @ values_of_run for of_run, values_of_run in zip(offsets, values, strict=True))
+    share = ((1 - 1 / np.sqrt(1 + squares)) / np.maximum(squares, np.finfo(float).tiny))[:, None]  # Eq. (4)
+    return [of_run - by @ (share * shared) for of_run, by in zip(values, offsets, strict=True)]
+
+
+def _given_offsets(groups: Sequence[_Group], walk: Walk, count: int) -> Array:
+    """Changes (n + count, n) of the columns' coefficients by the first n, with the last, of offsets, fitted along."""
+    size = groups[0].size
+    information = np.sum([group.information(walk) for group in groups], axis=0)
+    own = information[size - count :, size - count :] + np.eye(count)
+    along = np.linalg.solve(own, information[size - count :, : size - count])
+    return np.vstack([np.eye(size - count), -along])
 
 
 def _without(values: Array, count: int) -> Array:
@@ -240,6 +304,17 @@ class _Group:
             )
         return groups
 
+    @property
+    def size(self) -> int:
+        """Number n of columns of what is fitted."""
+        return self.values.shape[2] - 1 - self.count
+
+    def information(self, walk: Walk) -> Array:
+        """J'P J (n, n)."""
+        left = _without(self.whitened(walk)[0], self.count)[..., 1:]
+        total: Array = np.einsum("gki,gkj->ij", left, left)
+        return total
+
     def by_walk(self, walk: Walk, part: int) -> tuple[float, Array]:
         """Sum of tr (P G)^2, and J'P G P J (n, n), G being G_p (part 0) or G_h (1)."""
         white, _, roots = self._white(walk)
@@ -265,10 +340,11 @@ class _Group:
         return np.linalg.solve(roots, self.values), logarithms, roots
 
 
-def _minus_log_likelihood(groups: Sequence[_Group], walk: Walk) -> float:
-    """Eq. (2), up to a constant."""
-    size = groups[0].values.shape[2] - 1 - groups[0].count
-    total, information, scores = 0.0, np.zeros((size, size)), np.zeros(size)
+def _minus_log_likelihood(groups: Sequence[_Group], walk: Walk, offsets: int) -> float:
+    """Eq. (2), up to a constant. offsets: number of the last columns that are gyros' offsets."""
+    size = groups[0].size
+    total, scores = 0.0, np.zeros(size)
+    information = np.diag(np.repeat([0.0, 1.0], [size - offsets, offsets]))
     for group in groups:
         white, logarithms = group.whitened(walk)
         total += float(logarithms.sum())

@@ -60,6 +60,20 @@ class ReferenceRows:
         return np.asarray(~np.isnan(self.values))
 
     @cached_property
+    def offset_sigmas(self) -> Array:
+        """Standard deviations (S, 3) that a gyro's offset adds to the angles, rad; those of a session err alike."""
+        rates = np.array([0.0 if run.references is None else run.references.rate_sigma for run in self.runs])
+        counted = np.isin(self.angles, _SINCE)
+        sigmas = np.zeros(self.values.shape)
+        sigmas[counted, 2] = (rates[self.trajectory] * (self.t1 - self.t0))[counted]
+        return sigmas
+
+    @cached_property
+    def whole_sigmas(self) -> Array:
+        """Standard deviations (S, 3) of each row by itself, a gyro's offset included; NaN as ``sigmas``."""
+        return np.hypot(self.sigmas, self.offset_sigmas)
+
+    @cached_property
     def of_references(self) -> NDArray[np.bool_]:
         """True (S,) for rows that are no poses."""
         return np.asarray(self.lengths != "pose")

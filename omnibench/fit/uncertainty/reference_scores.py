@@ -75,7 +75,7 @@ def sigmas_of_rows(batch: ReferenceBatch, noise: Noise) -> Array:
     white = np.square([[noise.pose_position] * 2 + [noise.pose_heading]])
     bias = np.square([[noise.bias_position] * 2 + [noise.bias_heading]])
     of_poses = np.sqrt(np.maximum(white + walked + bias, np.finfo(float).tiny))
-    return np.where(rows.of_references[:, None], np.nan_to_num(rows.sigmas), of_poses)
+    return np.where(rows.of_references[:, None], np.nan_to_num(rows.whole_sigmas), of_poses)
 
 
 def scale_of(errors: Array, sigmas: Array, fitted: int) -> float:
@@ -94,7 +94,7 @@ def covariance_of_rows(batch: ReferenceBatch, run: int, by_errors: Array, noise:
     rows = batch.rows
     own = batch.trajectory == run
     references = rows.of_references[own]
-    sigmas = np.nan_to_num(rows.sigmas[own][references])
+    sigmas = np.nan_to_num(rows.whole_sigmas[own][references])
     scaled = (by_errors[references] * sigmas[..., None]).reshape(-1, by_errors.shape[2])
     total: Array = scaled.T @ scaled
     if not references.all():

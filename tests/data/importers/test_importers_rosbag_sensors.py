@@ -173,6 +173,25 @@ def test_a_gyro_gives_turned_angles_without_its_offset_at_rest(tmp_path: Path, o
         assert run.references.sigmas[:, 0] == pytest.approx(math.radians(0.2) * np.sqrt(spans))
 
 
+def test_the_offset_of_a_gyro_is_the_less_known_the_shorter_it_rests(tmp_path: Path) -> None:
+    data = read(write_rosbag2(tmp_path / "drive", WHEELS_ONLY + gyro(0.0)), gyro_noise_deg=0.2)
+    (sigma,) = {run.references.rate_sigma for run in data.trajectories if run.references is not None}
+    rested = (math.radians(0.2) / sigma) ** 2
+    still = (np.abs(DRIVE.rates).max(axis=1) < 0.01) @ np.diff(DRIVE.stamps) / 1e9
+    assert rested == pytest.approx(still, rel=0.1)
+
+
+def test_a_gyro_that_never_rests_needs_the_size_of_its_offset(tmp_path: Path) -> None:
+    sent = part(4.0, WHEELS_ONLY + gyro(0.0))
+    source = write_mcap(tmp_path / "drive", sent)
+    options = {"least_rest": 100.0, "cut": "none"}
+    with pytest.raises(DataError, match=r"never rests.*--set gyro_offset_deg=0\.5"):
+        read(source, **options)
+    (run,) = read(source, gyro_offset_deg=0.5, **options).trajectories
+    assert run.references is not None
+    assert run.references.rate_sigma == pytest.approx(math.radians(0.5))
+
+
 def test_a_sensor_mounted_upside_down_is_turned_by_the_signs(tmp_path: Path) -> None:
     source = write_mcap(tmp_path / "drive", part(20.0, WHEELS_ONLY + gyro(0.0)))
     upright, turned = (read(source, **options).trajectories for options in ({}, {"pose_signs": (1, 1, -1)}))

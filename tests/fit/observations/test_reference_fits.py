@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +100,27 @@ def test_intervals_hold_the_truth(study, kind: str) -> None:
     found = [study.covered(study.Case("diff", kind), seed) for seed in range(6)]
     errors = np.concatenate([each.combinations for each in found])
     assert (np.abs(errors) < 1).mean() > 0.75  # the study of 300 sets is tests/benchmarks/reference_coverage.py
+
+
+def test_turns_that_share_the_offset_of_a_gyro_have_errors_within_their_intervals(study) -> None:
+    offset_sigma = 0.01  # rad/s: ten times what the noise leaves of a turn of a second
+
+    def of_gyro(run: Trajectory, offset: float, rng: np.random.Generator) -> Trajectory:
+        headings = np.interp(edges := np.arange(0.0, run.pose_times[-1], 1.0), run.pose_times, run.poses[:, 2])
+        turned = np.diff(headings) + offset + 0.001 * rng.normal(size=len(edges) - 1)
+        turns = [Reference("turn", float(v), 0.001, t, t - 1) for v, t in zip(turned, edges[1:], strict=True)]
+        given = References.of(turns, float(run.times[-1]), rate_sigma=offset_sigma)
+        return replace(run, session="day", pose_times=np.zeros(1), poses=np.zeros((1, 3)), references=given)
+
+    away = []
+    for seed in range(6):
+        exact, truth = study.simulated("diff", seed)
+        rng = np.random.default_rng(seed)
+        runs = [of_gyro(run, offset_sigma * (-1.5) ** (seed % 2), rng) for run in exact.trajectories]
+        fit = calibrate(make_dataset("gyro", exact.robot, exact.sample_period, runs))
+        assert fit.uncertainty is not None
+        away.append((fit.calibration.matrix_array - truth)[2] / fit.uncertainty.standard_deviations[2])
+    assert np.sqrt(np.mean(np.square(away))) < 2
 
 
 def test_only_trajectory_ml_has_intervals_where_positions_do_not_tell_how_runs_start(study) -> None:

@@ -116,7 +116,7 @@ def read_recording(path: Path, name: str, options: RosbagOptions, warnings: list
         stream = ReferenceStream((poses.stamps - origin) / 1e9, poses.poses, poses.covariances)
     stream = stream.read_as(options) if reference else stream
     if sensors is not None:
-        sensors = sensors.without_bias(samples, options.least_rest, options.still, warnings, place)
+        sensors = sensors.without_bias(samples, options.least_rest, options.still, place)
     return Recording(name, place, origin, samples, stream, tuple(cuts), scans, reference, sensors)
 
 

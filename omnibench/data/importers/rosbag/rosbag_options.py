@@ -53,6 +53,9 @@ class RosbagOptions(EncoderOptions):
     gyro_noise_deg: Positive = Field(
         0.1, description="deg per sqrt(s), by which the angle of a gyro wanders; its offset at rest is taken off"
     )
+    gyro_offset_deg: Positive | None = Field(
+        None, description="deg/s, standard deviation of a gyro's offset where the robot never rests; else by its rests"
+    )
     reference_period: Positive = Field(1.0, description="s; one fix, heading or turn is taken in each")
     scan_topic: str | None = Field(
         None, min_length=1, description="sensor_msgs/LaserScan; default: the only one, or the one ending in /scan"

@@ -24,7 +24,12 @@ def measured_as(measured: References, options: ReferenceOptions, radian: float) 
     values = measured.values * factors
     fixed = measured.fixed_frame & angles
     values[fixed, 0] += np.radians(options.heading_offset_deg)
-    return replace(measured, values=values, sigmas=measured.sigmas * np.abs(factors))
+    return replace(
+        measured,
+        values=values,
+        sigmas=measured.sigmas * np.abs(factors),
+        rate_sigma=measured.rate_sigma * abs(heading),
+    )
 
 
 def measured_later(measured: References, offset: float, drift: float, first: float) -> References:

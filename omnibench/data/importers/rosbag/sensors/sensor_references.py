@@ -18,6 +18,7 @@ from omnibench.data.importers.runs.measured_references import measured_as
 from omnibench.data.importers.runs.rests import find_rests
 from omnibench.data.importers.wheel_samples import WheelSamples
 from omnibench.data.references.run_references import Reference, References
+from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
 _LONGEST_GAP = 0.3  # s between messages, across which no angle is counted; chosen
@@ -28,7 +29,7 @@ _LEAST_SPAN = 0.05  # s; a turn over less tells nothing
 class SensorReferences:
     """Fixes and inertial messages of a recording, with the stamp, ns, that its times count from.
 
-    bias: rate of turn, rad/s, that the gyro shows at rest.
+    bias: rate of turn, rad/s, that each gyro shows at rest. bias_sigma: largest standard deviation of these, rad/s.
     """
 
     fixes: Sequence[Fixes]
@@ -36,27 +37,41 @@ class SensorReferences:
     origin: int
     options: RosbagOptions
     bias: Sequence[float]
+    bias_sigma: float = 0.0
 
     @property
     def stamps(self) -> list[Stamps]:
         """Stamps of the messages of each topic, ns."""
         return [*(fixes.stamps for fixes in self.fixes), *(inertial.stamps for inertial in self.inertial)]
 
-    def without_bias(
-        self, samples: WheelSamples, least_rest: float, still: float, warnings: list[str], place: str
-    ) -> SensorReferences:
-        """The sensors with the gyros' offsets, seen while the wheels rest for ``least_rest`` s (see ``find_rests``)."""
+    def without_bias(self, samples: WheelSamples, least_rest: float, still: float, place: str) -> SensorReferences:
+        """The sensors with the gyros' offsets, seen while the wheels rest for ``least_rest`` s (see ``find_rests``).
+
+        White noise of a rate leaves its mean over a rest of T s unknown by the noise over sqrt(T). DataError: there is
+        no rest, and ``gyro_offset_deg`` is not given.
+        """
         rests = [rest for part in samples.stretches() for rest in find_rests(*samples.edges(part), least_rest, still)]
-        offsets = []
+        offsets, sigmas = [], [0.0]
         for inertial in self.inertial:
             times = self._times(inertial.stamps)
             resting = np.zeros(len(times), dtype=bool)
             for begin, end in rests:
                 resting |= (times >= begin) & (times <= end)
-            if not resting.any() and inertial.headings is None:
-                warnings.append(f"{place}: no rest tells the gyro's offset, which then is in its angles")
+            if inertial.headings is None:
+                sigmas.append(self._bias_sigma(float(resting.sum() * np.median(np.diff(times))), place))
             offsets.append(float(inertial.rates[resting].mean()) if resting.any() else 0.0)
-        return replace(self, bias=offsets)
+        return replace(self, bias=offsets, bias_sigma=max(sigmas))
+
+    def _bias_sigma(self, rested: float, place: str) -> float:
+        """Standard deviation, rad/s, of a gyro's offset that was seen for some time, s."""
+        if rested > 0:
+            return math.radians(self.options.gyro_noise_deg) / math.sqrt(rested)
+        if self.options.gyro_offset_deg is None:
+            raise DataError(
+                f"{place}: the robot never rests, so that nothing tells the gyro's offset; let it stand for some "
+                "seconds, or say how large the offset may be, a standard deviation in deg/s: --set gyro_offset_deg=0.5"
+            )
+        return math.radians(self.options.gyro_offset_deg)
 
     def of_run(self, zero: float, end: float, *, start_known: bool) -> References | None:
         """The references of a run from the time ``zero`` on, for ``end`` s; None if there are none.
@@ -81,8 +96,9 @@ class SensorReferences:
                 found += self._turns(times, inertial.rates - bias, end)
         if not found:
             return None
+        references = References.of(found, end, start_known=start_known, rate_sigma=self.bias_sigma)
         metres = self.options.model_copy(update={"position_unit": "m"})
-        return measured_as(References.of(found, end, start_known=start_known), metres, 1.0)
+        return measured_as(references, metres, 1.0)
 
     def _times(self, stamps: Stamps) -> Array:
         """Times (K,) of stamps, s, by the clock of the wheels as the options say."""
@@ -96,7 +112,7 @@ class SensorReferences:
         return [int(row) for row in inside[first]]
 
     def _turns(self, times: Array, rates: Array, end: float) -> list[Reference]:
-        """Angles turned in each period, whose errors are independent: those of a rate's white noise."""
+        """Angles turned in each period; beside the offset's, their errors are independent: a rate's white noise."""
         angles = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(times))])
         begin, last = max(0.0, float(times[0])), min(end, float(times[-1]))
         if last - begin < _LEAST_SPAN:
