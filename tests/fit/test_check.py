@@ -266,3 +266,23 @@ def test_a_steering_that_is_held_forward_and_backward_is_not_frozen() -> None:
         runs.append(Trajectory(name, "train", times, rates, stamps, scattered, steering=angles))
     found = check(make_dataset("held", TRICYCLE, 0.05, runs)).findings
     assert "steering_frozen" not in {finding.kind for finding in found}
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_robot_that_never_moved_is_not_ready() -> None:
+    rest = changed(lambda run: replace(run, rates=0 * run.rates, poses=0 * run.poses + (1.0, 2.0, 0.5)))
+    report = check(rest)
+    assert report.verdict != "ready"
+    assert "the robot never moved" in {finding.what for finding in report.findings}
+
+
+def test_runs_with_a_tape_count_beside_runs_with_poses() -> None:
+    tape = References.of([Reference("distance", 3.0, 0.01)], 24.0)
+
+    def taped(run: Trajectory) -> Trajectory:
+        if run.id in ("run0", "run4"):
+            return run
+        return replace(run, pose_times=np.zeros(1), poses=np.zeros((1, 3)), references=tape)
+
+    kinds = {finding.kind for finding in check(changed(taped)).findings}
+    assert not kinds & {"few_runs", "motion_missing"}

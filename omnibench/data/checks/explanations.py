@@ -1,4 +1,4 @@
-"""What may be wrong with the units and the wheels of a recording, and the misfit that remains if it is."""
+"""Explanations by units and wheels: mistakes of these in a recording, and the misfit that remains if they were made."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def implausible(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array]) 
 
 
 def _found(recording: Recording) -> tuple[list[Finding], bool]:
-    """What is wrong, and whether that is a unit."""
+    """Findings of a recording, and whether they are of units."""
     if recording.misfit < _SUSPICIOUS_ZERO:
         return contradictions(recording), False
     zeros = odd_zeros(recording)

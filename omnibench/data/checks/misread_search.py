@@ -121,7 +121,7 @@ def search(recording: Recorded) -> Explained:
     """The mistakes that explain a recording best; none if its matrix is near enough to the design."""
     some = recording.some()
     fit = some.fit()
-    if fit is None:
+    if fit is None or not fit.gram.any():  # too sparse, or the wheels stand
         return Explained((), (), 0.0, 0.0, told=False)
     far = DesignDistance(recording.robot)
     distance = far.of(fit)

@@ -21,7 +21,7 @@ RATE_UNITS = ((60 / (2 * math.pi), "rpm"), (180 / math.pi, "deg/s"), (1 / (2 * m
 POSITION_UNITS = ((1e3, "mm"), (1e2, "cm"))
 _COUNTS = (4.0, 2.0, 0.5, 0.25)  # factors of counters: edges counted fourfold, twofold, or stated so and counted once
 _GEARS = 1.1 ** np.array([power for power in range(-97, 98) if abs(power) > 3])  # 1/10,000 to 10,000, not about 1
-FEWEST_TICKS = 100  # of a turn of the wheel, from which on a factor is called ticks; chosen
+FEWEST_TICKS = 100  # ticks of a turn of the wheel: a factor from there on is named as theirs; chosen
 # Cost of a mistake, in units of d^2, so that the simplest explanation is taken of those that fit alike (chosen): each
 # wheel that is changed, a reference that is wrong, a factor that is fitted.
 _WHEEL, _REFERENCE, _FITTED = 4.0, 4.5, 6.0

@@ -1,4 +1,4 @@
-"""What may be wrong with the steering angles of a recording, and the misfit that remains if it is.
+"""Explanations by steering angles: mistakes of these in a recording, and the misfit that remains if they were made.
 
 The angle of one wheel may make the wheels contradict each other, whatever the reference is. Of a robot that has more
 drive signals than ways to move, a twist gives signals in the range of E Z only (E: from twist to signals, Z: the twists

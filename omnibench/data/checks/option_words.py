@@ -1,4 +1,4 @@
-"""What to type on import for the changes that mend a misreading, relative to the present options."""
+"""Options to type on import for the changes that mend a misreading, relative to the present ones."""
 
 from __future__ import annotations
 

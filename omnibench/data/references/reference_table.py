@@ -38,9 +38,11 @@ def read_references(
     numbers = {name: _column(table, name) for name in NUMBERS}
     texts = np.array(["" if kind is None else str(kind).strip() for kind in kinds], dtype=str)
     found: dict[str, References] = {}
-    names = owners.to_list()
-    for run, times in wheel_times.items():
-        rows = np.array([index for index, name in enumerate(names) if name == run], dtype=np.intp)
+    number = {run: index for index, run in enumerate(wheel_times)}
+    codes = np.array([number[run] for run in owners], dtype=np.intp)
+    counts = np.bincount(codes, minlength=len(number))
+    of_runs = np.split(np.argsort(codes, kind="stable"), np.cumsum(counts)[:-1])
+    for (run, times), rows in zip(wheel_times.items(), of_runs, strict=True):
         if not len(rows):
             continue
         chosen = {name: values[rows] for name, values in numbers.items()}

@@ -68,7 +68,9 @@ def check_recording(read: RecordingSource) -> CheckReport:
     found += [*misread, *odometry, *faults, *copied_runs(runs)]
     if not spoiled:
         found += clock_findings(runs, clocks)
-    found += [*missing_motions(dataset.robot, aligned), *too_few(runs)]
+    measured = any(run.references is not None for run in dataset.trajectories)
+    found += _left_open(dataset) if measured else missing_motions(dataset.robot, aligned)
+    found += too_few(dataset.trajectories)
     findings = with_fixes(read, sorted(_distinct(found), key=lambda finding: _ORDER[finding.severity]))
     gain = Gain(None, "") if misread or spoiled else expected_gain(dataset.robot, runs)
     return _report(read, findings, gain)
@@ -111,8 +113,8 @@ def _without_poses(read: RecordingSource) -> CheckReport:
 
 
 def _left_open(dataset: Dataset) -> Iterator[Finding]:
-    """What the references of the training runs leave open: with none of turning, or none of lengths, a warning."""
-    training = [run for run in dataset.split("train") if run.references is not None]
+    """Findings on what the training runs leave open: with no reference of turning, or none of lengths, a warning."""
+    training = dataset.split("train")
     for number, sentence in enumerate(open_sentences(dataset.robot, training) if training else ()):
         what, _, fix = sentence.rpartition("; " if "; " in sentence else ": ")
         missing = what.startswith(("no reference tells of turning", "no reference tells of lengths"))
@@ -144,7 +146,7 @@ def _misreadings(explained: Explained) -> Iterator[Finding]:
 
 
 def _warned(dataset: Dataset) -> list[Finding]:
-    """What reading a data set warned of, where the search for misreadings needs more poses than there are."""
+    """Findings that reading a data set warned of, where the search for misreadings needs more poses than there are."""
     return [finding for finding in findings_of(dataset.warnings) if finding.severity == "error"]
 
 

@@ -19,7 +19,7 @@ from omnibench.words import plural
 
 _TURNING, _STRAIGHT = 0.06, 0.04  # rad/s from which on a robot turns, and up to which it goes straight; chosen
 _MOVING = 0.02  # m/s from which on it moves; chosen
-_SHARE = 0.02  # of the time that a motion must be driven; chosen: some seconds in a minute
+SHARE = 0.02  # of the time that a motion must be driven; chosen: some seconds in a minute
 _SLIDING = 0.35  # rad between two directions of motion that count as different; chosen
 _FEW_RUNS, _SOME_RUNS = 3, 7  # runs up to which no interval can be had, and few
 _LEAST_REPEATED = 2
@@ -27,7 +27,10 @@ _ALIKE = 0.1  # by which the angles that wheels turn may differ in repetitions o
 
 
 def missing_motions(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
-    """Motions that a robot of this kind needs and that were not driven."""
+    """Motions that a robot of this kind needs and that were not driven; none where the reference does not move."""
+    if not any(run.rates.any() for run in runs):
+        yield _missing("the robot never moved", "drive it, and see that the columns of the wheels are those that count")
+        return
     windows = Windows.of([run.log(run.pose_times) for run in runs], [run.poses for run in runs])
     if windows is None:
         return
@@ -42,18 +45,18 @@ def missing_motions(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Findin
         return float(seconds[active & chosen].sum()) / whole
 
     left, right = share(turning > _TURNING), share(turning < -_TURNING)
-    if left < _SHARE and right < _SHARE:
+    if left < SHARE and right < SHARE:
         yield _missing("the robot never turned", f"drive {_turns(robot)}, to either side")
-    elif min(left, right) < _SHARE:
-        side = "left" if left < _SHARE else "right"
+    elif min(left, right) < SHARE:
+        side = "left" if left < SHARE else "right"
         yield _missing(f"the robot never turned {side}", f"drive {_turns(robot)}, to the {side}")
-    if share((np.abs(turning) < _STRAIGHT) & (speed > _MOVING)) < _SHARE:
+    if share((np.abs(turning) < _STRAIGHT) & (speed > _MOVING)) < SHARE:
         yield _missing("the robot never went straight", "drive three straight lines of 2 m and more")
     if robot.slides and not robot.skid and not _sideways(windows.moved[active & (speed > _MOVING)]):
         yield _missing("the robot went in one direction only", "drive forward, and sideways to either side, 2 m each")
-    if not robot.drive.steered and left >= _SHARE and right >= _SHARE and robot.slides:
+    if not robot.drive.steered and left >= SHARE and right >= SHARE and robot.slides:
         spot = share((np.abs(turning) > _TURNING) & (speed < 0.1 * robot.reach * np.abs(turning) + _MOVING))
-        if spot < _SHARE and driven_span(runs).shares[-1] < _SHARE / 2 and len(driven_span(runs).shares) == 3:
+        if spot < SHARE and driven_span(runs).shares[-1] < SHARE / 2 and len(driven_span(runs).shares) == 3:
             yield _missing("the robot never turned on the spot", "drive three turns at 0.5 rad/s, to either side")
 
 

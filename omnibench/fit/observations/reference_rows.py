@@ -274,6 +274,7 @@ def _pose_rows(run: Trajectory, poses: PoseRows) -> list[_Row]:
 def _rows_of(references: References | None) -> list[_Row]:
     """The references' rows; an angle joins the first row of the same span that has none."""
     rows: list[_Row] = []
+    free: dict[tuple[float, float], list[_Row]] = {}  # rows without an angle by their span, the first one last
     if references is None:
         return rows
     each = zip(
@@ -281,12 +282,14 @@ def _rows_of(references: References | None) -> list[_Row]:
     )
     for kind, t0, t1, value, sigma in sorted(each, key=lambda one: (one[2], one[1], UNITS[one[0]])):
         if UNITS[kind] == "m":
-            rows.append(_Row(t0, t1, kind, "", np.append(value, np.nan), np.append(sigma, np.nan)))
+            row = _Row(t0, t1, kind, "", np.append(value, np.nan), np.append(sigma, np.nan))
+            rows.append(row)
+            free.setdefault((t0, t1), []).insert(0, row)
             continue
         angle = "gyro" if kind == "heading" and t0 < t1 else kind
-        free = (row for row in rows if (row.t0, row.t1, row.angle) == (t0, t1, ""))
-        row = next(free, None)
-        if row is None:
+        if waiting := free.get((t0, t1)):
+            row = waiting.pop()
+        else:
             row = _Row(t0, t1, "", "", np.full(3, np.nan), np.full(3, np.nan))
             rows.append(row)
         row.angle, row.values[2], row.sigmas[2] = angle, value[0], sigma[0]

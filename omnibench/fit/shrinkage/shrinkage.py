@@ -75,7 +75,7 @@ def shrunk(problem: CalibrationProblem, result: RunResult, *, fitted: bool = Tru
 
 
 def _added(problem: CalibrationProblem, before: float, after: float) -> str:
-    """What a cost changed by, in words: as a share, which a cost that is rounding has not."""
+    """Change of a cost in words: as a share of it, or in its unit where it is rounding alone."""
     return f"{100 * (after / before - 1):+.2g} %" if before > problem.objective.rounding else f"{after - before:+.2g}"
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
+from omnibench.fit.check.missing_motions import SHARE
 from omnibench.report.blocks import Cell, Column, Figure, FigureGrid, LegendItem, Row, Table
 from omnibench.report.numbers import NOTHING, fixed, percent, significant
 from omnibench.report.recording.scan_points import evenly
@@ -20,7 +21,6 @@ _BLOCK = 0.5  # s: motions are means over so long, which smooths encoder ticks (
 _RESTS = 0.05  # share of the fastest motion below which the robot stands (chosen)
 _STRAIGHT = 0.03  # the wheels' way by turning, as a share of the way ahead, below which a motion is straight (chosen)
 _ON_THE_SPOT = 0.1  # the way ahead, as a share of the wheels' way by turning, below which it is on the spot (chosen)
-_HARDLY = 0.01  # share of the time in motion: a motion driven for less was not driven on purpose (chosen)
 _SECTOR = 30.0  # deg about an axis that count as along it (chosen)
 _DRAWN = 2500  # dots of a figure
 _LEFT = LegendItem("left", "turning left", PALETTE[0])
@@ -39,7 +39,7 @@ class DrivenMotion:
     @property
     def driven(self) -> bool:
         """True if it was driven for longer than by chance."""
-        return self.share >= _HARDLY
+        return self.share >= SHARE
 
 
 def driven_motions(runs: Sequence[Trajectory], robot: Robot) -> list[DrivenMotion]:

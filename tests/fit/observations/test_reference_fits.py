@@ -18,6 +18,7 @@ from omnibench.fit.certify import certify_optimum
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.inspect import inspect_dataset
 from omnibench.fit.observations.reference_batch import ReferenceBatch
+from omnibench.fit.observations.reference_fit import ReferenceFit
 from omnibench.fit.observations.reference_rows import reference_rows
 from omnibench.robot.odometry import Integration
 
@@ -188,3 +189,25 @@ def test_what_needs_poses_says_so_in_one_line(study) -> None:
         calibrate(dataset, cost="final_position")
     with pytest.raises(ConfigError, match="weighs references that are no poses by their own sigma"):
         calibrate(dataset, "trajectory_ml", loss="huber")
+
+
+@pytest.mark.parametrize("later", [0.0, 0.01])
+def test_a_compass_has_its_weight_beside_positions_that_tell_no_heading_of_the_same_time(later: float) -> None:
+    """Runs that turn on the spot; their positions count for nothing, whenever they were taken."""
+    rates = np.tile(APR_02.signal_equations @ np.array([0.0, 0.0, 0.3]), (100, 1))
+    runs = []
+    for seed in range(6):
+        noise = np.random.default_rng(seed).normal(0.0, 0.05, 8)
+        measured = [Reference("position", (0.0, 0.0), 0.5, t1=float(t)) for t in range(1, 9)]
+        measured += [Reference("heading", 0.3 * t + noise[t - 1], 0.05, t1=t + later) for t in range(1, 9)]
+        given = References.of(measured, 10.0)
+        runs.append(Trajectory(f"spot-{seed}", "train", TIMES, rates, np.zeros(1), np.zeros((1, 3)), references=given))
+    fit = ReferenceFit.of(runs, APR_02.inverse_kinematic_matrix, "arc")
+    assert fit is not None
+    design = APR_02.inverse_kinematic_matrix
+    _, columns = fit.whitened(design, np.eye(design.size))
+    information = sum(of_run.T @ of_run for of_run in columns)[-1, -1]  # of the last wheel's share of turning
+    # Of 8 headings that count from a heading of their own: the sum of squares of their turns about the mean turn.
+    moments = np.arange(1, 9) + later
+    turned = (0.3 / APR_02.inverse_kinematic_matrix[2].sum()) * (moments - moments.mean())
+    assert information == pytest.approx(6 * np.square(turned).sum() / 0.05**2, rel=0.02)
