@@ -14,7 +14,7 @@ from wheeled_samples import DIFF
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.fit.inspect import inspect_dataset
-from omnibench.report.recording.driven_motions import driven_motions, missing_in_words
+from omnibench.report.recording.driven_motions import driven_motions, missing_in_words, motion_table
 from omnibench.report.recording.inspection_report import inspection_document
 from omnibench.report.render import write_document
 from omnibench.robot.kinematics import Robot
@@ -61,6 +61,11 @@ def test_time_at_rest_is_no_motion() -> None:
     found = driven_motions(driving(OMNI, (0.2, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.5)), OMNI)
     shares = {motion.name: motion.share for motion in found}
     assert shares["straight"] == pytest.approx(0.5) == shares["on the spot to the left"]
+
+
+def test_a_speed_that_is_rounding_is_shown_as_zero() -> None:
+    table = motion_table(driven_motions(driving(OMNI, (0.0, 0.0, 0.5)), OMNI))
+    assert "×" not in repr(table.rows)
 
 
 def test_a_robot_on_two_wheels_is_not_asked_to_go_sideways() -> None:

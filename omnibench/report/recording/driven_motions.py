@@ -124,6 +124,8 @@ def motion_table(motions: Sequence[DrivenMotion]) -> Table:
 
 def _range(values: Array, decimals: int) -> str:
     low, high = np.quantile(values, [0.05, 0.95])
+    least = 10.0 ** -(decimals + 1)  # less is rounding, and is shown as 0
+    low, high = (value if value >= least else 0.0 for value in (low, high))
     shown = [fixed(value, decimals) if value > 10.0**-decimals else significant(value, 1) for value in (low, high)]
     return shown[0] if shown[0] == shown[1] else f"{shown[0]} to {shown[1]}"
 
