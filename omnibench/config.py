@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
@@ -33,8 +33,27 @@ def printable(text: str) -> str:
 CHOSEN = "@"  # marks a union member's tag in a pydantic location; what follows it is no key of the document
 
 
-class Model(BaseModel):
-    """Base of every document that omnibench reads: unknown keys are refused, instances are immutable."""
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)  # its name is private at run time
+
+
+class _OneLine(ModelMetaclass):
+    """Calls of a model in Python: what is wrong is a ConfigError of one line, as it is in files."""
+
+    def __call__(cls, *arguments: Any, **fields: Any) -> Any:  # noqa: N805 (of a metaclass)
+        try:
+            return super().__call__(*arguments, **fields)
+        except ValidationError as error:
+            raise ConfigError(f"{cls.__name__}: {_describe(cls, error)}") from None  # type: ignore[arg-type]
+
+
+class Model(BaseModel, metaclass=_OneLine):
+    """Base of every document that omnibench reads: unknown keys are refused, instances are immutable.
+
+    ConfigError in one line: an argument is missing, unknown or wrong.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from difflib import get_close_matches
+from numbers import Real
 
+_HOLDERS = ("calibration", "config", "dataset", "robot")  # attributes of results in which another argument lies
 _LONGEST = 2000  # characters of a message; a plug-in's may have millions (chosen: a screen of a terminal)
 
 
@@ -44,11 +47,28 @@ class Interrupted(OmnibenchError):  # noqa: N818 (the user's wish, not a mistake
     """Ctrl-C; the message says what is kept and how to go on."""
 
 
-def require_type(value: object, kind: type, reader: str) -> None:
-    """ConfigError: an argument is not of its type, as a path is not what ``reader`` reads from it."""
-    if not isinstance(value, kind):
-        shown = repr(value) if len(repr(value)) <= 60 else type(value).__name__
-        raise ConfigError(f"expected a {kind.__name__}, found {shown}; read a file or folder with omnibench.{reader}")
+def require_type(value: object, kind: type, maker: str) -> None:
+    """ConfigError: an argument is not of its type, as a path is not what ``maker`` makes of it."""
+    if isinstance(value, kind):
+        return
+    shown = repr(value) if len(repr(value)) <= 60 else type(value).__name__
+    held = [name for name in _HOLDERS if isinstance(getattr(value, name, None), kind)]
+    way = f"take its .{held[0]}" if held else f"make one with omnibench.{maker}"
+    raise ConfigError(f"expected a {kind.__name__}, found {shown}; {way}")
+
+
+def require_choice(what: str, value: object, words: Iterable[str]) -> None:
+    """UnknownNameError: an argument is none of the words that it may be."""
+    known = tuple(words)
+    if value not in known:
+        raise UnknownNameError(what, str(value), known)
+
+
+def require_range(what: str, value: object, least: float, most: float = math.inf) -> None:
+    """ConfigError: an argument is no number from least to most."""
+    if isinstance(value, bool) or not isinstance(value, Real) or not least <= float(value) <= most:
+        bounds = f"at least {least:g}" if math.isinf(most) else f"from {least:g} to {most:g}"
+        raise ConfigError(f"{what}: must be {bounds} (given: {value!r})")
 
 
 class UnknownNameError(ConfigError):

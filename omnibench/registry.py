@@ -144,12 +144,13 @@ REGISTRIES: tuple[Registry[Any], ...] = (calibrators, costs, effects, importers)
 _loaded: dict[Path, PluginFailure | None] = {}
 
 
-def load_plugins(folders: Iterable[Path | str] = (), installed: bool = True) -> list[PluginFailure]:
+def load_plugins(folders: Path | str | Iterable[Path | str] = (), installed: bool = True) -> list[PluginFailure]:
     """Load every plug-in of the folders (``*.py``, without tests) and of the installed packages' entry points.
 
     A plug-in that fails is returned with its error and the others are loaded. PluginError: a folder is missing.
     """
-    failures = [failure for folder in folders for failure in _load_folder(Path(folder))]
+    listed = [folders] if isinstance(folders, str | Path) else folders
+    failures = [failure for folder in listed for failure in _load_folder(Path(folder))]
     return failures + (_load_entry_points() if installed else [])
 
 

@@ -26,7 +26,7 @@ from omnibench.compare.statistics import (
 from omnibench.compare.uncertainties import typical_uncertainties
 from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
-from omnibench.errors import ConfigError, Interrupted, UnknownNameError
+from omnibench.errors import ConfigError, Interrupted, UnknownNameError, require_type
 from omnibench.fit.calibrator import RunResult
 from omnibench.fit.uncertainty.unidentified import warnings_of_calibration
 from omnibench.jobs.result_store import ResultStore
@@ -49,6 +49,7 @@ def run_comparison(
     ConfigError or DataError: the config, a data set or the folder is unfit, or the disk refuses. Interrupted: Ctrl-C;
     the results of all runs that had ended are kept.
     """
+    require_type(config, CompareConfig, "read_compare_config")
     check_output(output, config, force=force)
     failures = load_calibrators(config)
     with _naming_failed_plugins(failures):

@@ -20,7 +20,7 @@ from omnibench.data.references.reference_units import odd_references
 from omnibench.data.references.run_references import References
 from omnibench.data.run_checks import check_sample_period, pose_times_flaw, reach_flaw, values_flaw, wheel_times_flaw
 from omnibench.data.scans import Scans
-from omnibench.errors import DataError, nearest
+from omnibench.errors import DataError, nearest, require_type
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.wheels.drive import Drive, in_the_middle
@@ -71,13 +71,15 @@ class Trajectory(Shown):
 
     def with_arrays(self) -> Trajectory:
         """The run with its numbers as arrays, whatever sequences they were given as. DataError: they are no numbers."""
+        if self.references is not None:
+            require_type(self.references, References, "References.of([...], end=...)")
         arrays: dict[str, Any] = {}
         for name in _ARRAYS:
             if (value := getattr(self, name)) is not None:
                 try:
                     arrays[name] = np.asarray(value, dtype=float)
                 except (TypeError, ValueError):
-                    raise DataError(f"trajectory {self.id}: {name} are no numbers in rows of one length") from None
+                    raise DataError(f"trajectory {self.id}: {name}: expected numbers, in rows of one length") from None
         return replace(self, **arrays)
 
     @cached_property

@@ -65,6 +65,8 @@ def read_header(folder: Path) -> Header:
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder; a data set is a folder with dataset.yaml in it")
     file = folder / "dataset.yaml"
+    if not file.exists():
+        raise DataError(f"{file}: no such file, and so {folder} is no data set; `omnibench import` makes one of a log")
     try:
         content = read_yaml(file)
         given = content.get("format") if isinstance(content, dict) else None

@@ -12,7 +12,7 @@ from omnibench.design.config import Per, Use
 from omnibench.design.d_optimality import ContinuousDesign, Counts, continuous_optimum, equal_design, exact_designs
 from omnibench.design.result import Baseline, Design, Equivalent, Optimum, SetDesign, Step
 from omnibench.design.run_information import USES, DesignProblem
-from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.errors import ConfigError, require_choice, require_range
 from omnibench.robot.odometry import Integration
 from omnibench.words import plural
 
@@ -45,12 +45,11 @@ def design_experiment(
 
     OmnibenchError in one line: bad source or arguments, candidates that do not determine the whole matrix.
     """
-    for name, value, known in (("use", use, get_args(Use)), ("per", per, get_args(Per))):
-        if value not in known:
-            raise UnknownNameError(name, value, known)
+    require_choice("use", use, get_args(Use))
+    require_choice("per", per, get_args(Per))
     for name, number in (("runs", runs), ("repetitions", repetitions)):
-        if number is not None and not 1 <= number <= _MOST_RUNS:
-            raise ConfigError(f"{name}: must be from 1 to {_MOST_RUNS} (given: {number})")
+        if number is not None:
+            require_range(name, number, 1, _MOST_RUNS)
     if isinstance(source, CandidatePool):
         pool = source
     else:

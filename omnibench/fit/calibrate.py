@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.environment import package_versions
-from omnibench.errors import ConfigError, require_type
+from omnibench.errors import ConfigError, require_choice, require_range, require_type
 from omnibench.fit.calibrator import Calibrator, RunResult, run_calibrator
 from omnibench.fit.cost import Cost
 from omnibench.fit.evaluate import verdict_on
@@ -19,6 +19,8 @@ from omnibench.fit.observations.open_combinations import with_open_combinations
 from omnibench.fit.observations.open_in_words import open_sentences
 from omnibench.fit.parameterisation import (
     Box,
+    BoxName,
+    ExplicitBox,
     MatrixElements,
     ParameterisationName,
 )
@@ -117,6 +119,22 @@ def calibrate(
     when the calibrator gives no answer.
     """
     require_type(dataset, Dataset, "load_dataset")
+    for what, value, words in (
+        ("loss", loss, LossName),
+        ("parameterisation", parameterisation, ParameterisationName),
+        ("box", None if isinstance(box, ExplicitBox) else box, BoxName),
+        ("integration", integration, Integration),
+        ("unidentified", unidentified, Unidentified),
+        ("mount", mount, MountChoice),
+        ("steering", steering, SteeringChoice),
+    ):
+        if value is not None:
+            require_choice(what, value, get_args(words))
+    require_range("seed", seed, 0)
+    if tolerance is not None:
+        require_range("tolerance", tolerance, 1e-6)
+    budget = Budget() if budget is None else budget
+    require_type(budget, Budget, "Budget(evaluations=...)")
     training = training_split(dataset)
     calibrator = calibrator or default_calibrator(training)
     chosen: Calibrator = calibrators.create(calibrator, options)
@@ -147,7 +165,7 @@ def calibrate(
         objective,
         searched,
         integration=integration,
-        budget=budget or Budget(),
+        budget=budget,
         seed=seed,
         shrinks=unidentified == "shrink",
         watch=renamed(watch, calibrator),

@@ -15,14 +15,15 @@ import heapq
 import math
 import time
 from dataclasses import dataclass
+from typing import get_args
 
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
-from omnibench.errors import DataError, require_type
+from omnibench.errors import DataError, require_choice, require_range, require_type
 from omnibench.fit.bounds.lower_bound import LowerBounds, Node
 from omnibench.fit.bounds.stamp_sums import QUADRATURE
 from omnibench.fit.calibrator import run_calibrator
-from omnibench.fit.parameterisation import Box
+from omnibench.fit.parameterisation import Box, BoxName, ExplicitBox
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation, training_split
 from omnibench.processes import one_thread
 from omnibench.progress import Progress, Reporter, no_progress
@@ -104,6 +105,9 @@ def certify_optimum(
     """
     require_type(calibration, Calibration, "read_calibration")
     require_type(dataset, Dataset, "load_dataset")
+    if not (box is None or isinstance(box, ExplicitBox)):
+        require_choice("box", box, get_args(BoxName))
+    require_range("gap", gap, 0, 1)
     calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
     if calibration.effects:
         named = ", ".join(term.name for term in calibration.effects)

@@ -30,7 +30,8 @@ class ExplicitBox(Model):
     upper: tuple[tuple[FiniteFloat, ...], ...]
 
 
-Box = Literal["paper", "row"] | ExplicitBox
+BoxName = Literal["paper", "row"]
+Box = BoxName | ExplicitBox
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
 
+from omnibench.errors import require_type
 from omnibench.live.closing import Closing
 from omnibench.live.config import LiveConfig
 from omnibench.live.control.query_server import QueryServer
@@ -41,6 +42,7 @@ class LiveNode(Closing):
     """
 
     def __init__(self, config: LiveConfig, *, remember: bool = True, stop: Stop | None = None) -> None:
+        require_type(config, LiveConfig, "read_live_config")
         self.config = config
         self.keys = KeySpace(config.profile, config.domain)
         load_effects(config)

@@ -12,7 +12,6 @@ from pydantic import (
     Field,
     FiniteFloat,
     SerializerFunctionWrapHandler,
-    ValidationError,
     model_serializer,
     model_validator,
 )
@@ -228,9 +227,8 @@ def fitted_calibration(name: str, **fields: Any) -> Calibration:
     """The calibration that a fit ends in. DataError: recordings led it to values that no robot has."""
     try:
         return Calibration(name=name, **fields)
-    except ValidationError as error:
-        flaw = error.errors()[0]
-        reason = ": ".join([*map(str, flaw["loc"][:1]), flaw["msg"].removeprefix("Value error, ")])
+    except ConfigError as error:
+        reason = f"{error}".removeprefix("Calibration: ")
         raise DataError(
             f"calibration {name!r}: {reason}; check the recordings for poses and rates far from all others"
         ) from None

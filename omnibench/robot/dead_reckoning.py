@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from omnibench.errors import ConfigError, DataError
+from omnibench.errors import DataError, require_choice, require_type
+from omnibench.robot.arrays import finite_array
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.kinematics import Wheel as Wheel
@@ -47,12 +48,12 @@ def odometry(
     ((100, 3), True)
     """
     log = WheelLog(
-        times=_numbers("times", times, 1),
-        rates=_numbers("rates", rates, 2),
-        start=_numbers("start", start, 1),
-        stamps=_numbers("stamps", times if stamps is None else stamps, 1),
-        wheel_angles=None if angles is None else _numbers("angles", angles, 2),
-        steering=None if steering is None else _numbers("steering", steering, 2),
+        times=finite_array("times", times, 1),
+        rates=finite_array("rates", rates, 2),
+        start=finite_array("start", start, 1),
+        stamps=finite_array("stamps", times if stamps is None else stamps, 1),
+        wheel_angles=None if angles is None else finite_array("angles", angles, 2),
+        steering=None if steering is None else finite_array("steering", steering, 2),
     )
     model = _model(robot, integration)
     _check(model.robot, log)
@@ -62,28 +63,14 @@ def odometry(
 
 
 def _model(robot: Any, integration: Integration | None) -> OdometryModel:
+    if integration is not None:
+        require_choice("integration", integration, get_args(Integration))
     if isinstance(robot, Robot):
         return OdometryModel.of_design(robot, integration or "arc")
-    if isinstance(robot, Calibration):
-        model = robot.model
-        chosen = integration or model.integration
-        return OdometryModel(model.robot, model.matrix, chosen, model.terms, model.sample_period)
-    given = type(robot).__name__
-    raise ConfigError(f"expected a Robot or a Calibration, found {given}; read one with omnibench.read_calibration")
-
-
-def _numbers(name: str, values: ArrayLike, dimensions: int) -> Array:
-    """An array of finite numbers. DataError names it, and the row (1 is the first) of what is wrong."""
-    try:
-        array = np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        raise DataError(f"{name}: no numbers in rows of one length") from None
-    if array.ndim != dimensions or not array.size:
-        axes = "(rows,)" if dimensions == 1 else "(rows, columns)"
-        raise DataError(f"{name} has shape {array.shape}, expected {axes}")
-    for row in np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))[:1]:
-        raise DataError(f"{name}, row {row + 1}: it holds a value that is missing or infinite")
-    return array
+    require_type(robot, Calibration, "read_calibration, or a Robot with omnibench.Robot(name=..., wheels=[...])")
+    model = robot.model
+    chosen = integration or model.integration
+    return OdometryModel(model.robot, model.matrix, chosen, model.terms, model.sample_period)
 
 
 def _check(robot: Robot, log: WheelLog) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from pydantic import Discriminator, Tag
 
 from omnibench.config import CHOSEN
+from omnibench.errors import require_type
 from omnibench.progress import Reporter, no_progress
 from omnibench.simulate.chain.robot_config import RobotConfig
 from omnibench.simulate.config import FlowerConfig
@@ -44,6 +45,7 @@ def simulate_dataset(
     """
     if isinstance(config, FlowerConfig):
         return simulate_flower(config, name, description, watch)
+    require_type(config, RobotConfig, "read_simulation(...).config")
     from omnibench.simulate.chain.robot_simulator import simulate_robot  # loads for a second (numba)
 
     return simulate_robot(config, name, description, watch)

@@ -105,6 +105,10 @@ def test_the_angle_of_a_steered_wheel_is_a_column() -> None:
         ({"wheels": wheels() | {"omega_left": ["fast"] * 200}}, "^wheels, row 1: omega_left is 'fast', expected a nu"),
         ({"wheels": wheels(omega_left=np.ones(3))}, "^wheels: column 'omega_left' has 3 rows, 'trajectory' has 200"),
         ({"wheels": wheels(omega_left=np.ones((200, 2)))}, r"^wheels: column 'omega_left' has shape \(200, 2\)"),
+        (
+            {"wheels": wheels(t=np.tile(T, 2) + 1.7e9)},
+            "^wheels, row 1: t is 1.7e.09, .*; count the time from the",
+        ),
         ({"wheels": [1, 2]}, "^wheels: expected a data frame or a dict of arrays, found list"),
         ({"poses": poses(t=[0.1, 2, 0, 2])}, "^poses, row 1: trajectory r1 has no reference pose at t = 0"),
         ({"poses": poses(trajectory=["r1", "r1", "r3", "r3"])}, "^poses, row 3: trajectory r3 is not in trajectories"),

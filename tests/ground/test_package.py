@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from start_up import NUMPY, PACKAGE, ratio
 from timing import PATIENCE
@@ -43,7 +44,17 @@ def test_a_name_that_is_not_public_is_missed_by_its_name() -> None:
     [
         (
             lambda: omnibench.calibrate("data/robot"),
-            "expected a Dataset, found 'data/robot'; .* omnibench.load_dataset",
+            "expected a Dataset, found 'data/robot'; make one with omnibench.load_dataset",
+        ),
+        (
+            lambda: omnibench.run_comparison("apr02.yaml"),
+            "expected a CompareConfig, found 'apr02.yaml'; .*read_comp",
+        ),
+        (lambda: omnibench.simulate_dataset("small.yaml"), "expected a RobotConfig, found 'small.yaml'; .*read_simul"),
+        (lambda: omnibench.LiveNode("live.yaml"), "expected a LiveConfig, found 'live.yaml'; .*read_live_config"),
+        (
+            lambda: omnibench.References.of([3], end=1.0),
+            r"expected a Reference, found 3; .*Reference\(kind, value,",
         ),
         (lambda: omnibench.inspect_dataset(Path("data")), "expected a Dataset, found PosixPath"),
         (lambda: omnibench.discover_effects("data"), "expected a Dataset"),
@@ -57,6 +68,59 @@ def test_a_name_that_is_not_public_is_missed_by_its_name() -> None:
 def test_a_path_in_the_place_of_what_it_holds_is_named(call: Callable[[], Any], message: str) -> None:
     with pytest.raises(omnibench.OmnibenchError, match=message):
         call()
+
+
+CART = omnibench.Robot(
+    name="cart",
+    wheels=[omnibench.Wheel(name=name, type="fixed", radius=0.05, x=0, y=y) for name, y in (("l", 0.1), ("r", -0.1))],
+)
+DRIVEN = omnibench.make_dataset(
+    "driven",
+    CART,
+    wheels={"t": np.arange(1, 51) * 0.02, "omega_l": np.full(50, 4.0), "omega_r": np.full(50, 4.0)},
+    poses={"t": [0.0, 1.0], "x": [0.0, 0.2], "y": [0.0, 0.0], "theta": [0.0, 0.0]},
+)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: omnibench.Robot(name="cart"), "^Robot: key 'wheels' is missing$"),
+        (lambda: omnibench.Wheel(name="l", radus=1), "^Wheel: unknown key 'radus'; did you mean 'radius'"),
+        (
+            lambda: omnibench.Wheel(name="l", type="fixed", radius=-0.05, x=0, y=0.1),
+            r"^Wheel: radius: .*\(given: -0.05\)$",
+        ),
+        (lambda: omnibench.Budget(seconds=0), r"^Budget: seconds: Input should be greater than 0 \(given: 0\)$"),
+        (lambda: omnibench.calibrate(DRIVEN, loss="hubr"), "unknown loss 'hubr'; did you mean 'huber'"),
+        (lambda: omnibench.calibrate(DRIVEN, box="rows"), "unknown box 'rows'; did you mean 'row'"),
+        (lambda: omnibench.calibrate(DRIVEN, parameterisation="geom"), "unknown parameterisation 'geom'"),
+        (lambda: omnibench.calibrate(DRIVEN, integration="eulr"), "unknown integration 'eulr'"),
+        (lambda: omnibench.calibrate(DRIVEN, unidentified="drop"), "unknown unidentified 'drop'"),
+        (lambda: omnibench.calibrate(DRIVEN, mount="fitted"), "unknown mount 'fitted'"),
+        (lambda: omnibench.calibrate(DRIVEN, steering="fitted"), "unknown steering 'fitted'"),
+        (lambda: omnibench.calibrate(DRIVEN, tolerance=-1), r"tolerance: must be at least 1e-06 \(given: -1\)"),
+        (lambda: omnibench.calibrate(DRIVEN, seed="one"), r"seed: must be at least 0 \(given: 'one'\)"),
+        (lambda: omnibench.calibrate(DRIVEN, budget=100), r"expected a Budget, found 100; .*Budget\(evaluations=...\)"),
+        (lambda: omnibench.odometry(CART, [1], [[1, 1]], integration="ark"), "unknown integration 'ark'"),
+    ],
+)
+def test_a_wrong_argument_is_refused_in_one_line_that_names_it(call: Callable[[], Any], message: str) -> None:
+    with pytest.raises(omnibench.OmnibenchError, match=message):
+        call()
+
+
+def test_a_result_in_the_place_of_what_it_holds_is_told_where_that_lies() -> None:
+    run = omnibench.calibrate(DRIVEN)
+    with pytest.raises(omnibench.OmnibenchError, match=r"expected a Calibration, found CalibrationRun; take its \.cal"):
+        omnibench.evaluate(run, DRIVEN)
+    with pytest.raises(omnibench.OmnibenchError, match=r"gap: must be from 0 to 1 \(given: 2\)"):
+        omnibench.certify_optimum(run.calibration, DRIVEN, gap=2)
+
+
+def test_one_folder_of_plug_ins_is_not_taken_for_a_list_of_letters() -> None:
+    with pytest.raises(omnibench.OmnibenchError, match="plug-in folder nowhere does not exist"):
+        omnibench.load_plugins("nowhere")
 
 
 # Stands for Ctrl-C while a package that takes long is still being imported.

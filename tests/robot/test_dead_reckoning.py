@@ -49,13 +49,13 @@ def test_a_calibration_brings_its_matrix_and_integration() -> None:
     [
         ({"rates": np.ones((50, 3))}, r"rates has shape \(50, 3\), expected \(50, 2\): .* wheels right, left"),
         ({"rates": np.ones(50)}, r"rates has shape \(50,\), expected \(rows, columns\)"),
-        ({"rates": [["fast"] * 2] * 50}, "rates: no numbers"),
+        ({"rates": [["fast"] * 2] * 50}, "rates: expected numbers"),
         ({"rates": np.r_[np.ones((3, 2)), np.full((47, 2), np.nan)]}, "rates, row 4: it holds a value that is missing"),
         ({"times": T - 0.02}, "times, row 1: it is 0; times increase and are > 0"),
         ({"times": T[::-1]}, "times, row 2: it is 0.98; times increase"),
         ({"stamps": [-1.0]}, "stamps, row 1: it is -1; times increase and are >= 0"),
         ({"start": [0, 0]}, r"start has shape \(2,\), expected \(3,\): x, y in m and heading in rad"),
-        ({"robot": "robot.yaml"}, "expected a Robot or a Calibration, found str"),
+        ({"robot": "robot.yaml"}, "expected a Calibration, found 'robot.yaml'; .*, or a Robot with"),
         ({"robot": TRICYCLE, "rates": np.ones((50, 1))}, r"steering is missing: angles \(F, 1\) of the wheels front"),
     ],
 )

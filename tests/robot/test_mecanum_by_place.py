@@ -13,6 +13,7 @@ from commands import Command
 
 from omnibench.config import validate
 from omnibench.data.storage import save_dataset
+from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.geometry import WheelGeometry
 from omnibench.robot.export.formats import export_calibration
@@ -46,7 +47,7 @@ def test_rollers_that_are_given_stay() -> None:
 
 
 def test_a_wheel_on_an_axis_has_to_say_its_rollers() -> None:
-    with pytest.raises(ValueError, match="roller_angle of a mecanum wheel is missing"):
+    with pytest.raises(ConfigError, match="Wheel: roller_angle of a mecanum wheel is missing"):
         Wheel(name="ahead", type="mecanum", radius=0.05, x=0.2, y=0.0)
 
 

@@ -12,7 +12,7 @@ from omnibench.data.delimited import read_numbers
 from omnibench.data.importers.orientation import planar_headings
 from omnibench.errors import DataError
 from omnibench.files import write_text
-from omnibench.robot.kinematics import Array
+from omnibench.robot.arrays import Array, finite_array
 from omnibench.views import Brief
 
 FIELDS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
@@ -47,12 +47,11 @@ def write_tum(file: Path | str, times: ArrayLike, poses: ArrayLike) -> None:
     times (K,): s. poses (K, 3): x, y (m) and heading (rad); z is 0. DataError: shapes do not agree, a value is not
     finite, times do not increase, or the disk refuses.
     """
-    stamps, planar = np.asarray(times, dtype=float), np.asarray(poses, dtype=float)
-    if stamps.ndim != 1 or planar.shape != (*stamps.shape, 3):
+    stamps, planar = finite_array("times", times, 1), finite_array("poses", poses, 2)
+    if planar.shape != (*stamps.shape, 3):
         raise DataError(f"{file}: times have shape {stamps.shape}, poses {planar.shape}; expected (K,) and (K, 3)")
-    flawed = ~np.isfinite(np.column_stack([stamps, planar])).all(axis=1) | (np.diff(stamps, prepend=-np.inf) <= 0)
-    for row in np.flatnonzero(flawed)[:1]:
-        raise DataError(f"{file}: row {row + 1} of the poses: times must increase, and all values be finite")
+    for row in np.flatnonzero(np.diff(stamps, prepend=-np.inf) <= 0)[:1]:
+        raise DataError(f"times, row {row + 1}: it is {stamps[row]:g}; times increase")
     half = planar[:, 2] / 2
     zero = np.zeros_like(half)
     columns = (stamps, planar[:, 0], planar[:, 1], zero, zero, zero, np.sin(half), np.cos(half))

@@ -11,6 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from omnibench.errors import require_type
 from omnibench.robot.kinematics import Array
 from omnibench.views import Brief
 
@@ -66,6 +67,8 @@ class References(Brief):
     ) -> References:
         """The measurements of a run that ends after ``end`` s, by their times."""
         given = list(references)
+        for each in given:
+            require_type(each, Reference, "Reference(kind, value, sigma)")
         t1 = np.array([end if each.t1 is None else each.t1 for each in given], dtype=float)
         t0 = np.array(
             [

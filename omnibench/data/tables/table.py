@@ -55,7 +55,8 @@ class Table:
             lambda row: f"{column} is {'missing' if series[row] is None else series[row]}; remove or repair the row",
         )
         huge = np.abs(values) > LARGEST
-        self.refuse(huge, lambda row: f"{column} is {values[row]:g}, which no robot can reach; check the units")
+        way = "count the time from the start of its run" if column == "t" else "check the units"
+        self.refuse(huge, lambda row: f"{column} is {values[row]:g}, which no robot can reach; {way}")
         return values
 
     def name_trajectories(self) -> None:

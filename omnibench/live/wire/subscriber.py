@@ -13,7 +13,7 @@ import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
 from omnibench.config import validate
-from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.errors import ConfigError, require_choice
 from omnibench.live.closing import Closing
 from omnibench.live.network.presence import checked_robot
 from omnibench.live.network.rate_limiter import RateLimiter
@@ -60,10 +60,8 @@ def subscribe(
                 print(message.seconds, message.pose)
     """
     odometry_topics = [name for name, kind in TOPICS.items() if kind is ODOMETRY]
-    if topic not in odometry_topics:
-        raise UnknownNameError("odometry topic", topic, odometry_topics)
-    if profile not in get_args(Profile):
-        raise UnknownNameError("profile", profile, get_args(Profile))
+    require_choice("odometry topic", topic, odometry_topics)
+    require_choice("profile", profile, get_args(Profile))
     size = (_FIFO_CAPACITY if lossless else 1) if buffer is None else buffer
     if size < 1:
         raise ConfigError(f"buffer: expected a number of messages of at least 1, found {buffer}")
