@@ -39,8 +39,10 @@ _BIN = 0.2  # s: poses within are averaged, so that dense ones cost no more than
 _BLOCK = 2.0  # s: residuals that are nearer count as correlated; chosen, twice the window
 _SEARCH = 2.0  # s: offsets are looked for within this on either side, unless the caller says more; chosen
 _COARSE = 0.1  # s between the offsets that are tried first, a tenth of the window
+_MOST_BINS = 40_000  # offsets times bins that are looked at together; chosen: some MB
 _HUBER = 1.5  # standard deviations from which on a residual counts less
-_ROUNDS, _STEPS = 3, 4  # of h and s in turns with the clocks, and of Gauss-Newton in each
+_ROUNDS, _STEPS = 30, 4  # of h and s in turns with the clocks, and of Gauss-Newton in each, at most
+_SETTLED = 1e-4  # s: steps of the clocks that are shorter change nothing; below _CHORDS
 _FEWEST = 10  # windows of a run, below which its clock is not told; chosen
 _LEAST_DRIFTING = 10.0  # s: the drift of a shorter run is not told apart from its offset; chosen
 _LARGEST_DRIFT = 0.05  # s per s: no clock goes more wrong; OptiOdom's tricycle has 0.014
@@ -111,8 +113,11 @@ def match_clocks(robot: Robot, runs: Sequence[Streams], search: float = _SEARCH)
         return [None] * len(runs)
     clocks = [each.scanned(search) for each in usable]
     for _ in range(_ROUNDS):
-        fitted = _coefficients(usable, clocks)
+        fitted, before = _coefficients(usable, clocks), clocks
         clocks = [each.improved(fitted, clock) for each, clock in zip(usable, clocks, strict=True)]
+        pairs = zip(usable, before, clocks, strict=True)
+        if max(each.farthest_step(old[0] - new[0], old[1] - new[1]) for each, old, new in pairs) < _SETTLED:
+            break
     matches = iter([each.match(fitted, clock) for each, clock in zip(usable, clocks, strict=True)])
     return [None if each is None else next(matches) for each in windows]
 
@@ -174,18 +179,26 @@ class _Windows:
         """Length of the run by the reference's clock, s."""
         return float(self.stamps[-1] - self.stamps[0])
 
-    def columns(self, clock: Clock, later: float = 0.0) -> Array:
-        """Changes (W, C) of what the wheels count over the windows, so much ``later``, s, than by a clock."""
-        taken = self.stamps + clock[0] + clock[1] * (self.stamps - self.middle) + later
+    def farthest_step(self, offset: float, drift: float = 0.0) -> float:
+        """The most, s, that a step of the clock moves a stamp of the run."""
+        return abs(float(offset)) + abs(float(drift)) * self.length / 2
+
+    def columns(self, clock: Clock, later: Array) -> Array:
+        """Changes (L, W, C) of what the wheels count over the windows, ``later`` (L,), s, than by a clock."""
+        taken = self.stamps + clock[0] + clock[1] * (self.stamps - self.middle) + later[:, None]
         means = _means(_between(taken, self.edges, self.counted), self.starts)
-        changes: Array = means[self.last] - means[self.first]
+        changes: Array = means[:, self.last] - means[:, self.first]
         return changes
 
     def within(self, clock: Clock) -> NDArray[np.bool_]:
         """True (W,) for windows that lie within the wheels' samples by a clock."""
-        taken = self.stamps[self.starts] + clock[0] + clock[1] * (self.stamps[self.starts] - self.middle)
+        begins = self.stamps[self.starts]
+        return self._inside(begins + clock[0] + clock[1] * (begins - self.middle))
+
+    def _inside(self, taken: Array) -> NDArray[np.bool_]:
+        """True (..., W) for windows whose bins begin, at times (..., B), within the wheels' samples."""
         inside = (taken >= self.edges[0]) & (taken <= self.edges[-1] - _BIN)
-        both: NDArray[np.bool_] = inside[self.first] & inside[self.last]
+        both: NDArray[np.bool_] = inside[..., self.first] & inside[..., self.last]
         return both
 
     def channels(self) -> tuple[slice, slice]:
@@ -196,25 +209,33 @@ class _Windows:
         """The offset by which the run itself fits best, with coefficients of its own."""
         steps = int(np.ceil(search / _COARSE))
         offsets = np.arange(-steps, steps + 1) * _COARSE
-        return float(offsets[int(np.argmin([self._unexplained(offset) for offset in offsets.tolist()]))]), 0.0
+        parts = np.array_split(offsets, -(-len(offsets) * len(self.starts) // _MOST_BINS))
+        return float(offsets[int(np.argmin(np.concatenate([self._unexplained(part) for part in parts])))]), 0.0
 
-    def _unexplained(self, offset: float) -> float:
-        """Product of the shares of heading and way that the wheels do not explain by an offset, s."""
-        columns, within = self.columns((offset, 0.0)), self.within((offset, 0.0))
-        if within.sum() < max(_FEWEST, len(within) / 2):
-            return np.inf
-        share = 1.0
+    def _unexplained(self, offsets: Array) -> Array:
+        """Products (L,) of the shares of heading and way that the wheels do not explain by offsets (L,), s.
+
+        Bins count at their mean time, which is near enough for steps of _COARSE.
+        """
+        within = self._inside(self.stamps[self.starts] + offsets[:, None])
+        counts = _between(_means(self.stamps[:, None], self.starts)[:, 0] + offsets[:, None], self.edges, self.counted)
+        columns = counts[:, self.last] - counts[:, self.first]
+        shares = np.ones(len(offsets))
         for channel, shown in zip(self.channels(), self.shown, strict=True):
-            wanted = shown[within]
-            if (whole := float(wanted @ wanted)) > 0:
-                left = wanted - columns[within, channel] @ _solved(columns[within, channel], wanted)
-                share *= max(float(left @ left) / whole, 1e-9)
-        return share
+            wanted = np.where(within, shown, 0.0)
+            told = columns[..., channel]
+            left = np.where(within, shown - (told @ _solved(told, wanted, within)[..., None])[..., 0], 0.0)
+            whole = (wanted**2).sum(axis=1)
+            share = np.maximum((left**2).sum(axis=1) / np.maximum(whole, 1e-300), 1e-9)
+            shares *= np.where(whole > 0, share, 1.0)
+        shares[within.sum(axis=1) < max(_FEWEST, within.shape[1] / 2)] = np.inf
+        return shares
 
     def residuals(self, fitted: Sequence[Array], clock: Clock) -> tuple[Array, Array, Array]:
         """Residuals (2, W), in their standard deviations, their slopes by the middle's offset, and Huber's weights."""
-        rates = (self.columns(clock, _DELTA) - self.columns(clock, -_DELTA)) / (2 * _DELTA)
-        left = self._left(fitted, clock)
+        before, now, after = self.columns(clock, np.array([-_DELTA, 0.0, _DELTA]))
+        rates = (after - before) / (2 * _DELTA)
+        left = self._left(fitted, now)
         deviations = self._deviations(left, clock)[:, None]
         residuals = left / deviations
         slopes = np.array([rates[:, channel] @ each for channel, each in zip(self.channels(), fitted, strict=True)])
@@ -223,9 +244,8 @@ class _Windows:
         )
         return residuals, slopes / deviations, weights
 
-    def _left(self, fitted: Sequence[Array], clock: Clock) -> Array:
-        """What (2, W) the wheels do not explain by a clock, rad and m."""
-        columns = self.columns(clock)
+    def _left(self, fitted: Sequence[Array], columns: Array) -> Array:
+        """What (2, W) the wheels do not explain by changes (W, C) of what they count, rad and m."""
         told = [columns[:, channel] @ each for channel, each in zip(self.channels(), fitted, strict=True)]
         return self.shown - np.array(told)
 
@@ -246,18 +266,21 @@ class _Windows:
                 clock[0] + float(np.clip(step[0], -0.2, 0.2)),
                 float(np.clip(clock[1] + (step[1] if len(step) > 1 else 0.0), -_LARGEST_DRIFT, _LARGEST_DRIFT)),
             )
+            if self.farthest_step(*step) < _SETTLED / 10:
+                break
         return clock
 
     def _told(self, fitted: Sequence[Array], clock: Clock) -> bool:
         """True if other offsets fit clearly worse."""
-        best, _, counted = self.residuals(fitted, clock)
-        deviations = self._deviations(self._left(fitted, clock), clock)
-        for away in (-_AWAY, _AWAY):
-            other = clock[0] + away, clock[1]
-            both = (counted > 0).all(axis=0) & self.within(other)
+        now, *others = self.columns(clock, np.array([0.0, -_AWAY, _AWAY]))
+        present = self._left(fitted, now)
+        deviations = self._deviations(present, clock)[:, None]
+        best, counted = present / deviations, self.within(clock)
+        for away, columns in zip((-_AWAY, _AWAY), others, strict=True):
+            both = counted & self.within((clock[0] + away, clock[1]))
             if both.sum() < _FEWEST:
                 return False
-            left = self._left(fitted, other) / deviations[:, None]
+            left = self._left(fitted, columns) / deviations
             cost, least = (float(_huber(each[:, both]).sum()) for each in (left, best))
             if cost - least <= _TOLD * least:  # both are 0 where the reference stands still
                 return False
@@ -293,13 +316,17 @@ class _Windows:
 def _coefficients(windows: Sequence[_Windows], clocks: Sequence[Clock]) -> list[Array]:
     """The coefficients h and s of Eq. (2) and (3) that fit all runs best by their clocks."""
     fitted = []
+    told = [
+        (each, each.within(clock), each.columns(clock, np.zeros(1))[0])
+        for each, clock in zip(windows, clocks, strict=True)
+    ]
     for row in range(2):
         columns, wanted = [], []
-        for each, clock in zip(windows, clocks, strict=True):
-            within = each.within(clock)
-            columns.append(each.columns(clock)[within, each.channels()[row]])
+        for each, within, changes in told:
+            columns.append(changes[within, each.channels()[row]])
             wanted.append(each.shown[row][within])
-        fitted.append(_solved(np.concatenate(columns), np.concatenate(wanted)))
+        rows = np.concatenate(wanted)
+        fitted.append(_solved(np.concatenate(columns), rows, np.ones(len(rows), dtype=bool)))
     return fitted
 
 
@@ -310,28 +337,52 @@ def _huber(residuals: Array) -> Array:
     return loss
 
 
-def _solved(columns: Array, wanted: Array) -> Array:
-    """Least squares with Huber's weights, along the directions of the columns that are driven."""
-    solution: Array = np.linalg.lstsq(columns, wanted, rcond=_RANK)[0]
+def _solved(columns: Array, wanted: Array, counted: NDArray[np.bool_]) -> Array:
+    """Least squares (..., C) with Huber's weights, of rows that count, along the directions that are driven.
+
+    columns (..., W, C), wanted (..., W), counted (..., W). By the normal equations: _RANK is far above their rounding.
+    """
+    weights = counted.astype(float)
+    solution = _weighted(columns, wanted, weights)
     for _ in range(2):
-        left = wanted - columns @ solution
-        deviation = 1.4826 * float(np.median(np.abs(left))) if len(left) else 0.0
-        roots = np.sqrt(np.minimum(1.0, _HUBER * deviation / np.maximum(np.abs(left), 1e-300)))
-        if deviation:
-            solution = np.linalg.lstsq(columns * roots[:, None], wanted * roots, rcond=_RANK)[0]
+        sizes = np.abs(wanted - (columns @ solution[..., None])[..., 0])
+        deviation = 1.4826 * _median(sizes, counted)[..., None]
+        weights = np.where(
+            deviation > 0, counted * np.minimum(1.0, _HUBER * deviation / np.maximum(sizes, 1e-300)), weights
+        )
+        solution = _weighted(columns, wanted, weights)
     return solution
 
 
+def _weighted(columns: Array, wanted: Array, weights: Array) -> Array:
+    """Weighted least squares (..., C) along the directions that are driven."""
+    turned = np.swapaxes(columns * weights[..., None], -1, -2)
+    values, vectors = np.linalg.eigh(turned @ columns)
+    driven = values > _RANK**2 * np.maximum(values[..., -1:], 1e-300)
+    along = (np.swapaxes(vectors, -1, -2) @ (turned @ wanted[..., None]))[..., 0]
+    solution: Array = (vectors @ (np.where(driven, along / np.where(driven, values, 1.0), 0.0))[..., None])[..., 0]
+    return solution
+
+
+def _median(sizes: Array, counted: NDArray[np.bool_]) -> Array:
+    """Medians (...) of sizes (..., W) that count; 0 where none does."""
+    ordered = np.sort(np.where(counted, sizes, np.inf), axis=-1)
+    count = counted.sum(axis=-1)
+    pair = np.stack([np.maximum(count - 1, 0) // 2, np.minimum(count // 2, sizes.shape[-1] - 1)], axis=-1)
+    middle: Array = np.where(count > 0, np.take_along_axis(ordered, pair, axis=-1).mean(axis=-1), 0.0)
+    return middle
+
+
 def _between(times: Array, edges: Array, rows: Array) -> Array:
-    """Rows (K, n) at times (K,), by straight lines between the rows (F + 1, n) at the edges; held beyond."""
+    """Rows (..., n) at times (...), by straight lines between the rows (F + 1, n) at the edges; held beyond."""
     after = np.clip(np.searchsorted(edges, times), 1, len(edges) - 1)
-    share = np.clip((times - edges[after - 1]) / (edges[after] - edges[after - 1]), 0.0, 1.0)[:, None]
+    share = np.clip((times - edges[after - 1]) / (edges[after] - edges[after - 1]), 0.0, 1.0)[..., None]
     between: Array = rows[after - 1] * (1 - share) + rows[after] * share
     return between
 
 
 def _means(values: Array, starts: NDArray[np.intp]) -> Array:
-    """Means (B, n) of the rows of values (K, n) from each start to the next."""
-    counts = np.diff(np.append(starts, len(values)))
-    means: Array = np.add.reduceat(values, starts, axis=0) / counts[:, None]
+    """Means (..., B, n) of the rows of values (..., K, n) from each start to the next."""
+    counts = np.diff(np.append(starts, values.shape[-2]))
+    means: Array = np.add.reduceat(values, starts, axis=-2) / counts[:, None]
     return means

@@ -50,11 +50,16 @@ def recognised_register(counts: Array, times: Array, ranges: tuple[float, ...]) 
     So does a driver that takes the difference of two readings in a register of 16 bits, and now and then reads too
     late. The steps go backwards while the wheel turns on.
     """
-    for wrap in sorted(ranges):
-        if np.median(np.abs(np.diff(counts))) > _LONGEST_STEP * wrap:
-            continue
-        if np.ptp(counts) < wrap:
+    possible = [wrap for wrap in sorted(ranges) if wrap <= np.ptp(counts)]
+    if not possible:
+        return None
+    off, certain = _surprises(counts, times)
+    farthest, usual = np.abs(off[certain]).max(initial=0.0), np.median(np.abs(np.diff(counts)))
+    for wrap in possible:
+        if farthest <= _LOST * wrap:  # no step lost a turn of this register, or of a longer one
             return None
+        if usual > _LONGEST_STEP * wrap:
+            continue
         found = counts
         for _ in range(_ROUNDS):
             found = turns_restored(found, times, wrap)
