@@ -128,3 +128,11 @@ def test_clocks_of_a_real_robot_run_behind_by_a_tenth_of_a_second_a_minute(omni3
     assert np.median(drifts) == pytest.approx(
         -0.106, abs=0.02
     )  # s a minute; data/README: about 0.1, the other way round
+
+
+def test_clocks_that_are_a_second_off_are_followed_until_they_settle(tricyc: Dataset) -> None:
+    runs = [Streams.of_run(run) for run in tricyc.trajectories[:4]]
+    later = [replace(run, pose_times=run.pose_times + 0.35) for run in runs]
+    pairs = zip(match_clocks(tricyc.robot, runs), match_clocks(tricyc.robot, later), strict=True)
+    moved = [other.middle - clock.middle for clock, other in pairs if clock is not None and other is not None]
+    assert moved == pytest.approx([-0.35] * 4, abs=1e-3)

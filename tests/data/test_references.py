@@ -131,6 +131,9 @@ def test_a_refusal_on_reading_names_file_and_row(tmp_path: Path) -> None:
     frame.with_columns(sigma=pl.when(pl.col("kind") == "turn").then(0.0).otherwise("sigma")).write_csv(file)
     with pytest.raises(DataError, match=r"references\.csv, row \d: sigma is 0; a standard deviation is > 0"):
         load_dataset(tmp_path / "tape")
+    frame.with_columns(sigma_rate=-0.01).write_csv(file)
+    with pytest.raises(DataError, match=r"sigma_rate is -0\.01; the standard deviation of a gyro's offset is >= 0"):
+        load_dataset(tmp_path / "tape")
 
 
 def test_a_run_with_neither_poses_nor_references_is_refused(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from omnibench.config import parse_settings
 from omnibench.data.checks.option_words import as_yaml
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.references.run_references import Reference, References
+from omnibench.fit.check.missing_motions import command_names
 from omnibench.fit.check.result import CheckReport
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
@@ -150,8 +151,13 @@ SPARSE: dict[str, Change] = {
 
 
 @pytest.mark.parametrize("change", [ends, taped])
-def test_sparse_references_that_are_right_are_not_to_be_mended(change: Change) -> None:
-    assert check(changed(change)).command == ""
+def test_sparse_references_that_are_right_are_not_to_be_mended_and_tell_that_a_calibration_is_needed(
+    change: Change,
+) -> None:
+    report = check(changed(change))
+    assert report.command == ""
+    assert report.needed is True
+    assert report.gain.startswith("cross-validated (8 runs): ")
 
 
 @pytest.mark.parametrize("kind", SPARSE)
@@ -286,3 +292,22 @@ def test_runs_with_a_tape_count_beside_runs_with_poses() -> None:
 
     kinds = {finding.kind for finding in check(changed(taped)).findings}
     assert not kinds & {"few_runs", "motion_missing"}
+
+
+def test_wheel_samples_that_are_missing_are_told_of_runs_with_a_tape_too() -> None:
+    gap = without(6.0, 9.0, wheels=True)
+    report = check(changed(lambda run: gap(taped(run)) if run.id == "run1" else taped(run)))
+    assert [(f.kind, f.where) for f in report.findings if f.severity == "error"] == [("wheel_dropout", "run run1")]
+
+
+def test_a_tape_in_mm_is_told_beside_poses_in_m() -> None:
+    report = check(changed(lambda run: run if run.id in ("run0", "run4") else in_mm(taped(run))))
+    (finding,) = [each for each in report.findings if each.kind == "position_unit"]
+    assert finding.where == "references of kind displacement"
+    assert finding.fix == "write these references in m and rad, as the poses are, and import again"
+
+
+def test_runs_without_a_command_share_a_name_where_their_wheels_turn_alike() -> None:
+    runs = [replace(run, command=run.command if run.id == "run3" else None) for run in recording().trajectories]
+    names = ["like run0", "like run1", "like run2", "c3"]
+    assert command_names(runs) == [*names[:3], "c3", *names[:3], "like run7"]

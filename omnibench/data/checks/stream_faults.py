@@ -28,22 +28,29 @@ _DEAD, _EXPECTED, _ASKED = 0.002, 3.0, 0.25
 # s of a run's begin, and share of its usual speed above which wheels and reference do not begin at rest (chosen: real
 # robots that start from rest reach up to 0.32).
 _BEGIN, _MOVING = 0.12, 0.35
-# Steps of the robot's size that are needed, and spread of the turns over them, rad, that one angle cannot give; chosen.
-_FEWEST, _BENDS = 10, 0.3
+# Steps, of so many times the robot's size, that are needed, and spread of the turns over them, rad, that one angle
+# cannot give: that of circles seven times as wide as the robot is long and of straight lines; chosen.
+_FEWEST, _STEP, _BENDS = 10, 3.0, 0.3
 _SAME = 1e-4  # m and rad: a pose that is repeated, below the noise of any reference; chosen
 
 
-def stream_faults(robot: Robot, runs: Sequence[Trajectory], *, readable: bool) -> Iterator[Finding]:
-    """Faults of runs with poses. readable: True if the wheels are read rightly, which tells jumps of the reference."""
+def stream_faults(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
+    """Faults of runs, of which those without poses have only their wheels looked at.
+
+    Jumps of the reference are told by wheels that are read rightly.
+    """
+    posed = [run for run in runs if run.has_poses]
     yield from _restarts(robot, runs)
-    yield from _gaps(robot, runs)
-    frozen = _standing(robot, runs)
-    yield from _frozen(runs, frozen)
-    yield from dead_wheels(robot, runs)
-    yield from _frozen_steering(robot, runs)
-    if readable:
-        yield from _jumps(robot, [run for run in runs if run.id not in frozen])
-    yield from _moving_starts(robot, runs)
+    yield from _gaps_of(robot, runs, "wheel_dropout", lambda run: np.append(0.0, run.times), "wheel samples")
+    if not posed:
+        return
+    yield from _gaps_of(robot, posed, "reference_dropout", lambda run: run.pose_times, "reference poses")
+    frozen = _standing(robot, posed)
+    yield from _frozen(posed, frozen)
+    yield from dead_wheels(robot, posed)
+    yield from _frozen_steering(robot, posed)
+    yield from _jumps(robot, [run for run in posed if run.id not in frozen])
+    yield from _moving_starts(robot, posed)
 
 
 def runs_in_words(runs: Sequence[str], every: int) -> str:
@@ -72,18 +79,10 @@ def _restarts(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
         )
 
 
-def _gaps(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
-    """Samples or poses that are missing for long while the robot drives."""
-    for kind, times_of, what in (
-        ("wheel_dropout", lambda run: np.append(0.0, run.times), "wheel samples"),
-        ("reference_dropout", lambda run: run.pose_times, "reference poses"),
-    ):
-        yield from _gaps_of(robot, runs, kind, times_of, what)  # type: ignore[arg-type]
-
-
 def _gaps_of(
     robot: Robot, runs: Sequence[Trajectory], kind: Kind, times_of: Callable[[Trajectory], Array], what: str
 ) -> Iterator[Finding]:
+    """Samples or poses, ``what``, that are missing for long while the robot drives."""
     found, lengths = [], []
     usual = float(np.median(np.concatenate([np.diff(times_of(run)) for run in runs])))
     least = max(_LEAST_GAP, _PERIODS * usual)
@@ -225,10 +224,10 @@ def _frozen_steering(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Findi
 
 
 def _bends(robot: Robot, run: Trajectory) -> Array:
-    """Turns of the reference over steps of the robot's size, rad, signed by the wheels' direction of rolling."""
+    """Turns of the reference over steps of _STEP times the robot's size, rad, signed as the wheels roll."""
     steps = np.diff(run.poses, axis=0)
     whole = np.append(0.0, np.cumsum(np.hypot(steps[:, 0], steps[:, 1]) + robot.reach * np.abs(steps[:, 2])))
-    length = max(robot.reach, 1e-3)
+    length = _STEP * max(robot.reach, 1e-3)
     if whole[-1] < 3 * length:
         return np.zeros(0)
     rolled = np.append(0.0, np.cumsum(run.rates.mean(axis=1) * np.diff(run.times, prepend=0.0)))

@@ -28,8 +28,8 @@ def references_of(kinds: NDArray[np.str_], numbers: Mapping[str, Array], *, star
         [np.where(planar, _filled(numbers["sigma_x"], both), both), _filled(numbers["sigma_y"], both)]
     )
     values[~planar, 1] = sigmas[~planar, 1] = np.nan
-    rate_sigma = float(np.nan_to_num(numbers["sigma_rate"]).max(initial=0.0))
-    return References(kinds, t0, t1, values, sigmas, start_known, rate_sigma)
+    rates = np.append(np.nan_to_num(numbers["sigma_rate"]), 0.0)
+    return References(kinds, t0, t1, values, sigmas, start_known, float(rates[np.abs(rates).argmax()]))
 
 
 def _filled(values: Array, others: Array) -> Array:

@@ -18,6 +18,7 @@ from omnibench.data.checks.stream_faults import stream_faults
 from omnibench.data.clock_matching import ClockMatch
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importers.copied_reference import follows_the_wheels
+from omnibench.data.references.reference_units import odd_references
 from omnibench.fit.check.expected_gain import Gain, expected_gain
 from omnibench.fit.check.fixes import command, with_fixes
 from omnibench.fit.check.missing_motions import missing_motions, too_few
@@ -50,30 +51,27 @@ def check(
 
 def check_recording(read: RecordingSource) -> CheckReport:
     """The check of a recording that was read."""
-    dataset = read.dataset
+    dataset, robot = read.dataset, read.dataset.robot
     runs = [replace(run, poses=continuous(run.pose_times, run.poses)) for run in dataset.trajectories if run.has_poses]
-    if not runs:
-        return _without_poses(read)
-    clocks = clocks_of(dataset.robot, runs)
+    clocks = clocks_of(robot, runs)
     aligned = [_by_wheels(run, clock) for run, clock in zip(runs, clocks, strict=True)]
-    found = [*read.findings, *_noted(dataset)]
-    faults = list(stream_faults(dataset.robot, aligned, readable=True))
+    faults = list(stream_faults(robot, [*aligned, *(run for run in dataset.trajectories if not run.has_poses)]))
     odometry = list(_odometry(dataset, runs))
     spoiled = {finding.kind for finding in (*faults, *odometry)} & set(_SPOILED)
     explained = search(recorded(replace(dataset, trajectories=tuple(aligned))))
     frozen = any(fault.kind == "steering_frozen" for fault in faults)  # which no other reading of it mends
     misread = [] if frozen else list(_misreadings(explained)) if explained.told else _warned(dataset)
-    if misread:
-        faults = list(stream_faults(dataset.robot, aligned, readable=False))
-    found += [*misread, *odometry, *faults, *copied_runs(runs)]
+    if misread:  # wheels that are misread tell no jumps
+        faults = [fault for fault in faults if fault.kind != "reference_jump"]
+    odd = _odd_references(dataset) if explained.told else []
+    found = [*read.findings, *_noted(dataset), *misread, *odd, *odometry, *faults, *copied_runs(runs)]
     if not spoiled:
         found += clock_findings(runs, clocks)
     measured = any(run.references is not None for run in dataset.trajectories)
-    found += _left_open(dataset) if measured else missing_motions(dataset.robot, aligned)
+    found += _left_open(dataset) if measured else missing_motions(robot, aligned)
     found += too_few(dataset.trajectories)
     findings = with_fixes(read, sorted(_distinct(found), key=lambda finding: _ORDER[finding.severity]))
-    gain = Gain(None, "") if misread or spoiled else expected_gain(dataset.robot, runs)
-    return _report(read, findings, gain)
+    return _report(read, findings, Gain(None, "") if misread or odd or spoiled else expected_gain(dataset))
 
 
 def _report(read: RecordingSource, findings: Sequence[Finding], gain: Gain) -> CheckReport:
@@ -103,13 +101,6 @@ def _report(read: RecordingSource, findings: Sequence[Finding], gain: Gain) -> C
         gain=gain.sentence,
         command=command(read, typed),
     )
-
-
-def _without_poses(read: RecordingSource) -> CheckReport:
-    """The report on runs whose only reference is a distance, an angle and the like."""
-    dataset = read.dataset
-    found = [*read.findings, *_noted(dataset), *_warned(dataset), *_left_open(dataset), *too_few(dataset.trajectories)]
-    return _report(read, with_fixes(read, found), Gain(None, ""))
 
 
 def _left_open(dataset: Dataset) -> Iterator[Finding]:
@@ -148,6 +139,16 @@ def _misreadings(explained: Explained) -> Iterator[Finding]:
 def _warned(dataset: Dataset) -> list[Finding]:
     """Findings that reading a data set warned of, where the search for misreadings needs more poses than there are."""
     return [finding for finding in findings_of(dataset.warnings) if finding.severity == "error"]
+
+
+def _odd_references(dataset: Dataset) -> list[Finding]:
+    """Findings on references in another unit beside poses that are right: no option changes the ones alone."""
+    measured = [(run.log([0.0]), run.references) for run in dataset.trajectories if run.references is not None]
+    fix = "write these references in m and rad, as the poses are, and import again"
+    return [
+        finding.model_copy(update={"changes": {}, "fix": fix})
+        for finding in findings_of(odd_references(dataset.robot, measured))
+    ]
 
 
 def _odometry(dataset: Dataset, runs: Sequence[Trajectory]) -> Iterator[Finding]:

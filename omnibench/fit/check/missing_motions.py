@@ -101,19 +101,19 @@ def too_few(runs: Sequence[Trajectory]) -> Iterator[Finding]:
 
 def command_names(runs: Sequence[Trajectory]) -> list[str]:
     """The command of every run; of runs without one, runs whose wheels turn alike share a name."""
-    names: list[str] = []
-    known: list[tuple[str, Array]] = []
-    for run in runs:
-        if run.command is not None:
-            names.append(run.command)
-            continue
-        seconds = np.diff(run.times, prepend=0.0)
-        driven = np.concatenate([run.signals.T @ seconds, np.abs(run.signals).T @ seconds])
-        size = float(np.abs(driven).max(initial=0.0))
-        same = (name for name, other in known if float(np.abs(driven - other).max()) <= _ALIKE * size)
-        name = next(same, None)
-        if name is None:
-            name = f"like {run.id}"
-            known.append((name, driven))
-        names.append(name)
+    names = [run.command or "" for run in runs]
+    nameless = [index for index, run in enumerate(runs) if run.command is None]
+    driven = np.array([_driven(runs[index]) for index in nameless])
+    firsts: list[int] = []  # of the runs that drive alike
+    for row, index in enumerate(nameless):
+        alike = np.abs(driven[firsts] - driven[row]).max(axis=1) <= _ALIKE * np.abs(driven[row]).max()
+        first = firsts[int(alike.argmax())] if alike.any() else row
+        firsts += [row] if first == row else []
+        names[index] = f"like {runs[nameless[first]].id}"
     return names
+
+
+def _driven(run: Trajectory) -> Array:
+    """Angles (2 M,) that the drive signals count, with their signs and without, rad."""
+    seconds = np.diff(run.times, prepend=0.0)
+    return np.concatenate([run.signals.T @ seconds, np.abs(run.signals).T @ seconds])

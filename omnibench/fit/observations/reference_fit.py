@@ -15,12 +15,12 @@ standard deviation it is fitted beside J, and its information in A is 1 more. Wh
 less what N explains. With the columns w of the offset, stacked over the runs of a session, these still have the
 covariance I + w w', whose symmetric inverse root is
 
-    I - w w' (1 - 1/sqrt(1 + w'w)) / w'w.                                                                 (4)
+    I - w w' (1 - 1/sqrt(1 + w'w)) / w'w.                                                                 (3)
 
 A variance V_i of the fit, V = A^-1, changes with w^2 by (V K V)_ii, K = sum J'P G P J, and w^2 has the variance 1 / I,
 I = 1/2 sum tr (P G)^2 times the share of numbers that the fit leaves, so that V_i has
 
-    2 V_i^2 / sum_w ((V K V)_ii^2 / I)                                                                    (3)
+    2 V_i^2 / sum_w ((V K V)_ii^2 / I)                                                                    (4)
 
 degrees of freedom (Satterthwaite 1946), and any number where no walk is found.
 """
@@ -134,7 +134,7 @@ class ReferenceFit:
         return replace(GIVEN, description=f"{GIVEN.description}{walk}")
 
     def freedom(self, matrix: Array, slopes: Array, covariance: Array) -> Array:
-        """Degrees of freedom (n,) of the variances on the diagonal of a covariance (n, n), Eq. (3)."""
+        """Degrees of freedom (n,) of the variances on the diagonal of a covariance (n, n), Eq. (4)."""
         residuals, columns, starts = self._unweighted(matrix, slopes)
         groups = _Group.of(self._own, self.wander, residuals, self._with_offsets(columns), starts)
         fixed = _given_offsets(groups, self.walk, self._sessions)
@@ -241,7 +241,7 @@ def _without_offsets(white: Sequence[Array], count: int) -> list[Array]:
     values, offsets = [of_run[:, :-count] for of_run in white], [of_run[:, -count:] for of_run in white]
     squares = sum(np.square(of_run).sum(axis=0) for of_run in offsets)
     shared = sum(of_run.T @ values_of_run for of_run, values_of_run in zip(offsets, values, strict=True))
-    share = ((1 - 1 / np.sqrt(1 + squares)) / np.maximum(squares, np.finfo(float).tiny))[:, None]  # Eq. (4)
+    share = ((1 - 1 / np.sqrt(1 + squares)) / np.maximum(squares, np.finfo(float).tiny))[:, None]  # Eq. (3)
     return [of_run - by @ (share * shared) for of_run, by in zip(values, offsets, strict=True)]
 
 

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from omnibench.data.importers.rosbag.bag import Bag
 from omnibench.data.scans import Mount
@@ -41,6 +40,8 @@ def scanner_mounting(bag: Bag, frame: str) -> ScannerMounting | None:
 
 def fixed_transforms(bag: Bag) -> dict[str, tuple[str, Array]]:
     """Parent of every frame, and the transform (4, 4) from the frame to its parent."""
+    from scipy.spatial.transform import Rotation  # slow to import, and needed by bags with transforms alone
+
     parents: dict[str, tuple[str, Array]] = {}
     for topic in bag.topics:
         if topic.type != "tf2_msgs/msg/TFMessage" or not topic.name.endswith("tf_static"):
