@@ -47,8 +47,8 @@ class Entry(Generic[T]):
 
     @property
     def summary(self) -> str:
-        """First line of the class's docstring."""
-        return (inspect.getdoc(self.cls) or "").split("\n", 1)[0].replace("``", "")
+        """First paragraph of the class's docstring."""
+        return " ".join((inspect.getdoc(self.cls) or "").split("\n\n", 1)[0].replace("``", "").split())
 
     @property
     def options(self) -> type[BaseModel]:

@@ -50,6 +50,7 @@ def check(
     from omnibench.errors import PluginError
     from omnibench.files import refuse_existing
     from omnibench.fit.check.checking import check_recording
+    from omnibench.fit.check.fixes import next_command
     from omnibench.fit.check.recording_source import read_source
     from omnibench.registry import load_plugin_file, load_plugins
 
@@ -68,10 +69,9 @@ def check(
         document = check_document(read.dataset, checked.sentence, checked.findings, checked.gain)
         if report is not None:
             write_document(document, report)
+            typer.echo(f"report: {report}", err=True)
         write_asked_figures(document, figures)
     if as_json:
         print_json(checked.model_dump(mode="json", include={"verdict", "needed", "findings"}))
         return
-    print_check(make_console(), checked)
-    if report is not None:
-        typer.echo(f"report: {report}")
+    print_check(make_console(), checked, next_command(read))

@@ -55,6 +55,7 @@ def schema(
     module, name = _CONFIGS[kind]
     config: type[BaseModel] = getattr(import_module(module), name)
     print_json(config.model_json_schema(by_alias=True))
+    print_ending(f"this is the JSON schema of configs for {kind}", "write it to a file and name that in your editor")
 
 
 @_plugin.command("new")

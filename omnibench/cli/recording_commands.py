@@ -58,7 +58,14 @@ def inspect(
     if as_json:
         return print_json(inspection)
     print_inspection(make_console(), inspection)
-    return warn(inspection.warnings)
+    warn(inspection.warnings)
+    missing = [each.motion for each in inspection.identifiability.directions if each.state != "driven" and each.motion]
+    if missing:
+        return print_ending(
+            f"{dataset} hardly tells {' or '.join(missing)}", "read what to drive", "omnibench", "guide", "driving"
+        )
+    told = f"{dataset} drives all motions of the robot"
+    return print_ending(told, "calibrate it", "omnibench", "calibrate", dataset, "-o", "calibration.yaml")
 
 
 @recording_app.command()

@@ -22,6 +22,8 @@ def ending(stderr: str) -> str:
 
 QUICK = (
     ("list",),
+    ("schema",),
+    ("schema", "live"),
     ("guide",),
     ("guide", "data"),
     ("example",),
@@ -47,6 +49,8 @@ WORKING = (
     ("export", "{calibration}", "--to", "c_header"),
     ("export", "{calibration}", "--to", "c_header", "-o", "odometry.h"),
     ("design", "{data}"),
+    ("inspect", "{data}"),
+    ("check", "{data}"),
     ("simulate", "{config}", "-o", "simulated"),
     ("compare", "{config}", "-o", "compared"),
 )

@@ -15,8 +15,11 @@ if TYPE_CHECKING:
 _NEEDED = {True: "a calibration is needed", False: "a calibration is hardly needed", None: ""}
 
 
-def print_check(console: Console, checked: CheckReport) -> None:
-    """Print the report; what can be typed is not wrapped, so that it can be copied."""
+def print_check(console: Console, checked: CheckReport, then: str) -> None:
+    """Print the report; what can be typed is not wrapped, so that it can be copied.
+
+    then: the command line for a recording that is ready.
+    """
     console.print(f"{checked.verdict.upper()}: {checked.sentence}.", soft_wrap=True)
     for finding in checked.findings:
         _print_finding(console, finding)
@@ -30,7 +33,8 @@ def print_check(console: Console, checked: CheckReport) -> None:
     elif checked.verdict == "record more":
         print_ending("nothing of this can be typed", "record what is missing, and check again")
     else:
-        print_ending("nothing stands in the way", "calibrate it (omnibench calibrate)")
+        words = _words(then)
+        print_ending("nothing stands in the way", f"{words[1]} it", *words)
 
 
 def _print_finding(console: Console, finding: Finding) -> None:

@@ -86,8 +86,9 @@ def candidate_table(design: Design) -> Table:
 
 
 def _command_cells(candidate: Candidate) -> tuple[Cell, ...]:
+    words = command_in_words(candidate)
     return (
-        Cell(command_in_words(candidate), candidate.name),
+        Cell(words, "" if candidate.name == words else candidate.name),
         Cell(fixed(candidate.duration_s, 2)),
         Cell(fixed(candidate.distance_m, 2)),
         Cell(fixed(candidate.rolled_m, 2)),

@@ -43,6 +43,13 @@ def command(read: RecordingSource, findings: Sequence[Finding]) -> str:
     return typed if read.source.exists() else f"{typed}  # after save_dataset(dataset, {str(read.source)!r})"
 
 
+def next_command(read: RecordingSource) -> str:
+    """The command line that goes on where nothing is to be mended: a data set is calibrated, a log imported first."""
+    if read.folder is not None and (read.folder / "dataset.yaml").is_file():
+        return shlex.join(["omnibench", "calibrate", str(read.folder), "-o", "calibration.yaml"])
+    return _import(read.importer, read.source, read.options, _target(read))
+
+
 def _command(read: RecordingSource, changes: Sequence[Mapping[str, Any]]) -> str:
     """The command line; by way of a data set where the importer cannot."""
     try:
