@@ -64,7 +64,7 @@ def live(
     if not replay:
         if dataset is not None or speed is not None:
             raise ConfigError(f"{dataset or '--speed'}: is for a replay only; add --replay")
-        return _run(chosen, seconds)
+        return _run(chosen, config, seconds)
     return _replay_to_node(chosen, dataset, speed, config, seconds)
 
 
@@ -228,7 +228,7 @@ def keys(
     print_ending(f"{folder} holds keys for {', '.join(chosen)}", "read how to use them", "omnibench", "guide", "live")
 
 
-def _run(config: "LiveConfig", seconds: float | None) -> None:
+def _run(config: "LiveConfig", file: Path, seconds: float | None) -> None:
     from omnibench.cli.terminal.live_tables import node_log
     from omnibench.live.network.access_log import log_refused_access
     from omnibench.live.node import LiveNode
@@ -250,6 +250,7 @@ def _run(config: "LiveConfig", seconds: float | None) -> None:
         log.info("node %s %s %s; Ctrl-C ends it", config.name, verb, place)
         for _ in ticks(stop, _LISTENING, seconds):  # a signal that reaches one of Zenoh's threads wakes nobody here
             pass
+    print_ending(f"node {config.name} has ended, and sends nothing more", "start it again", "omnibench", "live", file)
 
 
 def _replay_to_node(

@@ -151,6 +151,12 @@ def test_a_recording_goes_out_and_comes_back_as_a_calibration_that_is_swapped_in
         assert node.process.poll() is None
 
 
+def test_a_node_ends_with_a_sentence_that_says_how_to_start_it_again(command: InProcess, workplace: Path) -> None:
+    ended = command("live", workplace / "node.yaml", "--seconds", "0")
+    assert ended.returncode == 0, ended.stderr
+    assert re.search(r"^node \w+ has ended, .*; next, start it again:\n  omnibench live ", ended.stderr, re.MULTILINE)
+
+
 def test_listen_prints_a_line_a_second_when_piped(command: InProcess, workplace: Path) -> None:
     config = workplace / "node.yaml"
     with Command("live", config):
