@@ -147,15 +147,28 @@ def parse_yaml(text: str, where: str) -> Any:
 
 
 def parse_settings(settings: Iterable[str] | None) -> dict[str, Any]:
-    """``KEY=VALUE`` pairs of a command line, values in YAML. ConfigError names the pair."""
+    """``KEY=VALUE`` pairs of a command line, values in YAML; mappings that are given twice are joined.
+
+    ConfigError names the pair.
+    """
     options: dict[str, Any] = {}
     for setting in settings or ():
         key, equals, value = setting.partition("=")
         if not equals or not key:
             raise ConfigError(f"--set {setting}: expected KEY=VALUE")
         # a pattern of names such as *_1 or [0-4]* has a meaning of its own in YAML, or none
-        options[key] = value if _PATTERN.match(value) else parse_yaml(value, f"--set {setting}")
+        read = value if _PATTERN.match(value) else _parsed(value, setting)
+        before = options.get(key)
+        options[key] = {**before, **read} if isinstance(before, dict) and isinstance(read, dict) else read
     return options
+
+
+def _parsed(value: str, setting: str) -> Any:
+    try:
+        return parse_yaml(value, f"--set {setting}")
+    except ConfigError as error:
+        way = "; put names that hold any of [ ] { } , : # in quotes, as {t: 'time [s]'}" if value[:1] == "{" else ""
+        raise ConfigError(f"{error}{way}") from None
 
 
 def read_model(model: type[M], path: Path) -> M:

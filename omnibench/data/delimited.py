@@ -92,6 +92,10 @@ class CellTable:
         """The table with other names of its columns."""
         return replace(self, names=tuple(names))
 
+    def in_lower_case(self) -> CellTable:
+        """The table with the names of its columns in lower case, for tables whose names are given."""
+        return self.named([name.lower() for name in self.names])
+
     def only(self, rows: NDArray[np.intp]) -> CellTable:
         """The table of some of the rows, by their indices."""
         columns = tuple(

@@ -78,6 +78,20 @@ def test_references_may_stand_beside_one_table_of_the_wheels_of_all_runs(tmp_pat
     assert [(run.id, measured(run)[0][3]) for run in runs] == [("a", 1.0), ("b", 1.1)]
 
 
+def test_references_that_do_not_name_their_run_are_not_taken_for_those_of_every_run(tmp_path: Path) -> None:
+    header, *rows = wheels().splitlines()
+    table = "\n".join([f"Lauf,{header}", *(f"{run},{row}" for run in "ab" for row in rows)])
+    told = "Name,Kind,Value,Sigma\na,distance,1.0,0.003\nb,distance,1.1,0.003\n"
+    source = write(tmp_path, log=table, references=told)
+    with pytest.raises(DataError, match=r"references\.csv: column 'Lauf' is missing; .* --set run_column=NAME"):
+        read(source, run_column="Lauf")
+    write(tmp_path, log=table.replace("Lauf,", "run,"))
+    with pytest.raises(DataError, match=r"references\.csv: column 'run' is missing, .*; --set run_column=NAME"):
+        read(source)
+    runs = read(write(tmp_path, references=told.replace("Name", "Run"))).trajectories
+    assert [measured(run)[0][3] for run in runs] == [1.0, 1.1]
+
+
 def test_some_runs_have_poses_and_others_references(tmp_path: Path) -> None:
     poses = "t,x,y,theta\n0,0,0,0\n2.5,0.5,0.001,0\n5,1.001,0,0.001\n"
     source = write(tmp_path, a_wheels=wheels(), a_poses=poses, b_wheels=wheels(), b_references=TAPE)

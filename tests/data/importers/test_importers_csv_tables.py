@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import polars as pl
 import pytest
 from drive_samples import DIFF, PERIOD, drive, odometry_error
 
+from omnibench.config import parse_settings
 from omnibench.data.dataset import Dataset
 from omnibench.errors import ConfigError, DataError
 from omnibench.robot.kinematics import Array
@@ -275,3 +277,59 @@ def test_wheels_that_end_before_their_first_pose_are_refused_in_a_line(tmp_path:
     wheels(1).head(15).write_csv(tmp_path / "run1_wheels.csv")
     with pytest.raises(DataError, match="run1"):
         read(tmp_path, wheel_time_unit="us")
+
+
+def refusal(source: Path, **options: Any) -> str:
+    """The line with which a recording is refused."""
+    with pytest.raises(DataError) as caught:
+        read(source, **options)
+    return str(caught.value)
+
+
+def test_what_is_suggested_for_foreign_columns_reads_them_as_it_is_typed(tmp_path: Path) -> None:
+    names = {"t": "Time [ms]", "omega_left": "LEFT SPEED", "omega_right": "RIGHT SPEED", "x": "X [mm]", "y": "Y [mm]"}
+    scaled = [pl.col("t") * 1e3, pl.col("x") * 1e3, pl.col("y") * 1e3, pl.col("theta").degrees()]
+    both(1).with_columns(scaled).rename(names | {"theta": "Yaw [°]"}).write_csv(tmp_path / "log.csv")
+    words = shlex.split(refusal(tmp_path).partition("did you mean ")[2].removesuffix("?"))
+    typed = parse_settings([word for word in words if word != "--set"])
+    assert typed["columns"]["x"] == "X [mm]"
+    assert odometry_error(read(tmp_path, **typed)) < FITS
+
+
+def test_units_in_names_of_columns_are_not_read_as_others_unless_they_are_said(tmp_path: Path) -> None:
+    both(1).rename({"x": "x (mm)", "theta": "heading deg"}).write_csv(tmp_path / "log.csv")
+    columns = {"x": "x (mm)", "theta": "heading deg"}
+    line = refusal(tmp_path, columns=columns)
+    assert "(x (mm), heading deg): --set position_unit=mm --set heading_unit=deg; or say" in line
+    assert odometry_error(read(tmp_path, columns=columns, position_unit="m", heading_unit="rad")) < FITS
+
+
+def test_a_table_whose_times_begin_anew_is_refused_with_the_column_that_names_its_runs(tmp_path: Path) -> None:
+    pl.concat([both(seed).with_columns(Lauf=pl.lit(f"r{seed}")) for seed in (1, 2)]).write_csv(tmp_path / "all.csv")
+    assert refusal(tmp_path).endswith("does Lauf name the run of each row? --set run_column=Lauf")
+    assert ids(read(tmp_path, run_column="Lauf")) == ["r1", "r2"]
+    assert "column 'Lauv' is missing; did you mean 'Lauf'?" in refusal(tmp_path, run_column="Lauv")
+
+
+def test_poses_in_the_rows_of_the_wheels_may_have_a_clock_of_their_own(tmp_path: Path) -> None:
+    apart = pl.concat([wheels(1), poses(1, t="camera")], how="diagonal")
+    apart.write_csv(tmp_path / "log.csv")
+    assert refusal(tmp_path).endswith('of their own, --set "columns={pose_t: NAME}"')
+    assert odometry_error(read(tmp_path, columns={"pose_t": "camera"})) < FITS
+
+
+def test_three_tables_with_capital_letters_are_told_and_share_the_name_of_their_times(tmp_path: Path) -> None:
+    for make, name in ((wheels, "Wheels"), (poses, "Poses")):
+        made = pl.concat([make(seed, t="Clock").with_columns(Trial=pl.lit(seed)) for seed in (1, 2)])
+        made.write_csv(tmp_path / f"{name}.CSV")
+    (tmp_path / "Runs.csv").write_text("Trial,Command\n1,curve\n2,line\n")
+    data = read(tmp_path, columns={"t": "Clock"})
+    assert [(run.id, run.command) for run in data.trajectories] == [("1", "curve"), ("2", "line")]
+    assert odometry_error(data) < FITS
+
+
+def test_wheels_and_poses_apart_under_other_names_are_refused_with_the_endings_to_say(tmp_path: Path) -> None:
+    wheels(1).write_csv(tmp_path / "encoders.csv")
+    poses(1).write_csv(tmp_path / "camera.csv")
+    assert "encoders.csv holds wheels and camera.csv poses; call them" in refusal(tmp_path)
+    assert odometry_error(read(tmp_path, wheel_suffix="encoders.csv", pose_suffix="camera.csv")) < FITS

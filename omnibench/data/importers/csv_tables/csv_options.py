@@ -22,7 +22,7 @@ BLANKS = "blanks"
 _SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t"}
 TIMES = ("t", "time", "stamp", "timestamp")
 HEADINGS = ("theta", "heading", "yaw")
-RUNS = ("run", "trajectory")
+RUNS = ("run", "trajectory", "trial", "experiment")
 PREFIXES = ("omega_", "ticks_", "phi_")
 """Of the columns of wheels: rates, positions or increments in ticks, and those in other units."""
 
@@ -67,7 +67,9 @@ class CsvOptions(EncoderOptions):
     pose_time_column: Column | None = Field(None, description="default: as for wheels")
     pose_time_unit: TimeUnit | None = Field(None, description="default: s, or the wheels' in one table")
     heading_unit: HeadingUnit = Field("rad", description="unit of the headings of CSV poses")
-    run_column: Column | None = Field(None, description="it names the run of a row; default: run or trajectory, if any")
+    run_column: Column | None = Field(
+        None, description=f"it names the run of a row; default, if any: {', '.join(RUNS)}"
+    )
     runs_table: Path | None = Field(
         None, description="table of run, command, repetition, split, session; default: runs.csv, if any"
     )

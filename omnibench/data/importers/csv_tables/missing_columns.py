@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
+from omnibench.data.checks.option_words import as_yaml
 from omnibench.data.delimited import DECIMAL_COMMA, CellTable, ColumnError
+from omnibench.data.importers.csv_tables.column_words import TIME_UNITS, typed_units, unit_options, words_of
 from omnibench.data.importers.csv_tables.csv_options import CsvOptions
 from omnibench.data.importers.csv_tables.wanted_columns import Wanted, pose_columns, wheel_columns
 
 _CLOSE = 0.75  # of difflib's ratio, from which on a name is taken for a misspelt one; chosen
-_WORDS = re.compile(r"[a-zA-Z][a-z]*|\d+")
-# Words of a column's name that say its unit, and the option of each kind of column that takes it.
-_TIME_UNITS = {"ms": "ms", "msec": "ms", "millis": "ms", "us": "us", "usec": "us", "micros": "us", "ns": "ns"}
-_LENGTHS = {"mm": "mm", "cm": "cm"}
-_ANGLES = {"deg": "deg", "degrees": "deg"}
-_RATES = {"rpm": "rpm", "deg": "deg/s", "ticks": "ticks", "tick": "ticks", "counts": "ticks", "count": "ticks"} | {
-    "enc": "ticks",
-    "encoder": "ticks",
-}
 _KINDS = {
-    "t": ("t", "time", "stamp", "timestamp", "clock", "sec", "secs", "seconds", *_TIME_UNITS),
+    "t": ("t", "time", "stamp", "timestamp", "clock", "sec", "secs", "seconds", *TIME_UNITS),
     "x": ("x", "px", "posx"),
     "y": ("y", "py", "posy"),
     "theta": ("theta", "heading", "yaw", "angle", "rotation", "orientation", "phi", "th"),
 }
+_STEERING = frozenset(("steer", "steering"))
 _SIDES = {"left": ("left", "l"), "right": ("right", "r"), "front": ("front", "f"), "rear": ("rear", "back", "b")}
 
 
@@ -62,12 +55,17 @@ def _way_out(table: CellTable, missing: Sequence[Wanted], options: CsvOptions) -
         free = [name for name in table.names if name and name not in taken.values() and name not in used]
         if (likely := _likely(wanted, free, options)) is not None:
             taken[wanted.key] = likely
-    units = "".join(f" --set {unit}" for unit in dict.fromkeys([*_units(taken, options), *_decimals(table, taken)]))
+    units = typed_units(unit_options(taken, options, shared=True))
+    typed = "".join(f" --set {setting}" for setting in [*units, *_decimals(table, taken)])
+    shown = ", ".join(f"{wanted.key}: {_typed(taken.get(wanted.key, 'NAME'))}" for wanted in missing)
     if len(taken) < len(missing):
-        shown = ", ".join(f"{wanted.key}: {taken.get(wanted.key, 'NAME')}" for wanted in missing)
-        return f'name {"it" if len(missing) == 1 else "them"}: --set "columns={{{shown}}}"{units}'
-    mapping = ", ".join(f"{key}: {name}" for key, name in taken.items())
-    return f'did you mean --set "columns={{{mapping}}}"{units}?'
+        return f'name {"it" if len(missing) == 1 else "them"}: --set "columns={{{shown}}}"{typed}'
+    return f'did you mean --set "columns={{{shown}}}"{typed}?'
+
+
+def _typed(name: str) -> str:
+    """A name as a value in a mapping of YAML that is typed between double quotes."""
+    return name if as_yaml(name) == name else "'" + name.replace("'", "''") + "'"
 
 
 def _decimals(table: CellTable, taken: Mapping[str, str]) -> list[str]:
@@ -79,39 +77,19 @@ def _decimals(table: CellTable, taken: Mapping[str, str]) -> list[str]:
 def _likely(wanted: Wanted, names: Sequence[str], options: CsvOptions) -> str | None:
     """The one of the columns whose name holds a word that says it; None if there is none, or several."""
     kind = "t" if wanted.key == "pose_t" else wanted.key
-    words = _KINDS.get(kind)
-    if words is None:
-        wheel = kind.split("_", 1)[-1] if kind not in options.robot.wheel_names else kind
-        words = _SIDES.get(wheel, (wheel,))
-    alike = [name for name in names if not {word.lower() for word in _words(name)}.isdisjoint(words)]
-    exact = [name for name in alike if _words(name)[0].lower() in words or len(alike) == 1]
+    steers = kind.startswith("steer_")
+    wheel = kind if kind in options.robot.wheel_names else kind.split("_", 1)[-1]
+    words = _KINDS.get(kind) or _SIDES.get(wheel.lower())
+    alike = [
+        name
+        for name in names
+        if steers == (not _STEERING.isdisjoint(said := words_of(name)))
+        and (not set(words).isdisjoint(said) if words else set(words_of(wheel)) <= set(said))
+    ]
+    if steers and not alike and len(options.robot.drive.steered) == 1:
+        alike = [name for name in names if not _STEERING.isdisjoint(words_of(name))]
+    exact = [name for name in alike if len(alike) == 1 or (words and words_of(name)[0] in words)]
     if len(exact) == 1:
         return exact[0]
     close = get_close_matches(wanted.names[0], names, n=1, cutoff=_CLOSE)
     return close[0] if close and not alike else None
-
-
-def _words(name: str) -> list[str]:
-    return _WORDS.findall(name) or [name]
-
-
-def _units(taken: dict[str, str], options: CsvOptions) -> list[str]:
-    """The options of the units that the names of columns say."""
-    said = []
-    for key, name in taken.items():
-        words = [word.lower() for word in _words(name)]
-        if key in ("t", "pose_t"):
-            option = "wheel_time_unit" if key == "t" else "pose_time_unit"
-            said += [f"{option}={_TIME_UNITS[word]}" for word in words if word in _TIME_UNITS]
-        elif key in ("x", "y"):
-            said += [f"position_unit={_LENGTHS[word]}" for word in words if word in _LENGTHS]
-        elif key == "theta":
-            said += [f"heading_unit={_ANGLES[word]}" for word in words if word in _ANGLES]
-        elif key.startswith("steer_"):
-            said += [f"steering_unit={_ANGLES[word]}" for word in words if word in _ANGLES]
-        elif "wheel_unit" not in options.model_fields_set:
-            for word in words:
-                if word in _RATES:
-                    ticks = " --set ticks_per_turn=N" if _RATES[word] == "ticks" else ""
-                    said.append(f"wheel_unit={_RATES[word]}{ticks}")
-    return said

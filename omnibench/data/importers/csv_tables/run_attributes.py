@@ -11,7 +11,7 @@ import numpy as np
 from omnibench.data.dataset import SPLITS, Split
 from omnibench.data.delimited import row_error
 from omnibench.data.importers.csv_tables.csv_options import CsvOptions
-from omnibench.data.importers.csv_tables.table_files import RUN_TABLES, load
+from omnibench.data.importers.csv_tables.table_files import RUN_TABLES, file_called, load
 from omnibench.data.importers.csv_tables.wanted_columns import run_column
 from omnibench.errors import DataError, nearest
 
@@ -34,7 +34,7 @@ def read_run_attributes(source: Path, options: CsvOptions) -> dict[str, RunAttri
     file = options.runs_table or _beside(source)
     if file is None:
         return {}
-    table = load(file, options)
+    table = load(file, options).in_lower_case()
     named = run_column(options, table)
     if named is None:
         raise DataError(f"{file}: column 'run' is missing; found: {', '.join(table.names)}; --set run_column=NAME")
@@ -75,9 +75,7 @@ def check_names(attributes: Collection[str], runs: Collection[str], warnings: li
 
 
 def _beside(source: Path) -> Path | None:
-    folder = source if source.is_dir() else source.parent
-    found = [folder / name for name in RUN_TABLES if (folder / name).is_file() and folder / name != source]
-    return found[0] if found else None
+    return file_called(source if source.is_dir() else source.parent, RUN_TABLES, other_than=source)
 
 
 def _number(numbers: np.ndarray | None, row: int) -> float | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,13 +46,18 @@ def find_tables(source: Path, options: CsvOptions, warnings: list[str]) -> list[
     """The tables under a folder, or those of a file, by the names of files, else by what their headers hold."""
     if source.is_file():
         return [_of_file(source, options)]
-    wheels, poses = _by_suffix(source, _wheel_suffixes(options)), _by_suffix(source, _pose_suffixes(options))
-    references = _References(_by_suffix(source, REFERENCE_SUFFIXES), _common(source))
+    files = sorted(file for file in source.rglob("*") if file.is_file())
+    wheels, poses, measured = (
+        _by_suffix(source, files, suffixes)
+        for suffixes in (_wheel_suffixes(options), _pose_suffixes(options), REFERENCE_SUFFIXES)
+    )
+    references = _References(measured, _common(source))
     if wheels or (poses and options.wheel_suffix):
         return _pairs(wheels, poses, references, options)
     if options.wheel_suffix:
         raise DataError(f"{source}: no *{options.wheel_suffix} below it; --set wheel_suffix=ENDING for other names")
-    return _by_headers(source, references, options, warnings)
+    tables = [file for file in files if file.suffix.lower() in _TABLES and file.name.lower() not in RUN_TABLES]
+    return _by_headers(source, tables, references, options, warnings)
 
 
 @dataclass(frozen=True)
@@ -69,8 +74,13 @@ class _References:
 
 def _common(folder: Path) -> Path | None:
     """The table of references of all runs in a folder."""
-    names = [suffix.lstrip("_") for suffix in REFERENCE_SUFFIXES]
-    return next((folder / name for name in names if (folder / name).is_file()), None)
+    return file_called(folder, [suffix.lstrip("_") for suffix in REFERENCE_SUFFIXES])
+
+
+def file_called(folder: Path, names: Sequence[str], *, other_than: Path | None = None) -> Path | None:
+    """The file of a folder that has one of the names, the first first, in any case of letters."""
+    files = {file.name.lower(): file for file in sorted(folder.iterdir()) if file.is_file() and file != other_than}
+    return next((files[name.lower()] for name in names if name.lower() in files), None)
 
 
 def load(file: Path, options: CsvOptions) -> CellTable:
@@ -102,13 +112,17 @@ def _pose_suffixes(options: CsvOptions) -> tuple[str, ...]:
 
 def _of_file(source: Path, options: CsvOptions) -> TablePair:
     for ending in _wheel_suffixes(options):
-        name = source.name.removesuffix(ending)
-        bare = source.name == ending.lstrip("_-.")
-        if name == source.name and not bare:
+        bare = source.name.lower() == ending.lstrip("_-.").lower()
+        if not bare and not source.name.lower().endswith(ending.lower()):
             continue
+        name = source.name[: -len(ending)]
         recording = source.resolve().parent.name if bare else name
         poses, references = (
-            _next_to(source, [suffix.lstrip("_-.") if bare else name + suffix for suffix in suffixes])
+            file_called(
+                source.parent,
+                [suffix.lstrip("_-.") if bare else name + suffix for suffix in suffixes],
+                other_than=source,
+            )
             for suffixes in (_pose_suffixes(options), REFERENCE_SUFFIXES)
         )
         references = references or _common(source.parent)
@@ -119,27 +133,21 @@ def _of_file(source: Path, options: CsvOptions) -> TablePair:
     return TablePair(source.stem, source, source if posed else None, references)
 
 
-def _next_to(source: Path, names: Sequence[str]) -> Path | None:
-    beside = [source.with_name(name) for name in names]
-    return next((file for file in beside if file.is_file() and file != source), None)
-
-
 def _all_missing(wanted: WantedColumns, table: CellTable) -> bool:
     """True if a table has none of the values of a stream."""
     return all(value.found(table) is None for value in wanted.values)
 
 
-def _by_suffix(source: Path, suffixes: Sequence[str]) -> dict[str, Path]:
-    """The files that end in one of the suffixes, or are called like one, by the name of their recording."""
+def _by_suffix(source: Path, files: Sequence[Path], suffixes: Sequence[str]) -> dict[str, Path]:
+    """The files that end in one of the suffixes, or are called like one, in any case, by the names of their runs."""
     found = {}
     for suffix in suffixes:
-        bare = suffix.lstrip("_-.")
-        for file in sorted(source.rglob(f"*{bare}")):
-            place = file.relative_to(source)
-            if file.name == bare and file.name != suffix:
+        for file in files:
+            place, name = file.relative_to(source), file.name.lower()
+            if name == suffix.lstrip("_-.").lower():
                 found[place.parent.as_posix() if place.parent.name else source.resolve().name] = file
-            elif file.name.endswith(suffix):
-                found[place.as_posix().removesuffix(suffix)] = file
+            elif name.endswith(suffix.lower()):
+                found[place.as_posix()[: -len(suffix)]] = file
     return found
 
 
@@ -162,10 +170,12 @@ def _pairs(
     return [TablePair(name, wheels[name], poses.get(name), references.of(name)) for name in sorted(wheels)]
 
 
-def _by_headers(source: Path, references: _References, options: CsvOptions, warnings: list[str]) -> list[TablePair]:
+def _by_headers(
+    source: Path, tables: Sequence[Path], references: _References, options: CsvOptions, warnings: list[str]
+) -> list[TablePair]:
     """The tables under a folder whose headers hold columns of wheels and of poses, or of wheels with references."""
     measured = {*references.own.values(), references.common}
-    files = [file for file in _tables(source) if file.name not in RUN_TABLES and file not in measured]
+    files = [file for file in tables if file not in measured]
     if not files:
         raise DataError(
             f"{source}: no tables below it; a recording is a pair <run>_wheels.csv and <run>_poses.csv, or one table "
@@ -189,6 +199,7 @@ def _by_headers(source: Path, references: _References, options: CsvOptions, warn
     if not fitting:
         if not lacking:
             raise DataError(f"{source}: none of its tables has rows ({_TEMPLATE})")
+        _check_apart([table for table, _ in lacking.values()], options)
         table, missing = min(lacking.values(), key=lambda pair: len(pair[1]))
         raise missing_error(table, missing, options)
     if lacking:
@@ -197,8 +208,15 @@ def _by_headers(source: Path, references: _References, options: CsvOptions, warn
     return fitting
 
 
-def _tables(source: Path) -> Iterable[Path]:
-    return sorted(file for file in source.rglob("*") if file.suffix.lower() in _TABLES and file.is_file())
+def _check_apart(tables: Sequence[CellTable], options: CsvOptions) -> None:
+    """DataError: some tables hold the wheels and others the poses, by names that do not say so."""
+    streams = (wheel_columns(options), pose_columns(options, shared=False))
+    wheels, poses = ([table.file for table in tables if not wanted.missing(table)] for wanted in streams)
+    if wheels and poses:
+        raise DataError(
+            f"{wheels[0]} holds wheels and {poses[0].name} poses; call them <run>_wheels.csv and <run>_poses.csv, or "
+            "say what their names end in: --set wheel_suffix=ENDING --set pose_suffix=ENDING"
+        )
 
 
 def _stem(file: Path, source: Path) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from omnibench.data.delimited import CellTable, ColumnError
+from omnibench.data.importers.csv_tables.column_words import check_units
 from omnibench.data.importers.csv_tables.csv_options import CsvOptions
 from omnibench.data.importers.csv_tables.missing_columns import missing_error
 from omnibench.data.importers.csv_tables.table_files import TablePair, load
@@ -72,6 +73,8 @@ def _check_columns(loaded: _Loaded, options: CsvOptions) -> None:
     errors = [str(missing_error(table, columns, options)) for table, columns in missing if columns]
     if errors:
         raise ColumnError("; and ".join(errors))
+    names = {each.key: found for table, wanted in lacking for each in wanted.all if (found := each.found(table))}
+    check_units(loaded.wheels.file, names, options, shared=loaded.shared)
 
 
 def _recordings(loaded: _Loaded, options: CsvOptions, warnings: list[str], *, several: bool) -> list[RecordedStreams]:
@@ -80,6 +83,8 @@ def _recordings(loaded: _Loaded, options: CsvOptions, warnings: list[str], *, se
     names = list(dict.fromkeys([*wheels, *poses]))
     if names == [None]:
         return [_recording(loaded, loaded.pair.name, (None, None), options, warnings)]
+    if loaded.references is not None and len(names) > 1:
+        loaded.references.check_of_several()
     recordings = []
     for name in filter(None, names):
         if name not in wheels and None not in wheels:

@@ -36,8 +36,17 @@ class ReferenceRows:
         rows = self.rows.get(run)
         return None if rows is None else read_measured(self.table.only(rows), options, shared=shared)
 
+    def check_of_several(self) -> None:
+        """DataError: the table does not say of which of several runs a row is."""
+        if None in self.rows:
+            found = ", ".join(self.table.names)
+            raise DataError(
+                f"{self.table.file}: column 'run' is missing, which says of which run a row is; found: {found}; --set "
+                "run_column=NAME"
+            )
+
     def check_names(self, runs: Sequence[str]) -> None:
-        """DataError: the table has references of a run that there is not, or of several without saying of which."""
+        """DataError: the table has references of a run that there is not."""
         for name in self.rows:
             if name is not None and name not in runs:
                 hint = nearest(name, runs)
@@ -49,12 +58,10 @@ def reference_rows(files: Sequence[Path | None], options: CsvOptions) -> dict[Pa
     measured = {}
     as_tables = options.model_copy(update={"header_lines": 1, "separator": None})
     for file in dict.fromkeys(filter(None, files)):
-        table = load(file, as_tables)
-        rows = rows_by_run(table, options)
-        if None in rows and files.count(file) > 1:
-            found = ", ".join(table.names)
-            raise DataError(f"{file}: column 'run' is missing, which says of which run a row is; found: {found}")
-        measured[file] = ReferenceRows(table, rows)
+        table = load(file, as_tables).in_lower_case()
+        measured[file] = ReferenceRows(table, rows_by_run(table, options))
+        if files.count(file) > 1:
+            measured[file].check_of_several()
     return measured
 
 

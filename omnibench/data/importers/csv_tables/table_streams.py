@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from shlex import quote
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.alignment import median_period
+from omnibench.data.checks.option_words import as_yaml
 from omnibench.data.delimited import CellTable, NumberTable
 from omnibench.data.importers.csv_tables.csv_options import CsvOptions
 from omnibench.data.importers.csv_tables.wanted_columns import WantedColumns
@@ -67,7 +69,10 @@ def _stream(
     filled = _filled(table, names)
     if not len(filled):
         raise DataError(f"{table.file}: no row has values of the {wanted.what} ({', '.join(names)})")
-    numbers = (table if len(filled) == len(table) else table.only(filled)).finite([time, *names])
+    rows = table if len(filled) == len(table) else table.only(filled)
+    if shared and wanted.what == "poses":
+        _check_clock(rows, time)
+    numbers = rows.finite([time, *names])
     blank = len(table) - len(filled)
     if blank and not shared:
         warnings.append(f"{table.file}: {plural(blank, 'row')} without values of the {wanted.what} left out")
@@ -76,7 +81,29 @@ def _stream(
     if 0 < repeated < _MOST_REPEATED * len(fresh):
         numbers = numbers.only(fresh)
         warnings.append(f"{table.file}: {plural(repeated, 'row')} that repeat the {time} of the one before left out")
-    return numbers, numbers.increasing(time) * SECONDS[unit], names
+    try:
+        return numbers, numbers.increasing(time) * SECONDS[unit], names
+    except DataError as error:
+        raise DataError(f"{error}{_of_runs(rows, time)}") from None
+
+
+def _check_clock(table: CellTable, time: str) -> None:
+    """DataError: poses in the rows of the wheels are without a time, as where they have a clock of their own."""
+    for row in np.flatnonzero(np.isnan(table.numbers([time])[:, 0]))[:1].tolist():
+        way = 'where poses have a column of times of their own, --set "columns={pose_t: NAME}"'
+        raise table.fail(row, f"{time} is missing; {way}")
+
+
+def _of_runs(table: CellTable, time: str) -> str:
+    """What to type where times begin anew, as they do in a table of several runs; empty where they do not."""
+    anew = (np.flatnonzero(np.diff(table.numbers([time])[:, 0]) < 0) + 1).tolist()
+    if not anew:
+        return ""
+    for name in filter(None, table.names):
+        cells = table.texts(name)
+        if [row for row in range(1, len(cells)) if cells[row] != cells[row - 1]] == anew:
+            return f"; does {name} name the run of each row? --set {quote(f'run_column={as_yaml(name)}')}"
+    return "; in a table of several runs a column names that of each row: --set run_column=NAME"
 
 
 def _filled(table: CellTable, names: Sequence[str]) -> NDArray[np.intp]:

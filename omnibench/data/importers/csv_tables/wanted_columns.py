@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from omnibench.data.delimited import CellTable
+from omnibench.data.delimited import CellTable, ColumnError, missing_column
 from omnibench.data.importers.csv_tables.csv_options import HEADINGS, PREFIXES, RUNS, TIMES, CsvOptions
 
 
@@ -58,20 +58,24 @@ def wheel_columns(options: CsvOptions) -> WantedColumns:
 def pose_columns(options: CsvOptions, *, shared: bool) -> WantedColumns:
     """The columns of the poses. shared: wheels stand in the same table, whose time is theirs unless it is said."""
     given = options.pose_time_column or options.columns.get("pose_t")
-    time = Wanted("pose_t", (given,)) if given else _time(options) if shared else Wanted("pose_t", TIMES)
+    wheels = _time(options)
+    alike = tuple(dict.fromkeys((*wheels.names, *TIMES)))
+    time = Wanted("pose_t", (given,)) if given else wheels if shared else Wanted("pose_t", alike)
     keys = ("x", "y", "theta")
-    alike = (("x",), ("y",), HEADINGS)
     values = []
-    for index, (key, names) in enumerate(zip(keys, alike, strict=True)):
+    for index, (key, names) in enumerate(zip(keys, (("x",), ("y",), HEADINGS), strict=True)):
         said = options.columns.get(key) or (options.pose_columns[index] if options.pose_columns else None)
         values.append(Wanted(key, (said,) if said else names))
     return WantedColumns("poses", time, tuple(values))
 
 
 def run_column(options: CsvOptions, table: CellTable) -> str | None:
-    """The column that names the run of a row; None without one."""
+    """The column that names the run of a row; None without one. DataError: it has not the one that the options name."""
     given = options.run_column or options.columns.get("run")
-    return Wanted("run", (given,) if given else RUNS).found(table)
+    found = Wanted("run", (given, *RUNS) if given else RUNS).found(table)
+    if given and found is None:
+        raise ColumnError(f"{missing_column(table.file, given, table.names)}; --set run_column=NAME")
+    return found
 
 
 def _time(options: CsvOptions) -> Wanted:
