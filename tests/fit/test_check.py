@@ -189,11 +189,16 @@ def test_a_data_set_in_ms_is_told_and_mended(tmp_path: Path, monkeypatch: pytest
 def test_a_wheel_that_never_turns_is_dead() -> None:
     report = check(changed(lambda run: replace(run, rates=run.rates * (1, 0))))
     assert report.verdict == "record more"
-    assert [f.where for f in report.findings if f.kind == "wheel_dead"] == [f"wheel {recording().robot.wheel_names[1]}"]
+    assert [(f.kind, f.where) for f in report.findings] == [("wheel_dead", f"wheel {recording().robot.wheel_names[1]}")]
 
 
-def test_a_reference_that_stands_still_throughout_is_frozen_and_nothing_else() -> None:
-    report = check(changed(lambda run: replace(run, poses=np.repeat(run.poses[:1], len(run.poses), 0))))
+@pytest.mark.parametrize("driven", [24.0, 3.0])
+def test_a_reference_that_stands_still_throughout_is_frozen_and_nothing_else(driven: float) -> None:
+    def still(run: Trajectory) -> Trajectory:
+        rates = run.rates * (np.abs(run.times - 12.0) < driven / 2)[:, None]
+        return replace(run, rates=rates, poses=np.repeat(run.poses[:1], len(run.poses), 0))
+
+    report = check(changed(still))
     assert (report.verdict, kinds(report)) == ("record more", {"reference_frozen"})
 
 
@@ -205,9 +210,10 @@ def test_copies_of_runs_are_named() -> None:
     assert [f.where for f in check(dataset).findings if f.kind == "copies"] == ["run copy"]
 
 
-def test_runs_that_begin_in_motion_are_told() -> None:
+@pytest.mark.parametrize("late", [0.0, 0.4])
+def test_runs_that_begin_in_motion_are_told_whatever_the_clocks(late: float) -> None:
     def cut(run: Trajectory) -> Trajectory:
-        kept, seen = run.times > 5.01, run.pose_times >= 4.99
+        kept, seen = run.times > 5.01, run.pose_times >= 4.99 + late
         moved = {"pose_times": run.pose_times[seen] - run.pose_times[seen][0], "poses": run.poses[seen]}
         return replace(run, times=run.times[kept] - 5.0, rates=run.rates[kept], **moved)
 
@@ -272,6 +278,19 @@ def test_a_steering_that_is_held_forward_and_backward_is_not_frozen() -> None:
         runs.append(Trajectory(name, "train", times, rates, stamps, scattered, steering=angles))
     found = check(make_dataset("held", TRICYCLE, 0.05, runs)).findings
     assert "steering_frozen" not in {finding.kind for finding in found}
+
+
+def test_a_steering_that_counts_nothing_on_wide_circles_and_straight_lines_is_frozen() -> None:
+    times, stamps = 0.05 * np.arange(1, 401), np.arange(0.0, 20.0, 0.1)
+    runs = []
+    for name, angle in (("circle", 0.15), ("line", 0.0)):
+        rates = np.full((400, 1), 6.0)
+        log = WheelLog(times, rates, np.zeros(3), stamps, steering=np.full((400, 1), angle), drive=TRICYCLE.drive)
+        (poses,) = OdometryModel.of_design(TRICYCLE, "arc").poses([log])
+        scattered = poses + np.random.default_rng(len(runs)).normal(0, 0.003, poses.shape)
+        runs.append(Trajectory(name, "train", times, rates, stamps, scattered, steering=np.zeros((400, 1))))
+    found = check(make_dataset("dead", TRICYCLE, 0.05, runs)).findings
+    assert "steering_frozen" in {finding.kind for finding in found}
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

@@ -146,6 +146,8 @@ def _standing(robot: Robot, runs: Sequence[Trajectory]) -> dict[str, float]:
             covered = np.zeros(len(run.pose_times), dtype=bool)
             for begin, end in zip(first[still], last[still], strict=True):
                 covered[begin : end + 1] = True
+            throughout = _equal(run.poses, np.array([0]), np.array([-1])).all()  # also while the robot is slow or rests
+            covered |= throughout
             found[run.id] = float((np.diff(run.pose_times) * (covered[1:] & covered[:-1])).sum())
     return found
 
@@ -186,18 +188,21 @@ def _frozen(runs: Sequence[Trajectory], frozen: dict[str, float]) -> Iterator[Fi
 def dead_wheels(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Finding]:
     """Wheels that count nothing though the reference shows that they turn."""
     dead: dict[str, list[str]] = {}
+    counts = np.zeros(len(robot.wheel_names), dtype=bool)
     for run in runs:
         expected = expected_angles(robot, run)
         counted = np.abs(run.rates).T @ np.diff(run.times, prepend=0.0)
         # Shares of the wheel that moves most, so that units which are misread do not matter.
-        still = (counted <= _DEAD * counted.max()) & (expected > max(_EXPECTED, _ASKED * expected.max()))
+        still = counted <= _DEAD * counted.max()
+        counts |= ~still
+        still &= expected > max(_EXPECTED, _ASKED * expected.max())
         if still.all() and len(still) > 1:
             continue  # a reference that moves by itself is told otherwise
         for name, is_dead in zip(robot.wheel_names, still.tolist(), strict=True):
             if is_dead:
                 dead.setdefault(name, []).append(run.id)
     for name, names in dead.items():
-        every = len(names) > 0.8 * len(runs)
+        every = len(names) > 0.8 * len(runs) or not counts[robot.wheel_names.index(name)]
         where = wheels_in_words([name])
         at = "" if every else f" in {runs_in_words(names, len(runs))}"
         yield Finding(
@@ -299,7 +304,7 @@ def _starts_moving(robot: Robot, run: Trajectory) -> bool:
         0.0, np.cumsum(np.hypot(*np.diff(run.poses[:, :2], axis=0).T) + robot.reach * np.abs(np.diff(run.poses[:, 2])))
     )
     for stamps, way in ((edges, ways), (run.pose_times, seen)):
-        moments = np.arange(0.0, stamps[-1], _BEGIN)
+        moments = np.arange(stamps[0], stamps[-1], _BEGIN)
         speeds = np.diff(np.interp(moments, stamps, way))
         moving = speeds[speeds > 0.1 * speeds.max(initial=0.0)]
         if not len(moving) or speeds[0] < _MOVING * float(np.median(moving)):

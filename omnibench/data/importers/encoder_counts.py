@@ -19,7 +19,7 @@ _USUAL = 2.0  # periods; a longer one without a step is a rest
 _AROUND = 1.0  # s before and after
 _KEPT = 0.4  # of the register's range, that other steps may be off
 _LOST = 0.6  # of the range
-_RARE = 0.01  # share of the steps
+_RARE, _NEARLY_ALL = 0.01, 0.95  # shares of the steps
 _ROUNDS = 3  # a lost turn beside another hides it at first
 
 
@@ -48,13 +48,15 @@ def recognised_register(counts: Array, times: Array, ranges: tuple[float, ...]) 
     """The one of ``ranges`` of which single steps of counts (F,), read at times (F,), s, lost a turn; None without.
 
     So does a driver that takes the difference of two readings in a register of 16 bits, and now and then reads too
-    late. The steps go backwards while the wheel turns on.
+    late. The steps go backwards while the wheel turns on, and not to 0, where a counter stands that was set anew.
     """
     possible = [wrap for wrap in sorted(ranges) if wrap <= np.ptp(counts)]
     if not possible:
         return None
     off, certain = _surprises(counts, times)
-    farthest, usual = np.abs(off[certain]).max(initial=0.0), np.median(np.abs(np.diff(counts)))
+    steps = np.abs(np.diff(counts))
+    farthest, usual = np.abs(off[certain]).max(initial=0.0), np.median(steps)
+    anew = np.abs(counts[1:]) <= _LONGER * np.quantile(steps, _NEARLY_ALL)
     for wrap in possible:
         if farthest <= _LOST * wrap:  # no step lost a turn of this register, or of a longer one
             return None
@@ -70,7 +72,9 @@ def recognised_register(counts: Array, times: Array, ranges: tuple[float, ...]) 
         left, certain = _surprises(found, times)
         backwards = np.diff(counts) * np.diff(found) < 0
         others = float(np.abs(left[certain & ~lost]).max(initial=0.0))
-        if lost.any() and lost.mean() < _RARE and backwards[lost].all() and others < _KEPT * wrap:
+        if (lost & anew).any() or not backwards[lost].all():
+            continue
+        if lost.any() and lost.mean() < _RARE and others < _KEPT * wrap:
             return wrap
     return None
 

@@ -59,7 +59,8 @@ def check_recording(read: RecordingSource) -> CheckReport:
     odometry = list(_odometry(dataset, runs))
     spoiled = {finding.kind for finding in (*faults, *odometry)} & set(_SPOILED)
     explained = search(recorded(replace(dataset, trajectories=tuple(aligned))))
-    frozen = any(fault.kind == "steering_frozen" for fault in faults)  # which no other reading of it mends
+    # A steering or a wheel that never counts is mended by no other reading of it.
+    frozen = any(fault.kind in ("steering_frozen", "wheel_dead") and not fault.changes for fault in faults)
     misread = [] if frozen else list(_misreadings(explained)) if explained.told else _warned(dataset)
     if misread:  # wheels that are misread tell no jumps
         faults = [fault for fault in faults if fault.kind != "reference_jump"]

@@ -111,8 +111,10 @@ def unsound(kind: str, damage: Damage, mended: Recording) -> str:
     kept = sum(run.seconds for run in mended.runs) / sum(run.seconds for run in sound.runs)
     if kept < (_KEPT if kind in _SPOILT else _KEPT_WHOLE) or kept > 1.1:
         return f"{100 * kept:.0f} % of the seconds are there"
+    there = {run.name.partition("#")[0] for run in mended.runs}  # parts of a run that was cut have a number
+    same = sound.of([run for run in sound.runs if file_name(run) in there] or list(sound.runs))
     for names in {(), damage.named}:  # all runs, and those that were spoilt
-        before, after = (misfit(_named(recording, names)) for recording in (sound, mended))
+        before, after = (misfit(_named(recording, names)) for recording in (same, mended))
         if not after <= _WORSE * before + _MARGIN and math.isfinite(before):
             return f"misfit {after:.3f}, sound {before:.3f}"
     lengths = [
@@ -131,7 +133,7 @@ def unsound(kind: str, damage: Damage, mended: Recording) -> str:
 
 
 def _named(recording: Recording, names: Sequence[str]) -> Recording:
-    """The runs with one of the names in theirs; all where no run has one, as if it was left out."""
+    """The runs with one of the names in theirs; all where no run has one, as where it was left out."""
     runs = [run for run in recording.runs if any(name in run.name for name in names)]
     return recording.of(runs or list(recording.runs))
 

@@ -8,6 +8,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import threading
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -53,13 +54,15 @@ def _by_shell(command: str, folder: Path, files: list[Path]) -> int:
 
 
 @cache
-def _server() -> subprocess.Popen[str]:
+def _server(thread: int) -> subprocess.Popen[str]:
+    """The server of a thread, whose answers no other thread reads."""
+    assert thread
     words = [sys.executable, str(Path(__file__))]
     return subprocess.Popen(words, env=_environment(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
 def _served(words: list[str], folder: Path, files: list[Path]) -> int:
-    server = _server()
+    server = _server(threading.get_ident())
     assert server.stdin is not None
     assert server.stdout is not None
     server.stdin.write(json.dumps([words, str(folder), *map(str, files)]) + "\n")

@@ -78,6 +78,12 @@ def power_near(number: int) -> float | None:
     return power if abs(power - number) < 0.05 * power else None
 
 
+@pytest.mark.parametrize("before", [8_000, 8_100])
+def test_a_counter_that_is_set_to_zero_while_its_wheel_turns_has_lost_no_turn(before: int) -> None:
+    counts = np.append(np.arange(0, before, 290), np.arange(0, 30_000, 290)).astype(float)
+    assert recognised_register(counts, 0.03 * np.arange(len(counts)), POWERS_OF_TWO) is None
+
+
 def test_steps_of_a_third_of_the_range_are_not_unambiguous() -> None:
     assert recognised_wrap(np.arange(0, 40000.0, 85) % 256, POWERS_OF_TWO) is None
 
