@@ -44,6 +44,7 @@ OMNI = sample().dataset.robot
     [
         ((0.2, 0.0, 0.0), {"straight", "forward"}),
         ((-0.2, 0.0, 0.0), {"straight", "backward"}),
+        ((0.1, 0.0, 0.02), {"straight", "forward"}),  # what a straight line of uneven wheels turns by
         ((0.2, 0.0, 0.5), {"curves to the left", "forward"}),
         ((0.0, 0.2, -0.5), {"curves to the right", "sideways to the left"}),
         ((0.0, -0.2, 0.0), {"straight", "sideways to the right"}),

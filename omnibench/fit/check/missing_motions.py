@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 from omnibench.data.checks.finding import Finding
 from omnibench.data.checks.motion_fit import Windows
 from omnibench.data.dataset import Trajectory
+from omnibench.fit.check.motion_kinds import MOVING, SHARE, TURNING, motion_kinds, turning
 from omnibench.fit.span import driven_span
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Complex
 from omnibench.words import plural
 
-_TURNING, _STRAIGHT = 0.06, 0.04  # rad/s from which on a robot turns, and up to which it goes straight; chosen
-_MOVING = 0.02  # m/s from which on it moves; chosen
-SHARE = 0.02  # of the time that a motion must be driven; chosen: some seconds in a minute
 _SLIDING = 0.35  # rad between two directions of motion that count as different; chosen
 _FEW_RUNS, _SOME_RUNS = 3, 7  # runs up to which no interval can be had, and few
 _LEAST_REPEATED = 2
@@ -35,8 +33,9 @@ def missing_motions(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Findin
     if windows is None:
         return
     seconds = windows.times[:, 1] - windows.times[:, 0]
-    turning, speed = windows.turned / seconds, np.abs(windows.moved) / seconds
-    active = (np.abs(turning) > _TURNING) | (speed > _MOVING)
+    velocity, rates = windows.moved / seconds, windows.turned / seconds
+    kinds = motion_kinds(np.column_stack([velocity.real, velocity.imag, rates]), robot)
+    active = (np.abs(rates) > TURNING) | (np.abs(velocity) > MOVING)
     if not active.any():
         return
     whole = float(seconds[active].sum())
@@ -44,19 +43,22 @@ def missing_motions(robot: Robot, runs: Sequence[Trajectory]) -> Iterator[Findin
     def share(chosen: NDArray[np.bool_]) -> float:
         return float(seconds[active & chosen].sum()) / whole
 
-    left, right = share(turning > _TURNING), share(turning < -_TURNING)
+    left, right = share(turning(kinds, "left")), share(turning(kinds, "right"))
     if left < SHARE and right < SHARE:
         yield _missing("the robot never turned", f"drive {_turns(robot)}, to either side")
     elif min(left, right) < SHARE:
         side = "left" if left < SHARE else "right"
         yield _missing(f"the robot never turned {side}", f"drive {_turns(robot)}, to the {side}")
-    if share((np.abs(turning) < _STRAIGHT) & (speed > _MOVING)) < SHARE:
+    if share(kinds["straight"]) < SHARE:
         yield _missing("the robot never went straight", "drive three straight lines of 2 m and more")
-    if robot.slides and not robot.skid and not _sideways(windows.moved[active & (speed > _MOVING)]):
+    if robot.slides and not robot.skid and not _sideways(windows.moved[np.abs(velocity) > MOVING]):
         yield _missing("the robot went in one direction only", "drive forward, and sideways to either side, 2 m each")
-    if not robot.drive.steered and left >= SHARE and right >= SHARE and robot.slides:
-        spot = share((np.abs(turning) > _TURNING) & (speed < 0.1 * robot.reach * np.abs(turning) + _MOVING))
-        if spot < SHARE and driven_span(runs).shares[-1] < SHARE / 2 and len(driven_span(runs).shares) == 3:
+    if robot.drive.direct and left >= SHARE and right >= SHARE and robot.slides:
+        spot, shares = (
+            share(kinds["on the spot to the left"] | kinds["on the spot to the right"]),
+            driven_span(runs).shares,
+        )
+        if spot < SHARE and shares[-1] < SHARE / 2 and len(shares) == 3:
             yield _missing("the robot never turned on the spot", "drive three turns at 0.5 rad/s, to either side")
 
 

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.fit.check.missing_motions import SHARE
+from omnibench.fit.check.motion_kinds import SHARE, motion_kinds, turning
 from omnibench.report.blocks import Cell, Column, Figure, FigureGrid, LegendItem, Row, Table
 from omnibench.report.numbers import NOTHING, fixed, percent, significant
 from omnibench.report.recording.scan_points import evenly
@@ -19,9 +18,6 @@ from omnibench.robot.kinematics import Array, Robot
 
 _BLOCK = 0.5  # s: motions are means over so long, which smooths encoder ticks (chosen)
 _RESTS = 0.05  # share of the fastest motion below which the robot stands (chosen)
-_STRAIGHT = 0.03  # the wheels' way by turning, as a share of the way ahead, below which a motion is straight (chosen)
-_ON_THE_SPOT = 0.1  # the way ahead, as a share of the wheels' way by turning, below which it is on the spot (chosen)
-_SECTOR = 30.0  # deg about an axis that count as along it (chosen)
 _DRAWN = 2500  # dots of a figure
 _LEFT = LegendItem("left", "turning left", PALETTE[0])
 _STRAIGHT_ON = LegendItem("straight", "straight", "#5b6772")
@@ -48,7 +44,7 @@ def driven_motions(runs: Sequence[Trajectory], robot: Robot) -> list[DrivenMotio
     total = float(seconds.sum()) or 1.0
     return [
         DrivenMotion(name, float(seconds[chosen].sum()) / total, twists[chosen])
-        for name, chosen in _kinds(twists, robot).items()
+        for name, chosen in motion_kinds(twists, robot).items()
     ]
 
 
@@ -74,28 +70,6 @@ def _twists(runs: Sequence[Trajectory], robot: Robot) -> tuple[Array, Array]:
     size = np.hypot(twists[:, 0], twists[:, 1]) + robot.reach * np.abs(twists[:, 2])
     moving = size > _RESTS * float(size.max(initial=0.0))
     return twists[moving], seconds[moving]
-
-
-def _kinds(twists: Array, robot: Robot) -> dict[str, NDArray[np.bool_]]:
-    """Masks (n,) of twists, by the name of the motion; those that the robot cannot drive are left out."""
-    speed, turn = np.hypot(twists[:, 0], twists[:, 1]), robot.reach * twists[:, 2]
-    spot = speed < _ON_THE_SPOT * np.abs(turn)
-    straight = ~spot & (np.abs(turn) < _STRAIGHT * speed)
-    angle = np.degrees(np.arctan2(twists[:, 1], twists[:, 0]))
-    kinds = {
-        "straight": straight,
-        "curves to the left": ~spot & ~straight & (turn > 0),
-        "curves to the right": ~spot & ~straight & (turn < 0),
-    }
-    if robot.drive.direct:  # a tricycle or a car may not be able to turn on the spot
-        kinds |= {"on the spot to the left": spot & (turn > 0), "on the spot to the right": spot & (turn < 0)}
-    kinds |= {"forward": ~spot & (np.abs(angle) <= _SECTOR), "backward": ~spot & (np.abs(angle) >= 180 - _SECTOR)}
-    if len(robot.motions) == 3:
-        kinds |= {
-            "sideways to the left": ~spot & (np.abs(angle - 90) <= _SECTOR),
-            "sideways to the right": ~spot & (np.abs(angle + 90) <= _SECTOR),
-        }
-    return kinds
 
 
 def motion_table(motions: Sequence[DrivenMotion]) -> Table:
@@ -134,23 +108,23 @@ def motion_figures(runs: Sequence[Trajectory], robot: Robot) -> FigureGrid:
     """Velocities seen from above, and speeds against rates of turn, a dot for every half second."""
     twists, _ = _twists(runs, robot)
     twists = twists[evenly(len(twists), _DRAWN)] if len(twists) else twists
-    turn = robot.reach * twists[:, 2]
-    straight = np.abs(turn) < _STRAIGHT * np.hypot(twists[:, 0], twists[:, 1])
-    groups = ((_LEFT, ~straight & (turn > 0)), (_STRAIGHT_ON, straight), (_RIGHT, ~straight & (turn < 0)))
-    above, turning = [], []
+    kinds = motion_kinds(twists, robot)
+    left, right = turning(kinds, "left"), turning(kinds, "right")
+    groups = ((_LEFT, left), (_STRAIGHT_ON, ~left & ~right), (_RIGHT, right))
+    above, beside = [], []
     for item, chosen in groups:
         ahead, aside, rate = twists[chosen].T
         words = f"{item.label}<br>%{{y:.2f}} m/s ahead, %{{x:.2f}} m/s to the left"
         above.append(marks(item, 5, aside, ahead, hover=words, marker_opacity=0.6))
         speeds, degrees = np.hypot(ahead, aside), np.degrees(rate)
-        turning.append(marks(item, 5, degrees, speeds, hover="%{x:.0f}°/s, %{y:.2f} m/s", marker_opacity=0.6))
+        beside.append(marks(item, 5, degrees, speeds, hover="%{x:.0f}°/s, %{y:.2f} m/s", marker_opacity=0.6))
     middle = marks(LegendItem("", "", INK, symbol="cross-thin-open"), 10, [0.0], [0.0])
     velocity = plot(*above, middle, x_title="to the left (m/s)", y_title="ahead (m/s)")
     reach = 1.1 * max(float(np.abs(twists[:, :2]).max(initial=0.0)), 0.01)
     velocity.update_layout(
         xaxis={"range": [reach, -reach], "scaleanchor": "y"}, yaxis={"range": [-reach, reach], "scaleratio": 1}
     )
-    rates = plot(*turning, x_title="rate of turn, to the left (°/s)", y_title="speed (m/s)")
+    rates = plot(*beside, x_title="rate of turn, to the left (°/s)", y_title="speed (m/s)")
     rates.update_xaxes(autorange="reversed")
     rates.update_yaxes(rangemode="tozero")
     return FigureGrid(
