@@ -77,7 +77,7 @@ def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: fl
     headline = " ".join([*of_sessions, of_model, *(doubts if findings.verdict == "none" else ()), *_warnings(findings)])
     needs_session = any("session" in term.effect.needs for term in fit.model.terms)
     return Discovery(
-        dataset=replace(dataset, trajectories=(*fit.runs, *findings.validation.kept)),
+        dataset=replace(dataset, trajectories=(*fit.runs, *findings.validation.runs)),
         dataset_hash=dataset.hash,
         simulated=dataset.simulated,
         verdict=findings.verdict,

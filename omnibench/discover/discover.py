@@ -119,7 +119,7 @@ def discover_effects(
     baseline = without_effects(plain, extended)
     validation = validation_runs(dataset, extended.fit)
     held_out = compare_held_out(baseline, extended, validation, folds)
-    steps = waterfall_steps(plain, baseline, extended, validation.kept)
+    steps = waterfall_steps(plain, baseline, extended, validation)
     sessions = compare_with_validation(extended, validation)
     eq6_of_sessions = eq6_with_changes(extended, validation.runs, sessions)
     extrapolations = extrapolations_of(validation.kept, baseline, models.weighted)

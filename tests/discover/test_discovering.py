@@ -28,13 +28,15 @@ def test_a_hidden_effect_is_named_with_its_parameters() -> None:
     assert {each.name: each.value for each in effect.parameters} == pytest.approx(truth, rel=0.03)
 
 
-def test_the_gap_on_the_held_out_session_closes() -> None:
+def test_the_gap_on_the_held_out_session_closes_from_step_to_step() -> None:
     coupling = repeated()
     session = coupling.held_out[-1]
     assert session.data == "session"
     assert session.chi2.closed is not None
     assert session.chi2.closed > 0.9
-    assert coupling.steps[-1].held_out < coupling.steps[0].held_out
+    first, last = coupling.steps[0], coupling.steps[-1]
+    assert (first.held_out, last.held_out) == pytest.approx((session.chi2.before, session.chi2.after), rel=1e-9)
+    assert (first.eq6_held_out, last.eq6_held_out) == pytest.approx((session.eq6.before, session.eq6.after), rel=1e-9)
 
 
 def test_the_extended_calibration_runs_what_was_found(tmp_path: Path) -> None:

@@ -11,14 +11,12 @@ scatter, by chance or because the repetitions were no repetitions, their mean is
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.extend import Extended
 from omnibench.discover.fitting.model_fit import Fit, at_runs
 from omnibench.discover.held_out.cross_validation import STANDARD_ERRORS, held_out_residuals, held_out_squares
@@ -43,7 +41,7 @@ def compare_held_out(
         before, after = (errors_of_repetitions(model, folds) for model in (plain, extended))
         held_out.append(_compared("repetitions", before, after, floor))
     if validation.kept:
-        before, after = (errors_on(model, validation.runs, validation.kept) for model in (plain, extended))
+        before, after = (errors_on(model.fit, validation) for model in (plain, extended))
         of_session = floor_of(at_runs(extended.fit, validation.kept))
         held_out.append(_compared("session", before, after, of_session or floor))
     return tuple(held_out)
@@ -51,14 +49,12 @@ def compare_held_out(
 
 def training_gap(plain: Extended, extended: Extended) -> Gap:
     """The gap in Eq. (6) on the runs of the fit, as fitted to them."""
-    before, after = (_norms([each[-1] for each in model.fit.nuisance_free_residuals]) for model in (plain, extended))
+    before, after = (
+        np.array([np.linalg.norm(each[-1]) for each in model.fit.nuisance_free_residuals])
+        for model in (plain, extended)
+    )
     floor = floor_of(extended.fit)
     return gap_between("eq6", before, after, None if floor is None else floor.eq6)
-
-
-def _norms(finals: Sequence[Array]) -> Array:
-    norms: Array = np.linalg.norm(finals, axis=1)
-    return norms
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +67,12 @@ class Errors:
     finals: Array
     chi2: Array
 
+    @property
+    def eq6(self) -> Array:
+        """Norms (Z,) of the final errors."""
+        norms: Array = np.linalg.norm(self.finals, axis=1)
+        return norms
+
 
 def errors_of_repetitions(extended: Extended, folds: NDArray[np.intp]) -> Errors:
     """Errors on the runs of the fit, each predicted from the other folds."""
@@ -79,10 +81,10 @@ def errors_of_repetitions(extended: Extended, folds: NDArray[np.intp]) -> Errors
     return Errors(finals, squares / [len(residuals) for residuals in extended.data.residuals])
 
 
-def errors_on(extended: Extended, runs: Sequence[Trajectory], without_jumps: Sequence[Trajectory]) -> Errors:
-    """Errors on other runs: of all final poses, and the chi-square of the poses that do not jump."""
-    finals = np.array([residuals[-1] for residuals in at_runs(extended.fit, runs).residuals])
-    kept = at_runs(extended.fit, without_jumps)
+def errors_on(fit: Fit, validation: ValidationRuns) -> Errors:
+    """Errors on the validation split: of all final poses, and the chi-square of the poses that do not jump."""
+    finals = np.array([residuals[-1] for residuals in at_runs(fit, validation.runs).residuals])
+    kept = at_runs(fit, validation.kept)
     white = kept.whitened([np.zeros((*residuals.shape, 0)) for residuals in kept.residuals]).residuals
     return Errors(finals, np.array([float(np.square(residuals).mean()) for residuals in white]))
 
@@ -120,13 +122,12 @@ def floor_of(fit: Fit) -> Floor | None:
 
 def _compared(data: Literal["repetitions", "session"], before: Errors, after: Errors, floor: Floor | None) -> HeldOut:
     """The gaps in Eq. (6) of the final poses and in whitened chi-square."""
-    norms = [_norms(list(errors.finals)) for errors in (before, after)]
     position = [float(np.hypot(errors.finals[:, 0], errors.finals[:, 1]).mean()) for errors in (before, after)]
     heading = [float(np.abs(errors.finals[:, 2]).mean()) for errors in (before, after)]
     return HeldOut(
         data=data,
         runs=len(before.finals),
-        eq6=gap_between("eq6", norms[0], norms[1], None if floor is None else floor.eq6),
+        eq6=gap_between("eq6", before.eq6, after.eq6, None if floor is None else floor.eq6),
         chi2=gap_between("chi2", before.chi2, after.chi2, None if floor is None else floor.chi2),
         position_m=(position[0], position[1]),
         heading_rad=(heading[0], heading[1]),

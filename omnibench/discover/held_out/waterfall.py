@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting.extend import Extended, extend
-from omnibench.discover.fitting.model_fit import Fit, at_runs
+from omnibench.discover.fitting.model_fit import Fit
+from omnibench.discover.held_out.gaps import errors_on
+from omnibench.discover.held_out.validation_runs import ValidationRuns
 from omnibench.discover.regressors.column_group import Group
 from omnibench.discover.result import Step
 from omnibench.fit.least_squares.noise import Whitener
@@ -16,9 +19,7 @@ from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 
 
-def waterfall_steps(
-    plain: Fit, baseline: Extended, extended: Extended, validation: Sequence[Trajectory]
-) -> tuple[Step, ...]:
+def waterfall_steps(plain: Fit, baseline: Extended, extended: Extended, validation: ValidationRuns) -> tuple[Step, ...]:
     """The plain matrix (baseline), then the models with one effect more each; all under the extended model's noise.
 
     plain: the fit that models between the first and the last are extended from.
@@ -27,7 +28,7 @@ def waterfall_steps(
     for count in group_counts(extended.groups):
         model = extended if count == len(extended.groups) else extend(plain, extended.groups[:count])
         models.append((f"+ {step_name(extended.groups[count - 1])}", model))
-    return tuple(_step(name, model.fit, extended.fit.noise.noise, validation) for name, model in models)
+    return tuple(_step(name, model.fit, extended.fit, validation) for name, model in models)
 
 
 def group_counts(groups: Sequence[Group]) -> list[int]:
@@ -41,14 +42,15 @@ def step_name(group: Group) -> str:
     return group.name if group.basis is None else f"smooth term over {group.basis.covariate} (no name)"
 
 
-def _step(name: str, fit: Fit, noise: Noise, validation: Sequence[Trajectory]) -> Step:
-    held_out = at_runs(fit, validation).residuals if validation else ()
+def _step(name: str, fit: Fit, extended: Fit, validation: ValidationRuns) -> Step:
+    """Errors of a step's model; on held-out runs as ``compare_held_out`` has them."""
+    errors = errors_on(replace(extended, model=fit.model), validation) if validation.kept else None
     return Step(
         name,
-        _chi2(noise, fit.runs, fit.residuals),
-        _chi2(noise, validation, held_out) if held_out else None,
+        _chi2(extended.noise.noise, fit.runs, fit.residuals),
+        None if errors is None else float(errors.chi2.mean()),
         _eq6(fit.nuisance_free_residuals),
-        _eq6(held_out) if held_out else None,
+        None if errors is None else float(errors.eq6.mean()),
     )
 
 
